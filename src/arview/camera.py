@@ -1,0 +1,119 @@
+"""The pinhole camera with Brown distortion (k1 k2 p1 p2 k3), in OpenCV's conventions.
+
+Pixel (u, v): integer coordinates are pixel centres. Camera frame: +X right, +Y down, +Z forward.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arview.errors import InputError
+from arview.geometry import Array
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one camera at one image size.
+
+    ``dist`` is (5,) = k1 k2 p1 p2 k3 of OpenCV. Raises InputError when a value cannot be a camera's.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    dist: Array = field(default_factory=lambda: np.zeros(5))
+
+    def __post_init__(self) -> None:
+        dist = np.zeros(5)
+        given = np.asarray(self.dist, dtype=np.float64).ravel()
+        if given.size > 5 and np.any(given[5:] != 0):
+            raise InputError(f"camera: {given.size} distortion terms; only k1 k2 p1 p2 k3 are supported")
+        dist[: min(5, given.size)] = given[:5]
+        object.__setattr__(self, "dist", dist)
+        values = np.array([self.fx, self.fy, self.cx, self.cy, *dist], dtype=np.float64)
+        if not np.all(np.isfinite(values)):
+            raise InputError("camera: a value is NaN or infinite; calibrate again or correct the file")
+        if self.width <= 0 or self.height <= 0:
+            raise InputError(f"camera: image size {self.width}×{self.height} is not positive")
+        if self.fx <= 0 or self.fy <= 0:
+            raise InputError(f"camera: focal length fx={self.fx} fy={self.fy} px is not positive")
+
+    @property
+    def matrix(self) -> Array:
+        """(3,3) calibration matrix K in px."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def is_distorted(self) -> bool:
+        """True when any distortion term is not zero."""
+        return bool(np.any(self.dist != 0.0))
+
+    def project(self, points_in_cam: ArrayLike) -> Array:
+        """Pixels (..., 2) of points (..., 3) in the camera frame; NaN for points not in front of it."""
+        points = np.asarray(points_in_cam, dtype=np.float64)
+        z = points[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = np.where(z > 0, points[..., 0] / z, np.nan)
+            y = np.where(z > 0, points[..., 1] / z, np.nan)
+        x, y = self.distort(x, y)
+        return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
+
+    def distort(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Distorted normalised coordinates of ideal ones (Brown 1966, OpenCV's formula)."""
+        k1, k2, p1, p2, k3 = self.dist
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        return xd, yd
+
+    def unproject(self, pixels: ArrayLike) -> Array:
+        """Ideal normalised rays (..., 3) with z = 1 of pixels (..., 2); distortion is removed by iteration."""
+        uv = np.asarray(pixels, dtype=np.float64)
+        xd = (uv[..., 0] - self.cx) / self.fx
+        yd = (uv[..., 1] - self.cy) / self.fy
+        x, y = xd.copy(), yd.copy()
+        if self.is_distorted:
+            for _ in range(20):
+                xe, ye = self.distort(x, y)
+                x, y = x + xd - xe, y + yd - ye
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same camera for an image resized to width × height (the whole field of view kept)."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+        )
+
+    def rotated(self, quarter_turns_clockwise: int) -> Camera:
+        """The same camera for an image turned clockwise by quarter turns; distortion turns with it."""
+        camera = self
+        for _ in range(quarter_turns_clockwise % 4):
+            k1, k2, p1, p2, k3 = camera.dist
+            camera = Camera(
+                width=camera.height,
+                height=camera.width,
+                fx=camera.fy,
+                fy=camera.fx,
+                cx=camera.height - 1 - camera.cy,
+                cy=camera.cx,
+                dist=np.array([k1, k2, p2, -p1, k3]),
+            )
+        return camera
+
+    def without_distortion(self) -> Camera:
+        """The ideal camera with the same K."""
+        return replace(self, dist=np.zeros(5))
