@@ -1,0 +1,130 @@
+"""Model and Component: a CAD assembly as named triangle meshes in one frame, in millimetres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.errors import InputError
+from arview.geometry import Array
+
+
+@dataclass(frozen=True)
+class Component:
+    """One named part of the assembly at its nominal place.
+
+    Attributes:
+        name: unique within its model.
+        vertices_in_model: (V,3) float64, mm.
+        faces: (F,3) int32, counter-clockwise seen from outside.
+        color: (3,) float64 sRGB in 0–1.
+    """
+
+    name: str
+    vertices_in_model: Array
+    faces: NDArray[np.int32]
+    color: tuple[float, float, float] = (0.6, 0.6, 0.62)
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices_in_model, dtype=np.float64)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int32)
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise InputError(f"component {self.name!r}: vertices have shape {vertices.shape}, expected (V, 3)")
+        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+            raise InputError(f"component {self.name!r}: faces have shape {faces.shape}, expected (F, 3), F > 0")
+        if not np.all(np.isfinite(vertices)):
+            bad = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
+            raise InputError(f"component {self.name!r}: {bad} of {len(vertices)} vertices are NaN or infinite")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise InputError(f"component {self.name!r}: a face refers to vertex {faces.max()} of {len(vertices)}")
+        object.__setattr__(self, "vertices_in_model", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @cached_property
+    def bounds_in_model(self) -> Array:
+        """(2,3) lowest and highest corner, mm."""
+        used = self.vertices_in_model[np.unique(self.faces)]
+        return np.stack([used.min(axis=0), used.max(axis=0)])
+
+
+@dataclass(frozen=True)
+class Model:
+    """A named assembly of components.
+
+    ``source_hash`` identifies the geometry (SHA-256 of names, vertices to a micrometre and faces) and is
+    what guide views and inspections are checked against.
+    """
+
+    name: str
+    components: tuple[Component, ...]
+    source_hash: str
+
+    def __post_init__(self) -> None:
+        if not self.components:
+            raise InputError(f"model {self.name!r} has no components")
+        names = [component.name for component in self.components]
+        if len(set(names)) != len(names):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            raise InputError(f"model {self.name!r}: component names are not unique: {', '.join(twice)}")
+
+    @cached_property
+    def mesh(self) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
+        """All components in one mesh: vertices (V,3) mm, faces (F,3), component index per face (F,)."""
+        vertices, faces, ids, offset = [], [], [], 0
+        for index, component in enumerate(self.components):
+            vertices.append(component.vertices_in_model)
+            faces.append(component.faces + offset)
+            ids.append(np.full(len(component.faces), index, dtype=np.int32))
+            offset += len(component.vertices_in_model)
+        return (
+            np.ascontiguousarray(np.concatenate(vertices)),
+            np.ascontiguousarray(np.concatenate(faces), dtype=np.int32),
+            np.concatenate(ids),
+        )
+
+    @cached_property
+    def bounds_in_model(self) -> Array:
+        """(2,3) lowest and highest corner of all components, mm."""
+        corners = np.stack([component.bounds_in_model for component in self.components])
+        return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+
+    @property
+    def center_in_model(self) -> Array:
+        """(3,) middle of the bounding box, mm."""
+        return self.bounds_in_model.mean(axis=0)
+
+    @property
+    def diameter_mm(self) -> float:
+        """Diagonal of the bounding box, mm."""
+        return float(np.linalg.norm(self.bounds_in_model[1] - self.bounds_in_model[0]))
+
+    def component(self, name: str) -> Component:
+        """The component of that name; raises InputError naming those that exist."""
+        for component in self.components:
+            if component.name == name:
+                return component
+        known = ", ".join(component.name for component in self.components)
+        raise InputError(f"model {self.name!r} has no component {name!r}; it has: {known}")
+
+    def index(self, name: str) -> int:
+        """Index of the component of that name."""
+        return self.components.index(self.component(name))
+
+    def only(self, names: list[str]) -> Model:
+        """A model of the named components alone, with a hash of its own."""
+        return make_model(f"{self.name}:{'+'.join(names)}", tuple(self.component(n) for n in names))
+
+
+def make_model(name: str, components: tuple[Component, ...]) -> Model:
+    """Model with its ``source_hash`` computed from the geometry."""
+    import hashlib
+
+    digest = hashlib.sha256()
+    for component in components:
+        digest.update(component.name.encode())
+        digest.update(np.round(component.vertices_in_model * 1000.0).astype(np.int64).tobytes())
+        digest.update(component.faces.tobytes())
+    return Model(name=name, components=components, source_hash=digest.hexdigest())

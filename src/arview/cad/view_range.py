@@ -1,0 +1,75 @@
+"""ViewRange: from where the camera may look at the part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from arview.errors import InputError
+from arview.geometry import Array
+
+
+@dataclass(frozen=True)
+class ViewRange:
+    """Declared range of viewpoints around the centre of the model's bounding box.
+
+    ``distance_mm`` is camera to centre. Azimuth runs from ``+X`` towards ``+Y``, elevation from the XY
+    plane towards ``+Z`` (model axes). Roll is about the viewing axis; 0 means that ``+Z`` points up in
+    the image. A range of 360° or more in azimuth or roll means "any".
+    """
+
+    distance_mm: tuple[float, float]
+    elevation_deg: tuple[float, float] = (-90.0, 90.0)
+    azimuth_deg: tuple[float, float] = (-180.0, 180.0)
+    roll_deg: tuple[float, float] = (-180.0, 180.0)
+
+    def __post_init__(self) -> None:
+        for name in ("distance_mm", "elevation_deg", "azimuth_deg", "roll_deg"):
+            low, high = getattr(self, name)
+            if not (np.isfinite(low) and np.isfinite(high) and low <= high):
+                raise InputError(f"view range: {name} = [{low}, {high}] is not an interval")
+        if self.distance_mm[0] <= 0:
+            raise InputError(f"view range: distance_mm = {list(self.distance_mm)} must be positive")
+        if self.elevation_deg[0] < -90 or self.elevation_deg[1] > 90:
+            raise InputError(f"view range: elevation_deg = {list(self.elevation_deg)} leaves [-90, 90]")
+
+    @property
+    def is_full_sphere(self) -> bool:
+        """True when every viewing direction is allowed."""
+        return (
+            self.elevation_deg[0] <= -90
+            and self.elevation_deg[1] >= 90
+            and self.azimuth_deg[1] - self.azimuth_deg[0] >= 360
+        )
+
+    def contains_direction(self, directions: ArrayLike, margin_deg: float = 0.0) -> NDArray[np.bool_]:
+        """For unit vectors (N,3) from the centre to the camera: which are inside, with a margin in deg."""
+        d = np.asarray(directions, dtype=np.float64)
+        elevation = np.rad2deg(np.arcsin(np.clip(d[..., 2], -1.0, 1.0)))
+        inside = (elevation >= self.elevation_deg[0] - margin_deg) & (
+            elevation <= self.elevation_deg[1] + margin_deg
+        )
+        low, high = self.azimuth_deg
+        if high - low < 360:
+            azimuth = np.rad2deg(np.arctan2(d[..., 1], d[..., 0]))
+            away = np.abs((azimuth - 0.5 * (low + high) + 180.0) % 360.0 - 180.0)
+            # Near a pole azimuth means little: the margin grows with 1 / cos(elevation).
+            widened = margin_deg / np.maximum(np.cos(np.deg2rad(elevation)), 1e-3)
+            inside &= away <= 0.5 * (high - low) + widened
+        return np.asarray(inside)
+
+    def rolls_deg(self, step_deg: float) -> Array:
+        """Rolls (R,) in deg that cover the range no coarser than the step, evenly spread."""
+        low, high = self.roll_deg
+        if high - low >= 360:
+            return np.arange(0.0, 360.0, 360.0 / np.ceil(360.0 / step_deg))
+        count = max(1, int(np.ceil((high - low) / step_deg)))
+        return np.asarray(low + (high - low) * (np.arange(count) + 0.5) / count)
+
+    def distances_mm(self, ratio: float) -> Array:
+        """Distances (D,) in mm, a geometric series whose steps do not exceed ``ratio``."""
+        low, high = self.distance_mm
+        count = max(1, int(np.ceil(np.log(high / low) / np.log(ratio) - 1e-9)))
+        return np.asarray(low * (high / low) ** ((np.arange(count) + 0.5) / count))

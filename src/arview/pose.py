@@ -1,0 +1,43 @@
+"""Pose: where the part is in one frame, how sure that is, and in which state the tracking is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from arview.geometry import Array
+
+
+class TrackingState(StrEnum):
+    """State of a tracking session."""
+
+    SEARCHING = "searching"
+    TRACKED = "tracked"
+    CRITICAL = "critical"
+    LOST = "lost"
+
+
+@dataclass(frozen=True)
+class Pose:
+    """The answer for one frame.
+
+    Attributes:
+        cam_from_model: (4,4) OpenCV camera from model, mm; None while searching or lost.
+        covariance: (6,6) of the twist (rotation rad, translation mm) applied on the right of
+            ``cam_from_model`` about the model's centre; None when there is no pose.
+        quality: 0–1, separates right from wrong poses at about 0.5.
+        state: see TrackingState.
+        time_s: time stamp of the frame.
+        index: index of the frame in its source.
+        ms: time spent on detection and tracking of this frame, milliseconds.
+        reason: for ``searching``, ``critical`` and ``lost``: why, in words.
+    """
+
+    cam_from_model: Array | None
+    covariance: Array | None
+    quality: float
+    state: TrackingState
+    time_s: float
+    index: int
+    ms: float = 0.0
+    reason: str = ""
