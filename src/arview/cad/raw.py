@@ -1,0 +1,134 @@
+"""What the CAD readers hand over: triangles with name paths in the file's own numbers, and unit names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.errors import InputError
+from arview.geometry import Array
+
+MAX_TRIANGLES = 5_000_000
+
+UNIT_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+"""Units a user may name, in mm."""
+
+_ALIASES_MM = {
+    "micron": 0.001,
+    "millimeter": 1.0,
+    "millimetre": 1.0,
+    "centimeter": 10.0,
+    "centimetre": 10.0,
+    "decimeter": 100.0,
+    "meter": 1000.0,
+    "metre": 1000.0,
+    "in": 25.4,
+    "inche": 25.4,
+    "ft": 304.8,
+    "foot": 304.8,
+    "feet": 304.8,
+}
+
+
+@dataclass(frozen=True)
+class RawComponent:
+    """One mesh of a file at its place.
+
+    Attributes:
+        path: names from the root to the mesh, empty names left out.
+        vertices: (V,3) float64, in the file's unit, nested transforms applied.
+        faces: (F,3) int64, counter-clockwise from outside as far as the file is.
+        color: sRGB in 0-1, None when the file does not say.
+    """
+
+    path: tuple[str, ...]
+    vertices: Array
+    faces: NDArray[np.int64]
+    color: tuple[float, float, float] | None = None
+
+
+@dataclass
+class RawModel:
+    """The content of a file: its meshes, its unit in mm (None: not said) and remarks for the user."""
+
+    components: list[RawComponent] = field(default_factory=list)
+    unit_mm: float | None = None
+    notes: list[str] = field(default_factory=list)
+    triangle_count: int = 0
+
+    def add(self, component: RawComponent, path: Path) -> None:
+        """Append a component; raises InputError when the file grows beyond MAX_TRIANGLES."""
+        self.triangle_count += len(component.faces)
+        check_triangle_count(self.triangle_count, path)
+        self.components.append(component)
+
+
+def check_triangle_count(count: int, path: Path) -> None:
+    """Raise InputError when a file holds more than MAX_TRIANGLES."""
+    if count > MAX_TRIANGLES:
+        raise InputError(
+            f"{path}: more than {MAX_TRIANGLES:,} triangles; decimate the mesh or export it with a coarser "
+            "tolerance (for STEP: a larger tol_linear_mm); about 100,000 are plenty for tracking"
+        )
+
+
+def unit_in_mm(name: str) -> float | None:
+    """Millimetres per unit of a unit's name as found in files, None when unknown."""
+    key = name.strip().lower()
+    singular = key[:-1] if key.endswith("s") else key
+    for candidate in (key, singular):
+        if candidate in UNIT_MM:
+            return UNIT_MM[candidate]
+        if candidate in _ALIASES_MM:
+            return _ALIASES_MM[candidate]
+    return None
+
+
+def place(parent_from_mesh: Array, vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (V,3) under an affine (4,4) transform; faces are turned over when it mirrors."""
+    placed = vertices @ parent_from_mesh[:3, :3].T + parent_from_mesh[:3, 3]
+    if np.linalg.det(parent_from_mesh[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    return placed, faces
+
+
+def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str], list[str]]:
+    """A unique name for every name path, and a note for each name that had to be changed.
+
+    The last name of a path is used when no other component has it; else as many parents are put before
+    it (``sub_1/post``) as tell all its namesakes apart; else they are numbered in the order of the file.
+    """
+    paths = [path or (fallback,) for path in paths]
+    names = [path[-1] for path in paths]
+    notes: list[str] = []
+    for name in dict.fromkeys(names):
+        same = [i for i, path in enumerate(paths) if path[-1] == name]
+        if len(same) == 1:
+            continue
+        deepest = max(len(paths[i]) for i in same)
+        candidates = [name] * len(same)
+        for depth in range(2, deepest + 1):
+            candidates = ["/".join(paths[i][-depth:]) for i in same]
+            if len(set(candidates)) == len(candidates):
+                break
+        else:
+            candidates = [name] * len(same)
+        for i, candidate in zip(same, candidates, strict=True):
+            names[i] = candidate
+        if candidates[0] != name:
+            notes.append(f"{len(same)} components are named {name!r}: called {', '.join(candidates[:4])}")
+    taken: set[str] = set()
+    given = set(names)
+    for i, name in enumerate(names):
+        number, unique = 1, name
+        while unique in taken or (number > 1 and unique in given):
+            number += 1
+            unique = f"{name}_{number}"
+        if number > 1:
+            notes.append(f"another component is named {name!r}: called {unique}")
+        taken.add(unique)
+        names[i] = unique
+    return names, notes

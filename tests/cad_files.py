@@ -1,0 +1,219 @@
+"""Makers of small CAD files with known geometry, written out as text or bytes for the tests of the CAD room."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+BOX_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
+BOX_QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+BOX_FACES = np.array([t for a, b, c, d in BOX_QUADS for t in ((a, b, c), (a, c, d))], dtype=np.int64)
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (8,3) and outward faces (12,3) of an axis-aligned box."""
+    return np.asarray(low) + BOX_CORNERS * (np.asarray(high) - np.asarray(low)), BOX_FACES.copy()
+
+
+# --- STEP ---------------------------------------------------------------------------------------------
+
+
+@dataclass
+class StepPart:
+    """A box or a cylinder about +Z standing on z = 0, at the origin of its own frame."""
+
+    name: str
+    size: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    radius: float | None = None
+    color: tuple[float, float, float] | None = None
+
+
+@dataclass
+class StepAssembly:
+    """Children as (instance name, StepPart or StepAssembly, parent_from_child)."""
+
+    name: str
+    children: list[tuple[str, StepPart | StepAssembly, Array]] = field(default_factory=list)
+
+
+class StepWriter:
+    """Writes AP214 text for assemblies of boxes and cylinders; ``unit`` is mm, m or inch."""
+
+    def __init__(self, unit: str = "mm") -> None:
+        self.lines: list[str] = []
+        self.product_of: dict[int, tuple[int, int, int]] = {}
+        self.styled: list[int] = []
+        self.app = self.add("APPLICATION_CONTEXT('core data for automotive mechanical design processes')")
+        self.add(
+            f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,#{self.app})"
+        )
+        self.product_context = self.add(f"PRODUCT_CONTEXT('',#{self.app},'mechanical')")
+        self.definition_context = self.add(f"PRODUCT_DEFINITION_CONTEXT('part definition',#{self.app},'design')")
+        prefix = "$" if unit == "m" else ".MILLI."
+        length = self.add(f"( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT({prefix},.METRE.) )")
+        if unit == "inch":
+            measure = self.add(f"LENGTH_MEASURE_WITH_UNIT(LENGTH_MEASURE(25.4),#{length})")
+            dims = self.add("DIMENSIONAL_EXPONENTS(1.,0.,0.,0.,0.,0.,0.)")
+            length = self.add(f"( CONVERSION_BASED_UNIT('INCH',#{measure}) LENGTH_UNIT() NAMED_UNIT(#{dims}) )")
+        angle = self.add("( NAMED_UNIT(*) PLANE_ANGLE_UNIT() SI_UNIT($,.RADIAN.) )")
+        solid = self.add("( NAMED_UNIT(*) SI_UNIT($,.STERADIAN.) SOLID_ANGLE_UNIT() )")
+        accuracy = self.add(
+            f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-07),#{length},'distance_accuracy_value','')"
+        )
+        self.context = self.add(
+            f"( GEOMETRIC_REPRESENTATION_CONTEXT(3) GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT((#{accuracy}))"
+            f" GLOBAL_UNIT_ASSIGNED_CONTEXT((#{length},#{angle},#{solid})) REPRESENTATION_CONTEXT('','') )"
+        )
+
+    def add(self, text: str) -> int:
+        self.lines.append(f"#{len(self.lines) + 1}={text};")
+        return len(self.lines)
+
+    def refs(self, ids: list[int]) -> str:
+        return "(" + ",".join(f"#{i}" for i in ids) + ")"
+
+    def point(self, xyz: Array) -> int:
+        return self.add(f"CARTESIAN_POINT('',({','.join(f'{v:.9E}' for v in xyz)}))")
+
+    def direction(self, xyz: Array) -> int:
+        return self.add(f"DIRECTION('',({','.join(f'{v:.9E}' for v in xyz)}))")
+
+    def axis(self, origin: Array, z: Array, x: Array) -> int:
+        o, d, r = self.point(origin), self.direction(z), self.direction(x)
+        return self.add(f"AXIS2_PLACEMENT_3D('',#{o},#{d},#{r})")
+
+    def vertex(self, xyz: Array) -> int:
+        return self.add(f"VERTEX_POINT('',#{self.point(xyz)})")
+
+    def line_edge(self, start: int, end: int, a: Array, b: Array) -> int:
+        length = float(np.linalg.norm(b - a))
+        origin, way = self.point(a), self.direction((b - a) / length)
+        vector = self.add(f"VECTOR('',#{way},{length:.9E})")
+        curve = self.add(f"LINE('',#{origin},#{vector})")
+        return self.add(f"EDGE_CURVE('',#{start},#{end},#{curve},.T.)")
+
+    def face(self, uses: list[tuple[int, bool]], surface: int, same_sense: bool = True) -> int:
+        oriented = [self.add(f"ORIENTED_EDGE('',*,*,#{e},.{'T' if s else 'F'}.)") for e, s in uses]
+        loop = self.add(f"EDGE_LOOP('',{self.refs(oriented)})")
+        bound = self.add(f"FACE_OUTER_BOUND('',#{loop},.T.)")
+        return self.add(f"ADVANCED_FACE('',(#{bound}),#{surface},.{'T' if same_sense else 'F'}.)")
+
+    def box_faces(self, size: tuple[float, float, float]) -> list[int]:
+        corners = BOX_CORNERS * np.asarray(size)
+        ids = [self.vertex(c) for c in corners]
+        edges: dict[tuple[int, int], int] = {}
+        faces = []
+        for quad in BOX_QUADS:
+            uses = []
+            for a, b in zip(quad, quad[1:] + quad[:1], strict=True):
+                key = (min(a, b), max(a, b))
+                if key not in edges:
+                    edges[key] = self.line_edge(ids[key[0]], ids[key[1]], corners[key[0]], corners[key[1]])
+                uses.append((edges[key], key == (a, b)))
+            x = corners[quad[1]] - corners[quad[0]]
+            normal = np.cross(x, corners[quad[3]] - corners[quad[0]])
+            place = self.axis(corners[quad[0]], normal / np.linalg.norm(normal), x / np.linalg.norm(x))
+            faces.append(self.face(uses, self.add(f"PLANE('',#{place})")))
+        return faces
+
+    def cylinder_faces(self, radius: float, height: float) -> list[int]:
+        x, z, top = np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 0, height])
+        a, b = self.vertex(radius * x), self.vertex(radius * x + top)
+        low, high = self.axis(0 * x, z, x), self.axis(top, z, x)
+        circles = []
+        for vertex, place in ((a, low), (b, high)):
+            curve = self.add(f"CIRCLE('',#{place},{radius:.9E})")
+            circles.append(self.add(f"EDGE_CURVE('',#{vertex},#{vertex},#{curve},.T.)"))
+        seam = self.line_edge(a, b, radius * x, radius * x + top)
+        side = self.add(f"CYLINDRICAL_SURFACE('',#{low},{radius:.9E})")
+        down, up = self.add(f"PLANE('',#{low})"), self.add(f"PLANE('',#{high})")
+        return [
+            self.face([(circles[0], True), (seam, True), (circles[1], False), (seam, False)], side),
+            self.face([(circles[0], False)], down, same_sense=False),
+            self.face([(circles[1], True)], up),
+        ]
+
+    def product(self, name: str, representation: int) -> int:
+        product = self.add(f"PRODUCT('{name}','{name}','',(#{self.product_context}))")
+        formation = self.add(f"PRODUCT_DEFINITION_FORMATION('','',#{product})")
+        definition = self.add(f"PRODUCT_DEFINITION('design','',#{formation},#{self.definition_context})")
+        shape = self.add(f"PRODUCT_DEFINITION_SHAPE('','',#{definition})")
+        self.add(f"SHAPE_DEFINITION_REPRESENTATION(#{shape},#{representation})")
+        return definition
+
+    def part(self, part: StepPart) -> tuple[int, int, int]:
+        faces = (
+            self.box_faces(part.size)
+            if part.radius is None
+            else self.cylinder_faces(part.radius, part.size[2])
+        )
+        shell = self.add(f"CLOSED_SHELL('',{self.refs(faces)})")
+        brep = self.add(f"MANIFOLD_SOLID_BREP('{part.name}',#{shell})")
+        place = self.axis(np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]))
+        representation = self.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',(#{place},#{brep}),#{self.context})")
+        if part.color is not None:
+            red, green, blue = part.color
+            last = self.add(f"COLOUR_RGB('',{red},{green},{blue})")
+            for template in (
+                "FILL_AREA_STYLE_COLOUR('',#{})",
+                "FILL_AREA_STYLE('',(#{}))",
+                "SURFACE_STYLE_FILL_AREA(#{})",
+                "SURFACE_SIDE_STYLE('',(#{}))",
+                "SURFACE_STYLE_USAGE(.BOTH.,#{})",
+                "PRESENTATION_STYLE_ASSIGNMENT((#{}))",
+            ):
+                last = self.add(template.format(last))
+            self.styled.append(self.add(f"STYLED_ITEM('color',(#{last}),#{brep})"))
+        return self.product(part.name, representation), representation, place
+
+    def item(self, item: StepPart | StepAssembly) -> tuple[int, int, int]:
+        """Product definition, representation and origin axis of a part or assembly (written once)."""
+        if id(item) not in self.product_of:
+            self.product_of[id(item)] = self.part(item) if isinstance(item, StepPart) else self.assembly(item)
+        return self.product_of[id(item)]
+
+    def assembly(self, assembly: StepAssembly) -> tuple[int, int, int]:
+        origin = self.axis(np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]))
+        children = [(name, self.item(child), matrix) for name, child, matrix in assembly.children]
+        places = [self.axis(m[:3, 3], m[:3, 2], m[:3, 0]) for _, _, m in children]
+        items = self.refs([origin, *places])
+        representation = self.add(f"SHAPE_REPRESENTATION('',{items},#{self.context})")
+        definition = self.product(assembly.name, representation)
+        for number, ((name, (child, child_rep, child_axis), _), place) in enumerate(
+            zip(children, places, strict=True)
+        ):
+            usage = self.add(
+                f"NEXT_ASSEMBLY_USAGE_OCCURRENCE('{number + 1}','{name}','',#{definition},#{child},$)"
+            )
+            shape = self.add(f"PRODUCT_DEFINITION_SHAPE('Placement','',#{usage})")
+            transform = self.add(f"ITEM_DEFINED_TRANSFORMATION('','',#{child_axis},#{place})")
+            relation = self.add(
+                f"( REPRESENTATION_RELATIONSHIP('','',#{child_rep},#{representation})"
+                f" REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION(#{transform})"
+                " SHAPE_REPRESENTATION_RELATIONSHIP() )"
+            )
+            self.add(f"CONTEXT_DEPENDENT_SHAPE_REPRESENTATION(#{relation},#{shape})")
+        return definition, representation, origin
+
+    def write(self, path: Path, item: StepPart | StepAssembly) -> Path:
+        self.item(item)
+        if self.styled:
+            self.add(
+                "MECHANICAL_DESIGN_GEOMETRIC_PRESENTATION_REPRESENTATION"
+                f"('',{self.refs(self.styled)},#{self.context})"
+            )
+        header = (
+            "ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION((''),'2;1');\n"
+            "FILE_NAME('','2026-01-01T00:00:00',(''),(''),'','','');\n"
+            "FILE_SCHEMA(('AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }'));\nENDSEC;\nDATA;\n"
+        )
+        path.write_text(header + "\n".join(self.lines) + "\nENDSEC;\nEND-ISO-10303-21;\n")
+        return path
