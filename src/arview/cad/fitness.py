@@ -1,0 +1,209 @@
+"""Cleaning of triangle meshes as they come from files, and what is to be known about one before tracking it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.model import Component
+from arview.geometry import Array
+
+Faces = NDArray[np.int64]
+
+MERGE_FRACTION = 1e-5
+"""Vertices closer than this share of the mesh's diagonal are one: 1 µm on 100 mm, above float32's grain."""
+
+
+@dataclass(frozen=True)
+class MeshFitness:
+    """What a component's mesh is like.
+
+    Attributes:
+        triangle_count: number of triangles.
+        open_edge_count: edges with a triangle on one side only (0 for a closed surface).
+        non_manifold_edge_count: edges shared by more than two triangles.
+        is_consistent: neighbouring triangles wind the same way.
+        volume_mm3: enclosed volume, None unless closed and consistent.
+        extents_mm: (3,) size along the principal axes of the surface, largest first.
+    """
+
+    triangle_count: int
+    open_edge_count: int
+    non_manifold_edge_count: int
+    is_consistent: bool
+    volume_mm3: float | None
+    extents_mm: tuple[float, float, float]
+
+    @property
+    def is_watertight(self) -> bool:
+        """True when every edge has exactly two triangles."""
+        return self.open_edge_count == 0 and self.non_manifold_edge_count == 0
+
+    @property
+    def thickness_mm(self) -> float:
+        """Smallest extent, mm: near zero for a sheet without thickness."""
+        return self.extents_mm[2]
+
+
+def inspect_mesh(component: Component) -> MeshFitness:
+    """Count open and non-manifold edges, and measure a component's volume and principal extents (mm)."""
+    faces = component.faces.astype(np.int64)
+    counts, balance = _edge_uses(faces, len(component.vertices_in_model))
+    open_edges = int(np.count_nonzero(counts == 1))
+    non_manifold = int(np.count_nonzero(counts > 2))
+    consistent = bool(np.all(balance[counts == 2] == 0))
+    closed = open_edges == 0 and non_manifold == 0 and consistent
+    axes = principal_axes(component.vertices_in_model, faces)
+    used = component.vertices_in_model[np.unique(faces)] @ axes.T
+    extents = sorted((float(size) for size in np.ptp(used, axis=0)), reverse=True)
+    return MeshFitness(
+        triangle_count=len(faces),
+        open_edge_count=open_edges,
+        non_manifold_edge_count=non_manifold,
+        is_consistent=consistent,
+        volume_mm3=float(signed_volumes(component.vertices_in_model, faces).sum()) if closed else None,
+        extents_mm=(extents[0], extents[1], extents[2]),
+    )
+
+
+def clean_mesh(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
+    """Mesh with coincident vertices merged and degenerate, double and unused items removed, wound outwards.
+
+    Takes and returns vertices (V,3) and faces (F,3) in any unit; F may come out 0. Surfaces that are not
+    closed are made consistent, their outside stays as the file has it for most of their area.
+    """
+    vertices, faces = _merge_vertices(vertices, faces)
+    faces = _drop_degenerate(vertices, faces)
+    if len(faces) == 0:
+        return vertices[:0], faces
+    faces = _wind_outwards(vertices, faces)
+    used, inverse = np.unique(faces, return_inverse=True)
+    return vertices[used], inverse.reshape(-1, 3).astype(np.int64)
+
+
+def signed_volumes(vertices: Array, faces: Faces) -> Array:
+    """(F,) signed volume of the tetrahedron of each triangle and the mesh's first vertex."""
+    a, b, c = (vertices[faces] - vertices[faces[0, 0]]).transpose(1, 0, 2)
+    return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
+
+
+def face_areas(vertices: Array, faces: Faces) -> Array:
+    """(F,) areas of triangles."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def surface_moments(vertices: Array, faces: Faces) -> tuple[Array, Array]:
+    """Centroid (3,) and covariance (3,3) of a surface seen as an evenly heavy skin (exact, not sampled)."""
+    areas = face_areas(vertices, faces)
+    corners = vertices[faces]
+    total = areas.sum()
+    centroid = (areas[:, None] * corners.mean(axis=1)).sum(axis=0) / total
+    local = corners - centroid
+    # Second moment of a triangle: area / 12 * (sum of corner outer products + outer product of the sum).
+    outer = np.einsum("f,fci,fcj->ij", areas, local, local)
+    summed = local.sum(axis=1)
+    outer += np.einsum("f,fi,fj->ij", areas, summed, summed)
+    return centroid, outer / (12.0 * total)
+
+
+def principal_axes(vertices: Array, faces: Faces) -> Array:
+    """(3,3) rows = principal axes of the surface, largest spread first."""
+    _, vectors = np.linalg.eigh(surface_moments(vertices, faces)[1])
+    return np.ascontiguousarray(vectors[:, ::-1].T)
+
+
+def _merge_vertices(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
+    """One vertex for each cluster closer than MERGE_FRACTION of the diagonal; the first of it is kept."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    distinct, faces = vertices[first], inverse.ravel()[faces]
+    tolerance = MERGE_FRACTION * float(np.linalg.norm(np.ptp(distinct, axis=0)))
+    pairs = cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
+    if len(pairs) == 0:
+        return distinct, faces
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(distinct),) * 2)
+    _, labels = connected_components(graph, directed=False)
+    _, representative = np.unique(labels, return_index=True)
+    return distinct[representative], labels[faces].astype(np.int64)
+
+
+def _drop_degenerate(vertices: Array, faces: Faces) -> Faces:
+    """Faces without those of no area and without repetitions of the same three vertices."""
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    if len(faces) == 0:
+        return faces
+    corners = vertices[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    faces = faces[face_areas(vertices, faces) > 1e-9 * longest**2]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return faces[np.sort(first)]
+
+
+def _edge_uses(faces: Faces, vertex_count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Per undirected edge: how many triangles use it, and forward minus backward uses (0 when consistent)."""
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    keys = np.minimum(start, end) * np.int64(vertex_count) + np.maximum(start, end)
+    _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    balance = np.bincount(inverse.ravel(), weights=np.where(start < end, 1.0, -1.0)).astype(np.int64)
+    return counts, balance
+
+
+def _bodies(faces: Faces, vertex_count: int) -> NDArray[np.int64]:
+    """(F,) number of the edge-connected body of each triangle."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    keys = np.minimum(start, end) * np.int64(vertex_count) + np.maximum(start, end)
+    owners = np.repeat(np.arange(len(faces)), 3)
+    order = np.argsort(keys, kind="stable")
+    same = keys[order][1:] == keys[order][:-1]
+    rows, columns = owners[order][1:][same], owners[order][:-1][same]
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(faces),) * 2)
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def _wind_outwards(vertices: Array, faces: Faces) -> Faces:
+    """Consistent winding, closed bodies outwards (the walls of a cavity towards the cavity)."""
+    counts, balance = _edge_uses(faces, len(vertices))
+    if np.any(balance[counts == 2] != 0):
+        import trimesh
+
+        mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+        trimesh.repair.fix_winding(mesh)
+        repaired = np.asarray(mesh.faces, dtype=np.int64)
+        # Winding is propagated from an arbitrary triangle: keep the side most of a body's area had.
+        turned = repaired[np.arange(len(faces)), :] != faces
+        sign = np.where(turned.any(axis=1), -1.0, 1.0) * face_areas(vertices, faces)
+        bodies = _bodies(repaired, len(vertices))
+        flip = np.bincount(bodies, weights=sign) < 0
+        faces = np.where(flip[bodies][:, None], repaired[:, ::-1], repaired)
+    bodies = _bodies(faces, len(vertices))
+    flips: list[int] = []
+    boxes: list[tuple[Array, Array]] = []
+    inward: list[int] = []
+    for body in range(int(bodies.max()) + 1):
+        own = faces[bodies == body]
+        body_counts, body_balance = _edge_uses(own, len(vertices))
+        corners = vertices[np.unique(own)]
+        closed = bool(np.all(body_counts == 2) and np.all(body_balance == 0))
+        if not closed:
+            continue
+        if signed_volumes(vertices, own).sum() < 0:
+            inward.append(body)
+        else:
+            boxes.append((corners.min(axis=0), corners.max(axis=0)))
+    for body in inward:
+        corners = vertices[np.unique(faces[bodies == body])]
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        is_cavity = any(np.all(low > outer[0]) and np.all(high < outer[1]) for outer in boxes)
+        if not is_cavity:
+            flips.append(body)
+    return np.where(np.isin(bodies, flips)[:, None], faces[:, ::-1], faces)

@@ -1,0 +1,265 @@
+"""load_model: a CAD file as a Model of named components in millimetres."""
+
+from __future__ import annotations
+
+import logging
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from arview.cad.fitness import clean_mesh
+from arview.cad.gltf import parse_gltf, read_gltf
+from arview.cad.model import Component, Model, make_model
+from arview.cad.obj import read_obj
+from arview.cad.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names, unit_in_mm
+from arview.cad.threemf import read_3mf
+from arview.errors import InputError, MissingDependencyError
+from arview.geometry import Array
+
+SUFFIXES = (".step", ".stp", ".glb", ".gltf", ".obj", ".stl", ".ply", ".3mf")
+SMALLEST_MM, LARGEST_MM = 1.0, 100_000.0
+DEFAULT_COLOR = (0.6, 0.6, 0.62)
+
+
+@dataclass(frozen=True)
+class LoadedCad:
+    """A model with what its file is worth telling: the unit in mm, and remarks (renamed or empty nodes)."""
+
+    model: Model
+    unit_mm: float
+    notes: tuple[str, ...]
+
+
+def load_model(
+    path: str | Path, unit: str | None = None, tol_linear_mm: float = 0.1, tol_angular_deg: float = 10.0
+) -> Model:
+    """Model of a STEP, glTF, OBJ, STL, PLY or 3MF file; see load_cad, which also returns the remarks."""
+    return load_cad(path, unit, tol_linear_mm, tol_angular_deg).model
+
+
+def load_cad(
+    path: str | Path, unit: str | None = None, tol_linear_mm: float = 0.1, tol_angular_deg: float = 10.0
+) -> LoadedCad:
+    """Read a CAD file: every mesh at its place in the file's root frame, in mm, under its own name.
+
+    Args:
+        path: .step .stp .glb .gltf .obj .stl .ply .3mf.
+        unit: "mm", "cm", "m" or "inch". Needed for OBJ, STL and PLY, which carry none. For the others it
+            overrides the file's unit: the numbers in the file are then taken to be in ``unit``.
+        tol_linear_mm: STEP only: largest distance of the triangles from the true surface, mm.
+        tol_angular_deg: STEP only: largest angle between neighbouring triangles on a curved surface, deg.
+
+    Returns:
+        Components in the order of the file. Vertices closer than 1e-5 of a component's size are merged,
+        degenerate and double triangles removed, closed surfaces wound outwards. Colours are sRGB.
+
+    Raises:
+        InputError: missing, empty, broken, truncated or unsupported file; NaN vertices; no triangles; more
+            than 5 million; no unit known; a size below 1 mm or above 100 m with no ``unit`` given.
+        MissingDependencyError: STEP without cascadio.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    if not path.is_file():
+        raise InputError(f"{path}: is not a file")
+    if suffix not in SUFFIXES:
+        raise InputError(f"{path}: CAD of type {suffix or '(none)'!s} is not read; give one of {' '.join(SUFFIXES)}")
+    if unit is not None and unit not in UNIT_MM:
+        raise InputError(f"unit {unit!r} is not known; give one of {', '.join(UNIT_MM)}")
+    if not (tol_linear_mm > 0 and tol_angular_deg > 0):
+        raise InputError(
+            f"tolerances must be positive: tol_linear_mm={tol_linear_mm} tol_angular_deg={tol_angular_deg}"
+        )
+    try:
+        if path.stat().st_size == 0:
+            raise InputError(f"{path}: the file is empty (0 bytes)")
+        raw = _read(path, suffix, tol_linear_mm, tol_angular_deg, unit is not None)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    for component in raw.components:
+        _check_finite(component, path)
+    if raw.triangle_count == 0:
+        raise InputError(f"{path}: holds no triangles (empty, or points and lines only)")
+    factor_mm = _unit_factor(raw, path, unit)
+    names, notes = unique_names([component.path for component in raw.components], path.stem)
+    components = []
+    for name, component in zip(names, raw.components, strict=True):
+        vertices, faces = clean_mesh(component.vertices * factor_mm, component.faces)
+        if len(faces) == 0:
+            notes.append(f"component {name!r} has no triangles of any area: left out")
+            continue
+        color = component.color or DEFAULT_COLOR
+        components.append(Component(name, vertices, faces.astype(np.int32), color))
+    if not components:
+        raise InputError(f"{path}: all triangles are degenerate (they have no area)")
+    model = make_model(path.stem, tuple(components))
+    if unit is None:
+        _check_size(model, path)
+    return LoadedCad(model, factor_mm, tuple(raw.notes + notes))
+
+
+def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
+    if suffix in (".step", ".stp"):
+        return _read_step(path, tol_linear_mm, tol_angular_deg, is_overridden)
+    if suffix in (".glb", ".gltf"):
+        return read_gltf(path)
+    if suffix == ".obj":
+        return read_obj(path)
+    if suffix == ".3mf":
+        return read_3mf(path)
+    return _read_mesh_file(path, suffix)
+
+
+# cascadio runs in a process of its own: OpenCASCADE writes to the terminal, and can abort on odd files.
+_STEP_TO_GLB = """
+import sys, cascadio
+source, target, linear, angular = sys.argv[1:]
+with open(source, "rb") as f: step = f.read()
+glb = cascadio.load(step, file_type="step", tol_linear=float(linear), tol_angular=float(angular))
+with open(target, "wb") as f: f.write(glb)
+"""
+
+
+def _read_step(path: Path, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
+    """Tessellate STEP to GLB by OpenCASCADE (cascadio), whose linear tolerance is in mm for every file unit."""
+    import importlib.util
+
+    if importlib.util.find_spec("cascadio") is None:
+        raise MissingDependencyError("reading STEP needs cascadio: pip install cascadio")
+    with path.open("rb") as file:
+        if b"ISO-10303-21" not in file.read(4096):
+            raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
+    with tempfile.TemporaryDirectory(prefix="arview-step-") as folder:
+        target = Path(folder) / "tessellated.glb"
+        angular_rad = float(np.deg2rad(tol_angular_deg))
+        arguments = [str(path.resolve()), str(target), repr(float(tol_linear_mm)), repr(angular_rad)]
+        done = subprocess.run(
+            [sys.executable, "-c", _STEP_TO_GLB, *arguments], capture_output=True, text=True, errors="replace"
+        )
+        data = target.read_bytes() if target.is_file() else b""
+    if not data:
+        said = re.sub(r"\x1b\[[0-9;]*m", "", done.stderr + done.stdout).strip().splitlines()
+        reason = next((line.strip(" *") for line in said if "ERR" in line or "Error" in line), "no reason given")
+        raise InputError(f"{path}: broken or truncated STEP ({reason}); export it again")
+    raw = parse_gltf(data, path)
+    if is_overridden:
+        declared_mm = _step_unit_mm(path)
+        for index, component in enumerate(raw.components):
+            vertices = component.vertices * (1000.0 / declared_mm)
+            raw.components[index] = RawComponent(component.path, vertices, component.faces, component.color)
+    return raw
+
+
+def _step_unit_mm(path: Path) -> float:
+    """Length unit that a STEP file declares, in mm; raises InputError when it declares none or several."""
+    text = path.read_text(encoding="latin-1")
+    prefixes = {"$": 1000.0, ".MILLI.": 1.0, ".CENTI.": 10.0, ".DECI.": 100.0, ".MICRO.": 0.001}
+    # An inch is defined by way of millimetres: of a conversion unit only the unit itself counts.
+    names = re.findall(r"CONVERSION_BASED_UNIT\s*\(\s*'([^']*)'[^;]*?LENGTH_UNIT", text)
+    units: set[float | None] = {unit_in_mm(name) for name in names}
+    if not units:
+        found = re.findall(r"LENGTH_UNIT\s*\(\s*\)[^;]*?SI_UNIT\s*\(\s*([^,\s]*)\s*,\s*\.METRE\.", text)
+        units = {prefixes.get(prefix) for prefix in found}
+    if len(units) != 1 or None in units:
+        raise InputError(f"{path}: its length unit cannot be told, so unit cannot be overridden; leave unit out")
+    return float(next(value for value in units if value is not None))
+
+
+def _read_mesh_file(path: Path, suffix: str) -> RawModel:
+    """STL and PLY through trimesh: one mesh (ASCII STL: one per solid) without a unit."""
+    import trimesh
+
+    size = path.stat().st_size
+    if suffix == ".stl":
+        with path.open("rb") as file:
+            head = file.read(84)
+        count = int.from_bytes(head[80:84], "little")
+        if 84 + 50 * count == size:
+            check_triangle_count(count, path)
+    try:
+        with _quiet_trimesh(), path.open("rb") as file:
+            scene = trimesh.load_scene(file, file_type=suffix[1:], process=False)
+    except Exception as error:  # trimesh raises whatever its parsers stumble over
+        raise InputError(
+            f"{path}: broken or truncated {suffix[1:].upper()} ({type(error).__name__}: {error}); export it again"
+        ) from error
+    raw = RawModel()
+    several = len(scene.geometry) > 1
+    for name, mesh in scene.geometry.items():
+        faces = np.asarray(getattr(mesh, "faces", []), dtype=np.int64).reshape(-1, 3)
+        if len(faces) == 0:
+            continue
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise InputError(f"{path}: broken: a triangle refers to vertex {faces.max()} of {len(vertices)}")
+        color = None
+        if mesh.visual.kind in ("vertex", "face"):
+            colors = mesh.visual.vertex_colors if mesh.visual.kind == "vertex" else mesh.visual.face_colors
+            red, green, blue = np.asarray(colors, dtype=np.float64)[:, :3].mean(axis=0) / 255.0
+            color = (float(red), float(green), float(blue))
+        raw.add(RawComponent((str(name),) if several else (), vertices, faces, color), path)
+    return raw
+
+
+@contextmanager
+def _quiet_trimesh() -> Iterator[None]:
+    """Keep trimesh's and numpy's remarks about odd files off the terminal."""
+    logger = logging.getLogger("trimesh")
+    was_disabled = logger.disabled
+    logger.disabled = True
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    finally:
+        logger.disabled = was_disabled
+
+
+def _check_finite(component: RawComponent, path: Path) -> None:
+    bad = int(np.count_nonzero(~np.isfinite(component.vertices).all(axis=1)))
+    if bad:
+        name = "/".join(component.path) or path.stem
+        raise InputError(
+            f"{path}: {bad} of {len(component.vertices)} vertices of {name!r} are NaN or infinite; export it again"
+        )
+
+
+def _bounding_size(raw: RawModel) -> Array:
+    used = [component.vertices[np.unique(component.faces)] for component in raw.components if len(component.faces)]
+    return np.ptp(np.concatenate([np.stack([v.min(axis=0), v.max(axis=0)]) for v in used]), axis=0)
+
+
+def _size_text(size_mm: Array) -> str:
+    """``120 × 80 × 8 mm``, in metres where millimetres get long."""
+    factor, name = (1000.0, "m") if size_mm.max() >= 10_000 else (1.0, "mm")
+    return " × ".join(f"{value:.4g}" for value in size_mm / factor) + f" {name}"
+
+
+def _unit_factor(raw: RawModel, path: Path, unit: str | None) -> float:
+    if unit is not None:
+        return UNIT_MM[unit]
+    if raw.unit_mm is not None:
+        return raw.unit_mm
+    size = _bounding_size(raw)
+    choices = ", ".join(f"--unit {name} ({_size_text(size * mm)})" for name, mm in UNIT_MM.items())
+    reason = "; ".join(raw.notes) or f"{path.suffix[1:].upper()} files carry no unit"
+    raise InputError(f"{path}: which unit? {reason}; give {choices}")
+
+
+def _check_size(model: Model, path: Path) -> None:
+    size = model.diameter_mm
+    if SMALLEST_MM <= size <= LARGEST_MM:
+        return
+    extent = _size_text(model.bounds_in_model[1] - model.bounds_in_model[0])
+    raise InputError(
+        f"{path}: is it really {extent}? If the file's unit is wrong, say which its numbers are in: "
+        f"--unit {'|'.join(UNIT_MM)}"
+    )
