@@ -1,0 +1,22 @@
+"""Inspection: the measured deviations of one built part, and the file ``inspection.json`` that holds them."""
+
+from arview.inspection.files import load_inspection, save_inspection
+from arview.inspection.record import (
+    SCHEMA_VERSION,
+    ComponentDeviation,
+    Finding,
+    Inspection,
+    Provenance,
+    Verdict,
+)
+
+__all__ = [
+    "SCHEMA_VERSION",
+    "ComponentDeviation",
+    "Finding",
+    "Inspection",
+    "Provenance",
+    "Verdict",
+    "load_inspection",
+    "save_inspection",
+]

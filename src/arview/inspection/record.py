@@ -1,0 +1,211 @@
+"""The record of one inspection: verdict and measured displacement of each component against the CAD."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+
+from arview.cad.model import Model
+from arview.errors import InputError, MismatchError
+
+SCHEMA_VERSION = "1.0"
+
+_DISTANCE_SLACK_MM = 0.006
+"""Distance and displacement may each be rounded to 0.01 mm in a file; more than that is an inconsistency."""
+
+
+class Verdict(StrEnum):
+    """Answer of the decision rule for one component."""
+
+    PASS = "pass"
+    FAIL = "fail"
+    UNDECIDED = "undecided"
+    NOT_MEASURED = "not_measured"
+
+
+class Finding(StrEnum):
+    """What was found beyond a displacement."""
+
+    MISSING = "missing"
+
+
+@dataclass(frozen=True)
+class ComponentDeviation:
+    """What was measured of one component. A degree of freedom that was not determined is None, not a number.
+
+    Attributes:
+        name: the component's name in the model.
+        displacement_mm: measured minus design place along the model's x, y, z; None where undetermined.
+        distance_mm: length of the determined part of the displacement; None when nothing is determined.
+        observable: which degrees of freedom are determined: rotation about x, y, z, translation along x, y, z
+            (the order of a twist in ``arview.geometry``).
+        uncertainty_mm: expanded uncertainty U (k = 2) of ``distance_mm``; None when nothing is determined.
+        tolerance_mm: largest distance allowed; None when there is no tolerance.
+        verdict: answer of the decision rule.
+        tilt_deg: angle between measured and design axis of the component; None where undetermined.
+        twist_deg: turn about that axis; None where undetermined.
+        finding: ``missing`` when the component is not there.
+
+    Raises:
+        InputError: when the fields contradict each other; the message starts with the field's name.
+    """
+
+    name: str
+    displacement_mm: tuple[float | None, float | None, float | None]
+    distance_mm: float | None
+    observable: tuple[bool, bool, bool, bool, bool, bool]
+    uncertainty_mm: float | None
+    tolerance_mm: float | None
+    verdict: Verdict
+    tilt_deg: float | None = None
+    twist_deg: float | None = None
+    finding: Finding | None = None
+
+    def __post_init__(self) -> None:
+        self._check_numbers()
+        self._check_observable()
+        self._check_distance()
+        self._check_verdict()
+
+    def _check_numbers(self) -> None:
+        if not self.name:
+            raise InputError("name: is empty")
+        if len(self.displacement_mm) != 3 or len(self.observable) != 6:
+            raise InputError("displacement_mm: needs 3 values, and observable 6")
+        numbers = {f"displacement_mm[{i}]": value for i, value in enumerate(self.displacement_mm)}
+        for field in ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg", "twist_deg"):
+            numbers[field] = getattr(self, field)
+        for field, value in numbers.items():
+            if value is not None and not math.isfinite(value):
+                raise InputError(f"{field}: is {value}, expected a finite number or null")
+            if (
+                field in ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg")
+                and (value or 0.0) < 0.0
+            ):
+                raise InputError(f"{field}: is {value}, must not be negative")
+
+    def _check_observable(self) -> None:
+        for axis, value, seen in zip("xyz", self.displacement_mm, self.observable[3:], strict=True):
+            index = "xyz".index(axis)
+            if value is not None and not seen:
+                raise InputError(
+                    f"displacement_mm[{index}]: is {value}, but observable[{index + 3}] says that d{axis} is"
+                    " undetermined; an undetermined value must be null"
+                )
+            if value is None and seen:
+                raise InputError(
+                    f"displacement_mm[{index}]: is null, but observable[{index + 3}] says that d{axis} is"
+                    " determined"
+                )
+        if not any(self.observable[:3]) and (self.tilt_deg is not None or self.twist_deg is not None):
+            raise InputError("rotation: holds a number, but observable says that no rotation is determined")
+
+    def _check_distance(self) -> None:
+        known = [value for value in self.displacement_mm if value is not None]
+        if not known:
+            if self.distance_mm is not None:
+                raise InputError(f"distance_mm: is {self.distance_mm}, but no displacement is determined")
+            return
+        length = math.hypot(*known)
+        if self.distance_mm is None:
+            raise InputError(f"distance_mm: is null, but displacement_mm has the length {length:.3f} mm")
+        if abs(self.distance_mm - length) > _DISTANCE_SLACK_MM + 1e-3 * length:
+            raise InputError(
+                f"distance_mm: is {self.distance_mm}, but displacement_mm has the length {length:.3f} mm"
+            )
+        if self.uncertainty_mm is None:
+            raise InputError("uncertainty_mm: is null, but a distance is given; a measured value needs its U")
+
+    def _check_verdict(self) -> None:
+        if self.finding is Finding.MISSING:
+            if self.verdict is not Verdict.FAIL:
+                raise InputError(f"verdict: is {self.verdict}, but the component is missing; expected fail")
+            if any(self.observable) or self.distance_mm is not None:
+                raise InputError("displacement_mm: a missing component has no displacement; expected nulls")
+            return
+        if self.verdict is Verdict.NOT_MEASURED:
+            if any(self.observable) or self.distance_mm is not None:
+                raise InputError("verdict: is not_measured, but the component has measured values")
+        elif self.verdict in (Verdict.PASS, Verdict.FAIL) and self.tolerance_mm is None:
+            raise InputError(f"tolerance_mm: is null, but the verdict is {self.verdict}")
+        if self.verdict is Verdict.PASS:
+            if self.distance_mm is None:
+                raise InputError("distance_mm: is null, but the verdict is pass")
+            if self.tolerance_mm is not None and self.distance_mm > self.tolerance_mm:
+                raise InputError(
+                    f"verdict: is pass, but distance_mm {self.distance_mm} exceeds tolerance_mm"
+                    f" {self.tolerance_mm}"
+                )
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the numbers come from; ``note`` is shown on the picture (e.g. "example, written by hand")."""
+
+    tool: str
+    version: str
+    method: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Measured deviations of one built part.
+
+    Attributes:
+        part: name of the part.
+        serial: serial number of the built part; may be empty.
+        model_hash: ``Model.source_hash`` of the CAD model measured against.
+        created: when it was measured, UTC.
+        components: one entry per inspected component; components of the model may be left out.
+        provenance: tool, version, method and note.
+
+    Raises:
+        InputError: a component appears twice, or ``created`` has no time zone.
+    """
+
+    part: str
+    serial: str
+    model_hash: str
+    created: datetime
+    components: tuple[ComponentDeviation, ...]
+    provenance: Provenance
+
+    def __post_init__(self) -> None:
+        if self.created.utcoffset() != timedelta(0):
+            raise InputError(f"created: {self.created.isoformat()} is not a UTC time")
+        seen: set[str] = set()
+        for index, component in enumerate(self.components):
+            if component.name in seen:
+                raise InputError(f"components[{index}].name: {component.name!r} appears twice")
+            seen.add(component.name)
+
+    def find(self, name: str) -> ComponentDeviation | None:
+        """The entry of the component of that name, or None when it was not inspected."""
+        return next((component for component in self.components if component.name == name), None)
+
+    def age_s(self, now: datetime | None = None) -> float:
+        """Seconds from the measurement to ``now`` (default: this moment); negative when it lies ahead."""
+        return ((now or datetime.now(UTC)) - self.created).total_seconds()
+
+    def check_model(self, model: Model) -> None:
+        """Make sure that this is an inspection of ``model``.
+
+        Raises:
+            MismatchError: another geometry was measured, or a component does not exist in the model.
+        """
+        names = {component.name for component in model.components}
+        unknown = sorted({component.name for component in self.components} - names)
+        if unknown:
+            raise MismatchError(
+                f"the inspection of {self.part!r} names {', '.join(map(repr, unknown))}, which model"
+                f" {model.name!r} does not have"
+            )
+        if self.model_hash != model.source_hash:
+            raise MismatchError(
+                f"the inspection of {self.part!r} was made against another model: model_hash"
+                f" {self.model_hash[:12]}…, model {model.name!r} has {model.source_hash[:12]}…"
+                " (other CAD file, revision, unit or tessellation)"
+            )
