@@ -1,0 +1,288 @@
+"""VideoSink: annotated frames to an H.264 file with the source's time stamps and sound."""
+
+from __future__ import annotations
+
+import errno
+import os
+import queue
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import av
+import cv2
+from av.audio.stream import AudioStream
+from av.container import InputContainer, OutputContainer
+from av.packet import Packet
+from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
+from av.video.stream import VideoStream
+
+from arview.errors import OutputError
+from arview.video.frame import Image
+from arview.video.source import FrameSource
+
+CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
+TICKS_PER_S = 90_000  # fine enough that 30, 29.97, 25 and 24 fps and odd camera stamps keep their time
+QUEUED_FRAMES = 4  # frames waiting for the encoder; 25 MB at 1080p
+_AUDIO_LEAD_S = 0.05  # sound this much before the first frame is kept (AAC starts with a silent packet)
+
+
+class VideoSink:
+    """Writes H.264 (yuv420p, BT.709, index in front) in a thread of its own; a context manager.
+
+    The file grows under a temporary name beside the target and takes its name when it is complete.
+    Leaving the ``with`` block finishes the file, also on Ctrl-C, so that what was written can be played;
+    any other exception removes it. The first frame is at time 0 of the file, the others keep their distance
+    from it; sound is copied from the source without decoding, from the first to the last frame.
+
+    Attributes:
+        frames_written: frames handed over so far.
+        audio_note: why the source's sound is not in the file, or empty.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        width: int,
+        height: int,
+        fps_hint: float | None = 30.0,
+        source: FrameSource | str | Path | None = None,
+        crf: int = 20,
+        preset: str = "veryfast",
+    ) -> None:
+        """Open the file.
+
+        Args:
+            path: target, ending in .mp4, .m4v, .mov or .mkv; an existing file is replaced at the end.
+            width: width of the frames in px; odd sizes are padded by a pixel.
+            height: height of the frames in px.
+            fps_hint: nominal rate for the header and the duration of the last frame.
+            source: source or file whose sound is copied; None for none.
+            crf: quality of x264, 0 (lossless) to 51; 18–23 is usual.
+            preset: speed of x264; "veryfast" is real time at 1080p on one core.
+
+        Raises:
+            OutputError: the name or the folder cannot be written to.
+        """
+        self.path = Path(path)
+        self.frames_written = 0
+        self.audio_note = ""
+        self._width, self._height = width, height
+        rate = fps_hint if fps_hint is not None and 1.0 <= fps_hint <= 1000.0 else 30.0
+        self._fps = Fraction(rate).limit_denominator(1001)
+        self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
+        if self.path.suffix.lower() not in CONTAINERS:
+            raise OutputError(f"{path}: the name of the video must end in {', '.join(CONTAINERS)}")
+        if not self.path.parent.is_dir():
+            raise OutputError(f"{path}: there is no folder {self.path.parent}; create it first")
+        if self.path.is_dir():
+            raise OutputError(f"{path}: is a folder; give the name of a file")
+        self._sound = _open_sound(source)
+        try:
+            self._container, self._video, self._audio = self._opened(crf, preset)
+        except BaseException:
+            self._remove_part()
+            raise
+        self._frames: queue.Queue[tuple[av.VideoFrame, float] | None] = queue.Queue(QUEUED_FRAMES)
+        self._error: Exception | None = None
+        self._closed = False
+        self._encoder = threading.Thread(target=self._encode_all, name="arview-encoder", daemon=True)
+        self._encoder.start()
+
+    def write(self, image: Image, time_s: float) -> None:
+        """Add a frame (H,W,3) uint8 RGB with its time stamp in the source; the array may be reused after.
+
+        A time stamp that does not grow is moved to just after the one before.
+
+        Raises:
+            ValueError: the image has another size than the sink.
+            OutputError: the disk is full or the file cannot be written.
+        """
+        if image.shape != (self._height, self._width, 3):
+            raise ValueError(f"image is {image.shape}, the sink expects ({self._height}, {self._width}, 3)")
+        if self._error is not None:
+            raise self._error
+        pad_right, pad_bottom = self._width % 2, self._height % 2
+        if pad_right or pad_bottom:
+            image = cv2.copyMakeBorder(image, 0, pad_bottom, 0, pad_right, cv2.BORDER_REPLICATE)
+        self._frames.put((av.VideoFrame.from_ndarray(image, format="rgb24"), time_s))
+        self.frames_written += 1
+
+    def close(self) -> None:
+        """Finish the file and give it its name; further calls do nothing.
+
+        Raises OutputError when no frame was written or the file cannot be completed; nothing is left then.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._stop_encoder()
+            if self._error is not None:
+                raise self._error
+            if self.frames_written == 0:
+                raise OutputError(f"{self.path}: no frame was written, so there is no video")
+            try:
+                self._container.close()
+                self._part.replace(self.path)
+            except (av.FFmpegError, OSError) as error:
+                raise self._explained(error) from error
+        finally:
+            self._discard()
+
+    def abort(self) -> None:
+        """Stop and remove what was written; an older file of the same name stays."""
+        if not self._closed:
+            self._closed = True
+            self._stop_encoder()
+            self._discard()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None or (isinstance(error, KeyboardInterrupt) and self.frames_written):
+            self.close()
+        else:
+            self.abort()
+
+    def _opened(self, crf: int, preset: str) -> tuple[OutputContainer, VideoStream, AudioStream | None]:
+        container_format = CONTAINERS[self.path.suffix.lower()]
+        options = {"movflags": "+faststart"} if container_format != "matroska" else {}
+        try:
+            container = av.open(str(self._part), "w", format=container_format, options=options)
+            video = container.add_stream("libx264", rate=self._fps)
+            video.width, video.height = self._width + self._width % 2, self._height + self._height % 2
+            video.pix_fmt = "yuv420p"
+            video.options = {"crf": str(crf), "preset": preset}
+            context = video.codec_context
+            context.time_base = Fraction(1, TICKS_PER_S)
+            context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
+            context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+            audio = self._add_audio(container)
+            container.start_encoding()
+        except (av.FFmpegError, OSError) as error:
+            raise self._explained(error) from error
+        return container, video, audio
+
+    def _add_audio(self, container: OutputContainer) -> AudioStream | None:
+        if self._sound is None or not self._sound.streams.audio:
+            return None
+        template = self._sound.streams.audio[0]
+        codec = template.codec_context.name if template.codec_context else "unknown"
+        if codec not in container.supported_codecs:
+            self.audio_note = (
+                f"the sound ({codec}) cannot be copied into {self.path.suffix}; the video is silent"
+            )
+            return None
+        return container.add_stream_from_template(template)
+
+    def _stop_encoder(self) -> None:
+        """Let the encoder work off what is queued and end."""
+        self._frames.put(None)
+        self._encoder.join()
+
+    def _discard(self) -> None:
+        """Close what is still open and remove what is left of the temporary file."""
+        # A second Ctrl-C can leave the encoder at work: its container must not be closed under it then.
+        if not self._encoder.is_alive():
+            with suppress(av.FFmpegError, OSError):
+                self._container.close()
+        self._remove_part()
+
+    def _remove_part(self) -> None:
+        if self._sound is not None:
+            self._sound.close()
+        with suppress(OSError):
+            self._part.unlink(missing_ok=True)
+
+    def _encode_all(self) -> None:
+        """Body of the encoder thread; after an error it empties the queue so that no writer waits."""
+        queued = iter(self._frames.get, None)
+        try:
+            self._encode(queued)
+        except (av.FFmpegError, OSError) as error:
+            self._error = self._explained(error)
+        except Exception as error:  # raised again by write() or close()
+            self._error = error
+        for _ in queued:
+            pass
+
+    def _encode(self, queued: Iterator[tuple[av.VideoFrame, float]]) -> None:
+        origin_s: float | None = None
+        sound: Iterator[Packet[AudioStream]] = iter(())
+        waiting: Packet[AudioStream] | None = None
+        ticks = -1
+        frame_ticks = round(TICKS_PER_S / self._fps)
+        for rgb, time_s in queued:
+            if origin_s is None:
+                origin_s = time_s
+                sound = self._sound_packets(origin_s)
+                waiting = next(sound, None)
+            ticks = max(round((time_s - origin_s) * TICKS_PER_S), ticks + 1)
+            frame = rgb.reformat(
+                format="yuv420p",
+                dst_colorspace=Colorspace.ITU709,
+                dst_color_range=ColorRange.MPEG,
+                threads=1,
+            )
+            frame.pts, frame.time_base, frame.duration = ticks, Fraction(1, TICKS_PER_S), frame_ticks
+            self._container.mux(self._video.encode(frame))
+            # Sound follows the picture, so that the muxer never holds much of either.
+            while waiting is not None and _end_s(waiting) <= (ticks + frame_ticks) / TICKS_PER_S:
+                self._container.mux(waiting)
+                waiting = next(sound, None)
+        self._container.mux(self._video.encode(None))
+
+    def _sound_packets(self, origin_s: float) -> Iterator[Packet[AudioStream]]:
+        """Sound packets from the time of the first frame on, moved to the clock of the file."""
+        if self._sound is None or self._audio is None:
+            return
+        stream = self._sound.streams.audio[0]
+        if origin_s > 1.0:
+            with suppress(av.FFmpegError):
+                self._sound.seek(int((origin_s - 1.0) * av.time_base))
+        with suppress(av.FFmpegError):  # a file that breaks off has sound up to there
+            for packet in self._sound.demux(stream):
+                if packet.pts is None or packet.dts is None or packet.time_base is None:
+                    continue
+                if packet.pts * packet.time_base < origin_s - _AUDIO_LEAD_S:
+                    continue
+                shift = round(origin_s / packet.time_base)
+                packet.pts -= shift
+                packet.dts -= shift
+                packet.stream = self._audio
+                yield packet
+
+    def _explained(self, error: Exception) -> OutputError:
+        code = getattr(error, "errno", None)
+        if code == errno.ENOSPC:
+            return OutputError(f"{self.path}: the disk is full; free some space or choose another folder")
+        if code in (errno.EACCES, errno.EPERM, errno.EROFS):
+            return OutputError(f"{self.path}: the folder cannot be written to; choose another folder with -o")
+        return OutputError(
+            f"{self.path}: cannot write the video: {getattr(error, 'strerror', None) or error}"
+        )
+
+
+def _open_sound(source: FrameSource | str | Path | None) -> InputContainer | None:
+    """The file whose sound is to be copied, opened; None when there is none to open."""
+    path = source.audio_path if isinstance(source, FrameSource) else source
+    if path is None:
+        return None
+    try:
+        return av.open(str(path))
+    except (av.FFmpegError, OSError, ValueError):
+        return None
+
+
+def _end_s(packet: Packet[AudioStream]) -> float:
+    """Time at which a sound packet has been played, seconds."""
+    assert packet.pts is not None and packet.time_base is not None
+    return float((packet.pts + (packet.duration or 0)) * packet.time_base)

@@ -1,0 +1,84 @@
+"""open_source: a FrameSource for whatever the user names."""
+
+from __future__ import annotations
+
+import glob
+import re
+from pathlib import Path
+
+from arview.errors import InputError
+from arview.photo_exif import PHOTO_SUFFIXES
+from arview.video.files import PictureSource, VideoFileSource, picture_paths, sorted_naturally
+from arview.video.live import CameraGrabber, LiveSource, UrlGrabber
+from arview.video.source import FrameRange, FrameSource
+
+_CAMERA_INDEX = re.compile(r"(?:/dev/video)?([0-9]{1,3})")
+_URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
+
+
+def open_source(
+    spec: str | Path,
+    start: int | None = None,
+    end: int | None = None,
+    stride: int = 1,
+    fps: float = 30.0,
+    open_timeout_s: float = 10.0,
+    read_timeout_s: float = 5.0,
+) -> FrameSource:
+    """Source of frames: video file, picture, folder or glob of pictures, camera index, RTSP or HTTP URL.
+
+    Args:
+        spec: path, glob ("shots/*.png"), camera index ("0") or URL ("rtsp://…").
+        start: index of the first wanted frame in the source; None is 0.
+        end: index before which to stop; None is the end of the source.
+        stride: take every stride-th frame from ``start`` on.
+        fps: frames per second by which pictures get their time stamps.
+        open_timeout_s: how long to wait for the first frame of a camera or URL.
+        read_timeout_s: how long a camera or URL may be silent before its iteration ends.
+
+    Raises:
+        InputError: nothing there, or nothing that can be read; the message says what and what to do.
+    """
+    wanted = FrameRange(start or 0, end, stride)
+    text = str(spec)
+    if not 0 < fps < float("inf"):
+        raise InputError(f"fps {fps}: expected a positive number of frames per second")
+    path = Path(text.removeprefix("file://"))
+    if _URL.match(text) and not text.startswith("file://"):
+        return LiveSource(
+            text,
+            lambda: UrlGrabber(text, open_timeout_s, read_timeout_s),
+            wanted,
+            open_timeout_s,
+            read_timeout_s,
+        )
+    camera = _CAMERA_INDEX.fullmatch(text)
+    if camera and (text.startswith("/dev/") or not path.exists()):
+        index = int(camera.group(1))
+        return LiveSource(
+            f"camera {index}", lambda: CameraGrabber(index), wanted, open_timeout_s, read_timeout_s
+        )
+    if path.is_dir():
+        pictures = picture_paths(path)
+        if not pictures:
+            raise InputError(
+                f"{path}: the folder holds no pictures ({_suffixes()}); give another folder or file"
+            )
+        return PictureSource(text, pictures, wanted, fps)
+    if path.exists():
+        if path.suffix.lower() in PHOTO_SUFFIXES:
+            return PictureSource(text, [path], wanted, fps)
+        return VideoFileSource(path, wanted)
+    if glob.has_magic(text):
+        found = (Path(match) for match in glob.glob(text, recursive=True))  # noqa: PTH207 - absolute patterns too
+        pictures = sorted_naturally(match for match in found if match.suffix.lower() in PHOTO_SUFFIXES)
+        if not pictures:
+            raise InputError(f"{text}: no picture ({_suffixes()}) matches; check the pattern")
+        return PictureSource(text, pictures, wanted, fps)
+    raise InputError(
+        f"{text}: no such file or folder; give a video, a folder or glob of pictures, a camera index or a URL"
+    )
+
+
+def _suffixes() -> str:
+    return ", ".join(sorted(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES))
