@@ -1,0 +1,218 @@
+"""The ghost: the model's z-buffer in a window around the part, shaded and blended over the frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.cad.model import Model
+from arview.camera import Camera
+from arview.geometry import Array, apply
+from arview.raster import rasterise
+
+NEAR_MM = 1.0
+"""Geometry nearer to the camera is clipped."""
+CELL_PX = 8
+"""Size of a cell of the coverage grid that the label layout avoids."""
+_WINDOW_MARGIN_PX = 4
+_PIECES_PER_DIAMETER = 12
+"""Under distortion no face or edge is longer than this fraction of the part: keeps curved edges to 0.1 px."""
+
+
+@dataclass(frozen=True)
+class GhostView:
+    """The model as one frame's camera sees it.
+
+    Attributes:
+        u0, v0: first column and row of the window in the image, px.
+        inverse_depth: (h,w) 1/mm, 0 off the part.
+        face_ids: (h,w) int32 into the ghost's faces, -1 off the part.
+        shade: (F,) float32, |cos| of the angle between face normal and line of sight.
+    """
+
+    u0: int
+    v0: int
+    inverse_depth: NDArray[np.float64]
+    face_ids: NDArray[np.int32]
+    shade: NDArray[np.float32]
+
+
+class Ghost:
+    """Z-buffer of a model at a pose, in the window of the image that the part covers.
+
+    Lens distortion is honoured by moving the vertices; faces are split beforehand where that needs it.
+    """
+
+    def __init__(self, model: Model, camera: Camera) -> None:
+        self.camera = camera
+        vertices, faces, component_of_face = model.mesh
+        if camera.is_distorted:
+            longest_mm = model.diameter_mm / _PIECES_PER_DIAMETER
+            vertices, faces, component_of_face = _split_long(vertices, faces, component_of_face, longest_mm)
+        self.vertices_in_model, self.faces = vertices, faces
+        self.component_of_face = component_of_face
+        self._distortion_limit_r2 = _monotone_limit_r2(camera)
+
+    def bent(self, points_in_cam: Array) -> Array:
+        """Points (N,3) moved sideways so that a pinhole projects them where the real lens would.
+
+        Beyond the field of view, where the polynomial of the lens may fold back, the displacement factor is
+        kept at its value on the limit.
+        """
+        if not self.camera.is_distorted:
+            return points_in_cam
+        z = points_in_cam[:, 2]
+        safe_z = np.where(z > NEAR_MM, z, NEAR_MM)
+        x, y = points_in_cam[:, 0] / safe_z, points_in_cam[:, 1] / safe_z
+        shrink = np.sqrt(np.minimum(1.0, self._distortion_limit_r2 / np.maximum(x * x + y * y, 1e-12)))
+        xd, yd = self.camera.distort(x * shrink, y * shrink)
+        return np.stack([xd / shrink * safe_z, yd / shrink * safe_z, z], axis=-1)
+
+    def view(self, cam_from_model: Array) -> GhostView | None:
+        """What the camera sees from this pose; None when the part is outside the image."""
+        camera = self.camera
+        points = self.bent(apply(cam_from_model, self.vertices_in_model))
+        window = _window(points, camera)
+        if window is None:
+            return None
+        u0, v0, u1, v1 = window
+        inverse_depth, face_ids = rasterise(
+            points,
+            self.faces,
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            u1 - u0,
+            v1 - v0,
+            NEAR_MM,
+            (u0, v0),
+        )
+        shade = np.empty(len(self.faces), dtype=np.float32)
+        _shade_faces(points, self.faces, shade)
+        return GhostView(u0, v0, inverse_depth, face_ids, shade)
+
+
+def _window(points: Array, camera: Camera) -> tuple[int, int, int, int] | None:
+    """Window (u0, v0, u1, v1) of the image around projected points, end exclusive; None when empty."""
+    z = points[:, 2]
+    in_front = z > NEAR_MM
+    if not in_front.any():
+        return None
+    if not in_front.all():
+        return 0, 0, camera.width, camera.height
+    u = camera.fx * points[:, 0] / z + camera.cx
+    v = camera.fy * points[:, 1] / z + camera.cy
+    u0 = int(np.clip(np.floor(u.min()) - _WINDOW_MARGIN_PX, 0, camera.width))
+    v0 = int(np.clip(np.floor(v.min()) - _WINDOW_MARGIN_PX, 0, camera.height))
+    u1 = int(np.clip(np.ceil(u.max()) + _WINDOW_MARGIN_PX + 1, 0, camera.width))
+    v1 = int(np.clip(np.ceil(v.max()) + _WINDOW_MARGIN_PX + 1, 0, camera.height))
+    if u1 <= u0 or v1 <= v0:
+        return None
+    return u0, v0, u1, v1
+
+
+def _monotone_limit_r2(camera: Camera) -> float:
+    """Largest squared normalised radius, to 1.5 × the corner's radius, where the lens does not fold back."""
+    corners = np.array(
+        [[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], dtype=float
+    )
+    rays = (corners - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    r2 = np.linspace(0.0, 2.25 * float(np.max(np.sum(rays * rays, axis=1))), 400)
+    k1, k2, _, _, k3 = camera.dist
+    slope = 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3))
+    folded = np.flatnonzero(slope < 0.05)
+    return float(r2[folded[0] - 1] if len(folded) else r2[-1])
+
+
+def _split_long(
+    vertices: Array, faces: NDArray[np.int32], component_of_face: NDArray[np.int32], longest_mm: float
+) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
+    """The same surface with every face that has an edge over ``longest_mm`` cut in four, repeatedly."""
+    done_faces, done_components = [], []
+    while True:
+        corners = vertices[faces]
+        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
+        long = lengths > longest_mm
+        done_faces.append(faces[~long])
+        done_components.append(component_of_face[~long])
+        if not long.any():
+            break
+        a, b, c = faces[long].T
+        count, start = int(long.sum()), len(vertices)
+        middles = 0.5 * (corners[long] + np.roll(corners[long], -1, axis=1))
+        vertices = np.concatenate([vertices, middles.transpose(1, 0, 2).reshape(-1, 3)])
+        ab, bc, ca = (np.arange(count, dtype=np.int32) + start + k * count for k in range(3))
+        quarters = [np.stack(q, axis=1) for q in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        faces = np.concatenate(quarters).astype(np.int32)
+        component_of_face = np.tile(component_of_face[long], 4)
+    return vertices, np.ascontiguousarray(np.concatenate(done_faces)), np.concatenate(done_components)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _shade_faces(points, faces, shade):  # type: ignore[no-untyped-def]
+    for f in range(faces.shape[0]):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        e1x, e1y, e1z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        e2x, e2y, e2z = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        nx, ny, nz = e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, e1x * e2y - e1y * e2x
+        mx = points[a, 0] + points[b, 0] + points[c, 0]
+        my = points[a, 1] + points[b, 1] + points[c, 1]
+        mz = points[a, 2] + points[b, 2] + points[c, 2]
+        norm = np.sqrt((nx * nx + ny * ny + nz * nz) * (mx * mx + my * my + mz * mz))
+        shade[f] = abs(nx * mx + ny * my + nz * mz) / norm if norm > 1e-12 else 0.0
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def blend(image, u0, v0, face_ids, shade, component_of_face, ghost_style, edge_cover, edge_owner, edge_style):  # type: ignore[no-untyped-def]
+    """Blend ghost and edges over the image in place.
+
+    ``ghost_style`` and ``edge_style`` are (C,4) float32: r, g, b in 0–255 and alpha in 0–1 per component;
+    ``edge_cover`` (h,w) uint8 and ``edge_owner`` (h,w) int16 come from ``arview.overlay.edges``.
+    """
+    height, width = face_ids.shape
+    for row in range(height):
+        for column in range(width):
+            face = face_ids[row, column]
+            cover = edge_cover[row, column]
+            if face < 0 and cover == 0:
+                continue
+            r = np.float32(image[v0 + row, u0 + column, 0])
+            g = np.float32(image[v0 + row, u0 + column, 1])
+            b = np.float32(image[v0 + row, u0 + column, 2])
+            if face >= 0:
+                component = component_of_face[face]
+                alpha = ghost_style[component, 3]
+                if alpha > 0:
+                    # Grazing faces a little denser, like glass; faces towards the camera brighter.
+                    facing = shade[face]
+                    alpha = min(np.float32(1.0), alpha * (np.float32(1.25) - np.float32(0.35) * facing))
+                    light = np.float32(0.45) + np.float32(0.55) * facing
+                    r += alpha * (ghost_style[component, 0] * light - r)
+                    g += alpha * (ghost_style[component, 1] * light - g)
+                    b += alpha * (ghost_style[component, 2] * light - b)
+            if cover > 0:
+                component = edge_owner[row, column]
+                alpha = edge_style[component, 3] * cover * np.float32(1.0 / 255.0)
+                r += alpha * (edge_style[component, 0] - r)
+                g += alpha * (edge_style[component, 1] - g)
+                b += alpha * (edge_style[component, 2] - b)
+            image[v0 + row, u0 + column, 0] = np.uint8(r + np.float32(0.5))
+            image[v0 + row, u0 + column, 1] = np.uint8(g + np.float32(0.5))
+            image[v0 + row, u0 + column, 2] = np.uint8(b + np.float32(0.5))
+
+
+@njit(cache=True, nogil=True)
+def count_cells(u0, v0, face_ids, component_of_face, weight, cells, seen_px):  # type: ignore[no-untyped-def]
+    """Sum of ``weight`` (C,) per cell of the image (in pixel areas) and of visible pixels per component."""
+    height, width = face_ids.shape
+    for row in range(height):
+        for column in range(width):
+            face = face_ids[row, column]
+            if face >= 0:
+                component = component_of_face[face]
+                seen_px[component] += 1
+                cells[(v0 + row) // CELL_PX, (u0 + column) // CELL_PX] += weight[component]

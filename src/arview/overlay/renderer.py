@@ -1,0 +1,250 @@
+"""OverlayRenderer: frame, pose and inspection in, annotated frame out."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.model import Component, Model
+from arview.camera import Camera
+from arview.errors import MismatchError
+from arview.geometry import Array, apply
+from arview.inspection import ComponentDeviation, Inspection, Verdict
+from arview.overlay import labels, paint
+from arview.overlay.edges import Edges
+from arview.overlay.ghost import CELL_PX, NEAR_MM, Ghost, GhostView, blend, count_cells
+from arview.overlay.layout import LabelLayout, LabelRequest, PlacedLabel
+from arview.overlay.options import CONTEXT_RGB, NEUTRAL_RGB, VERDICT_RGB, OverlayOptions
+from arview.overlay.status import StatusLine
+from arview.pose import Pose, TrackingState
+
+_CONTEXT_WEIGHT = 0.25
+"""How bad it is for a label to cover a component that was not inspected, against one that was."""
+_CONTEXT_EDGE_ALPHA = 0.5
+_CRITICAL_DIMMING = 0.55
+"""Ghost and edges fade while the tracker is not sure of the pose."""
+_SEEN_PX = 12
+"""A component that shows fewer pixels gets a label only if it did not pass."""
+
+
+class OverlayRenderer:
+    """Draws ghosts, edges, labels, arrows and the status line for one model, camera and inspection.
+
+    It remembers where labels were, so one renderer belongs to one video; it is not safe to share by threads.
+    All numbers on the picture are the inspection's; the pose only says where to draw.
+
+    Raises:
+        MismatchError: the inspection belongs to another model.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        camera: Camera,
+        inspection: Inspection | None = None,
+        options: OverlayOptions | None = None,
+    ) -> None:
+        if inspection is not None:
+            inspection.check_model(model)
+        self.model, self.camera, self.inspection = model, camera, inspection
+        self.options = options or OverlayOptions()
+        self._ghost = Ghost(model, camera)
+        self._edges = Edges(model, model.diameter_mm / 16 if camera.is_distorted else None)
+        self._ghost_style, self._edge_style, self._weight = self._styles()
+        self._anchors_in_model = np.stack([_anchor(component) for component in model.components])
+        self._centers_in_model = np.stack([c.bounds_in_model.mean(axis=0) for c in model.components])
+        self._line_px = max(1.0, 0.7 + camera.height / 800)
+
+        size_px = labels.text_size_px(camera.height)
+        self._size_px = size_px
+        urgent = labels.by_urgency(inspection) if inspection else []
+        self._arrow_scale = (
+            labels.arrow_scale(inspection, model.diameter_mm, self.options) if inspection else 1.0
+        )
+        self._arrows = self._arrow_list(urgent) if self.options.show_arrows else []
+        self._status = StatusLine(
+            camera.width, camera.height, round(0.95 * size_px), inspection,
+            self._arrow_scale if self._arrows else None,
+        )  # fmt: skip
+        margin_px = round(0.6 * size_px)
+        bottom_px = camera.height - margin_px - (self._status.height_px if self.options.show_status else 0)
+        self._layout = LabelLayout(camera.width, margin_px, bottom_px, margin_px, round(0.5 * size_px))
+        self._labelled = urgent if self.options.show_labels else []
+        self._sprites = {
+            deviation.name: labels.label_sprite(deviation, self.options, size_px, self._layout.widest_px)
+            for deviation in self._labelled
+        }
+        self._was_seen: set[str] = set()
+
+    def draw(
+        self, image: paint.Image, pose: Pose, fps: float | None = None, now: datetime | None = None
+    ) -> paint.Image:
+        """The annotated frame; the given one is not changed.
+
+        Args:
+            image: (H,W,3) uint8 RGB, of the camera's size.
+            pose: of this frame; without ``cam_from_model`` only the status line is drawn.
+            fps: frames per second to show, if any.
+            now: moment that the age of the inspection refers to; default: this moment.
+
+        Raises:
+            MismatchError: the image is not of the camera's size.
+        """
+        expected = (self.camera.height, self.camera.width, 3)
+        if image.shape != expected or image.dtype != np.uint8:
+            raise MismatchError(
+                f"overlay: image is {image.dtype} {image.shape}, the camera expects uint8 {expected}"
+            )
+        canvas = np.array(image, order="C")
+        view = self._ghost.view(pose.cam_from_model) if pose.cam_from_model is not None else None
+        if pose.cam_from_model is None or view is None:
+            self._layout.reset()
+            self._was_seen.clear()
+        else:
+            self._draw_model(canvas, view, pose.cam_from_model, pose.state)
+            self._draw_annotations(canvas, view, pose.cam_from_model)
+        if self.options.show_status:
+            self._status.draw(canvas, pose, fps, now)
+        return canvas
+
+    def _styles(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Ghost and edge style (C,4) r g b alpha, and weight (C,) in the layout, of every component."""
+        ghost_style, edge_style, weight = [], [], []
+        for component in self.model.components:
+            deviation = self.inspection.find(component.name) if self.inspection else None
+            opacity, edge_alpha, cost = self.options.opacity, 1.0, 1.0
+            if deviation is not None:
+                color = VERDICT_RGB[deviation.verdict]
+            elif self.inspection is None:
+                color = NEUTRAL_RGB
+            else:
+                color, opacity, edge_alpha, cost = CONTEXT_RGB, 0.0, _CONTEXT_EDGE_ALPHA, _CONTEXT_WEIGHT
+            ghost_style.append([*color, opacity if self.options.show_ghost else 0.0])
+            edge_style.append([*(0.75 * np.array(color) + 0.25 * 255), edge_alpha])
+            weight.append(cost)
+        return (
+            np.array(ghost_style, dtype=np.float32),
+            np.array(edge_style, dtype=np.float32),
+            np.array(weight, dtype=np.float32),
+        )
+
+    def _draw_model(
+        self, canvas: paint.Image, view: GhostView, cam_from_model: Array, state: TrackingState
+    ) -> None:
+        options = self.options
+        if options.show_edges == "none":
+            cover = np.zeros(view.face_ids.shape, dtype=np.uint8)
+            owner = np.zeros(view.face_ids.shape, dtype=np.int16)
+        else:
+            cover, owner = self._edges.draw(
+                self._ghost, view, cam_from_model, self._line_px, options.show_edges == "all"
+            )
+        dimming = np.array(
+            [1, 1, 1, _CRITICAL_DIMMING if state is TrackingState.CRITICAL else 1], dtype=np.float32
+        )
+        blend(
+            canvas, view.u0, view.v0, view.face_ids, view.shade, self._ghost.component_of_face,
+            self._ghost_style * dimming, cover, owner, self._edge_style * dimming,
+        )  # fmt: skip
+
+    def _draw_annotations(self, canvas: paint.Image, view: GhostView, cam_from_model: Array) -> None:
+        placed: list[PlacedLabel] = []
+        if self._labelled:
+            anchors_px = self.camera.project(apply(cam_from_model, self._anchors_in_model))
+            seen_px, placed = self._place_labels(view, anchors_px)
+            for label in placed:
+                self._draw_leader(canvas, label, anchors_px, seen_px)
+        self._draw_arrows(canvas, cam_from_model)
+        for label in placed:
+            paint.put_sprite(canvas, self._sprites[label.key], label.x, label.y, label.opacity)
+
+    def _place_labels(
+        self, view: GhostView, anchors_px: Array
+    ) -> tuple[NDArray[np.int64], list[PlacedLabel]]:
+        """Visible pixels (C,) per component, and the boxes of the labels."""
+        camera = self.camera
+        cells = np.zeros((-(-camera.height // CELL_PX), -(-camera.width // CELL_PX)), dtype=np.float32)
+        seen_px = np.zeros(len(self.model.components), dtype=np.int64)
+        count_cells(
+            view.u0, view.v0, view.face_ids, self._ghost.component_of_face, self._weight, cells, seen_px
+        )
+        requests: list[LabelRequest] = []
+        for deviation in self._labelled:
+            if len(requests) == self.options.max_labels:
+                break
+            index = self.model.index(deviation.name)
+            if self._deserves_label(deviation, anchors_px[index], int(seen_px[index])):
+                sprite = self._sprites[deviation.name]
+                requests.append(LabelRequest(deviation.name, sprite.width, sprite.height, anchors_px[index]))
+        self._was_seen = {request.key for request in requests}
+        part_px = (float(view.u0), float(view.u0 + view.face_ids.shape[1]))
+        return seen_px, self._layout.place(requests, part_px, cells)
+
+    def _deserves_label(self, deviation: ComponentDeviation, anchor_px: Array, seen_px: int) -> bool:
+        """Whether the component is in the picture, and seen in it if it passed; with some inertia."""
+        was_seen = deviation.name in self._was_seen
+        slack = 0.02 * self.camera.height if was_seen else 0.0
+        u, v = anchor_px
+        inside = -slack <= u < self.camera.width + slack and -slack <= v < self.camera.height + slack
+        if not inside:
+            return False
+        if deviation.verdict in (Verdict.FAIL, Verdict.UNDECIDED):
+            return True
+        return seen_px >= (_SEEN_PX // 3 if was_seen else _SEEN_PX)
+
+    def _draw_leader(
+        self, canvas: paint.Image, label: PlacedLabel, anchors_px: Array, seen_px: NDArray[np.int64]
+    ) -> None:
+        if label.opacity < 0.5:
+            return
+        deviation = next(d for d in self._labelled if d.name == label.key)
+        index = self.model.index(label.key)
+        color = VERDICT_RGB[deviation.verdict]
+        anchor = np.clip(anchors_px[index], 0, [self.camera.width - 1, self.camera.height - 1])
+        x = float(label.x + label.width if label.on_left else label.x)
+        y = label.y + 0.5 * min(label.height, 1.9 * self._size_px)
+        knee = np.array([x + (0.8 if label.on_left else -0.8) * self._size_px, y])
+        is_urgent = deviation.verdict in (Verdict.FAIL, Verdict.UNDECIDED)
+        paint.line(
+            canvas, np.array([[x, y], knee, anchor]), color, 2 if is_urgent and self._size_px > 13 else 1
+        )
+        paint.dot(canvas, anchor, color, 0.2 * self._size_px, bool(seen_px[index] == 0))
+
+    def _arrow_list(self, deviations: list[ComponentDeviation]) -> list[tuple[int, Array]]:
+        """Component index and exaggerated displacement (3,) mm of every arrow, the most urgent last."""
+        arrows = []
+        for deviation in reversed(deviations):
+            displacement = labels.arrow_in_model(deviation)
+            if displacement is not None and deviation.verdict is not Verdict.PASS:
+                arrows.append((self.model.index(deviation.name), self._arrow_scale * np.array(displacement)))
+        return arrows
+
+    def _draw_arrows(self, canvas: paint.Image, cam_from_model: Array) -> None:
+        for index, offset in self._arrows:
+            tail = self._centers_in_model[index]
+            ends_in_cam = apply(cam_from_model, np.stack([tail, tail + offset]))
+            if ends_in_cam[:, 2].min() <= NEAR_MM:
+                continue
+            tail_px, tip_px = self.camera.project(ends_in_cam)
+            limit = 2 * max(self.camera.width, self.camera.height)
+            if np.abs([tail_px, tip_px]).max() < limit:
+                paint.arrow(canvas, tail_px, tip_px, (255, 255, 255), 0.24 * self._size_px)
+
+
+def _anchor(component: Component) -> Array:
+    """Point (3,) of the surface nearest to its centre of area; unlike that centre it projects onto it."""
+    corners = component.vertices_in_model[component.faces]
+    for _ in range(2):
+        middles = 0.5 * (corners + np.roll(corners, -1, axis=1))
+        corners = np.concatenate(
+            [
+                middles,
+                *(np.stack([corners[:, k], middles[:, k], middles[:, k - 1]], axis=1) for k in range(3)),
+            ]
+        )
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    centroids = corners.mean(axis=1)
+    center = area @ centroids / max(float(area.sum()), 1e-12)
+    return np.asarray(centroids[np.argmin(np.linalg.norm(centroids - center, axis=1))])

@@ -1,0 +1,117 @@
+"""The status line: state of the tracking, part and serial number, inspection age, scale of arrows."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from arview.inspection import Inspection, Verdict
+from arview.overlay import paint
+from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, Rgb
+from arview.pose import Pose, TrackingState
+
+_STATE_RGB: dict[TrackingState, Rgb] = {
+    TrackingState.TRACKED: VERDICT_RGB[Verdict.PASS],
+    TrackingState.CRITICAL: VERDICT_RGB[Verdict.UNDECIDED],
+    TrackingState.SEARCHING: (96, 165, 250),
+    TrackingState.LOST: VERDICT_RGB[Verdict.FAIL],
+}
+_WHITE = (240, 244, 248)
+_MUTED = (176, 186, 200)
+_COUNT_ORDER = (Verdict.FAIL, Verdict.UNDECIDED, Verdict.PASS)
+
+
+def age_text(age_s: float) -> str:
+    """Age in the largest unit that gives a whole number above one, e.g. ``3 h``."""
+    if age_s < 0:
+        return "in the future"
+    for unit, length_s in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if age_s >= 2 * length_s or (unit == "min" and age_s >= length_s):
+            return f"{age_s / length_s:.0f} {unit} ago"
+    return "just now"
+
+
+class StatusLine:
+    """A bar at the lower edge of the image; what does not fit in one row goes to a second."""
+
+    def __init__(
+        self, width: int, height: int, size_px: int, inspection: Inspection | None, scale: float | None
+    ):
+        self._width, self._height, self._size = width, height, size_px
+        self._inspection, self._scale = inspection, scale
+        self._row_px = round(1.75 * size_px)
+        self._pad = round(0.7 * size_px)
+        self._fixed = self._inspection_items(None)
+        # The longest age decides once how many rows there are, so that the bar does not change its height.
+        sample = [("searching  q 0.00  00.0 fps", _WHITE), *self._fixed, ("inspected in the future", _MUTED)]
+        self.rows = 1 if self._length(sample) <= width - 3 * size_px else 2
+        self.height_px = self.rows * self._row_px
+        self._panel = paint.panel(width, self.height_px + 2, 0.0, 0.78)
+
+    def draw(self, image: paint.Image, pose: Pose, fps: float | None, now: datetime | None) -> None:
+        """Draw the bar on the image in place."""
+        top = self._height - self.height_px
+        paint.put_sprite(image, self._panel, 0, top)
+        tracking = self._tracking_items(pose, fps)
+        about_part = self._inspection_items(now or datetime.now(UTC))
+        if self.rows == 1 and self._length([*tracking, *about_part]) > self._width - 3 * self._size:
+            about_part = []  # a long reason for being lost matters more
+        y = top + round(0.16 * self._size)
+        state_x = self._pad + round(0.9 * self._size)
+        paint.dot(
+            image, (self._pad + 0.3 * self._size, y + 0.72 * self._size), _STATE_RGB[pose.state],
+            0.34 * self._size, False,
+        )  # fmt: skip
+        self._row(image, tracking, state_x, y)
+        if not about_part:
+            return
+        if self.rows == 1:
+            self._row(image, about_part, self._width - self._pad - self._length(about_part), y)
+        else:
+            self._row(image, about_part, self._pad, y + self._row_px)
+
+    def _tracking_items(self, pose: Pose, fps: float | None) -> list[tuple[str, Rgb]]:
+        items = [(pose.state.value.upper(), _STATE_RGB[pose.state])]
+        if pose.cam_from_model is not None:
+            items.append((f"quality {pose.quality:.2f}", _WHITE))
+        if fps is not None:
+            items.append((f"{fps:.0f} fps", _WHITE))
+        if pose.state is not TrackingState.TRACKED and pose.reason:
+            used = self._length(items) + 4 * self._size
+            items.append((paint.shortened(pose.reason, self._size, self._width - used), _MUTED))
+        return items
+
+    def _inspection_items(self, now: datetime | None) -> list[tuple[str, Rgb]]:
+        inspection = self._inspection
+        if inspection is None:
+            return [("no inspection", _MUTED)]
+        serial = f"  {inspection.serial}" if inspection.serial else ""
+        items: list[tuple[str, Rgb]] = [(inspection.part + serial, _WHITE)]
+        verdicts = [component.verdict for component in inspection.components]
+        items += [
+            (f"{verdicts.count(verdict)} {VERDICT_WORD[verdict]}", VERDICT_RGB[verdict])
+            for verdict in _COUNT_ORDER
+            if verdict in verdicts
+        ]
+        if now is not None:
+            items.append((f"inspected {age_text(inspection.age_s(now))}", _MUTED))
+        if self._scale is not None:
+            items.append((f"arrows ×{self._scale:g}", _MUTED))
+        if inspection.provenance.note:
+            items.append((inspection.provenance.note, VERDICT_RGB[Verdict.UNDECIDED]))
+        widths = self._length(items[:-1]) if len(items) > 1 else 0
+        limit = max(4 * self._size, self._width - widths - 3 * self._size)
+        text, color = items[-1]
+        return [*items[:-1], (paint.shortened(text, self._size, limit), color)]
+
+    def _gap(self) -> int:
+        return round(1.1 * self._size)
+
+    def _length(self, items: list[tuple[str, Rgb]]) -> int:
+        widths = [paint.text_mask(text, self._size).shape[1] for text, _ in items]
+        return int(sum(widths)) + self._gap() * max(0, len(widths) - 1)
+
+    def _row(self, image: paint.Image, items: list[tuple[str, Rgb]], x: int, y: int) -> None:
+        for text, color in items:
+            mask = paint.text_mask(text, self._size)
+            paint.put_text(image, mask, x, y, color)
+            x += mask.shape[1] + self._gap()
