@@ -1,7 +1,25 @@
 """CAD in: models of named components, part files, ranges of viewpoints, fitness for tracking."""
 
+from arview.cad.check import PartCheck, check_part
 from arview.cad.load import load_model
 from arview.cad.model import Component, Model, make_model
+from arview.cad.part import PART_FILE_EXAMPLE, ComponentSettings, Datum, Part, default_view_range, load_part
+from arview.cad.symmetry import Symmetry
 from arview.cad.view_range import ViewRange
 
-__all__ = ["Component", "Model", "ViewRange", "load_model", "make_model"]
+__all__ = [
+    "PART_FILE_EXAMPLE",
+    "Component",
+    "ComponentSettings",
+    "Datum",
+    "Model",
+    "Part",
+    "PartCheck",
+    "Symmetry",
+    "ViewRange",
+    "check_part",
+    "default_view_range",
+    "load_model",
+    "load_part",
+    "make_model",
+]

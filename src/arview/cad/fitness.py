@@ -1,4 +1,4 @@
-"""Cleaning of triangle meshes as they come from files, and what is to be known about one before tracking it."""
+"""Cleaning of triangle meshes as they come from files, and what to know about one before tracking it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class MeshFitness:
         non_manifold_edge_count: edges shared by more than two triangles.
         is_consistent: neighbouring triangles wind the same way.
         volume_mm3: enclosed volume, None unless closed and consistent.
-        extents_mm: (3,) size along the principal axes of the surface, largest first.
+        extents_mm: (3,) sides of a tight box around it, largest first.
     """
 
     triangle_count: int
@@ -55,16 +55,13 @@ def inspect_mesh(component: Component) -> MeshFitness:
     non_manifold = int(np.count_nonzero(counts > 2))
     consistent = bool(np.all(balance[counts == 2] == 0))
     closed = open_edges == 0 and non_manifold == 0 and consistent
-    axes = principal_axes(component.vertices_in_model, faces)
-    used = component.vertices_in_model[np.unique(faces)] @ axes.T
-    extents = sorted((float(size) for size in np.ptp(used, axis=0)), reverse=True)
     return MeshFitness(
         triangle_count=len(faces),
         open_edge_count=open_edges,
         non_manifold_edge_count=non_manifold,
         is_consistent=consistent,
         volume_mm3=float(signed_volumes(component.vertices_in_model, faces).sum()) if closed else None,
-        extents_mm=(extents[0], extents[1], extents[2]),
+        extents_mm=_tight_extents(component.vertices_in_model, faces),
     )
 
 
@@ -113,6 +110,24 @@ def principal_axes(vertices: Array, faces: Faces) -> Array:
     """(3,3) rows = principal axes of the surface, largest spread first."""
     _, vectors = np.linalg.eigh(surface_moments(vertices, faces)[1])
     return np.ascontiguousarray(vectors[:, ::-1].T)
+
+
+def _tight_extents(vertices: Array, faces: Faces) -> tuple[float, float, float]:
+    """Sides, largest first, of the smallest box that stands on a principal or a model axis."""
+    import cv2
+
+    used = vertices[np.unique(faces)]
+    used = used - used.mean(axis=0)
+    best: list[float] = []
+    for axis in (*principal_axes(vertices, faces), *np.eye(3)):
+        # Two directions across the axis; the box around it is the smallest rectangle of the projection.
+        across = np.linalg.svd(axis[None, :])[2][1:]
+        (_, (width, height), _) = cv2.minAreaRect((used @ across.T).astype(np.float32))
+        sides = [float(np.ptp(used @ axis)), float(width), float(height)]
+        if not best or np.prod(sides) < np.prod(best) * (1.0 - 1e-6):
+            best = sides
+    small, middle, large = sorted(best)
+    return large, middle, small
 
 
 def _merge_vertices(vertices: Array, faces: Faces) -> tuple[Array, Faces]:

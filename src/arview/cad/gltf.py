@@ -56,7 +56,7 @@ def parse_gltf(data: bytes, path: Path) -> RawModel:
 
 
 def srgb_from_linear(linear: Array) -> Array:
-    """sRGB in 0-1 of linear values (IEC 61966-2-1)."""
+    """Linear values as sRGB in 0-1 (IEC 61966-2-1)."""
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
 
@@ -210,7 +210,11 @@ class _Gltf:
             sparse = accessor["sparse"]
             where, what = sparse["indices"], sparse["values"]
             rows = self._view(
-                where["bufferView"], where.get("byteOffset", 0), sparse["count"], _DTYPES[where["componentType"]], 1
+                where["bufferView"],
+                where.get("byteOffset", 0),
+                sparse["count"],
+                _DTYPES[where["componentType"]],
+                1,
             )
             values[rows.ravel()] = self._view(
                 what["bufferView"], what.get("byteOffset", 0), sparse["count"], dtype, width
@@ -229,7 +233,9 @@ class _Gltf:
         units = {unit_in_mm(tag) for tag in tags}
         if len(units) == 1 and None not in units:
             self.model.unit_mm = units.pop()
-            self.model.notes.append(f"trimesh tagged its numbers as {tags.pop()!r}: believed over glTF's metres")
+            self.model.notes.append(
+                f"trimesh tagged its numbers as {tags.pop()!r}: used instead of glTF's metres"
+            )
         else:
             self.model.unit_mm = None
             self.model.notes.append(f"its meshes are tagged with the units {', '.join(sorted(tags))}")

@@ -1,0 +1,433 @@
+"""Part: a CAD model with what must be known about it beyond its CAD, read from a part file."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from arview.cad.load import SUFFIXES, load_cad
+from arview.cad.model import Model, make_model
+from arview.cad.raw import UNIT_MM
+from arview.cad.symmetry import Symmetry
+from arview.cad.view_range import ViewRange
+from arview.errors import InputError
+
+Role = Literal["base", "inspect", "ignore"]
+Vector = tuple[float, float, float]
+
+ROLES = ("base", "inspect", "ignore")
+DATUM_FEATURES = ("plane", "hole", "pin")
+
+PART_FILE_EXAMPLE = """\
+# A part file. Lengths in mm, angles in degrees, positions in the frame of the CAD file.
+# Only [part] with its cad is required; everything else has a default.
+
+[part]
+name = "bracket plate"         # default: the name of this file, or of its folder for part.toml
+cad = "bracket_plate.step"     # relative to this file
+# unit = "mm"                  # mm, cm, m, inch: needed for OBJ, STL and PLY; overrides the unit of others
+tol_linear_mm = 0.1            # STEP: largest distance of the triangles from the true surface
+tol_angular_deg = 10.0         # STEP: largest angle between neighbouring triangles of a curved surface
+serial = "BP-0042"             # of the specimen at hand, shown in the overlay
+
+# From where the camera may look at the middle of the part's bounding box. Azimuth runs from +X to +Y,
+# elevation from the XY plane to +Z, roll 0 has +Z up in the picture. All but distance_mm may be left out.
+# Without this table: every direction and roll, from 1.5 to 6 diameters of the part.
+[view_range]
+distance_mm = [400.0, 900.0]
+elevation_deg = [20.0, 85.0]
+azimuth_deg = [-180.0, 180.0]
+roll_deg = [-30.0, 30.0]
+
+# For components that do not say otherwise.
+[defaults]
+role = "inspect"
+position_tolerance_mm = 1.0
+
+# One table for each component that needs one. Names as `arview check` prints them; quote odd ones:
+# [components."sub_1/post"]
+[components.base_plate]
+role = "base"                  # base: carries the datums and is not judged; inspect: is measured and judged;
+                               # ignore: is left out of the model (a fixture that the camera never sees)
+color = "#8a8f98"              # sRGB, default: the colour in the CAD
+
+[components.post_1]
+role = "inspect"
+position_tolerance_mm = 0.5    # largest allowed distance from the nominal place (half of GD&T's zone)
+angle_tolerance_deg = 0.5      # largest allowed rotation from nominal
+# A rotation that changes nothing about the component: it cannot be measured and is not judged.
+symmetry = { axis = [0.0, 0.0, 1.0], through_mm = [60.0, 40.0, 0.0], order = "continuous" }
+
+# Rotations that change nothing about the whole part: order 2 is half a turn, 6 a hexagon's; or "continuous".
+# through_mm may be left out here: the middle of the bounding box.
+# [[symmetry]]
+# axis = [0.0, 0.0, 1.0]
+# order = 2
+
+# The features of the base that define the frame in which deviations are stated, in order of precedence.
+[datums.A]
+feature = "plane"
+component = "base_plate"
+point_mm = [0.0, 0.0, 0.0]
+normal = [0.0, 0.0, 1.0]
+
+[datums.B]
+feature = "hole"               # or "pin"
+component = "base_plate"
+point_mm = [-97.0, -67.0, 0.0]
+axis = [0.0, 0.0, 1.0]
+diameter_mm = 12.0
+"""
+"""A complete part file with comments; what `arview check --help` shows."""
+
+
+@dataclass(frozen=True)
+class ComponentSettings:
+    """What the part file says about one component.
+
+    Attributes:
+        name: of the component.
+        role: base, inspect or ignore.
+        position_tolerance_mm: largest allowed distance from the nominal place; None: not judged.
+        angle_tolerance_deg: largest allowed rotation from nominal; None: not judged.
+        symmetry: rotation that cannot be observed, in the model frame.
+    """
+
+    name: str
+    role: Role = "inspect"
+    position_tolerance_mm: float | None = None
+    angle_tolerance_deg: float | None = None
+    symmetry: Symmetry | None = None
+
+
+@dataclass(frozen=True)
+class Datum:
+    """A feature that defines the frame of measurement.
+
+    ``direction_in_model`` is the unit normal of a plane or the unit axis of a hole or pin;
+    ``point_in_model`` lies on it, mm; ``diameter_mm`` belongs to holes and pins only.
+    """
+
+    label: str
+    feature: Literal["plane", "hole", "pin"]
+    component: str
+    point_in_model: Vector
+    direction_in_model: Vector
+    diameter_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class Part:
+    """A model and the settings of a part file (or the defaults, for a bare CAD file).
+
+    Attributes:
+        name: of the part.
+        path: the part file, or the bare CAD file.
+        cad_path: the CAD file.
+        model: without the components whose role is ``ignore``, in the colours of the part file.
+        settings: one per component of the CAD, ignored ones included, in the order of the CAD.
+        view_range: as declared, or None; see default_view_range.
+        symmetries: declared rotations of the whole part.
+        datums: in order of precedence.
+        serial: of the specimen, or None.
+        notes: remarks of the loader (renamed or empty components).
+    """
+
+    name: str
+    path: Path
+    cad_path: Path
+    model: Model
+    settings: tuple[ComponentSettings, ...]
+    view_range: ViewRange | None = None
+    symmetries: tuple[Symmetry, ...] = ()
+    datums: tuple[Datum, ...] = ()
+    serial: str | None = None
+    notes: tuple[str, ...] = ()
+
+    def component_settings(self, name: str) -> ComponentSettings:
+        """Settings of a component; raises InputError with the closest names when there is none."""
+        for settings in self.settings:
+            if settings.name == name:
+                return settings
+        raise InputError(f"part {self.name!r}: {_unknown_component(name, [s.name for s in self.settings])}")
+
+    @property
+    def inspected(self) -> tuple[str, ...]:
+        """Names of the components that are measured and judged."""
+        return tuple(settings.name for settings in self.settings if settings.role == "inspect")
+
+    @property
+    def effective_view_range(self) -> ViewRange:
+        """The declared range of viewpoints, or the default one."""
+        return self.view_range or default_view_range(self.model)
+
+
+def default_view_range(model: Model) -> ViewRange:
+    """Range for a part that declares none: every direction, every roll, 1.5 to 6 diameters away.
+
+    At 1.5 diameters the part just fits a picture of 1.2 focal lengths' width to its height's edge; at 6 it
+    is about 250 of 1280 pixels across, about as small as a tracker can use.
+    """
+    return ViewRange(distance_mm=(1.5 * model.diameter_mm, 6.0 * model.diameter_mm))
+
+
+def load_part(path: str | Path, unit: str | None = None) -> Part:
+    """Part of a part file (TOML, see PART_FILE_EXAMPLE), of a folder with a part.toml, or of a bare CAD file.
+
+    ``unit`` (mm, cm, m, inch) overrides the unit of the part file and of the CAD.
+
+    Raises:
+        InputError: missing or broken file, unknown key, wrong type or value, a component that the CAD does
+            not have; and everything that load_cad raises.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "part.toml"
+    if not path.is_file():
+        raise InputError(
+            f"{path}: no such file; give a part file (.toml) or a CAD file ({' '.join(SUFFIXES)})"
+        )
+    if path.suffix.lower() != ".toml":
+        cad = load_cad(path, unit)
+        settings = tuple(ComponentSettings(component.name) for component in cad.model.components)
+        return Part(path.stem, path, path, cad.model, settings, notes=cad.notes)
+    try:
+        content = tomllib.loads(path.read_bytes().decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    return _read_part(_Table(path, "", content), path, unit)
+
+
+def _read_part(root: _Table, path: Path, unit: str | None) -> Part:
+    head = root.table("part", required=True)
+    default_name = path.resolve().parent.name if path.stem == "part" else path.stem
+    name = head.text("name", default_name)
+    cad_path = path.parent / head.text("cad")
+    own_unit = head.choice("unit", tuple(UNIT_MM), None)
+    tol_linear_mm = head.positive("tol_linear_mm", 0.1)
+    tol_angular_deg = head.positive("tol_angular_deg", 10.0)
+    serial = head.text("serial", "") or None
+    head.finish()
+    if not cad_path.is_file():
+        raise InputError(f"{path}: [part] cad = {str(head.content['cad'])!r}: there is no file {cad_path}")
+    view_range = _read_view_range(root.table("view_range")) if "view_range" in root.content else None
+    cad = load_cad(cad_path, unit or own_unit, cast(float, tol_linear_mm), cast(float, tol_angular_deg))
+    names = [component.name for component in cad.model.components]
+    defaults = _read_settings(root.table("defaults"), "", cad.model, ComponentSettings(""))
+    tables = root.table("components")
+    for unknown in [key for key in tables.content if key not in names]:
+        raise InputError(f"{path}: [components] {_unknown_component(unknown, names)}")
+    settings, components = [], []
+    for component in cad.model.components:
+        table = tables.table(component.name)
+        color = table.color("color")
+        setting = _read_settings(table, component.name, cad.model, defaults)
+        settings.append(setting)
+        if setting.role != "ignore":
+            components.append(replace(component, color=color) if color else component)
+    tables.finish()
+    if not components:
+        raise InputError(f"{path}: every component has the role 'ignore'; nothing is left to track")
+    model = make_model(cad.model.name, tuple(components))
+    symmetries = tuple(
+        _read_symmetry(table, tuple(model.center_in_model.tolist())) for table in root.tables("symmetry")
+    )
+    datums = _read_datums(root.table("datums"), names)
+    root.finish()
+    return Part(
+        name=name,
+        path=path,
+        cad_path=cad_path,
+        model=model,
+        settings=tuple(settings),
+        view_range=view_range,
+        symmetries=symmetries,
+        datums=datums,
+        serial=serial,
+        notes=cad.notes,
+    )
+
+
+def _read_view_range(table: _Table) -> ViewRange:
+    intervals: dict[str, tuple[float, float]] = {"distance_mm": table.interval("distance_mm")}
+    for key in ("elevation_deg", "azimuth_deg", "roll_deg"):
+        if key in table.content:
+            intervals[key] = table.interval(key)
+    table.finish()
+    try:
+        return ViewRange(**intervals)
+    except InputError as error:
+        raise InputError(f"{table.path}: [view_range] {error}") from error
+
+
+def _read_settings(table: _Table, name: str, model: Model, defaults: ComponentSettings) -> ComponentSettings:
+    """Settings of one component, or of [defaults] when ``name`` is empty."""
+    symmetry = defaults.symmetry
+    if name and "symmetry" in table.content:
+        center = model.component(name).bounds_in_model.mean(axis=0)
+        symmetry = _read_symmetry(table.table("symmetry"), tuple(center.tolist()))
+    elif name:
+        table.known("symmetry")
+    settings = ComponentSettings(
+        name=name,
+        role=cast(Role, table.choice("role", ROLES, defaults.role)),
+        position_tolerance_mm=table.positive("position_tolerance_mm", defaults.position_tolerance_mm),
+        angle_tolerance_deg=table.positive("angle_tolerance_deg", defaults.angle_tolerance_deg),
+        symmetry=symmetry,
+    )
+    table.finish()
+    return settings
+
+
+def _read_symmetry(table: _Table, default_through: Vector) -> Symmetry:
+    axis = table.direction("axis")
+    through = table.vector("through_mm", default_through)
+    order = table.take("order")
+    table.finish()
+    if order == "continuous":
+        return Symmetry(axis, through, None)
+    if isinstance(order, bool) or not isinstance(order, int) or order < 2:
+        table.fail("order", order, 'a whole number of at least 2, or "continuous"')
+    return Symmetry(axis, through, order)
+
+
+def _read_datums(tables: _Table, names: list[str]) -> tuple[Datum, ...]:
+    datums = []
+    for label in tables.content:
+        table = tables.table(label)
+        feature = cast(
+            Literal["plane", "hole", "pin"], table.choice("feature", DATUM_FEATURES, required=True)
+        )
+        component = table.text("component")
+        if component not in names:
+            raise InputError(f"{table.path}: [{table.name}] {_unknown_component(component, names)}")
+        point = table.vector("point_mm")
+        direction = table.direction("normal" if feature == "plane" else "axis")
+        diameter_mm = None if feature == "plane" else table.positive("diameter_mm", required=True)
+        table.finish()
+        datums.append(Datum(label, feature, component, point, direction, diameter_mm))
+    tables.finish()
+    return tuple(datums)
+
+
+def _unknown_component(name: str, names: list[str]) -> str:
+    close = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    return f"no component {name!r} in the CAD; {hint}It has: {', '.join(names)}"
+
+
+class _Table:
+    """A TOML table that is read key by key, and complains about what is wrong or left over."""
+
+    def __init__(self, path: Path, name: str, content: dict[str, Any]) -> None:
+        self.path = path
+        self.name = name
+        self.content = content
+        self.allowed: list[str] = []
+
+    def known(self, key: str) -> bool:
+        """Mark a key as allowed; True when it is there."""
+        if key not in self.allowed:
+            self.allowed.append(key)
+        return key in self.content
+
+    def take(self, key: str) -> Any:
+        if not self.known(key):
+            raise InputError(f"{self.path}: {self._where()}the key {key!r} is missing")
+        return self.content[key]
+
+    def fail(self, key: str, value: object, expected: str) -> None:
+        raise InputError(f"{self.path}: {self._where()}{key} = {value!r}: expected {expected}")
+
+    def finish(self) -> None:
+        """Raise InputError for the first key that nobody asked for."""
+        for key in self.content:
+            if key not in self.allowed:
+                close = difflib.get_close_matches(key, self.allowed, n=1)
+                hint = f"; did you mean {close[0]!r}?" if close else ""
+                allowed = ", ".join(self.allowed)
+                raise InputError(f"{self.path}: {self._where()}unknown key {key!r}{hint} Allowed: {allowed}")
+
+    def table(self, key: str, required: bool = False) -> _Table:
+        value = self.take(key) if required or self.known(key) else {}
+        if not isinstance(value, dict):
+            self.fail(key, value, "a table")
+        return _Table(self.path, f"{self.name}.{key}".lstrip("."), value)
+
+    def tables(self, key: str) -> list[_Table]:
+        value = self.content[key] if self.known(key) else []
+        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+            self.fail(key, value, f"tables [[{key}]]")
+        return [_Table(self.path, key, item) for item in value]
+
+    def text(self, key: str, default: str | None = None) -> str:
+        if default is not None and not self.known(key):
+            return default
+        value = self.take(key)
+        if not isinstance(value, str):
+            self.fail(key, value, "text in quotes")
+        return str(value)
+
+    def choice(
+        self, key: str, options: tuple[str, ...], default: str | None = None, required: bool = False
+    ) -> str | None:
+        if not required and not self.known(key):
+            return default
+        value = self.take(key)
+        if value not in options:
+            self.fail(key, value, "one of " + ", ".join(f'"{option}"' for option in options))
+        return str(value)
+
+    def positive(self, key: str, default: float | None = None, required: bool = False) -> float | None:
+        if not required and not self.known(key):
+            return default
+        value = self.take(key)
+        if not _is_number(value) or value <= 0:
+            self.fail(key, value, "a positive number")
+        return float(value)
+
+    def interval(self, key: str) -> tuple[float, float]:
+        value = self.take(key)
+        if not isinstance(value, list) or len(value) != 2 or not all(_is_number(item) for item in value):
+            self.fail(key, value, "two numbers [low, high]")
+        return float(value[0]), float(value[1])
+
+    def vector(self, key: str, default: Vector | None = None) -> Vector:
+        if default is not None and not self.known(key):
+            return default
+        value = self.take(key)
+        if not isinstance(value, list) or len(value) != 3 or not all(_is_number(item) for item in value):
+            self.fail(key, value, "three numbers [x, y, z]")
+        return float(value[0]), float(value[1]), float(value[2])
+
+    def direction(self, key: str) -> Vector:
+        value = np.array(self.vector(key))
+        length = float(np.linalg.norm(value))
+        if length < 1e-9:
+            self.fail(key, value.tolist(), "a direction other than zero")
+        x, y, z = (value / length).tolist()
+        return x, y, z
+
+    def color(self, key: str) -> Vector | None:
+        if not self.known(key):
+            return None
+        value = self.content[key]
+        if not isinstance(value, str) or not re.fullmatch(r"#[0-9a-fA-F]{6}", value):
+            self.fail(key, value, 'a colour like "#8a8f98"')
+        red, green, blue = (int(value[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
+        return red, green, blue
+
+    def _where(self) -> str:
+        return f"[{self.name}] " if self.name else ""
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
