@@ -2,8 +2,8 @@
 
 HDR is brought to BT.709 in three steps, each pixel by itself: the transfer curve is undone to linear light in
 which diffuse white (HLG 75 %, PQ 203 cd/m², ITU-R BT.2408) is 1; BT.2020 primaries become BT.709; highlights
-are rolled off above 0.8 and the BT.709 curve (for PQ, which describes the display, gamma 2.4) is applied. HLG
-describes the scene, as BT.709 does, so that no display gamma is needed between them.
+are rolled off above 0.8 and a curve to 8 bit is applied: that of BT.709 for HLG, since both describe the
+scene (no display gamma is needed between them), that of sRGB for PQ, since both describe the display.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from arview.video.frame import Image
 
 UNSPECIFIED_COLORSPACE = 2  # AVCOL_SPC_UNSPECIFIED
 LINEAR_LEVELS = 4096  # entries of the table from signal to light, 12 bit
-ENCODED_LEVELS = 16384  # entries of the table from light to 8 bit: a quarter of a code value near black
+ENCODED_LEVELS = 65536  # entries of the table from light to 8 bit: under half a code value near black
 PEAK_LIGHT = 8.0  # brightest light told apart, in units of diffuse white
 KNEE = 0.8  # light above which highlights are rolled off
 
@@ -64,7 +64,7 @@ def tables(is_pq: bool) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     rolled = np.where(light <= KNEE, light, 1.0 - (1.0 - KNEE) * np.exp(-(light - KNEE) / (1.0 - KNEE)))
     if is_pq:
         light_of_signal = np.minimum(light_of_pq(signal), PEAK_LIGHT)
-        code = rolled ** (1.0 / 2.4)
+        code = np.where(rolled < 0.0031308, 12.92 * rolled, 1.055 * rolled ** (1.0 / 2.4) - 0.055)
     else:
         light_of_signal = light_of_hlg(signal)
         code = np.where(rolled < 0.018, 4.5 * rolled, 1.099 * rolled**0.45 - 0.099)
