@@ -7,22 +7,18 @@ major axis and weighing pixels by their distance from the line (Gupta & Sproull,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from arview.cad.model import Component, Model
 from arview.geometry import Array, apply, invert
 from arview.overlay.ghost import NEAR_MM, Ghost, GhostView
+from arview.overlay.mesh import Topology
 
 _CREASE_COS = float(np.cos(np.deg2rad(30.0)))
 """Faces that meet at a larger angle form a crease."""
 _FLAT_COS = float(np.cos(np.deg2rad(0.05)))
 """Faces that meet at a smaller angle lie in one plane: no silhouette can run between them."""
-_WELD_MM = 1e-4
-"""Vertices closer than this are one: exporters repeat vertices at creases and seams."""
 _HIDDEN_COVER = 0.4
 """Strength of a hidden edge against a visible one."""
 _DASH_PX = 5
@@ -31,27 +27,31 @@ _DASH_PX = 5
 class Edges:
     """The edges of a model worth drawing: creases, open borders and candidates for the silhouette."""
 
-    def __init__(self, model: Model, pieces_mm: float | None = None) -> None:
-        parts = [_component_edges(component) for component in model.components]
-        offsets_v = np.cumsum([0, *(len(part.vertices) for part in parts)])
-        offsets_f = np.cumsum([0, *(len(part.normals) for part in parts)])
-        self._points = np.concatenate([part.vertices for part in parts])
-        self._normals = np.concatenate([part.normals for part in parts])
-        self._face_points = np.concatenate([part.face_points for part in parts])
-        self._ends = np.concatenate(
-            [part.ends + offset for part, offset in zip(parts, offsets_v, strict=False)]
-        )
-        self._faces = np.concatenate(
-            [
-                np.where(part.faces >= 0, part.faces + offset, -1)
-                for part, offset in zip(parts, offsets_f, strict=False)
-            ]
-        )
-        self._is_crease = np.concatenate([part.is_crease for part in parts])
-        self._is_closed = np.concatenate([np.full(len(part.ends), part.is_closed) for part in parts])
-        self._owner = np.concatenate(
-            [np.full(len(part.ends), i, dtype=np.int16) for i, part in enumerate(parts)]
-        )
+    def __init__(self, shapes: list[Topology], pieces_mm: float | None = None) -> None:
+        """From one topology per component; edges are cut to ``pieces_mm`` where the lens bends them."""
+        points, normals, face_points, ends, faces, creases, closed, owners = [], [], [], [], [], [], [], []
+        vertex_offset = face_offset = 0
+        for index, shape in enumerate(shapes):
+            cosine = np.sum(
+                shape.normals[shape.edge_faces[:, 0]] * shape.normals[shape.edge_faces[:, 1]], axis=1
+            )
+            is_crease = (shape.edge_faces[:, 1] < 0) | (cosine < _CREASE_COS)
+            keep = is_crease | (cosine < _FLAT_COS)
+            points.append(shape.vertices)
+            normals.append(shape.normals)
+            face_points.append(shape.vertices[shape.faces[:, 0]])
+            ends.append(shape.ends[keep] + vertex_offset)
+            faces.append(np.where(shape.edge_faces >= 0, shape.edge_faces + face_offset, -1)[keep])
+            creases.append(is_crease[keep])
+            closed.append(np.full(int(keep.sum()), shape.is_closed))
+            owners.append(np.full(int(keep.sum()), index, dtype=np.int16))
+            vertex_offset += len(shape.vertices)
+            face_offset += len(shape.faces)
+        self._points, self._normals = np.concatenate(points), np.concatenate(normals)
+        self._face_points = np.concatenate(face_points)
+        self._ends, self._faces = np.concatenate(ends), np.concatenate(faces)
+        self._is_crease, self._is_closed = np.concatenate(creases), np.concatenate(closed)
+        self._owner = np.concatenate(owners)
         if pieces_mm is not None:
             self._split(pieces_mm)
 
@@ -87,61 +87,6 @@ class Edges:
         return cover, owner
 
 
-@dataclass(frozen=True)
-class _ComponentEdges:
-    """Edges of one component.
-
-    ``vertices`` (V,3) welded, mm; ``normals`` and ``face_points`` (F,3); ``ends`` (E,2) vertex indices;
-    ``faces`` (E,2) the faces at each edge, -1 for none; ``is_crease`` (E,).
-    """
-
-    vertices: Array
-    normals: Array
-    face_points: Array
-    ends: NDArray[np.int64]
-    faces: NDArray[np.int64]
-    is_crease: NDArray[np.bool_]
-    is_closed: bool
-
-
-def _component_edges(component: Component) -> _ComponentEdges:
-    keys = np.round(component.vertices_in_model / _WELD_MM).astype(np.int64)
-    _, first, welded = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    vertices = component.vertices_in_model[first]
-    faces = welded.reshape(-1)[component.faces]
-    corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    solid = area > 1e-9
-    faces, corners, cross, area = faces[solid], corners[solid], cross[solid], area[solid]
-    normals = cross / area[:, None]
-
-    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    face_of_half = np.tile(np.arange(len(faces)), 3)
-    ends, edge_of_half, count = np.unique(
-        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    order = np.argsort(edge_of_half.reshape(-1), kind="stable")
-    start = np.cumsum(count) - count
-    face_a = face_of_half[order[start]]
-    face_b = np.where(count == 2, face_of_half[order[np.minimum(start + 1, len(order) - 1)]], -1)
-    cosine = np.sum(normals[face_a] * normals[face_b], axis=1)
-    is_crease = (count != 2) | (cosine < _CREASE_COS)
-    keep = is_crease | (cosine < _FLAT_COS)
-    is_closed = bool(np.all(count == 2))
-    if is_closed and np.sum(corners[:, 0] * cross) < 0:
-        normals = -normals  # wound inside out
-    return _ComponentEdges(
-        vertices,
-        normals,
-        corners[:, 0],
-        ends[keep],
-        np.stack([face_a, face_b], axis=1)[keep],
-        is_crease[keep],
-        is_closed,
-    )
-
-
 @njit(cache=True, nogil=True, fastmath=True)
 def _faces_camera(normals, face_points, eye, face):  # type: ignore[no-untyped-def]
     return (
@@ -152,14 +97,11 @@ def _faces_camera(normals, face_points, eye, face):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _is_visible(column, row, w, focal_px, inverse_depth):  # type: ignore[no-untyped-def]
-    """True when the farthest surface within one pixel is not nearer than the point at inverse depth ``w``.
-
-    One pixel of slack, in the image and in depth, keeps edges whole on faces seen at a grazing angle.
-    """
+def _is_visible(column, row, limit, inverse_depth):  # type: ignore[no-untyped-def]
+    """True when a surface within one pixel is no nearer than the inverse depth ``limit``."""
     height, width = inverse_depth.shape
-    z = 1.0 / w
-    limit = 1.0 / (z - z / focal_px - 5e-4 * z)
+    if 0 <= row < height and 0 <= column < width and inverse_depth[row, column] <= limit:
+        return True
     for r in range(max(0, row - 1), min(height, row + 2)):
         for c in range(max(0, column - 1), min(width, column + 2)):
             if inverse_depth[r, c] <= limit:
@@ -173,6 +115,8 @@ def _draw_edges(  # type: ignore[no-untyped-def]
     fx, fy, cx, cy, inverse_depth, width_px, with_hidden, cover, owner,
 ):  # fmt: skip
     height, width = inverse_depth.shape
+    # One pixel of slack, in the image and in depth, keeps edges whole on faces seen at a grazing angle.
+    slack = 1.0 / (1.0 - 1.0 / fx - 5e-4)
     for edge in range(ends.shape[0]):
         front_a = _faces_camera(normals, face_points, eye, faces[edge, 0])
         front_b = front_a
@@ -219,7 +163,7 @@ def _draw_edges(  # type: ignore[no-untyped-def]
             nearest = int(np.round(b))
             strength = 1.0
             column, row = (nearest, a) if steep else (a, nearest)
-            if surely_hidden or not _is_visible(column, row, w, fx, inverse_depth):
+            if surely_hidden or not _is_visible(column, row, w * slack, inverse_depth):
                 if not with_hidden or (a // _DASH_PX) % 2 == 1:
                     continue
                 strength = _HIDDEN_COVER

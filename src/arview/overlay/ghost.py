@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.geometry import Array, apply
+from arview.overlay.mesh import Topology
 from arview.raster import rasterise
 
 NEAR_MM = 1.0
@@ -29,8 +30,9 @@ class GhostView:
     Attributes:
         u0, v0: first column and row of the window in the image, px.
         inverse_depth: (h,w) 1/mm, 0 off the part.
-        face_ids: (h,w) int32 into the ghost's faces, -1 off the part.
-        shade: (F,) float32, |cos| of the angle between face normal and line of sight.
+        face_ids: (h,w) int32 into the faces drawn, -1 off the part.
+        shade: (D,) float32 of the faces drawn, |cos| of the angle between normal and line of sight.
+        components: (D,) int32 component of the faces drawn.
     """
 
     u0: int
@@ -38,6 +40,7 @@ class GhostView:
     inverse_depth: NDArray[np.float64]
     face_ids: NDArray[np.int32]
     shade: NDArray[np.float32]
+    components: NDArray[np.int32]
 
 
 class Ghost:
@@ -46,14 +49,18 @@ class Ghost:
     Lens distortion is honoured by moving the vertices; faces are split beforehand where that needs it.
     """
 
-    def __init__(self, model: Model, camera: Camera) -> None:
+    def __init__(self, model: Model, camera: Camera, shapes: list[Topology]) -> None:
+        """For a model and the topology of each of its components."""
         self.camera = camera
         vertices, faces, component_of_face = model.mesh
         if camera.is_distorted:
             longest_mm = model.diameter_mm / _PIECES_PER_DIAMETER
             vertices, faces, component_of_face = _split_long(vertices, faces, component_of_face, longest_mm)
-        self.vertices_in_model, self.faces = vertices, faces
-        self.component_of_face = component_of_face
+        self._vertices_in_model, self._faces = vertices, faces
+        self._component_of_face = component_of_face
+        # Of a closed mesh only faces turned to the camera can be seen: 1, -1 where it is wound inside out.
+        winding = [(-1 if shape.is_inside_out else 1) if shape.is_closed else 0 for shape in shapes]
+        self._winding = np.array(winding, dtype=np.int8)[component_of_face]
         self._distortion_limit_r2 = _monotone_limit_r2(camera)
 
     def bent(self, points_in_cam: Array) -> Array:
@@ -74,26 +81,20 @@ class Ghost:
     def view(self, cam_from_model: Array) -> GhostView | None:
         """What the camera sees from this pose; None when the part is outside the image."""
         camera = self.camera
-        points = self.bent(apply(cam_from_model, self.vertices_in_model))
+        points = self.bent(apply(cam_from_model, self._vertices_in_model))
         window = _window(points, camera)
         if window is None:
             return None
         u0, v0, u1, v1 = window
-        inverse_depth, face_ids = rasterise(
-            points,
-            self.faces,
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-            u1 - u0,
-            v1 - v0,
-            NEAR_MM,
-            (u0, v0),
+        shade = np.empty(len(self._faces), dtype=np.float32)
+        faces, components, count = _faces_to_draw(
+            points, self._faces, self._winding, self._component_of_face, shade
         )
-        shade = np.empty(len(self.faces), dtype=np.float32)
-        _shade_faces(points, self.faces, shade)
-        return GhostView(u0, v0, inverse_depth, face_ids, shade)
+        inverse_depth, face_ids = rasterise(
+            points, faces[:count], camera.fx, camera.fy, camera.cx, camera.cy,
+            u1 - u0, v1 - v0, NEAR_MM, (u0, v0),
+        )  # fmt: skip
+        return GhostView(u0, v0, inverse_depth, face_ids, shade[:count], components[:count])
 
 
 def _window(points: Array, camera: Camera) -> tuple[int, int, int, int] | None:
@@ -153,21 +154,30 @@ def _split_long(
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _shade_faces(points, faces, shade):  # type: ignore[no-untyped-def]
+def _faces_to_draw(points, faces, winding, component_of_face, shade):  # type: ignore[no-untyped-def]
+    """Faces that may be seen (first ``count`` rows), their components and ``count``; fills ``shade``."""
+    kept = np.empty_like(faces)
+    components = np.empty_like(component_of_face)
+    count = 0
     for f in range(faces.shape[0]):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        e1x, e1y, e1z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-        e2x, e2y, e2z = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        ax, ay, az = points[a, 0], points[a, 1], points[a, 2]
+        e1x, e1y, e1z = points[b, 0] - ax, points[b, 1] - ay, points[b, 2] - az
+        e2x, e2y, e2z = points[c, 0] - ax, points[c, 1] - ay, points[c, 2] - az
         nx, ny, nz = e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, e1x * e2y - e1y * e2x
-        mx = points[a, 0] + points[b, 0] + points[c, 0]
-        my = points[a, 1] + points[b, 1] + points[c, 1]
-        mz = points[a, 2] + points[b, 2] + points[c, 2]
-        norm = np.sqrt((nx * nx + ny * ny + nz * nz) * (mx * mx + my * my + mz * mz))
-        shade[f] = abs(nx * mx + ny * my + nz * mz) / norm if norm > 1e-12 else 0.0
+        along = nx * ax + ny * ay + nz * az
+        if winding[f] * along > 0:
+            continue
+        norm = np.sqrt((nx * nx + ny * ny + nz * nz) * (ax * ax + ay * ay + az * az))
+        shade[count] = abs(along) / norm if norm > 1e-12 else 0.0
+        kept[count, 0], kept[count, 1], kept[count, 2] = a, b, c
+        components[count] = component_of_face[f]
+        count += 1
+    return kept, components, count
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def blend(image, u0, v0, face_ids, shade, component_of_face, ghost_style, edge_cover, edge_owner, edge_style):  # type: ignore[no-untyped-def]
+def blend(image, u0, v0, face_ids, shade, components, ghost_style, edge_cover, edge_owner, edge_style):  # type: ignore[no-untyped-def]
     """Blend ghost and edges over the image in place.
 
     ``ghost_style`` and ``edge_style`` are (C,4) float32: r, g, b in 0–255 and alpha in 0–1 per component;
@@ -178,22 +188,23 @@ def blend(image, u0, v0, face_ids, shade, component_of_face, ghost_style, edge_c
         for column in range(width):
             face = face_ids[row, column]
             cover = edge_cover[row, column]
-            if face < 0 and cover == 0:
+            alpha = np.float32(0.0)
+            if face >= 0:
+                component = components[face]
+                alpha = ghost_style[component, 3]
+            if alpha == 0 and cover == 0:
                 continue
             r = np.float32(image[v0 + row, u0 + column, 0])
             g = np.float32(image[v0 + row, u0 + column, 1])
             b = np.float32(image[v0 + row, u0 + column, 2])
-            if face >= 0:
-                component = component_of_face[face]
-                alpha = ghost_style[component, 3]
-                if alpha > 0:
-                    # Grazing faces a little denser, like glass; faces towards the camera brighter.
-                    facing = shade[face]
-                    alpha = min(np.float32(1.0), alpha * (np.float32(1.25) - np.float32(0.35) * facing))
-                    light = np.float32(0.45) + np.float32(0.55) * facing
-                    r += alpha * (ghost_style[component, 0] * light - r)
-                    g += alpha * (ghost_style[component, 1] * light - g)
-                    b += alpha * (ghost_style[component, 2] * light - b)
+            if alpha > 0:
+                # Grazing faces a little denser, like glass; faces towards the camera brighter.
+                facing = shade[face]
+                alpha = min(np.float32(1.0), alpha * (np.float32(1.25) - np.float32(0.35) * facing))
+                light = np.float32(0.45) + np.float32(0.55) * facing
+                r += alpha * (ghost_style[component, 0] * light - r)
+                g += alpha * (ghost_style[component, 1] * light - g)
+                b += alpha * (ghost_style[component, 2] * light - b)
             if cover > 0:
                 component = edge_owner[row, column]
                 alpha = edge_style[component, 3] * cover * np.float32(1.0 / 255.0)
@@ -206,13 +217,16 @@ def blend(image, u0, v0, face_ids, shade, component_of_face, ghost_style, edge_c
 
 
 @njit(cache=True, nogil=True)
-def count_cells(u0, v0, face_ids, component_of_face, weight, cells, seen_px):  # type: ignore[no-untyped-def]
-    """Sum of ``weight`` (C,) per cell of the image (in pixel areas) and of visible pixels per component."""
+def count_cells(u0, v0, face_ids, components, weight, cells, seen_px):  # type: ignore[no-untyped-def]
+    """Add ``weight`` (C,) per cell of the image (in pixel areas) and visible pixels per component.
+
+    Every second pixel of every second row stands for four.
+    """
     height, width = face_ids.shape
-    for row in range(height):
-        for column in range(width):
+    for row in range(0, height, 2):
+        for column in range(0, width, 2):
             face = face_ids[row, column]
             if face >= 0:
-                component = component_of_face[face]
-                seen_px[component] += 1
-                cells[(v0 + row) // CELL_PX, (u0 + column) // CELL_PX] += weight[component]
+                component = components[face]
+                seen_px[component] += 4
+                cells[(v0 + row) // CELL_PX, (u0 + column) // CELL_PX] += 4 * weight[component]

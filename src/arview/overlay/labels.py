@@ -50,7 +50,7 @@ def value_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
 
 
 def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
-    """Displacement per axis, rotation, U and tolerance; axes within U of zero are left out.
+    """Displacement per axis, rotation and U; axes within U of zero are left out.
 
     An undetermined axis is named as such.
     """
@@ -69,8 +69,6 @@ def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
     if deviation.twist_deg is not None and abs(deviation.twist_deg) >= 0.1:
         parts.append(f"twist {deviation.twist_deg:+.1f}°".replace("-", "−"))
     parts.append(f"U {_number(uncertainty_mm, options)}")
-    if deviation.tolerance_mm is not None:
-        parts.append(f"tol {_number(deviation.tolerance_mm, options)}")
     return "  ".join(parts)
 
 

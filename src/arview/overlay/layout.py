@@ -140,7 +140,7 @@ class LabelLayout:
 
     def _glide(self, now: float, goal: float) -> float:
         fastest = max(3.0, self._bottom / 110.0)
-        return now + float(np.clip(_GLIDE * (goal - now), -fastest, fastest))
+        return now + min(max(_GLIDE * (goal - now), -fastest), fastest)
 
     def _x(self, request: LabelRequest, on_left: bool) -> float:
         assert self._edges is not None
@@ -191,7 +191,7 @@ class LabelLayout:
         for side in room:
             edge = self._edges[0] if side else self._edges[1]
             space = edge - self._margin if side else self._width - self._margin - edge
-            lack = float(np.clip((request.width - space) / request.width, 0.0, 1.0))
+            lack = min(max((request.width - space) / request.width, 0.0), 1.0)
             reach = abs(float(request.anchor_px[0]) - edge) / self._width
             fullness = 1.0 - free_px[side] / (self._bottom - self._top)
             costs[side] = 10.0 * reach + 8.0 * lack + 3.0 * fullness

@@ -84,7 +84,8 @@ def panel(width: int, height: int, radius_px: float, opacity: float, rgb: Rgb = 
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     across = np.abs(u - 0.5 * (width - 1)) - (0.5 * width - radius_px)
     down = np.abs(v - 0.5 * (height - 1)) - (0.5 * height - radius_px)
-    distance = np.hypot(np.maximum(across, 0), np.maximum(down, 0)) - radius_px
+    outside = np.hypot(np.maximum(across, 0), np.maximum(down, 0))
+    distance = outside + np.minimum(np.maximum(across, down), 0) - radius_px
     cover = np.clip(0.5 - distance, 0.0, 1.0)
     alpha = np.round(255.0 * opacity * cover).astype(np.uint8)
     return Sprite(np.full((height, width, 3), rgb, dtype=np.uint8), alpha)
@@ -114,7 +115,7 @@ def put_sprite(image: Image, sprite: Sprite, x: int, y: int, opacity: float = 1.
 def line(image: Image, points_px: Array, rgb: Rgb, width_px: int) -> None:
     """An outlined polyline through points (N,2)."""
     fixed = np.round(points_px * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
-    cv2.polylines(image, [fixed], False, _OUTLINE_RGB, width_px + 2, cv2.LINE_AA, _SHIFT)
+    cv2.polylines(image, [fixed], False, _OUTLINE_RGB, width_px + 1, cv2.LINE_AA, _SHIFT)
     cv2.polylines(image, [fixed], False, rgb, width_px, cv2.LINE_AA, _SHIFT)
 
 

@@ -7,7 +7,7 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Component, Model
+from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import MismatchError
 from arview.geometry import Array, apply
@@ -16,6 +16,7 @@ from arview.overlay import labels, paint
 from arview.overlay.edges import Edges
 from arview.overlay.ghost import CELL_PX, NEAR_MM, Ghost, GhostView, blend, count_cells
 from arview.overlay.layout import LabelLayout, LabelRequest, PlacedLabel
+from arview.overlay.mesh import anchor_in_model, topology
 from arview.overlay.options import CONTEXT_RGB, NEUTRAL_RGB, VERDICT_RGB, OverlayOptions
 from arview.overlay.status import StatusLine
 from arview.pose import Pose, TrackingState
@@ -25,6 +26,9 @@ _CONTEXT_WEIGHT = 0.25
 _CONTEXT_EDGE_ALPHA = 0.5
 _CRITICAL_DIMMING = 0.55
 """Ghost and edges fade while the tracker is not sure of the pose."""
+_PASS_DIMMING = 0.65
+"""Ghosts of components that passed are fainter, so that the others stand out."""
+_ARROW_RGB = (255, 255, 255)
 _SEEN_PX = 12
 """A component that shows fewer pixels gets a label only if it did not pass."""
 
@@ -50,11 +54,16 @@ class OverlayRenderer:
             inspection.check_model(model)
         self.model, self.camera, self.inspection = model, camera, inspection
         self.options = options or OverlayOptions()
-        self._ghost = Ghost(model, camera)
-        self._edges = Edges(model, model.diameter_mm / 16 if camera.is_distorted else None)
+        shapes = [topology(component) for component in model.components]
+        self._ghost = Ghost(model, camera, shapes)
+        self._edges = Edges(shapes, model.diameter_mm / 16 if camera.is_distorted else None)
         self._ghost_style, self._edge_style, self._weight = self._styles()
-        self._anchors_in_model = np.stack([_anchor(component) for component in model.components])
-        self._centers_in_model = np.stack([c.bounds_in_model.mean(axis=0) for c in model.components])
+        self._anchors_in_model = np.stack(
+            [
+                anchor_in_model(component, shape)
+                for component, shape in zip(model.components, shapes, strict=True)
+            ]
+        )
         self._line_px = max(1.0, 0.7 + camera.height / 800)
 
         size_px = labels.text_size_px(camera.height)
@@ -72,6 +81,8 @@ class OverlayRenderer:
         bottom_px = camera.height - margin_px - (self._status.height_px if self.options.show_status else 0)
         self._layout = LabelLayout(camera.width, margin_px, bottom_px, margin_px, round(0.5 * size_px))
         self._labelled = urgent if self.options.show_labels else []
+        self._index = {component.name: index for index, component in enumerate(model.components)}
+        self._verdict = {deviation.name: deviation.verdict for deviation in self._labelled}
         self._sprites = {
             deviation.name: labels.label_sprite(deviation, self.options, size_px, self._layout.widest_px)
             for deviation in self._labelled
@@ -79,15 +90,21 @@ class OverlayRenderer:
         self._was_seen: set[str] = set()
 
     def draw(
-        self, image: paint.Image, pose: Pose, fps: float | None = None, now: datetime | None = None
+        self,
+        image: paint.Image,
+        pose: Pose,
+        fps: float | None = None,
+        now: datetime | None = None,
+        in_place: bool = False,
     ) -> paint.Image:
-        """The annotated frame; the given one is not changed.
+        """The annotated frame.
 
         Args:
             image: (H,W,3) uint8 RGB, of the camera's size.
             pose: of this frame; without ``cam_from_model`` only the status line is drawn.
             fps: frames per second to show, if any.
             now: moment that the age of the inspection refers to; default: this moment.
+            in_place: draw on the given image, which must be writable, instead of on a copy of it.
 
         Raises:
             MismatchError: the image is not of the camera's size.
@@ -97,7 +114,7 @@ class OverlayRenderer:
             raise MismatchError(
                 f"overlay: image is {image.dtype} {image.shape}, the camera expects uint8 {expected}"
             )
-        canvas = np.array(image, order="C")
+        canvas = image if in_place else np.array(image, order="C")
         view = self._ghost.view(pose.cam_from_model) if pose.cam_from_model is not None else None
         if pose.cam_from_model is None or view is None:
             self._layout.reset()
@@ -117,6 +134,7 @@ class OverlayRenderer:
             opacity, edge_alpha, cost = self.options.opacity, 1.0, 1.0
             if deviation is not None:
                 color = VERDICT_RGB[deviation.verdict]
+                opacity *= _PASS_DIMMING if deviation.verdict is Verdict.PASS else 1.0
             elif self.inspection is None:
                 color = NEUTRAL_RGB
             else:
@@ -145,7 +163,7 @@ class OverlayRenderer:
             [1, 1, 1, _CRITICAL_DIMMING if state is TrackingState.CRITICAL else 1], dtype=np.float32
         )
         blend(
-            canvas, view.u0, view.v0, view.face_ids, view.shade, self._ghost.component_of_face,
+            canvas, view.u0, view.v0, view.face_ids, view.shade, view.components,
             self._ghost_style * dimming, cover, owner, self._edge_style * dimming,
         )  # fmt: skip
 
@@ -167,14 +185,12 @@ class OverlayRenderer:
         camera = self.camera
         cells = np.zeros((-(-camera.height // CELL_PX), -(-camera.width // CELL_PX)), dtype=np.float32)
         seen_px = np.zeros(len(self.model.components), dtype=np.int64)
-        count_cells(
-            view.u0, view.v0, view.face_ids, self._ghost.component_of_face, self._weight, cells, seen_px
-        )
+        count_cells(view.u0, view.v0, view.face_ids, view.components, self._weight, cells, seen_px)
         requests: list[LabelRequest] = []
         for deviation in self._labelled:
             if len(requests) == self.options.max_labels:
                 break
-            index = self.model.index(deviation.name)
+            index = self._index[deviation.name]
             if self._deserves_label(deviation, anchors_px[index], int(seen_px[index])):
                 sprite = self._sprites[deviation.name]
                 requests.append(LabelRequest(deviation.name, sprite.width, sprite.height, anchors_px[index]))
@@ -199,52 +215,34 @@ class OverlayRenderer:
     ) -> None:
         if label.opacity < 0.5:
             return
-        deviation = next(d for d in self._labelled if d.name == label.key)
-        index = self.model.index(label.key)
-        color = VERDICT_RGB[deviation.verdict]
+        index, verdict = self._index[label.key], self._verdict[label.key]
+        color = VERDICT_RGB[verdict]
         anchor = np.clip(anchors_px[index], 0, [self.camera.width - 1, self.camera.height - 1])
         x = float(label.x + label.width if label.on_left else label.x)
         y = label.y + 0.5 * min(label.height, 1.9 * self._size_px)
         knee = np.array([x + (0.8 if label.on_left else -0.8) * self._size_px, y])
-        is_urgent = deviation.verdict in (Verdict.FAIL, Verdict.UNDECIDED)
+        is_urgent = verdict in (Verdict.FAIL, Verdict.UNDECIDED)
         paint.line(
             canvas, np.array([[x, y], knee, anchor]), color, 2 if is_urgent and self._size_px > 13 else 1
         )
         paint.dot(canvas, anchor, color, 0.2 * self._size_px, bool(seen_px[index] == 0))
 
-    def _arrow_list(self, deviations: list[ComponentDeviation]) -> list[tuple[int, Array]]:
-        """Component index and exaggerated displacement (3,) mm of every arrow, the most urgent last."""
+    def _arrow_list(self, deviations: list[ComponentDeviation]) -> list[Array]:
+        """Tail and exaggerated tip (2,3) in the model, mm, of every arrow, the most urgent last."""
         arrows = []
         for deviation in reversed(deviations):
             displacement = labels.arrow_in_model(deviation)
             if displacement is not None and deviation.verdict is not Verdict.PASS:
-                arrows.append((self.model.index(deviation.name), self._arrow_scale * np.array(displacement)))
+                tail = self.model.component(deviation.name).bounds_in_model.mean(axis=0)
+                arrows.append(np.stack([tail, tail + self._arrow_scale * np.array(displacement)]))
         return arrows
 
     def _draw_arrows(self, canvas: paint.Image, cam_from_model: Array) -> None:
-        for index, offset in self._arrows:
-            tail = self._centers_in_model[index]
-            ends_in_cam = apply(cam_from_model, np.stack([tail, tail + offset]))
-            if ends_in_cam[:, 2].min() <= NEAR_MM:
-                continue
-            tail_px, tip_px = self.camera.project(ends_in_cam)
-            limit = 2 * max(self.camera.width, self.camera.height)
-            if np.abs([tail_px, tip_px]).max() < limit:
-                paint.arrow(canvas, tail_px, tip_px, (255, 255, 255), 0.24 * self._size_px)
-
-
-def _anchor(component: Component) -> Array:
-    """Point (3,) of the surface nearest to its centre of area; unlike that centre it projects onto it."""
-    corners = component.vertices_in_model[component.faces]
-    for _ in range(2):
-        middles = 0.5 * (corners + np.roll(corners, -1, axis=1))
-        corners = np.concatenate(
-            [
-                middles,
-                *(np.stack([corners[:, k], middles[:, k], middles[:, k - 1]], axis=1) for k in range(3)),
-            ]
-        )
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    centroids = corners.mean(axis=1)
-    center = area @ centroids / max(float(area.sum()), 1e-12)
-    return np.asarray(centroids[np.argmin(np.linalg.norm(centroids - center, axis=1))])
+        if not self._arrows:
+            return
+        ends_in_cam = apply(cam_from_model, np.stack(self._arrows))
+        ends_px = self.camera.project(ends_in_cam)
+        limit_px = 2 * max(self.camera.width, self.camera.height)
+        for in_cam, (tail_px, tip_px) in zip(ends_in_cam, ends_px, strict=True):
+            if in_cam[:, 2].min() > NEAR_MM and max(np.abs(tail_px).max(), np.abs(tip_px).max()) < limit_px:
+                paint.arrow(canvas, tail_px, tip_px, _ARROW_RGB, 0.24 * self._size_px)
