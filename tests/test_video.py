@@ -129,7 +129,7 @@ def test_truncated_mp4(tmp_path: Path) -> None:
     frames = list(source)
     assert 5 <= len(frames) < 20
     assert [number_of(frame.image) for frame in frames] == list(range(len(frames)))
-    assert "cut short" in source.ended_reason and "of 20 frames" in source.ended_reason
+    assert f"cut short or damaged; {len(frames)} of 20 frames could be read" in source.ended_reason
     plain = write_clip(tmp_path / "b.mp4", CLIP)
     plain.write_bytes(plain.read_bytes()[:-2000])
     with pytest.raises(InputError, match="damaged or cut-short MP4"):
@@ -347,6 +347,43 @@ def test_dead_addresses_are_refused_at_start(serve) -> None:
         open_source(serve(0, hang=True).url, open_timeout_s=0.3)
     with pytest.raises(InputError, match="there is no camera 97"):
         open_source("97", open_timeout_s=5)
+
+
+class FakeCapture:
+    """Stands for cv2.VideoCapture: a camera that is unplugged after a few frames."""
+
+    def __init__(self, index: int) -> None:
+        self.left = 5
+
+    def isOpened(self) -> bool:
+        return True
+
+    def get(self, key: int) -> float:
+        return 25.0
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        self.left -= 1
+        threading.Event().wait(0.02)
+        return (
+            (True, cv2.cvtColor(quarters(160, 120), cv2.COLOR_RGB2BGR)) if self.left >= 0 else (False, None)
+        )
+
+    def release(self) -> None:
+        pass
+
+
+def test_camera_that_is_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
+    with open_source("0") as source:
+        assert (source.name, source.fps, source.is_live) == ("camera 0", 25.0, True)
+        frames = list(source)
+    assert 1 <= len(frames) <= 5
+    np.testing.assert_array_equal(frames[0].image, quarters(160, 120))
+    assert source.ended_reason == "camera 0: the camera gives no more frames; was it unplugged?"
+    with open_source("0", start=2, end=4) as source:
+        indices = [frame.index for frame in source]
+    assert indices and set(indices) <= {2, 3}
+    assert source.ended_reason == ""
 
 
 # --- Sink ---

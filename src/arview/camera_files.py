@@ -78,7 +78,7 @@ def load_camera(
     spec: str | Path,
     width: int | None = None,
     height: int | None = None,
-    source: Path | None = None,
+    source: str | Path | None = None,
     quarter_turns_clockwise: int = 0,
 ) -> Camera:
     """Camera for frames of width × height px from a file, ``fov:DEG`` or ``exif``.
@@ -459,13 +459,13 @@ def _entry_from_colmap(line: str) -> _Entry:
 # --- EXIF ----------------------------------------------------------------------------------------------
 
 
-def _camera_from_exif(source: Path | None, width: int | None, height: int | None) -> Camera:
+def _camera_from_exif(source: str | Path | None, width: int | None, height: int | None) -> Camera:
     """Camera of photos from the focal length that the phone or camera wrote into the first one."""
     if source is None:
         raise InputError(
             "camera 'exif': no source to read it from; give a photo, a folder or a glob of photos"
         )
-    photo = _first_photo(source)
+    photo = _first_photo(Path(source))
     exif = read_exif(photo)
     if width is None or height is None:
         width, height = exif.width, exif.height

@@ -89,7 +89,8 @@ class VideoFileSource(FrameSource):
                 yield Frame(upright_image(frame, self.quarter_turns_clockwise), index, time_s)
         if self._total is not None and index + 1 < self._total and not self.ended_reason:
             self.ended_reason = (
-                f"{self.name}: the file is cut short, {index + 1} of {self._total} frames are there"
+                f"{self.name}: the file is cut short or damaged; "
+                f"{index + 1 - self.skipped} of {self._total} frames could be read"
             )
 
     @contextmanager
@@ -165,7 +166,7 @@ class PictureSource(FrameSource):
 
     def __init__(self, name: str, paths: Sequence[Path], wanted: FrameRange, fps: float) -> None:
         self.name = name
-        self.fps = fps
+        self.fps = self._pictures_per_s = fps
         self._paths = paths
         self._wanted = wanted
         self.frame_count = wanted.count(len(paths))
@@ -187,7 +188,6 @@ class PictureSource(FrameSource):
 
     def _frames(self) -> Iterator[Frame]:
         self.skipped = 0
-        assert self.fps is not None
         for index, path in enumerate(self._paths):
             if not self._wanted.wants(index):
                 continue
@@ -195,7 +195,7 @@ class PictureSource(FrameSource):
             if image is None or image.shape != (self.height, self.width, 3):
                 self.skipped += 1
                 continue
-            yield Frame(image, index, index / self.fps)
+            yield Frame(image, index, index / self._pictures_per_s)
 
 
 def picture_paths(folder: Path) -> list[Path]:

@@ -60,6 +60,7 @@ class LiveSource(FrameSource):
         self._read_timeout_s = read_timeout_s
         self._changed = threading.Condition()
         self._newest: Frame | None = None
+        self._heard_s = 0.0  # monotonic time at which the last frame came
         self._opened = False
         self._finished = False
         self._closing = False
@@ -72,20 +73,23 @@ class LiveSource(FrameSource):
                 raise InputError(f"{why}; check the address, the cable and that no other program uses it")
 
     def __iter__(self) -> Iterator[Frame]:
-        while True:
-            with self._changed:
-                self._changed.wait_for(
-                    lambda: self._newest is not None or self._finished, timeout=self._read_timeout_s
-                )
-                frame, self._newest = self._newest, None
-                if frame is None:
-                    if not self._finished:
-                        self.ended_reason = (
-                            f"{self.name}: no frame for {self._read_timeout_s:g} s; is it still connected?"
-                        )
-                        self._closing = True
-                    return
+        while (frame := self._next_frame()) is not None:
             yield frame
+
+    def _next_frame(self) -> Frame | None:
+        """The newest wanted frame, waited for while others come; None at the end or after a long silence."""
+        with self._changed:
+            while self._newest is None and not self._finished:
+                patience_s = self._heard_s + self._read_timeout_s - time.monotonic()
+                if patience_s <= 0:
+                    self.ended_reason = (
+                        f"{self.name}: no frame for {self._read_timeout_s:g} s; is it still connected?"
+                    )
+                    self._closing = True
+                    return None
+                self._changed.wait(patience_s)
+            frame, self._newest = self._newest, None
+            return frame
 
     def close(self) -> None:
         """Stop reading; the device is released as soon as its pending read returns."""
@@ -115,6 +119,7 @@ class LiveSource(FrameSource):
             image = grabber.read()
             now_s = time.monotonic()
             with self._changed:
+                self._heard_s = now_s
                 if not self._opened and image is not None:
                     first_s = now_s
                     self.height, self.width = image.shape[:2]
