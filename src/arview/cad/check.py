@@ -13,6 +13,7 @@ from arview.cad.part import ComponentSettings, Part
 from arview.cad.symmetry import FoundSymmetry, Symmetry, find_symmetries
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
+from arview.geometry import Array, exp_so3
 
 Severity = Literal["problem", "warning", "note"]
 
@@ -37,7 +38,7 @@ MANY_TRIANGLES = 200_000
 
 @dataclass(frozen=True)
 class Finding:
-    """One remark: ``problem`` will fail unless something is done, ``warning`` is hard, ``note`` is good to know."""
+    """One remark: a ``problem`` fails unless something is done, a ``warning`` is hard, a ``note`` helps."""
 
     severity: Severity
     text: str
@@ -95,8 +96,8 @@ class PartCheck:
             f"  {_extent(size)} mm, {len(self.components)} components, {triangles:,} triangles, "
             f"hash {model.source_hash[:12]}",
             f"  view range{'' if self.part.view_range else ' (default)'}: {_range_text(self.view_range)}",
-            f"  camera{' (guessed)' if self.is_camera_guessed else ''}: {self.camera.width}×{self.camera.height}, "
-            f"focal length {self.camera.fx:.0f} px",
+            f"  camera{' (guessed)' if self.is_camera_guessed else ''}: "
+            f"{self.camera.width}×{self.camera.height}, focal length {self.camera.fx:.0f} px",
         ]
         lines += [
             f"  datum {datum.label}: {datum.feature} of {datum.component}" for datum in self.part.datums
@@ -112,7 +113,7 @@ class PartCheck:
             "component",
             "role",
             "size mm",
-            "triangles",
+            "faces",
             "colour",
             "tolerance",
             "px far-near",
@@ -131,8 +132,7 @@ class PartCheck:
                     "#" + "".join(f"{round(255 * value):02x}" for value in component.color),
                     _tolerance_text(check.settings),
                     f"{far:.0f}-{near:.0f}",
-                    "; ".join(found.symmetry.describe() for found in check.symmetries if found.is_exact)
-                    or "-",
+                    _listed([found.symmetry.describe() for found in check.symmetries], 2, "; ") or "-",
                 )
             )
         ignored = [settings.name for settings in self.part.settings if settings.role == "ignore"]
@@ -156,20 +156,16 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         _check_component(part, component, camera, view_range) for component in part.model.components
     )
     vertices, faces, owners = part.model.mesh
-    symmetries = (
-        components[0].symmetries
-        if len(components) == 1
-        else find_symmetries(vertices, faces.astype(np.int64), owners.astype(np.int64))
-    )
+    symmetries = find_symmetries(vertices, faces.astype(np.int64), owners.astype(np.int64))
     findings = [
         *[Finding("note", note) for note in part.notes],
         *_view_findings(part, camera, view_range),
-        *_symmetry_findings(part, symmetries),
+        *_symmetry_findings(part, view_range, symmetries),
     ]
     for check in components:
         findings += _size_findings(check, view_range)
         findings += _mesh_findings(check)
-        findings += _own_symmetry_findings(check)
+    findings += _own_symmetry_findings(components)
     findings += _tolerance_findings(part)
     order: tuple[Severity, ...] = ("problem", "warning", "note")
     return PartCheck(
@@ -194,7 +190,9 @@ def _check_component(
         settings=part.component_settings(component.name),
         fitness=fitness,
         pixels_across=(camera.fx * middle_mm / far_mm, camera.fx * middle_mm / near_mm),
-        symmetries=find_symmetries(component.vertices_in_model, component.faces.astype(np.int64)),
+        symmetries=find_symmetries(
+            component.vertices_in_model, component.faces.astype(np.int64), near_share=0.0
+        ),
     )
 
 
@@ -206,7 +204,7 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Fi
         findings.append(
             Finding(
                 "problem",
-                f"the nearest distance {near_mm:g} mm lies inside the part (half its diameter is "
+                f"the nearest distance {near_mm:.0f} mm lies inside the part (half its diameter is "
                 f"{0.5 * diameter_mm:.0f} mm); distance_mm is from the camera to the part's middle",
             )
         )
@@ -214,56 +212,104 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Fi
         share = camera.fx * diameter_mm / near_mm / max(camera.width, camera.height)
         findings.append(
             Finding(
-                "warning", f"at {near_mm:g} mm the part is {share:.1f} pictures wide: little contour is seen"
+                "warning",
+                f"at {near_mm:.0f} mm the part is {share:.1f} pictures wide: little contour is seen",
             )
         )
     across_px = camera.fx * diameter_mm / far_mm
     if across_px < 60.0:
         findings.append(
-            Finding("problem", f"at {far_mm:g} mm the whole part is {across_px:.0f} px across; come nearer")
+            Finding("problem", f"at {far_mm:.0f} mm the whole part is {across_px:.0f} px across; come nearer")
         )
     triangles = len(part.model.mesh[1])
     if triangles > MANY_TRIANGLES:
         findings.append(
             Finding(
                 "warning",
-                f"{triangles:,} triangles make guide views slow; decimate, or load STEP with a larger tol_linear_mm",
+                f"{triangles:,} triangles make guide views slow; decimate, or for STEP raise tol_linear_mm",
             )
         )
     return findings
 
 
-def _symmetry_findings(part: Part, symmetries: tuple[FoundSymmetry, ...]) -> list[Finding]:
+def _symmetry_findings(
+    part: Part, view_range: ViewRange, symmetries: tuple[FoundSymmetry, ...]
+) -> list[Finding]:
+    """Turns of the whole part that look the same, or nearly, judged by what the view range lets happen."""
     findings = []
     for declared in part.symmetries:
         if not any(found.is_exact and _covers(found.symmetry, declared) for found in symmetries):
-            text = (
-                f"the part file declares the symmetry {declared.describe()}, which the geometry does not have"
-            )
+            text = f"the declared symmetry of the part, {declared.describe()}, is not in its geometry"
             findings.append(Finding("warning", text))
-    names = [component.name for component in part.model.components]
+    ambiguous, excluded = [], []
     for found in symmetries:
         what = found.symmetry.describe()
-        if found.is_exact:
-            if any(_covers(declared, found.symmetry) for declared in part.symmetries):
-                findings.append(Finding("note", f"the part is symmetric as declared: {what}"))
-                continue
-            text = (
-                f"the part looks the same when turned by {what}: its pose is ambiguous; restrict [view_range], "
-                "declare it as [[symmetry]] if it does not matter, or rely on texture"
-            )
-            findings.append(Finding("problem", text))
-            continue
-        breaking = [
-            name for name, share in zip(names, found.unmatched_of_group, strict=True) if share > MOVING_SHARE
-        ]
-        told = (
-            f"only {', '.join(breaking)} tell" if len(breaking) <= 8 else f"{len(breaking)} components tell"
+        if not can_confuse(found.symmetry, view_range):
+            excluded.append(what)
+        elif any(_covers(declared, found.symmetry) for declared in part.symmetries):
+            findings.append(Finding("note", f"the part is symmetric as declared: {what}"))
+        elif found.is_exact:
+            ambiguous.append(what)
+        else:
+            findings.append(Finding("warning", _near_text(part, found)))
+    if ambiguous:
+        text = (
+            f"the part looks the same when turned by {_listed(ambiguous, 4)}: its pose is ambiguous; "
+            "restrict [view_range], declare it as [[symmetry]] if it does not matter, or rely on its texture"
         )
-        by = f"; {told} the two apart" if len(names) > 1 and breaking else ""
-        text = f"the part is nearly the same ({100 * (1 - found.unmatched_share):.0f} % of its surface) turned by {what}{by}"
-        findings.append(Finding("warning", text))
+        findings.append(Finding("problem", text))
+    if excluded:
+        text = f"looks (nearly) the same when turned, but the view range keeps apart: {_listed(excluded, 4)}"
+        findings.append(Finding("note", text))
     return findings
+
+
+def _near_text(part: Part, found: FoundSymmetry) -> str:
+    names = [component.name for component in part.model.components]
+    shares = zip(names, found.unmatched_of_group, strict=True)
+    breaking = [name for name, share in shares if share > MOVING_SHARE]
+    told = f"; told apart by {_listed(breaking, 6)}" if len(names) > 1 and breaking else ""
+    same = 100.0 * (1.0 - found.unmatched_share)
+    what = found.symmetry.describe()
+    return f"the part is nearly the same ({same:.0f} % of its surface) when turned by {what}{told}"
+
+
+def can_confuse(symmetry: Symmetry, view_range: ViewRange) -> bool:
+    """True when two allowed views of a part show the same because of a symmetry.
+
+    A view from direction d with image-up u looks like the one from S d with image-up S u, for every turn S
+    of the symmetry; both must be in the range, roll included.
+    """
+    if symmetry.order is None:
+        return True
+    count = 2000
+    z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    radius = np.sqrt(1.0 - z * z)
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
+    # Half the spacing of the directions as margin, so that a narrow range is not missed.
+    directions = directions[view_range.contains_direction(directions, margin_deg=2.5)]
+    width_deg = view_range.roll_deg[1] - view_range.roll_deg[0]
+    for turn in range(1, symmetry.order):
+        rotation = exp_so3(np.array(symmetry.axis_in_model) * (2.0 * np.pi * turn / symmetry.order))
+        turned = directions @ rotation.T
+        roll_deg = _angle_about_deg(turned, _image_up(turned), _image_up(directions) @ rotation.T)
+        same_roll = np.abs(roll_deg) <= width_deg
+        if np.any(view_range.contains_direction(turned, margin_deg=2.5) & same_roll):
+            return True
+    return False
+
+
+def _image_up(directions: Array) -> Array:
+    """(N,3) unit vectors across directions (N,3) that lie closest to +Z: up in a picture of roll 0."""
+    up = np.array([0.0, 0.0, 1.0]) - directions * directions[:, 2:]
+    return up / np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-12)
+
+
+def _angle_about_deg(axes: Array, start: Array, end: Array) -> Array:
+    """(N,) signed angles in deg about unit axes (N,3) from start to end (N,3), both across the axis."""
+    sine = np.einsum("ij,ij->i", axes, np.cross(start, end))
+    return np.asarray(np.rad2deg(np.arctan2(sine, np.einsum("ij,ij->i", start, end))))
 
 
 def _size_findings(check: ComponentCheck, view_range: ViewRange) -> list[Finding]:
@@ -272,15 +318,17 @@ def _size_findings(check: ComponentCheck, view_range: ViewRange) -> list[Finding
     name = check.component.name
     is_judged = check.settings.role == "inspect"
     if near_px < SMALL_PX:
-        text = f"{name} is too small to see: {near_px:.1f} px across even at {near_mm:g} mm"
+        text = f"{name} is too small to see: {near_px:.1f} px across even at {near_mm:.0f} mm"
         return [Finding("problem" if is_judged else "warning", text)]
     if far_px < SMALL_PX:
         limit_mm = near_mm * near_px / SMALL_PX
-        text = f"{name} is small: {far_px:.1f} px across at {far_mm:g} mm; well seen up to {limit_mm:.0f} mm"
+        text = (
+            f"{name} is small: {far_px:.1f} px across at {far_mm:.0f} mm; well seen up to {limit_mm:.0f} mm"
+        )
         return [Finding("warning", text)]
     thin_px = far_px * check.fitness.extents_mm[2] / check.fitness.extents_mm[1]
     if thin_px < THIN_PX:
-        text = f"{name} is thin: {thin_px:.1f} px at {far_mm:g} mm when seen edge-on"
+        text = f"{name} is thin: {thin_px:.1f} px at {far_mm:.0f} mm when seen edge-on"
         return [Finding("note", text)]
     return []
 
@@ -289,36 +337,41 @@ def _mesh_findings(check: ComponentCheck) -> list[Finding]:
     fitness, name = check.fitness, check.component.name
     findings = []
     if fitness.thickness_mm < SHEET_FRACTION * fitness.extents_mm[0]:
-        text = f"{name} is a sheet without thickness ({fitness.thickness_mm:.3g} mm): give it its thickness in the CAD"
+        text = f"{name} is a sheet without thickness ({fitness.thickness_mm:.3g} mm): give it one in the CAD"
         findings.append(Finding("warning", text))
     elif fitness.open_edge_count:
         text = f"{name} is not closed: {fitness.open_edge_count} open edges; they will show as contours"
         findings.append(Finding("warning", text))
     if fitness.non_manifold_edge_count:
-        text = f"{name} has {fitness.non_manifold_edge_count} edges shared by more than two triangles (non-manifold)"
+        count = fitness.non_manifold_edge_count
+        text = f"{name} has {count} edges shared by more than two triangles (non-manifold)"
         findings.append(Finding("warning", text))
     if not fitness.is_consistent:
         findings.append(Finding("warning", f"{name} has triangles that face the wrong way"))
     return findings
 
 
-def _own_symmetry_findings(check: ComponentCheck) -> list[Finding]:
-    """A judged component that can be turned about itself unseen, where the part file does not say so."""
-    if check.settings.role != "inspect":
-        return []
-    declared = check.settings.symmetry
-    exact = [found.symmetry for found in check.symmetries if found.is_exact]
-    name = check.component.name
-    if declared is not None and not any(_covers(symmetry, declared) for symmetry in exact):
-        text = f"{name}: the declared symmetry {declared.describe()} is not in its geometry"
-        return [Finding("warning", text)]
-    spins = [symmetry for symmetry in exact if symmetry.order is None]
-    if declared is None and spins:
-        axis = spins[0].describe().removeprefix("any angle about ")
-        return [
-            Finding("note", f"{name} is a body of revolution: its rotation about {axis} cannot be measured")
-        ]
-    return []
+def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[Finding]:
+    """Judged components that can be turned about themselves unseen, and declared turns that are not there."""
+    findings = []
+    spinning = []
+    for check in checks:
+        declared = check.settings.symmetry
+        exact = [found.symmetry for found in check.symmetries]
+        if declared is not None and not any(_covers(symmetry, declared) for symmetry in exact):
+            name, what = check.component.name, declared.describe()
+            findings.append(
+                Finding("warning", f"{name}: the declared symmetry, {what}, is not in its geometry")
+            )
+        spins = [symmetry for symmetry in exact if symmetry.order is None]
+        if check.settings.role == "inspect" and declared is None and spins:
+            spinning.append(
+                f"{check.component.name} ({spins[0].describe().removeprefix('any angle about ')})"
+            )
+    if spinning:
+        text = f"bodies of revolution, whose turn about their axis cannot be measured: {_listed(spinning, 8)}"
+        findings.append(Finding("note", text))
+    return findings
 
 
 def _tolerance_findings(part: Part) -> list[Finding]:
@@ -327,7 +380,7 @@ def _tolerance_findings(part: Part) -> list[Finding]:
     ]
     if not open_ended:
         return []
-    names = ", ".join(open_ended[:6]) + (f" and {len(open_ended) - 6} more" if len(open_ended) > 6 else "")
+    names = _listed(open_ended, 6)
     return [Finding("note", f"no position_tolerance_mm, so measured but not judged: {names}")]
 
 
@@ -338,7 +391,12 @@ def _covers(wide: Symmetry, narrow: Symmetry) -> bool:
     return wide.order is None or (narrow.order is not None and wide.order % narrow.order == 0)
 
 
-def _extent(size_mm: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
+def _listed(items: list[str], most: int, separator: str = ", ") -> str:
+    rest = f" and {len(items) - most} more" if len(items) > most else ""
+    return separator.join(items[:most]) + rest
+
+
+def _extent(size_mm: Array) -> str:
     return " × ".join(f"{value:.4g}" for value in size_mm)
 
 

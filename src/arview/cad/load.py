@@ -134,7 +134,7 @@ with open(target, "wb") as f: f.write(glb)
 
 
 def _read_step(path: Path, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
-    """Tessellate STEP to GLB by OpenCASCADE (cascadio), whose linear tolerance is in mm for every file unit."""
+    """STEP as triangles by OpenCASCADE (cascadio), whose linear tolerance is in mm for every file unit."""
     import importlib.util
 
     if importlib.util.find_spec("cascadio") is None:
@@ -197,8 +197,9 @@ def _read_mesh_file(path: Path, suffix: str) -> RawModel:
         with _quiet_trimesh(), path.open("rb") as file:
             scene = trimesh.load_scene(file, file_type=suffix[1:], process=False)
     except Exception as error:  # trimesh raises whatever its parsers stumble over
+        kind, said = suffix[1:].upper(), next(iter(str(error).splitlines()), "")
         raise InputError(
-            f"{path}: broken or truncated {suffix[1:].upper()} ({type(error).__name__}: {error}); export it again"
+            f"{path}: broken or truncated {kind} ({type(error).__name__}: {said}); export it again"
         ) from error
     raw = RawModel()
     several = len(scene.geometry) > 1
@@ -235,8 +236,9 @@ def _check_finite(component: RawComponent, path: Path) -> None:
     bad = int(np.count_nonzero(~np.isfinite(component.vertices).all(axis=1)))
     if bad:
         name = "/".join(component.path) or path.stem
+        total = len(component.vertices)
         raise InputError(
-            f"{path}: {bad} of {len(component.vertices)} vertices of {name!r} are NaN or infinite; export it again"
+            f"{path}: {bad} of {total} vertices of {name!r} are NaN or infinite; export it again"
         )
 
 
