@@ -97,6 +97,13 @@ def test_rotation_metadata_is_applied(tmp_path: Path, turns: int) -> None:
     np.testing.assert_allclose(corner_colors(image), expected, atol=6)
 
 
+def test_names_with_a_colon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with VideoSink("take:2.mp4", 160, 120) as sink:
+        write_frames(sink, 2)
+    assert open_source("take:2.mp4").frame_count == 2
+
+
 def test_leaving_early_ends_the_reader(tmp_path: Path) -> None:
     source = open_source(write_clip(tmp_path / "a.mp4", CLIP))
     for frame in source:

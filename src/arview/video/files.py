@@ -97,7 +97,8 @@ class VideoFileSource(FrameSource):
     def _opened(self) -> Iterator[tuple[InputContainer, VideoStream]]:
         """Open the container and pick its video stream, or raise InputError."""
         try:
-            container = av.open(self.name)
+            # Absolute, since FFmpeg takes what stands before a colon in a relative name for a protocol.
+            container = av.open(str(self._path.absolute()))
         except (av.FFmpegError, OSError, ValueError) as error:
             raise InputError(f"{self.name}: {_why_unreadable(self._path, error)}") from error
         with container:

@@ -279,7 +279,7 @@ def _open_sound(source: FrameSource | str | Path | None) -> InputContainer | Non
     if path is None:
         return None
     try:
-        return av.open(str(path))
+        return av.open(str(Path(path).absolute()))
     except (av.FFmpegError, OSError, ValueError):
         return None
 
