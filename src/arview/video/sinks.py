@@ -157,7 +157,7 @@ class VideoSink:
         container_format = CONTAINERS[self.path.suffix.lower()]
         try:
             container = av.open(
-                str(self._part), "w", format=container_format, options={"movflags": "+faststart"}
+                str(self._part.absolute()), "w", format=container_format, options={"movflags": "+faststart"}
             )
             video = container.add_stream("libx264", rate=self._fps)
             video.width, video.height = self._width + self._width % 2, self._height + self._height % 2
