@@ -1,4 +1,4 @@
-"""Makers of small CAD files with known geometry, written out as text or bytes for the tests of the CAD room."""
+"""Makers of small CAD files of known geometry for the tests of the CAD room."""
 
 from __future__ import annotations
 
@@ -56,13 +56,17 @@ class StepWriter:
             f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,#{self.app})"
         )
         self.product_context = self.add(f"PRODUCT_CONTEXT('',#{self.app},'mechanical')")
-        self.definition_context = self.add(f"PRODUCT_DEFINITION_CONTEXT('part definition',#{self.app},'design')")
+        self.definition_context = self.add(
+            f"PRODUCT_DEFINITION_CONTEXT('part definition',#{self.app},'design')"
+        )
         prefix = "$" if unit == "m" else ".MILLI."
         length = self.add(f"( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT({prefix},.METRE.) )")
         if unit == "inch":
             measure = self.add(f"LENGTH_MEASURE_WITH_UNIT(LENGTH_MEASURE(25.4),#{length})")
             dims = self.add("DIMENSIONAL_EXPONENTS(1.,0.,0.,0.,0.,0.,0.)")
-            length = self.add(f"( CONVERSION_BASED_UNIT('INCH',#{measure}) LENGTH_UNIT() NAMED_UNIT(#{dims}) )")
+            length = self.add(
+                f"( CONVERSION_BASED_UNIT('INCH',#{measure}) LENGTH_UNIT() NAMED_UNIT(#{dims}) )"
+            )
         angle = self.add("( NAMED_UNIT(*) PLANE_ANGLE_UNIT() SI_UNIT($,.RADIAN.) )")
         solid = self.add("( NAMED_UNIT(*) SI_UNIT($,.STERADIAN.) SOLID_ANGLE_UNIT() )")
         accuracy = self.add(
@@ -158,7 +162,9 @@ class StepWriter:
         shell = self.add(f"CLOSED_SHELL('',{self.refs(faces)})")
         brep = self.add(f"MANIFOLD_SOLID_BREP('{part.name}',#{shell})")
         place = self.axis(np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]))
-        representation = self.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',(#{place},#{brep}),#{self.context})")
+        representation = self.add(
+            f"ADVANCED_BREP_SHAPE_REPRESENTATION('',(#{place},#{brep}),#{self.context})"
+        )
         if part.color is not None:
             red, green, blue = part.color
             last = self.add(f"COLOUR_RGB('',{red},{green},{blue})")
@@ -217,3 +223,74 @@ class StepWriter:
         )
         path.write_text(header + "\n".join(self.lines) + "\nENDSEC;\nEND-ISO-10303-21;\n")
         return path
+
+
+# --- other formats ------------------------------------------------------------------------------------
+
+
+def write_glb(path: Path, tree: dict[str, object], binary: bytes) -> Path:
+    """A GLB of a glTF tree (without ``buffers``) and its binary chunk."""
+    tree = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": len(binary)}], **tree}
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    length = 12 + 8 + len(text) + 8 + len(binary)
+    head = struct.pack("<4sII", b"glTF", 2, length) + struct.pack("<I4s", len(text), b"JSON")
+    path.write_bytes(head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    return path
+
+
+def glb_with_boxes(path: Path, nodes: list[dict[str, object]], roots: list[int], **tree: object) -> Path:
+    """A GLB whose mesh 0 is a box of 0.01 × 0.02 × 0.03 (metres) that nodes may instance."""
+    vertices, faces = box((0, 0, 0), (0.01, 0.02, 0.03))
+    binary = vertices.astype("<f4").tobytes() + faces.astype("<u2").tobytes()
+    content: dict[str, object] = {
+        "nodes": nodes,
+        "scenes": [{"nodes": roots}],
+        "scene": 0,
+        "meshes": [
+            {"name": "box", "primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}
+        ],
+        "materials": [{"pbrMetallicRoughness": {"baseColorFactor": [0.21404114, 0.05087609, 1.0, 1.0]}}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 36, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 96},
+            {"buffer": 0, "byteOffset": 96, "byteLength": 72},
+        ],
+    }
+    return write_glb(path, {**content, **tree}, binary)
+
+
+def write_3mf(path: Path, resources: str, build: str, unit: str = "millimeter") -> Path:
+    """A 3MF of the XML text of its resources and its build items."""
+    xml = (
+        f'<?xml version="1.0" encoding="UTF-8"?><model unit="{unit}" '
+        'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">'
+        f"<resources>{resources}</resources><build>{build}</build></model>"
+    )
+    relation = (
+        '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">'
+        '<Relationship Id="r0" Target="/3D/3dmodel.model" '
+        'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>'
+    )
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("_rels/.rels", relation)
+        archive.writestr("3D/3dmodel.model", xml)
+    return path
+
+
+def mesh_xml(vertices: Array, faces: NDArray[np.int64]) -> str:
+    """The ``mesh`` element of a 3MF object."""
+    points = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in vertices)
+    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in faces)
+    return f"<mesh><vertices>{points}</vertices><triangles>{triangles}</triangles></mesh>"
+
+
+def obj_text(name: str, vertices: Array, faces: NDArray[np.int64], offset: int = 0) -> str:
+    """An ``o`` block of OBJ; ``offset`` is the number of vertices written before."""
+    lines = [f"o {name}"] + [f"v {x} {y} {z}" for x, y, z in vertices]
+    lines += [f"f {a + 1 + offset} {b + 1 + offset} {c + 1 + offset}" for a, b, c in faces]
+    return "\n".join(lines) + "\n"

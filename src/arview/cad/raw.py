@@ -120,7 +120,7 @@ def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str]
             candidates = [name] * len(same)
         for i, candidate in zip(same, candidates, strict=True):
             names[i] = candidate
-        if candidates[0] != name:
+        if any(candidate != name for candidate in candidates):
             notes.append(f"{len(same)} components are named {name!r}: called {', '.join(candidates[:4])}")
     taken: set[str] = set()
     given = set(names)

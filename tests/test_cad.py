@@ -1,0 +1,701 @@
+"""load_model: known geometry through every format, and files that must be refused with one clear line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from arview.cad.fitness import clean_mesh, inspect_mesh, signed_volumes
+from arview.cad.load import load_cad, load_model
+from arview.cad.model import Component
+from arview.cad.obj import triangulate
+from arview.cad.raw import unique_names
+from arview.errors import ArviewError, InputError
+from cad_files import (
+    StepAssembly,
+    StepPart,
+    StepWriter,
+    box,
+    glb_with_boxes,
+    mesh_xml,
+    obj_text,
+    write_3mf,
+    write_glb,
+)
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+# parent_from_child: a quarter turn about Z, and shifts in mm; the box is 10 × 20 × 30 mm at its origin.
+QUARTER_TURN = np.array([[0, -1, 0, 100], [1, 0, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1.0]])
+SHIFT = np.array([[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+# The box moved by SHIFT, then turned: x in [-22, -2] + 100, y in [1, 11], z in [3, 33] + 5.
+NESTED_BOUNDS = np.array([[78, 1, 8], [98, 11, 38]], dtype=np.float64)
+
+
+def scaled(matrix: np.ndarray, factor: float) -> np.ndarray:
+    result = matrix.copy()
+    result[:3, 3] *= factor
+    return result
+
+
+def nested_glb(folder: Path) -> Path:
+    nodes: list[dict[str, object]] = [
+        {"name": "frame", "children": [1], "matrix": scaled(QUARTER_TURN, 0.001).T.ravel().tolist()},
+        {"name": "lug", "mesh": 0, "translation": [0.001, 0.002, 0.003]},
+    ]
+    return glb_with_boxes(folder / "nested.glb", nodes, [0])
+
+
+def nested_trs_glb(folder: Path) -> Path:
+    half = float(np.sqrt(0.5))
+    nodes: list[dict[str, object]] = [
+        {"name": "frame", "children": [1], "rotation": [0, 0, half, half], "translation": [0.1, 0, 0.005]},
+        # The mesh in this node is ten times too small, and its scale mends it.
+        {"name": "lug", "mesh": 0, "translation": [0.001, 0.002, 0.003], "scale": [1, 1, 1]},
+    ]
+    return glb_with_boxes(folder / "nested_trs.glb", nodes, [0])
+
+
+def nested_scaled_glb(folder: Path) -> Path:
+    nodes: list[dict[str, object]] = [
+        {"name": "inches", "children": [1], "scale": [0.5, 0.5, 0.5]},
+        {"name": "frame", "children": [2], "matrix": scaled(QUARTER_TURN, 0.002).T.ravel().tolist()},
+        {"name": "lug", "mesh": 0, "translation": [0.002, 0.004, 0.006], "scale": [2, 2, 2]},
+    ]
+    return glb_with_boxes(folder / "nested_scaled.glb", nodes, [0])
+
+
+def nested_trimesh_glb(folder: Path) -> Path:
+    import trimesh
+
+    scene = trimesh.Scene()
+    scene.graph.update(frame_to="frame", frame_from="world", matrix=scaled(QUARTER_TURN, 0.001))
+    mesh = trimesh.Trimesh(*box((0, 0, 0), (0.01, 0.02, 0.03)), process=False)
+    scene.add_geometry(
+        mesh, node_name="lug", geom_name="block", parent_node_name="frame", transform=scaled(SHIFT, 0.001)
+    )
+    (folder / "nested_trimesh.glb").write_bytes(scene.export(file_type="glb"))
+    return folder / "nested_trimesh.glb"
+
+
+def nested_step(folder: Path, unit: str) -> Path:
+    per_mm = {"mm": 1.0, "m": 0.001, "inch": 1 / 25.4}[unit]
+    part = StepPart("block", (10 * per_mm, 20 * per_mm, 30 * per_mm))
+    frame = StepAssembly("frame_product", [("lug", part, scaled(SHIFT, per_mm))])
+    root = StepAssembly("root", [("frame", frame, scaled(QUARTER_TURN, per_mm))])
+    return StepWriter(unit).write(folder / f"nested_{unit}.step", root)
+
+
+def nested_3mf(folder: Path, unit: str = "millimeter") -> Path:
+    per_mm = {"millimeter": 1.0, "inch": 1 / 25.4}[unit]
+
+    def transform(matrix: np.ndarray) -> str:
+        return " ".join(f"{v:.12g}" for v in scaled(matrix, per_mm)[:3, :].T.ravel())
+
+    mesh = mesh_xml(*box((0, 0, 0), (10 * per_mm, 20 * per_mm, 30 * per_mm)))
+    resources = (
+        f'<object id="1" name="lug">{mesh}</object><object id="2" name="frame"><components>'
+        f'<component objectid="1" transform="{transform(SHIFT)}"/></components></object>'
+    )
+    item = f'<item objectid="2" transform="{transform(QUARTER_TURN)}"/>'
+    return write_3mf(folder / f"nested_{unit}.3mf", resources, item, unit)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        nested_glb,
+        nested_trs_glb,
+        nested_scaled_glb,
+        nested_trimesh_glb,
+        lambda folder: nested_step(folder, "mm"),
+        lambda folder: nested_step(folder, "m"),
+        lambda folder: nested_step(folder, "inch"),
+        nested_3mf,
+        lambda folder: nested_3mf(folder, "inch"),
+    ],
+    ids=["glb", "glb-trs", "glb-scaled", "glb-trimesh", "step-mm", "step-m", "step-inch", "3mf", "3mf-inch"],
+)
+def test_nested_transform_lands_in_mm(make, tmp_path):
+    model = load_model(make(tmp_path))
+    assert [component.name for component in model.components] == ["lug"]
+    np.testing.assert_allclose(model.components[0].bounds_in_model, NESTED_BOUNDS, atol=2e-5)
+    fitness = inspect_mesh(model.components[0])
+    assert fitness.is_watertight
+    assert fitness.volume_mm3 == pytest.approx(6000.0, rel=1e-5)
+    np.testing.assert_allclose(fitness.extents_mm, [30, 20, 10], atol=1e-4)
+
+
+@pytest.mark.parametrize("unit,mm", [("mm", 1.0), ("cm", 10.0), ("m", 1000.0), ("inch", 25.4)])
+def test_obj_stl_ply_take_the_unit_given(unit, mm, tmp_path):
+    import trimesh
+
+    vertices, faces = box((1 / mm, 2 / mm, 3 / mm), (11 / mm, 22 / mm, 33 / mm))
+    (tmp_path / "block.obj").write_text(obj_text("lug", vertices, faces))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.export(tmp_path / "block.stl")
+    mesh.export(tmp_path / "block.ply")
+    (tmp_path / "ascii.stl").write_text(mesh.export(file_type="stl_ascii"))
+    for name, component in [
+        ("block.obj", "lug"),
+        ("block.stl", "block"),
+        ("block.ply", "block"),
+        ("ascii.stl", "ascii"),
+    ]:
+        model = load_model(tmp_path / name, unit=unit)
+        assert [c.name for c in model.components] == [component]
+        np.testing.assert_allclose(model.bounds_in_model, [[1, 2, 3], [11, 22, 33]], rtol=1e-6)
+        assert len(model.components[0].vertices_in_model) == 8
+
+
+def test_obj_keeps_names_polygons_negative_indices_and_materials(tmp_path):
+    (tmp_path / "two.mtl").write_text("newmtl red\nKd 1.0 0.25 0.0\nnewmtl odd\nKd a b c\n")
+    vertices, faces = box((50, 0, 0), (60, 10, 10))
+    text = "mtllib two.mtl\no base plate\nusemtl red\n"
+    # An L-shaped sheet as one polygon that is not convex, by negative indices and over two lines.
+    for x, y in [(0, 0), (20, 0), (20, 5), (5, 5), (5, 20), (0, 20)]:
+        text += f"v {x} {y} 0\n"
+    text += "f -6/1/1 -5/1/1 -4/1/1 \\\n-3/1/1 -2/1/1 -1/1/1\n" + obj_text("post", vertices, faces, offset=6)
+    (tmp_path / "two.obj").write_text(text)
+    model = load_model(tmp_path / "two.obj", unit="mm")
+    assert [component.name for component in model.components] == ["base plate", "post"]
+    assert model.components[0].color == (1.0, 0.25, 0.0)
+    a, b, c = model.components[0].vertices_in_model[model.components[0].faces].transpose(1, 0, 2)
+    areas = np.cross(b - a, c - a)[:, 2] / 2
+    assert np.all(areas > 0)
+    assert areas.sum() == pytest.approx(20 * 5 + 5 * 15)
+
+
+def test_obj_groups_name_components_where_there_are_no_objects(tmp_path):
+    vertices, faces = box((0, 0, 0), (10, 10, 10))
+    half = obj_text("x", vertices, faces[:6]).replace("o x", "g left")
+    rest = "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces[6:])
+    other = obj_text("x", vertices + 50, faces, offset=8).replace("o x", "g right")
+    (tmp_path / "groups.obj").write_text(half + other + "g left\n" + rest)
+    model = load_model(tmp_path / "groups.obj", unit="mm")
+    assert {component.name for component in model.components} == {"left", "right"}
+    assert inspect_mesh(model.component("left")).is_watertight
+
+
+@pytest.mark.parametrize("turn", [0, 1, 2])
+@pytest.mark.parametrize("mirror", [False, True])
+def test_triangulate_any_plane_and_sense(turn, mirror):
+    polygon = np.array([[0, 0, 0], [4, 0, 0], [4, 1, 0], [1, 1, 0], [1, 3, 0], [0, 3, 0]], dtype=np.float64)
+    polygon = np.roll(polygon[::-1] if mirror else polygon, turn, axis=1)
+    triangles = polygon[np.array(triangulate(polygon, list(range(6))))]
+    normal = np.cross(polygon, np.roll(polygon, -1, axis=0)).sum(axis=0) / 2
+    doubled = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    assert np.all(doubled @ normal > 0)
+    np.testing.assert_allclose(doubled.sum(axis=0) / 2, normal, atol=1e-12)
+    assert np.linalg.norm(normal) == pytest.approx(6.0)
+
+
+def test_multi_solid_ascii_stl_keeps_solid_names(tmp_path):
+    import trimesh
+
+    texts = []
+    for name, at in [("left", 0.0), ("right", 50.0)]:
+        mesh = trimesh.Trimesh(*box((at, 0, 0), (at + 10, 10, 10)), process=False)
+        texts.append(mesh.export(file_type="stl_ascii").replace("solid \n", f"solid {name}\n", 1))
+    (tmp_path / "two.stl").write_text("\n".join(texts))
+    model = load_model(tmp_path / "two.stl", unit="mm")
+    assert len(model.components) == 2
+    np.testing.assert_allclose(model.bounds_in_model, [[0, 0, 0], [60, 10, 10]], atol=1e-5)
+
+
+# --- names --------------------------------------------------------------------------------------------
+
+
+def test_instances_keep_their_own_names_and_places(tmp_path):
+    nodes: list[dict[str, object]] = [
+        {"name": "post_1", "mesh": 0},
+        {"name": "post_2", "mesh": 0, "translation": [0.1, 0, 0]},
+        {"name": "post_2", "mesh": 0, "translation": [0.2, 0, 0]},
+        {"name": "right", "children": [4]},
+        {"name": "post_1", "mesh": 0, "translation": [0.3, 0, 0]},
+        {"mesh": 0, "translation": [0.4, 0, 0]},
+    ]
+    cad = load_cad(glb_with_boxes(tmp_path / "many.glb", nodes, [0, 1, 2, 3, 5]))
+    low_x = {c.name: round(float(c.bounds_in_model[0, 0])) for c in cad.model.components}
+    assert low_x == {"post_1": 0, "post_2": 100, "post_2_2": 200, "right/post_1": 300, "box": 400}
+    assert any("'post_1'" in note for note in cad.notes)
+    assert any("post_2_2" in note for note in cad.notes)
+
+
+def test_step_instances_of_two_subassemblies_are_told_apart(tmp_path):
+    post = StepPart("post", (1, 1, 40), radius=10, color=(0.5, 0.25, 1.0))
+    sub = StepAssembly("sub", [("post", post, np.eye(4))])
+    root = StepAssembly("root", [("sub_1", sub, np.eye(4)), ("sub_2", sub, scaled(SHIFT, 50.0))])
+    model = load_model(StepWriter().write(tmp_path / "a.step", root))
+    assert [c.name for c in model.components] == ["sub_1/post", "sub_2/post"]
+    np.testing.assert_allclose(model.components[1].bounds_in_model[:, 2], [150, 190], atol=1e-4)
+    # OpenCASCADE writes linear colours; what the STEP file says is sRGB.
+    np.testing.assert_allclose(model.components[0].color, (0.5, 0.25, 1.0), atol=1e-4)
+
+
+def test_single_part_step_has_the_product_name(tmp_path):
+    model = load_model(StepWriter().write(tmp_path / "file.stp", StepPart("lonely", (10, 20, 30))))
+    assert model.name == "file"
+    assert [c.name for c in model.components] == ["lonely"]
+
+
+def test_unique_names_never_collide():
+    names, _ = unique_names([("a", "x"), ("a", "x"), ("x_2",), (), ("x",)], "file")
+    assert len(set(names)) == 5
+    assert "x_2" in names and "file" in names
+
+
+# --- colours ------------------------------------------------------------------------------------------
+
+
+def test_gltf_colour_is_turned_from_linear_to_srgb(tmp_path):
+    path = glb_with_boxes(tmp_path / "c.glb", [{"name": "a", "mesh": 0}], [0])
+    np.testing.assert_allclose(load_model(path).components[0].color, (0.5, 0.25, 1.0), atol=1e-4)
+
+
+def test_3mf_and_ply_colours(tmp_path):
+    import trimesh
+
+    mesh = mesh_xml(*box((0, 0, 0), (10, 10, 10)))
+    materials = '<basematerials id="9"><base name="m" displaycolor="#FF8000FF"/></basematerials>'
+    resources = f'{materials}<object id="1" name="a" pid="9" pindex="0">{mesh}</object>'
+    model = load_model(write_3mf(tmp_path / "c.3mf", resources, '<item objectid="1" partnumber="P-7"/>'))
+    assert [c.name for c in model.components] == ["P-7"]
+    np.testing.assert_allclose(model.components[0].color, (1.0, 128 / 255, 0.0), atol=1e-6)
+    block = trimesh.Trimesh(*box((0, 0, 0), (10, 10, 10)), process=False)
+    block.visual.vertex_colors = np.tile([0, 51, 255, 255], (8, 1))
+    block.export(tmp_path / "c.ply")
+    np.testing.assert_allclose(
+        load_model(tmp_path / "c.ply", unit="mm").components[0].color, (0, 0.2, 1), atol=1e-3
+    )
+
+
+# --- units --------------------------------------------------------------------------------------------
+
+
+def test_trimesh_unit_tag_is_believed_only_from_trimesh(tmp_path):
+    import trimesh
+
+    mesh = trimesh.Trimesh(*box((0, 0, 0), (10, 20, 30)), process=False)
+    mesh.units = "mm"
+    data = mesh.export(file_type="glb")
+    (tmp_path / "tagged.glb").write_bytes(data)
+    cad = load_cad(tmp_path / "tagged.glb")
+    np.testing.assert_allclose(cad.model.bounds_in_model[1], [10, 20, 30], atol=1e-4)
+    assert any("tagged" in note for note in cad.notes)
+    # The same bytes from another program are metres by the specification: 30 m, fine as such.
+    (tmp_path / "foreign.glb").write_bytes(
+        data.replace(b"github.com/mikedh/trimesh", b"github.com/mikedh/notrims")
+    )
+    np.testing.assert_allclose(
+        load_model(tmp_path / "foreign.glb").bounds_in_model[1], [1e4, 2e4, 3e4], rtol=1e-6
+    )
+
+
+def test_mixed_trimesh_tags_ask_for_the_unit(tmp_path):
+    import trimesh
+
+    scene = trimesh.Scene()
+    for index, unit in enumerate(["mm", "inches"]):
+        mesh = trimesh.Trimesh(*box((0, 0, 0), (10, 20, 30)), process=False)
+        mesh.units = unit
+        scene.add_geometry(mesh, node_name=f"n{index}")
+    (tmp_path / "mixed.glb").write_bytes(scene.export(file_type="glb"))
+    with pytest.raises(InputError, match=r"which unit\?.*inches.*--unit mm"):
+        load_model(tmp_path / "mixed.glb")
+    np.testing.assert_allclose(load_model(tmp_path / "mixed.glb", unit="mm").bounds_in_model[1], [10, 20, 30])
+
+
+@pytest.mark.parametrize("file_unit", ["mm", "m", "inch"])
+def test_unit_overrides_the_files_own(file_unit, tmp_path):
+    # The numbers in the STEP file are those of mm / m / inch; read as cm they scale as numbers.
+    per_mm = {"mm": 1.0, "m": 0.001, "inch": 1 / 25.4}[file_unit]
+    model = load_model(nested_step(tmp_path, file_unit), unit="cm")
+    np.testing.assert_allclose(model.bounds_in_model, NESTED_BOUNDS * per_mm * 10.0, rtol=1e-5, atol=1e-4)
+
+
+def test_unit_overrides_glb_and_3mf(tmp_path):
+    np.testing.assert_allclose(
+        load_model(nested_glb(tmp_path), unit="inch").bounds_in_model, NESTED_BOUNDS * 0.0254
+    )
+    np.testing.assert_allclose(
+        load_model(nested_3mf(tmp_path), unit="cm").bounds_in_model, NESTED_BOUNDS * 10.0
+    )
+
+
+def test_no_unit_is_asked_for_with_the_size_under_each(tmp_path):
+    (tmp_path / "b.obj").write_text(obj_text("b", *box((0, 0, 0), (120, 80, 8))))
+    with pytest.raises(InputError) as caught:
+        load_model(tmp_path / "b.obj")
+    message = str(caught.value)
+    assert "OBJ files carry no unit" in message
+    assert "--unit mm (120 × 80 × 8 mm)" in message
+    assert "--unit m (120 × 80 × 8 m)" in message
+    assert "--unit inch (3048 × 2032 × 203.2 mm)" in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("factor,size", [(1e-5, "0.1 × 0.2 × 0.3 mm"), (1e4, "100 × 200 × 300 m")])
+def test_absurd_sizes_are_questioned_and_a_unit_settles_it(factor, size, tmp_path):
+    nodes: list[dict[str, object]] = [{"name": "a", "mesh": 0, "scale": [factor * 1000] * 3}]
+    nodes[0]["scale"] = [0.01 if factor < 1 else 1e4] * 3
+    path = glb_with_boxes(tmp_path / "odd.glb", nodes, [0])
+    with pytest.raises(InputError, match=f"is it really {size}.*--unit mm"):
+        load_model(path)
+    assert load_model(path, unit="cm").diameter_mm > 0
+
+
+def test_unknown_unit(tmp_path):
+    with pytest.raises(InputError, match="unit 'furlong' is not known; give one of mm, cm, m, inch"):
+        load_model(nested_glb(tmp_path), unit="furlong")
+
+
+# --- tessellation and hash ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("unit", ["mm", "inch"])
+def test_step_tolerance_is_in_mm_whatever_the_files_unit(unit, tmp_path):
+    per_mm = {"mm": 1.0, "inch": 1 / 25.4}[unit]
+    path = StepWriter(unit).write(tmp_path / "c.step", StepPart("c", (1, 1, 40 * per_mm), radius=10 * per_mm))
+    for tolerance_mm in (0.02, 0.5):
+        component = load_model(path, tol_linear_mm=tolerance_mm, tol_angular_deg=60).components[0]
+        fitness = inspect_mesh(component)
+        assert fitness.is_watertight
+        # The middles of the chords lie inside the circle by no more than the tolerance, and not far less.
+        middles = component.vertices_in_model[component.faces][:, [0, 1, 2]].mean(axis=1)
+        edges = component.vertices_in_model[component.faces[:, [0, 1]]].mean(axis=1)
+        rim = edges[np.abs(edges[:, 2]) < 1e-6]
+        sag_mm = 10.0 - np.hypot(rim[:, 0], rim[:, 1]).max(initial=0.0)
+        assert len(middles) > 12
+        assert sag_mm <= tolerance_mm * 1.05
+    angular = load_model(path, tol_linear_mm=5.0, tol_angular_deg=5.0)
+    assert len(angular.components[0].faces) >= 4 * 72 - 8
+
+
+def test_hash_is_stable_between_runs_and_tells_parts_apart(tmp_path):
+    path = nested_step(tmp_path, "mm")
+    first = load_model(path).source_hash
+    code = f"from arview.cad import load_model; print(load_model({str(path)!r}).source_hash)"
+    again = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert again.stdout.strip() == first
+    assert load_model(nested_3mf(tmp_path)).source_hash == load_model(nested_3mf(tmp_path)).source_hash
+    assert load_model(path, unit="cm").source_hash != first
+
+
+# --- cleaning -----------------------------------------------------------------------------------------
+
+
+def test_cleaning_merges_and_drops_and_winds_outwards():
+    vertices, faces = box((0, 0, 0), (10, 10, 10))
+    rng = np.random.default_rng(1)
+    soup = vertices[faces].reshape(-1, 3) + rng.uniform(-3e-5, 3e-5, (36, 3))
+    soup = np.concatenate([soup, [[500.0, 0, 0]]])
+    soup_faces = np.arange(36).reshape(12, 3)[:, ::-1]
+    # A triangle without area, one with a repeated corner, and a double.
+    soup_faces = np.concatenate([soup_faces, [[0, 0, 1], [0, 1, 0], soup_faces[3]]])
+    clean_vertices, clean_faces = clean_mesh(soup, soup_faces)
+    assert clean_vertices.shape == (8, 3)
+    assert clean_faces.shape == (12, 3)
+    assert signed_volumes(clean_vertices, clean_faces).sum() == pytest.approx(1000.0, rel=1e-4)
+
+
+def test_inconsistent_winding_is_mended():
+    vertices, faces = box((0, 0, 0), (10, 10, 10))
+    faces[[1, 4, 7]] = faces[[1, 4, 7]][:, ::-1]
+    clean_vertices, clean_faces = clean_mesh(vertices, faces)
+    fitness = inspect_mesh(Component("a", clean_vertices, clean_faces.astype(np.int32)))
+    assert fitness.is_consistent
+    assert fitness.volume_mm3 == pytest.approx(1000.0)
+
+
+def test_a_cavity_stays_a_cavity_and_a_second_body_turns_out():
+    outer, faces = box((0, 0, 0), (10, 10, 10))
+    inner, _ = box((2, 2, 2), (4, 4, 4))
+    beside, _ = box((20, 0, 0), (21, 1, 1))
+    vertices = np.concatenate([outer, inner, beside])
+    everything = np.concatenate([faces, faces[:, ::-1] + 8, faces[:, ::-1] + 16])
+    clean_vertices, clean_faces = clean_mesh(vertices, everything)
+    assert signed_volumes(clean_vertices, clean_faces).sum() == pytest.approx(1000.0 - 8.0 + 1.0)
+
+
+def test_mirrored_instance_still_faces_outwards(tmp_path):
+    nodes: list[dict[str, object]] = [{"name": "a", "mesh": 0, "scale": [-1, 1, 1]}]
+    model = load_model(glb_with_boxes(tmp_path / "m.glb", nodes, [0]))
+    np.testing.assert_allclose(model.bounds_in_model[0], [-10, 0, 0], atol=1e-6)
+    assert inspect_mesh(model.components[0]).volume_mm3 == pytest.approx(6000.0, rel=1e-6)
+
+
+def test_mirrored_open_sheet_is_turned_over(tmp_path):
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"},
+        {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
+    ]
+    normals = []
+    for name, scale in [("plain", [1, 1, 1]), ("mirrored", [-1, 1, 1])]:
+        nodes: list[dict[str, object]] = [{"name": "a", "mesh": 0, "scale": scale}]
+        model = load_model(glb_with_boxes(tmp_path / f"{name}.glb", nodes, [0], accessors=accessors))
+        a, b, c = model.components[0].vertices_in_model[model.components[0].faces[0]]
+        normals.append(np.cross(b - a, c - a))
+        assert inspect_mesh(model.components[0]).open_edge_count == 4
+    # The sheet lies in x = 0 and looks along -x; its mirror image looks along +x.
+    assert normals[0][0] < 0 < normals[1][0]
+
+
+# --- refused ------------------------------------------------------------------------------------------
+
+
+def truncated_glb(folder: Path) -> Path:
+    path = nested_glb(folder)
+    path.write_bytes(path.read_bytes()[:-40])
+    return path
+
+
+def short_buffer_glb(folder: Path) -> Path:
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"},
+        {"bufferView": 1, "componentType": 5123, "count": 360, "type": "SCALAR"},
+    ]
+    return glb_with_boxes(folder / "short.glb", [{"mesh": 0}], [0], accessors=accessors)
+
+
+def nan_glb(folder: Path) -> Path:
+    path = nested_glb(folder)
+    data = bytearray(path.read_bytes())
+    start = data.rindex(b"BIN\0") + 4
+    data[start : start + 4] = np.float32(np.nan).tobytes()
+    path.write_bytes(bytes(data))
+    return path
+
+
+def text_file(name: str, text: str = "this is not a CAD file\n"):
+    def make(folder: Path) -> Path:
+        (folder / name).write_text(text)
+        return folder / name
+
+    return make
+
+
+def truncated_step(folder: Path) -> Path:
+    path = nested_step(folder, "mm")
+    path.write_text(path.read_text()[:3000])
+    return path
+
+
+def truncated_stl(folder: Path) -> Path:
+    import trimesh
+
+    data = trimesh.Trimesh(*box((0, 0, 0), (10, 10, 10)), process=False).export(file_type="stl")
+    (folder / "t.stl").write_bytes(data[:400])
+    return folder / "t.stl"
+
+
+def truncated_ply(folder: Path) -> Path:
+    import trimesh
+
+    data = trimesh.Trimesh(*box((0, 0, 0), (10, 10, 10)), process=False).export(file_type="ply")
+    (folder / "t.ply").write_bytes(data[:-30])
+    return folder / "t.ply"
+
+
+def point_ply(folder: Path) -> Path:
+    import trimesh
+
+    trimesh.PointCloud(np.eye(3)).export(folder / "points.ply")
+    return folder / "points.ply"
+
+
+def nan_ply(folder: Path) -> Path:
+    text = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    text += (
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 nan 0\n0 1 0\n3 0 1 2\n"
+    )
+    (folder / "nan.ply").write_text(text)
+    return folder / "nan.ply"
+
+
+def truncated_3mf(folder: Path) -> Path:
+    path = nested_3mf(folder)
+    path.write_bytes(path.read_bytes()[:300])
+    return path
+
+
+def circular_glb(folder: Path) -> Path:
+    return glb_with_boxes(folder / "ring.glb", [{"name": "a", "children": [0], "mesh": 0}], [0])
+
+
+def huge_stl(folder: Path) -> Path:
+    path = folder / "huge.stl"
+    with path.open("wb") as file:
+        file.write(b"\0" * 80 + (6_000_000).to_bytes(4, "little"))
+        file.truncate(84 + 50 * 6_000_000)
+    return path
+
+
+def empty_file(folder: Path) -> Path:
+    (folder / "empty.step").touch()
+    return folder / "empty.step"
+
+
+REFUSED = [
+    (lambda folder: folder / "missing.glb", "no such file"),
+    (lambda folder: folder, "is not a file"),
+    (text_file("drawing.dwg"), r"type \.dwg is not read; give one of \.step"),
+    (empty_file, "empty"),
+    (truncated_glb, "truncated"),
+    (short_buffer_glb, "truncated"),
+    (nan_glb, r"1 of 8 vertices of 'frame/lug' are NaN"),
+    (circular_glb, "nested in a circle"),
+    (text_file("t.glb"), "not a GLB file"),
+    (text_file("t.gltf"), "broken or truncated glTF"),
+    (text_file("t.gltf", '{"asset": {"version": "1.0"}}'), r"glTF version 1\.0"),
+    (text_file("t.gltf", '{"asset": {"version": "2.0"}}'), "no triangles"),
+    (
+        text_file(
+            "d.gltf", '{"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]}'
+        ),
+        "Draco",
+    ),
+    (text_file("t.step"), "not a STEP file"),
+    (truncated_step, r"broken or truncated STEP \(.*unexpected end of file"),
+    (
+        text_file("t.step", "ISO-10303-21;\nHEADER;\nENDSEC;\nDATA;\nENDSEC;\nEND-ISO-10303-21;\n"),
+        "STEP|triangles",
+    ),
+    (text_file("t.obj", "v 0 0 0\nv 1 0\n"), "line 2 is not valid OBJ"),
+    (text_file("t.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 4\n"), "vertex 4 of 3"),
+    (text_file("t.obj", "v 0 0 0\nv 1 0 0\n"), "no triangles"),
+    (text_file("t.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"), "degenerate"),
+    (text_file("t.obj", "v 0 0 0\nv 1 0 nan\nv 2 0 0\nf 1 2 3\n"), "NaN"),
+    (text_file("t.stl"), "STL|no triangles"),
+    (truncated_stl, "broken or truncated STL"),
+    (huge_stl, "more than 5,000,000 triangles; decimate"),
+    (text_file("t.ply"), "broken or truncated PLY"),
+    (truncated_ply, "broken or truncated PLY"),
+    (point_ply, "no triangles"),
+    (nan_ply, "NaN"),
+    (text_file("t.3mf"), "not a 3MF file"),
+    (truncated_3mf, "not a 3MF file, or truncated"),
+    (lambda f: write_3mf(f / "a.3mf", "", '<item objectid="4"/>'), "object 4 does not exist"),
+    (lambda f: write_3mf(f / "a.3mf", "<object", ""), "broken 3MF"),
+    (lambda f: write_3mf(f / "a.3mf", "", ""), "no triangles"),
+]
+
+
+@pytest.mark.parametrize("make,expected", REFUSED, ids=[str(i) for i in range(len(REFUSED))])
+def test_bad_files_get_one_clear_line_and_nothing_is_printed(make, expected, tmp_path, capfd):
+    path = make(tmp_path)
+    with pytest.raises(ArviewError, match=expected) as caught:
+        load_model(path, unit="mm")
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+    said = capfd.readouterr()
+    assert said.out == "" and said.err == ""
+
+
+def test_too_many_triangles_in_instances(tmp_path, monkeypatch):
+    monkeypatch.setattr("arview.cad.raw.MAX_TRIANGLES", 30)
+    nodes: list[dict[str, object]] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(3)]
+    with pytest.raises(InputError, match="more than 30 triangles"):
+        load_model(glb_with_boxes(tmp_path / "g.glb", nodes, [0, 1, 2]))
+
+
+def test_nodes_without_triangles_are_left_out(tmp_path):
+    meshes = [
+        {"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]},
+        {"primitives": [{"attributes": {"POSITION": 0}, "mode": 0}]},
+    ]
+    nodes: list[dict[str, object]] = [{"name": "a", "mesh": 0}, {"name": "points", "mesh": 1}]
+    model = load_model(glb_with_boxes(tmp_path / "g.glb", nodes, [0, 1], meshes=meshes))
+    assert [c.name for c in model.components] == ["a"]
+
+
+def test_gltf_strips_fans_strides_and_vertex_colours(tmp_path):
+    corners = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0.01, 0.01, 0]], dtype="<f4")
+    interleaved = np.concatenate([corners, np.tile(np.array([[1, 0.5, 0]], "<f4"), (4, 1))], axis=1).tobytes()
+    tree: dict[str, object] = {
+        "nodes": [{"name": "strip", "mesh": 0}, {"name": "fan", "mesh": 1, "translation": [0.1, 0, 0]}],
+        "scenes": [{"nodes": [0, 1]}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "mode": 5}]},
+            {"primitives": [{"attributes": {"POSITION": 0}, "indices": 2, "mode": 6}]},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"bufferView": 0, "byteOffset": 12, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5121, "count": 4, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 96, "byteStride": 24},
+            {"buffer": 0, "byteOffset": 96, "byteLength": 4},
+        ],
+    }
+    model = load_model(write_glb(tmp_path / "s.glb", tree, interleaved + bytes([0, 1, 3, 2])))
+    for component in model.components:
+        a, b, c = component.vertices_in_model[component.faces].transpose(1, 0, 2)
+        normals = np.cross(b - a, c - a)
+        assert np.all(normals[:, 2] > 0)
+        assert normals[:, 2].sum() / 2 == pytest.approx(100.0, rel=1e-5)
+    np.testing.assert_allclose(model.component("strip").color, (1.0, 0.7354, 0.0), atol=1e-3)
+
+
+def test_gltf_with_external_buffer(tmp_path):
+    glb = nested_glb(tmp_path).read_bytes()
+    import json
+
+    length = int.from_bytes(glb[12:16], "little")
+    tree = json.loads(glb[20 : 20 + length])
+    (tmp_path / "a b.bin").write_bytes(glb[28 + length :])
+    tree["buffers"][0]["uri"] = "a%20b.bin"
+    (tmp_path / "x.gltf").write_text(json.dumps(tree))
+    np.testing.assert_allclose(load_model(tmp_path / "x.gltf").bounds_in_model, NESTED_BOUNDS, atol=1e-5)
+    (tmp_path / "a b.bin").unlink()
+    with pytest.raises(InputError, match=r"a b\.bin is missing"):
+        load_model(tmp_path / "x.gltf")
+
+
+def test_importing_the_room_is_light():
+    code = (
+        "import sys, arview.cad; print([m for m in ('trimesh', 'scipy', 'cv2', 'lxml') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# --- real files ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not here")
+def test_plate_glb_is_in_metres_with_17_named_components():
+    model = load_model(DATA / "plate" / "plate.glb")
+    assert len(model.components) == 17
+    assert model.components[0].name == "base_plate"
+    np.testing.assert_allclose(model.bounds_in_model, [[-150, -150, -8], [150, 150, 40]], atol=1e-3)
+    np.testing.assert_allclose(
+        model.component("post_1").bounds_in_model, [[-78, 62, 0], [-62, 78, 40]], atol=2e-3
+    )
+    assert all(inspect_mesh(component).is_watertight for component in model.components)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not here")
+@pytest.mark.parametrize("name", ["castle", "cube", "teabox", "dragon"])
+def test_sequence_glb_and_ply_are_the_same_part(name):
+    folder = DATA / "sequences" / name / "models"
+    assembly = load_model(folder / "assembly.glb")
+    ply = load_model(folder / "obj_000001.ply", unit="mm")
+    np.testing.assert_allclose(assembly.bounds_in_model, ply.bounds_in_model, atol=2e-3)
+    if name == "castle":
+        assert [c.name for c in assembly.components] == ["chateau_floor", "chateau_tower", "cube"]
+
+
+def test_sample_step_comes_with_names_and_colours():
+    path = Path(__file__).parents[1] / "samples" / "bracket_plate" / "bracket_plate.step"
+    if not path.is_file():
+        pytest.skip("samples/bracket_plate is not built yet")
+    model = load_model(path)
+    assert "base_plate" in [c.name for c in model.components]
+    assert len({c.color for c in model.components}) > 1
+    assert all(inspect_mesh(component).is_watertight for component in model.components)
