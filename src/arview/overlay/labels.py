@@ -63,13 +63,13 @@ def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
             shown.append(f"d{axis} ?")
         elif abs(value) > uncertainty_mm:
             shown.append(f"d{axis} {_number(value, options, signed=True)}")
-    parts = [" ".join(shown)] if shown else []
+    parts = ["  ".join(shown)] if shown else []
     if deviation.tilt_deg is not None and deviation.tilt_deg >= 0.1:
         parts.append(f"tilt {deviation.tilt_deg:.1f}°")
     if deviation.twist_deg is not None and abs(deviation.twist_deg) >= 0.1:
         parts.append(f"twist {deviation.twist_deg:+.1f}°".replace("-", "−"))
     parts.append(f"U {_number(uncertainty_mm, options)}")
-    return "  ".join(parts)
+    return "   ".join(parts)
 
 
 def label_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:

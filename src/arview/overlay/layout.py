@@ -78,21 +78,20 @@ class _Slot:
 class LabelLayout:
     """Places labels in an image and remembers them from frame to frame.
 
-    Labels lie inside ``top_px`` to ``bottom_px`` of the image and never cover each other.
+    Labels lie inside ``top_px`` to ``bottom_px`` of an image ``width`` px wide and never cover each other.
+    None of them is wider than ``widest_px``, which must leave room for two side by side.
     """
 
-    def __init__(self, width: int, top_px: int, bottom_px: int, margin_px: int, gap_px: int) -> None:
+    def __init__(
+        self, width: int, top_px: int, bottom_px: int, margin_px: int, gap_px: int, widest_px: int
+    ) -> None:
         self._width, self._top, self._bottom = width, top_px, bottom_px
+        self._limits = (width - margin_px - widest_px - gap_px, margin_px + widest_px + gap_px)
         self._margin, self._gap = margin_px, gap_px
         self._rows = np.arange(top_px, bottom_px, _ROW_PX, dtype=np.float64)
         self._left: list[_Slot] = []
         self._right: list[_Slot] = []
         self._edges: tuple[float, float] | None = None
-
-    @property
-    def widest_px(self) -> int:
-        """Width that two labels may have side by side."""
-        return (self._width - 2 * self._margin - self._gap) // 2
 
     def reset(self) -> None:
         """Forget all labels: the next ones appear at once where they belong."""
@@ -104,7 +103,7 @@ class LabelLayout:
         """Boxes for one frame.
 
         Args:
-            requests: labels wanted, the most urgent first; each ``width`` at most ``widest_px``.
+            requests: labels wanted, the most urgent first.
             part_px: first and last column of the image that the part covers.
             cells: covered area per cell of CELL_PX × CELL_PX of the image, weighted, px².
 
@@ -112,7 +111,7 @@ class LabelLayout:
             Labels to draw, in any order. Those for which there is no room are left out.
         """
         is_first = not (self._left or self._right)
-        self._move_edges(part_px, max((r.width for r in requests), default=0))
+        self._move_edges(part_px)
         self._update_slots(requests)
         integral = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=np.float64)
         np.cumsum(np.cumsum(cells, axis=0, dtype=np.float64), axis=1, out=integral[1:, 1:])
@@ -121,10 +120,9 @@ class LabelLayout:
             self._fade(column)
         return [self._box(slot) for slot in (*self._left, *self._right) if slot.opacity > 0]
 
-    def _move_edges(self, part_px: tuple[float, float], widest: int) -> None:
+    def _move_edges(self, part_px: tuple[float, float]) -> None:
         """Move the inner edges of both columns towards the part's sides."""
-        limit_left = self._width - self._margin - widest - self._gap
-        limit_right = self._margin + widest + self._gap
+        limit_left, limit_right = self._limits
         goal_left = min(part_px[0] - self._gap, limit_left)
         goal_right = max(part_px[1] + self._gap, limit_right)
         if self._edges is None:
@@ -194,7 +192,7 @@ class LabelLayout:
             lack = min(max((request.width - space) / request.width, 0.0), 1.0)
             reach = abs(float(request.anchor_px[0]) - edge) / self._width
             fullness = 1.0 - free_px[side] / (self._bottom - self._top)
-            costs[side] = 10.0 * reach + 8.0 * lack + 3.0 * fullness
+            costs[side] = 10.0 * reach + 5.0 * lack + 3.0 * fullness
             if present is not None and present.on_left == side:
                 costs[side] -= _SIDE_HYSTERESIS
         return min(costs, key=costs.__getitem__) if costs else None
@@ -233,16 +231,15 @@ class LabelLayout:
                 slot.y = float(goal)
             elif abs(goal - slot.y) > _ROW_PX:
                 slot.y = self._glide(slot.y, float(goal))
-        drawn = [slot for slot in column if slot.opacity > 0]
-        self._part(drawn)
-        for slot in column:
-            if (
-                slot.opacity == 0
-                and not slot.is_leaving
-                and not any(self._touch(slot, other) for other in drawn)
+        self._part([slot for slot in column if slot.opacity > 0])
+        for place, slot in enumerate(column):
+            if slot.opacity > 0 or slot.is_leaving:
+                continue
+            above = all(self._is_above(other, slot) for other in column[:place] if other.opacity > 0)
+            if above and all(
+                self._is_above(slot, other) for other in column[place + 1 :] if other.opacity > 0
             ):
                 slot.opacity = 1.0 if is_first else 1.0 / _FADE_FRAMES
-                drawn.append(slot)
 
     def _drop_overflow(self, column: list[_Slot]) -> None:
         """Labels on their way out may overfill a column: the newcomers then wait."""
@@ -263,11 +260,8 @@ class LabelLayout:
             slot.y = min(slot.y, high - slot.request.height)
             high = slot.y - self._gap
 
-    def _touch(self, slot: _Slot, other: _Slot) -> bool:
-        return (
-            slot.y < other.y + other.request.height + self._gap
-            and other.y < slot.y + slot.request.height + self._gap
-        )
+    def _is_above(self, upper: _Slot, lower: _Slot) -> bool:
+        return upper.y + upper.request.height + self._gap <= lower.y
 
     def _fade(self, column: list[_Slot]) -> None:
         for slot in list(column):

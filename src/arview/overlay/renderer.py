@@ -77,16 +77,18 @@ class OverlayRenderer:
             camera.width, camera.height, round(0.95 * size_px), inspection,
             self._arrow_scale if self._arrows else None,
         )  # fmt: skip
-        margin_px = round(0.6 * size_px)
-        bottom_px = camera.height - margin_px - (self._status.height_px if self.options.show_status else 0)
-        self._layout = LabelLayout(camera.width, margin_px, bottom_px, margin_px, round(0.5 * size_px))
         self._labelled = urgent if self.options.show_labels else []
         self._index = {component.name: index for index, component in enumerate(model.components)}
         self._verdict = {deviation.name: deviation.verdict for deviation in self._labelled}
+        margin_px, gap_px = round(0.6 * size_px), round(0.5 * size_px)
+        widest_px = (camera.width - 2 * margin_px - 2 * gap_px) // 2
         self._sprites = {
-            deviation.name: labels.label_sprite(deviation, self.options, size_px, self._layout.widest_px)
+            deviation.name: labels.label_sprite(deviation, self.options, size_px, widest_px)
             for deviation in self._labelled
         }
+        widest_px = max((sprite.width for sprite in self._sprites.values()), default=0)
+        bottom_px = camera.height - margin_px - (self._status.height_px if self.options.show_status else 0)
+        self._layout = LabelLayout(camera.width, margin_px, bottom_px, margin_px, gap_px, widest_px)
         self._was_seen: set[str] = set()
 
     def draw(

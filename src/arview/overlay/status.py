@@ -56,7 +56,7 @@ class StatusLine:
         if self.rows == 1 and self._length([*tracking, *about_part]) > self._width - 3 * self._size:
             about_part = []  # a long reason for being lost matters more
         y = top + round(0.16 * self._size)
-        state_x = self._pad + round(0.9 * self._size)
+        state_x = self._pad + round(1.1 * self._size)
         paint.dot(
             image, (self._pad + 0.3 * self._size, y + 0.72 * self._size), _STATE_RGB[pose.state],
             0.34 * self._size, False,
