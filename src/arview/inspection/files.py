@@ -96,6 +96,8 @@ def _read_json(path: Path) -> Any:
         raise InputError(f"{path}: is nested too deeply to be an inspection") from error
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: holds a number too long to read") from error
 
 
 def _object_without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -110,7 +112,8 @@ def _object_without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _check_finite(document: Any) -> None:
     for place, value in _numbers(document, ""):
         if not abs(value) < _NUMBER_LIMIT:
-            raise InputError(f"{place}: is {value}, expected a finite number below 1e9, or null")
+            shown = value if isinstance(value, float) else "a huge number"
+            raise InputError(f"{place}: is {shown}, expected a finite number below 1e9, or null")
 
 
 def _numbers(node: Any, place: str) -> Iterator[tuple[str, float]]:

@@ -78,6 +78,11 @@ class Ghost:
         xd, yd = self.camera.distort(x * shrink, y * shrink)
         return np.stack([xd / shrink * safe_z, yd / shrink * safe_z, z], axis=-1)
 
+    def project(self, points_in_cam: Array) -> Array:
+        """Pixels (..., 2) of points (..., 3), as the camera sees them; NaN for points not in front of it."""
+        points = self.bent(points_in_cam.reshape(-1, 3)).reshape(points_in_cam.shape)
+        return self.camera.without_distortion().project(points)
+
     def view(self, cam_from_model: Array) -> GhostView | None:
         """What the camera sees from this pose; None when the part is outside the image."""
         camera = self.camera

@@ -72,13 +72,6 @@ def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
     return "   ".join(parts)
 
 
-def label_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
-    """The whole label as one line, e.g. ``post_3  1.17 mm (dx +1.00 dy −0.61  U 0.12)  FAIL``."""
-    detail = detail_text(deviation, options)
-    parts = [deviation.name, value_text(deviation, options), f"({detail})" if detail else ""]
-    return "  ".join([part for part in parts if part] + [VERDICT_WORD[deviation.verdict]])
-
-
 def arrow_scale(inspection: Inspection, diameter_mm: float, options: OverlayOptions) -> float:
     """Exaggeration of the arrows: as asked for, or the roundest number that keeps the longest one short."""
     if options.arrow_scale is not None:

@@ -172,7 +172,7 @@ class OverlayRenderer:
     def _draw_annotations(self, canvas: paint.Image, view: GhostView, cam_from_model: Array) -> None:
         placed: list[PlacedLabel] = []
         if self._labelled:
-            anchors_px = self.camera.project(apply(cam_from_model, self._anchors_in_model))
+            anchors_px = self._ghost.project(apply(cam_from_model, self._anchors_in_model))
             seen_px, placed = self._place_labels(view, anchors_px)
             for label in placed:
                 self._draw_leader(canvas, label, anchors_px, seen_px)
@@ -220,14 +220,20 @@ class OverlayRenderer:
         index, verdict = self._index[label.key], self._verdict[label.key]
         color = VERDICT_RGB[verdict]
         anchor = np.clip(anchors_px[index], 0, [self.camera.width - 1, self.camera.height - 1])
-        x = float(label.x + label.width if label.on_left else label.x)
-        y = label.y + 0.5 * min(label.height, 1.9 * self._size_px)
-        knee = np.array([x + (0.8 if label.on_left else -0.8) * self._size_px, y])
+        points = np.array([*self._leader_start(label, anchor), anchor])
         is_urgent = verdict in (Verdict.FAIL, Verdict.UNDECIDED)
-        paint.line(
-            canvas, np.array([[x, y], knee, anchor]), color, 2 if is_urgent and self._size_px > 13 else 1
-        )
+        paint.line(canvas, points, color, 2 if is_urgent and self._size_px > 13 else 1)
         paint.dot(canvas, anchor, color, 0.2 * self._size_px, bool(seen_px[index] == 0))
+
+    def _leader_start(self, label: PlacedLabel, anchor_px: Array) -> list[tuple[float, float]]:
+        """Where a leader leaves its box: sideways with a short stub, else up or down."""
+        stub = 0.8 * self._size_px if label.on_left else -0.8 * self._size_px
+        x = float(label.x + label.width if label.on_left else label.x)
+        if (anchor_px[0] - x - stub) * stub > 0:
+            y = label.y + 0.5 * min(label.height, 1.9 * self._size_px)
+            return [(x, y), (x + stub, y)]
+        inside = min(max(float(anchor_px[0]), label.x + 4.0), label.x + label.width - 4.0)
+        return [(inside, float(label.y if anchor_px[1] < label.y else label.y + label.height))]
 
     def _arrow_list(self, deviations: list[ComponentDeviation]) -> list[Array]:
         """Tail and exaggerated tip (2,3) in the model, mm, of every arrow, the most urgent last."""
@@ -243,7 +249,7 @@ class OverlayRenderer:
         if not self._arrows:
             return
         ends_in_cam = apply(cam_from_model, np.stack(self._arrows))
-        ends_px = self.camera.project(ends_in_cam)
+        ends_px = self._ghost.project(ends_in_cam)
         limit_px = 2 * max(self.camera.width, self.camera.height)
         for in_cam, (tail_px, tip_px) in zip(ends_in_cam, ends_px, strict=True):
             if in_cam[:, 2].min() > NEAR_MM and max(np.abs(tail_px).max(), np.abs(tip_px).max()) < limit_px:

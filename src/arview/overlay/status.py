@@ -17,7 +17,7 @@ _STATE_RGB: dict[TrackingState, Rgb] = {
 }
 _WHITE = (240, 244, 248)
 _MUTED = (176, 186, 200)
-_COUNT_ORDER = (Verdict.FAIL, Verdict.UNDECIDED, Verdict.PASS)
+_COUNT_ORDER = (Verdict.FAIL, Verdict.UNDECIDED, Verdict.PASS, Verdict.NOT_MEASURED)
 
 
 def age_text(age_s: float) -> str:
