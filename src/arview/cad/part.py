@@ -207,6 +207,9 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
 
 
 def _read_part(root: _Table, path: Path, unit: str | None) -> Part:
+    for key in ("part", "view_range", "defaults", "components", "symmetry", "datums"):
+        root.known(key)
+    root.finish()
     head = root.table("part", required=True)
     default_name = path.resolve().parent.name if path.stem == "part" else path.stem
     name = head.text("name", default_name)
@@ -241,7 +244,6 @@ def _read_part(root: _Table, path: Path, unit: str | None) -> Part:
         _read_symmetry(table, tuple(model.center_in_model.tolist())) for table in root.tables("symmetry")
     )
     datums = _read_datums(root.table("datums"), names)
-    root.finish()
     return Part(
         name=name,
         path=path,
@@ -259,7 +261,7 @@ def _read_part(root: _Table, path: Path, unit: str | None) -> Part:
 def _read_view_range(table: _Table) -> ViewRange:
     intervals: dict[str, tuple[float, float]] = {"distance_mm": table.interval("distance_mm")}
     for key in ("elevation_deg", "azimuth_deg", "roll_deg"):
-        if key in table.content:
+        if table.known(key):
             intervals[key] = table.interval(key)
     table.finish()
     try:
@@ -352,9 +354,9 @@ class _Table:
         for key in self.content:
             if key not in self.allowed:
                 close = difflib.get_close_matches(key, self.allowed, n=1)
-                hint = f"; did you mean {close[0]!r}?" if close else ""
+                hint = f" (did you mean {close[0]!r}?)" if close else ""
                 allowed = ", ".join(self.allowed)
-                raise InputError(f"{self.path}: {self._where()}unknown key {key!r}{hint} Allowed: {allowed}")
+                raise InputError(f"{self.path}: {self._where()}unknown key {key!r}{hint}; allowed: {allowed}")
 
     def table(self, key: str, required: bool = False) -> _Table:
         value = self.take(key) if required or self.known(key) else {}
