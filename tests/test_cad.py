@@ -699,3 +699,22 @@ def test_sample_step_comes_with_names_and_colours():
     assert "base_plate" in [c.name for c in model.components]
     assert len({c.color for c in model.components}) > 1
     assert all(inspect_mesh(component).is_watertight for component in model.components)
+
+
+def test_winding_of_a_large_patchwork_is_mended_quickly():
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=20)
+    faces = np.asarray(sphere.faces, dtype=np.int64).copy()
+    rng = np.random.default_rng(3)
+    wrong = rng.random(len(faces)) < 0.4
+    faces[wrong] = faces[wrong][:, ::-1]
+    shell = faces[np.asarray(sphere.triangles_center)[:, 2] > 0]
+    vertices = np.concatenate([sphere.vertices, sphere.vertices + 100])
+    clean_vertices, clean_faces = clean_mesh(vertices, np.concatenate([faces, shell + len(sphere.vertices)]))
+    assert inspect_mesh(Component("a", clean_vertices, clean_faces.astype(np.int32))).is_consistent
+    a, b, c = clean_vertices[clean_faces].transpose(1, 0, 2)
+    center = np.where((a[:, :1] > 50), 100.0, 0.0)
+    outward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - center)
+    # The closed ball faces outwards whatever most triangles did; the open half keeps its majority's side.
+    assert np.all(outward > 0)

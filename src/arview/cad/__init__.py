@@ -1,6 +1,6 @@
 """CAD in: models of named components, part files, ranges of viewpoints, fitness for tracking."""
 
-from arview.cad.check import PartCheck, check_part
+from arview.cad.check import Finding, PartCheck, check_part
 from arview.cad.load import load_model
 from arview.cad.model import Component, Model, make_model
 from arview.cad.part import PART_FILE_EXAMPLE, ComponentSettings, Datum, Part, default_view_range, load_part
@@ -12,6 +12,7 @@ __all__ = [
     "Component",
     "ComponentSettings",
     "Datum",
+    "Finding",
     "Model",
     "Part",
     "PartCheck",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -84,6 +84,10 @@ class PartCheck:
     def has_problems(self) -> bool:
         """True when something will fail unless it is changed."""
         return any(finding.severity == "problem" for finding in self.findings)
+
+    def with_findings(self, findings: list[Finding]) -> PartCheck:
+        """The same report with further findings (of guide views, say) sorted in."""
+        return replace(self, findings=_sorted([*self.findings, *findings]))
 
     def format(self) -> str:
         """The report as text of several lines, without a newline at its end."""
@@ -167,7 +171,6 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         findings += _mesh_findings(check)
     findings += _own_symmetry_findings(components)
     findings += _tolerance_findings(part)
-    order: tuple[Severity, ...] = ("problem", "warning", "note")
     return PartCheck(
         part=part,
         camera=camera,
@@ -175,8 +178,13 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         view_range=view_range,
         components=components,
         symmetries=symmetries,
-        findings=tuple(sorted(findings, key=lambda finding: order.index(finding.severity))),
+        findings=_sorted(findings),
     )
+
+
+def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:
+    order: tuple[Severity, ...] = ("problem", "warning", "note")
+    return tuple(sorted(findings, key=lambda finding: order.index(finding.severity)))
 
 
 def _check_component(

@@ -50,7 +50,7 @@ class MeshFitness:
 def inspect_mesh(component: Component) -> MeshFitness:
     """Count open and non-manifold edges, and measure a component's volume and principal extents (mm)."""
     faces = component.faces.astype(np.int64)
-    counts, balance = _edge_uses(faces, len(component.vertices_in_model))
+    counts, balance, _ = _edges(faces, len(component.vertices_in_model))
     open_edges = int(np.count_nonzero(counts == 1))
     non_manifold = int(np.count_nonzero(counts > 2))
     consistent = bool(np.all(balance[counts == 2] == 0))
@@ -161,13 +161,13 @@ def _drop_degenerate(vertices: Array, faces: Faces) -> Faces:
     return faces[np.sort(first)]
 
 
-def _edge_uses(faces: Faces, vertex_count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Per undirected edge: how many triangles use it, and forward minus backward uses (0 when consistent)."""
+def _edges(faces: Faces, vertex_count: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Undirected edges: triangles at each (E,), forward minus backward uses (E,), edges of faces (F,3)."""
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     keys = np.minimum(start, end) * np.int64(vertex_count) + np.maximum(start, end)
     _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
     balance = np.bincount(inverse.ravel(), weights=np.where(start < end, 1.0, -1.0)).astype(np.int64)
-    return counts, balance
+    return counts, balance, inverse.reshape(-1, 3)
 
 
 def _bodies(faces: Faces, vertex_count: int) -> NDArray[np.int64]:
@@ -175,11 +175,10 @@ def _bodies(faces: Faces, vertex_count: int) -> NDArray[np.int64]:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    keys = np.minimum(start, end) * np.int64(vertex_count) + np.maximum(start, end)
+    edges = _edges(faces, vertex_count)[2].ravel()
     owners = np.repeat(np.arange(len(faces)), 3)
-    order = np.argsort(keys, kind="stable")
-    same = keys[order][1:] == keys[order][:-1]
+    order = np.argsort(edges, kind="stable")
+    same = edges[order][1:] == edges[order][:-1]
     rows, columns = owners[order][1:][same], owners[order][:-1][same]
     graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(faces),) * 2)
     return connected_components(graph, directed=False)[1].astype(np.int64)
@@ -187,38 +186,56 @@ def _bodies(faces: Faces, vertex_count: int) -> NDArray[np.int64]:
 
 def _wind_outwards(vertices: Array, faces: Faces) -> Faces:
     """Consistent winding, closed bodies outwards (the walls of a cavity towards the cavity)."""
-    counts, balance = _edge_uses(faces, len(vertices))
+    counts, balance, _ = _edges(faces, len(vertices))
     if np.any(balance[counts == 2] != 0):
-        import trimesh
-
-        mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
-        trimesh.repair.fix_winding(mesh)
-        repaired = np.asarray(mesh.faces, dtype=np.int64)
-        # Winding is propagated from an arbitrary triangle: keep the side most of a body's area had.
-        turned = repaired[np.arange(len(faces)), :] != faces
-        sign = np.where(turned.any(axis=1), -1.0, 1.0) * face_areas(vertices, faces)
-        bodies = _bodies(repaired, len(vertices))
-        flip = np.bincount(bodies, weights=sign) < 0
-        faces = np.where(flip[bodies][:, None], repaired[:, ::-1], repaired)
+        faces = _wind_alike(vertices, faces)
     bodies = _bodies(faces, len(vertices))
-    flips: list[int] = []
-    boxes: list[tuple[Array, Array]] = []
-    inward: list[int] = []
-    for body in range(int(bodies.max()) + 1):
-        own = faces[bodies == body]
-        body_counts, body_balance = _edge_uses(own, len(vertices))
-        corners = vertices[np.unique(own)]
-        closed = bool(np.all(body_counts == 2) and np.all(body_balance == 0))
-        if not closed:
-            continue
-        if signed_volumes(vertices, own).sum() < 0:
-            inward.append(body)
-        else:
-            boxes.append((corners.min(axis=0), corners.max(axis=0)))
-    for body in inward:
-        corners = vertices[np.unique(faces[bodies == body])]
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        is_cavity = any(np.all(low > outer[0]) and np.all(high < outer[1]) for outer in boxes)
-        if not is_cavity:
-            flips.append(body)
-    return np.where(np.isin(bodies, flips)[:, None], faces[:, ::-1], faces)
+    counts, balance, edges_of_face = _edges(faces, len(vertices))
+    is_open = ((counts != 2) | (balance != 0))[edges_of_face].any(axis=1)
+    closed = np.bincount(bodies, weights=is_open) == 0
+    volumes = np.bincount(bodies, weights=signed_volumes(vertices, faces))
+    low, high = np.full((len(closed), 3), np.inf), np.full((len(closed), 3), -np.inf)
+    np.minimum.at(low, bodies, vertices[faces].min(axis=1))
+    np.maximum.at(high, bodies, vertices[faces].max(axis=1))
+    outer = closed & (volumes > 0)
+    flip = closed & (volumes < 0)
+    for body in np.flatnonzero(flip):
+        # A body that is turned inwards is a cavity when it lies inside one that is not.
+        flip[body] = not np.any(outer & (low < low[body]).all(axis=1) & (high > high[body]).all(axis=1))
+    return np.where(flip[bodies][:, None], faces[:, ::-1], faces)
+
+
+def _wind_alike(vertices: Array, faces: Faces) -> Faces:
+    """Neighbours over manifold edges wound the same way; each patch keeps the side most of its area has."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+    count = len(faces)
+    forward = faces.ravel() < np.roll(faces, -1, axis=1).ravel()
+    counts, _, edges_of_face = _edges(faces, len(vertices))
+    edges = edges_of_face.ravel()
+    slots = np.flatnonzero(counts[edges] == 2)
+    pairs = slots[np.argsort(edges[slots], kind="stable")].reshape(-1, 2)
+    one, other = pairs.T // 3
+    is_opposed = forward[pairs[:, 0]] == forward[pairs[:, 1]]
+    links = coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
+    _, patches = connected_components(links, directed=False)
+    # One search over all patches, from a root that is linked to the first face of each.
+    _, first = np.unique(patches, return_index=True)
+    rows, columns = np.concatenate([one, np.full(len(first), count)]), np.concatenate([other, first])
+    tree = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count + 1, count + 1)).tocsr()
+    sequence, parents = breadth_first_order(tree, count, directed=False)
+    keys = np.minimum(one, other) * np.int64(count + 1) + np.maximum(one, other)
+    order = np.argsort(keys)
+    wanted = np.minimum(parents[:count], np.arange(count)) * np.int64(count + 1)
+    wanted += np.maximum(parents[:count], np.arange(count))
+    found = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+    flips = (is_opposed[order][found] & (keys[order][found] == wanted)).tolist()
+    turned = [False] * (count + 1)
+    parent_of = parents.tolist()
+    for face in sequence[1:].tolist():
+        turned[face] = turned[parent_of[face]] ^ flips[face]
+    is_turned = np.array(turned[:count])
+    kept_area = np.bincount(patches, weights=np.where(is_turned, -1.0, 1.0) * face_areas(vertices, faces))
+    is_turned ^= (kept_area < 0)[patches]
+    return np.where(is_turned[:, None], faces[:, ::-1], faces)
