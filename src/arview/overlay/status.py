@@ -85,7 +85,8 @@ class StatusLine:
         if inspection is None:
             return [("no inspection", _MUTED)]
         serial = f"  {inspection.serial}" if inspection.serial else ""
-        items: list[tuple[str, Rgb]] = [(inspection.part + serial, _WHITE)]
+        title = paint.shortened(inspection.part + serial, self._size, round(0.3 * self._width))
+        items: list[tuple[str, Rgb]] = [(title, _WHITE)]
         verdicts = [component.verdict for component in inspection.components]
         items += [
             (f"{verdicts.count(verdict)} {VERDICT_WORD[verdict]}", VERDICT_RGB[verdict])
