@@ -1,0 +1,240 @@
+"""What detector and tracker need of one view: contour points with normals and run lengths, edge points with tangents.
+
+The contour is traced in the silhouette; each of its points is then moved onto the mesh edge that makes it, so that
+its 3D place is that of the CAD and not of a pixel. Run lengths are how far the normal stays on the part (inwards)
+and off it (outwards): Stoiber et al., "A Sparse Gaussian Approach to Region-Based 6DoF Object Tracking" (ACCV 2020).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.camera import Camera
+from arview.geometry import Array
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, MeshEdges, sample_visible_edges
+from arview.render import Rendering
+
+SNAP_PX = 1.6
+"""A contour pixel is moved onto a mesh edge sample at most this far away."""
+
+
+@dataclass(frozen=True)
+class ViewFeatures:
+    """Features of one view; points are in the model frame, mm.
+
+    Attributes:
+        contour_points: (C,3); contour_normals: (C,3) unit, outwards and across the line of sight.
+        contour_runs_mm: (C,2) how far the normal stays on the part, and on the background.
+        contour_component: (C,).
+        edge_points: (E,3); edge_tangents: (E,3) unit; edge_kinds: (E,) EDGE_* bits; edge_component: (E,).
+    """
+
+    contour_points: Array
+    contour_normals: Array
+    contour_runs_mm: Array
+    contour_component: NDArray[np.int32]
+    edge_points: Array
+    edge_tangents: Array
+    edge_kinds: NDArray[np.uint8]
+    edge_component: NDArray[np.int32]
+
+
+@njit(cache=True, nogil=True)
+def _run_length(mask, u, v, du, dv, on_part, longest):  # type: ignore[no-untyped-def]
+    """Steps of one pixel from (u, v) along (du, dv) for which the mask stays ``on_part``."""
+    height, width = mask.shape
+    for step in range(1, longest + 1):
+        x = int(np.round(u + du * (step - 0.5)))
+        y = int(np.round(v + dv * (step - 0.5)))
+        inside = 0 <= x < width and 0 <= y < height and mask[y, x] > 0
+        if inside != on_part:
+            return step - 1
+    return longest
+
+
+@njit(cache=True, nogil=True)
+def _describe_contour(mask, xs, ys, starts, ends_, half, longest):  # type: ignore[no-untyped-def]
+    """Normals (pointing off the part) and run lengths at contour pixels chosen as indices into closed chains."""
+    count = xs.shape[0]
+    u = np.empty(count)
+    v = np.empty(count)
+    normal = np.zeros((count, 2))
+    runs = np.zeros((count, 2))
+    ok = np.zeros(count, dtype=np.bool_)
+    for i in range(count):
+        first, last = starts[i], ends_[i]
+        size = last - first
+        k = i - first
+        # Tangent: least-squares line through the neighbours within `half` pixels along the chain.
+        tx = 0.0
+        ty = 0.0
+        for s in range(1, half + 1):
+            ahead = first + (k + s) % size
+            behind = first + (k - s) % size
+            tx += s * (xs[ahead] - xs[behind])
+            ty += s * (ys[ahead] - ys[behind])
+        norm = np.sqrt(tx * tx + ty * ty)
+        u[i] = xs[i]
+        v[i] = ys[i]
+        if norm < 1e-9:
+            continue
+        nx, ny = ty / norm, -tx / norm
+        inner = _run_length(mask, u[i], v[i], -nx, -ny, True, 3)
+        outer = _run_length(mask, u[i], v[i], nx, ny, True, 3)
+        if inner < outer:
+            nx, ny = -nx, -ny
+        normal[i, 0], normal[i, 1] = nx, ny
+        # The pixel's centre lies inside: the outline itself is about half a pixel further out.
+        u[i] += 0.5 * nx
+        v[i] += 0.5 * ny
+        runs[i, 0] = _run_length(mask, u[i], v[i], -nx, -ny, True, longest)
+        runs[i, 1] = _run_length(mask, u[i], v[i], nx, ny, False, longest)
+        ok[i] = runs[i, 0] >= 1 and runs[i, 1] >= 1
+    return u, v, normal, runs, ok
+
+
+@njit(cache=True, nogil=True)
+def _nearest_sample(u, v, sample_pixels, width, height, reach):  # type: ignore[no-untyped-def]
+    """Index of the nearest sample within ``reach`` px of each (u, v), or -1; by a pixel grid."""
+    grid = np.full((height, width), -1, dtype=np.int32)
+    following = np.full(sample_pixels.shape[0], -1, dtype=np.int32)
+    for i in range(sample_pixels.shape[0]):
+        x = int(np.round(sample_pixels[i, 0]))
+        y = int(np.round(sample_pixels[i, 1]))
+        following[i] = grid[y, x]
+        grid[y, x] = i
+    nearest = np.full(u.shape[0], -1, dtype=np.int32)
+    cells = int(np.ceil(reach))
+    for i in range(u.shape[0]):
+        best = reach * reach
+        x0, y0 = int(np.round(u[i])), int(np.round(v[i]))
+        for y in range(max(0, y0 - cells), min(height, y0 + cells + 1)):
+            for x in range(max(0, x0 - cells), min(width, x0 + cells + 1)):
+                j = grid[y, x]
+                while j >= 0:
+                    d = (sample_pixels[j, 0] - u[i]) ** 2 + (sample_pixels[j, 1] - v[i]) ** 2
+                    if d < best:
+                        best = d
+                        nearest[i] = j
+                    j = following[j]
+    return nearest
+
+
+def _smooth_tangents(pixels: Array, tangents_px: Array, shape: tuple[int, int]) -> Array:
+    """Directions (N,2) in the picture averaged over neighbours within 3 px by their structure tensor."""
+    x = np.round(pixels[:, 0]).astype(np.intp)
+    y = np.round(pixels[:, 1]).astype(np.intp)
+    flat = y * shape[1] + x
+    size = shape[0] * shape[1]
+    products = (tangents_px[:, 0] ** 2, tangents_px[:, 0] * tangents_px[:, 1], tangents_px[:, 1] ** 2)
+    xx, xy, yy = (
+        cv2.boxFilter(np.bincount(flat, p, size).reshape(shape), -1, (7, 7), normalize=False)[y, x]
+        for p in products
+    )
+    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def extract_features(
+    rendering: Rendering,
+    cam_from_model: Array,
+    camera: Camera,
+    edges: MeshEdges,
+    contour_count: int,
+    edge_count: int,
+) -> ViewFeatures:
+    """Contour and edge points of one rendered view.
+
+    Args:
+        rendering: the view; the part must lie inside the picture.
+        cam_from_model: (4,4) its pose.
+        camera: ideal camera of the view.
+        edges: edges of the same model.
+        contour_count, edge_count: at most so many points are kept, evenly spread.
+    """
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    depth = rendering.depth_mm
+    height, width = depth.shape
+    model_from_cam_rotation = cam_from_model[:3, :3].T
+    eye = -model_from_cam_rotation @ cam_from_model[:3, 3]
+    samples = sample_visible_edges(edges, cam_from_model, (fx, fy, cx, cy), depth, spacing_px=1.0)
+
+    # Directions in the picture; short edges of curved surfaces zigzag and are smoothed.
+    tangents_in_cam = samples.tangents_in_model @ cam_from_model[:3, :3].T
+    x = (samples.pixels[:, 0] - cx) / fx
+    y = (samples.pixels[:, 1] - cy) / fy
+    tangents_px = np.stack(
+        [fx * (tangents_in_cam[:, 0] - x * tangents_in_cam[:, 2]), fy * (tangents_in_cam[:, 1] - y * tangents_in_cam[:, 2])],
+        axis=1,
+    )  # fmt: skip
+    norms = np.linalg.norm(tangents_px, axis=1)
+    along_sight = norms < 0.05 * fx
+    tangents_px /= np.maximum(norms, 1e-12)[:, None]
+    edge_tangents = samples.tangents_in_model
+    if len(samples.pixels):
+        is_short = samples.lengths_px < 6.0
+        smooth_px = _smooth_tangents(samples.pixels, tangents_px, (height, width))
+        smooth_in_cam = np.stack([smooth_px[:, 0] / fx, smooth_px[:, 1] / fy, np.zeros(len(smooth_px))], axis=1)
+        smooth_in_cam /= np.linalg.norm(smooth_in_cam, axis=1, keepdims=True)
+        edge_tangents = np.where(is_short[:, None], smooth_in_cam @ cam_from_model[:3, :3], edge_tangents)
+    usable = np.flatnonzero(~along_sight | (samples.lengths_px < 6.0)) if len(samples.pixels) else np.zeros(0, int)
+    chosen = usable[_evenly(len(usable), edge_count)]
+
+    mask = rendering.silhouette
+    chains, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    chains = [chain[:, 0, :] for chain in chains if len(chain) >= 24]
+    if chains:
+        lengths = [len(chain) for chain in chains]
+        pixels = np.concatenate(chains).astype(np.float64)
+        firsts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+        lasts = np.repeat(np.cumsum(lengths), lengths)
+        longest = max(width, height) // 2
+        u, v, normal_px, runs_px, ok = _describe_contour(
+            mask, pixels[:, 0].copy(), pixels[:, 1].copy(), firsts, lasts, 5, longest
+        )
+        border = (u > 2) & (v > 2) & (u < width - 3) & (v < height - 3)
+        keep = np.flatnonzero(ok & border)
+        keep = keep[_evenly(len(keep), contour_count)]
+        u, v, normal_px, runs_px = u[keep], v[keep], normal_px[keep], runs_px[keep]
+        inner = np.round(pixels[keep]).astype(np.intp)
+        z = depth[inner[:, 1], inner[:, 0]].astype(np.float64)
+        points_in_cam = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
+        contour_points = (points_in_cam - cam_from_model[:3, 3]) @ cam_from_model[:3, :3]
+        outline = np.flatnonzero(samples.kinds & EDGE_CONTOUR)
+        nearest = _nearest_sample(u, v, samples.pixels[outline], width, height, SNAP_PX)
+        snapped = nearest >= 0
+        contour_points[snapped] = samples.points_in_model[outline[nearest[snapped]]]
+        # The normal as a 3D vector across the line of sight, so that it projects to normal_px.
+        normals_in_cam = np.stack([normal_px[:, 0], normal_px[:, 1], np.zeros(len(u))], axis=1)
+        contour_normals = normals_in_cam @ cam_from_model[:3, :3]
+        sight = contour_points - eye
+        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        contour_normals -= np.sum(contour_normals * sight, axis=1, keepdims=True) * sight
+        contour_normals /= np.linalg.norm(contour_normals, axis=1, keepdims=True)
+        runs_mm = runs_px * (z / fx)[:, None]
+        component = rendering.component_ids[inner[:, 1], inner[:, 0]].astype(np.int32)
+    else:
+        contour_points, contour_normals = np.zeros((0, 3)), np.zeros((0, 3))
+        runs_mm, component = np.zeros((0, 2)), np.zeros(0, dtype=np.int32)
+    return ViewFeatures(
+        contour_points=contour_points,
+        contour_normals=contour_normals,
+        contour_runs_mm=runs_mm,
+        contour_component=component,
+        edge_points=samples.points_in_model[chosen],
+        edge_tangents=edge_tangents[chosen],
+        edge_kinds=samples.kinds[chosen],
+        edge_component=samples.component[chosen],
+    )
+
+
+def _evenly(available: int, wanted: int) -> NDArray[np.intp]:
+    """At most ``wanted`` indices spread evenly over ``available``."""
+    if available <= wanted:
+        return np.arange(available)
+    return np.floor((np.arange(wanted) + 0.5) * available / wanted).astype(np.intp)

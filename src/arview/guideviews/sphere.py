@@ -1,0 +1,65 @@
+"""Viewpoints: evenly spread directions on a sphere and the camera poses that look from them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arview.cad.view_range import ViewRange
+from arview.geometry import Array, look_at
+
+
+def icosphere_directions(subdivisions: int) -> Array:
+    """(10 · 4^n + 2, 3) unit vectors of an icosahedron subdivided n times: 4 gives 2,562, about 4° apart."""
+    golden = (1.0 + 5.0**0.5) / 2.0
+    vertices = [
+        (s1 * a, s2 * b, 0.0) for s1 in (1, -1) for s2 in (1, -1) for a, b in ((1.0, golden),)
+    ]
+    points = np.array([np.roll(v, k) for v in vertices for k in range(3)], dtype=np.float64)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    distances = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    side = np.min(distances[distances > 1e-9])
+    near = np.abs(distances - side) < 1e-6
+    faces = [
+        (i, j, k)
+        for i in range(12)
+        for j in range(i + 1, 12)
+        for k in range(j + 1, 12)
+        if near[i, j] and near[j, k] and near[i, k]
+    ]
+    triangles = np.array(faces)
+    for _ in range(subdivisions):
+        edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+        unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+        middles = points[unique].sum(axis=1)
+        middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+        ab, bc, ca = np.split(inverse.ravel() + len(points), 3)
+        a, b, c = triangles.T
+        triangles = np.concatenate(
+            [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+        )
+        points = np.concatenate([points, middles])
+    return points
+
+
+def view_poses(directions: Array, distance_mm: float, center_in_model: Array) -> Array:
+    """(N,4,4) ``cam_from_model`` of cameras on a sphere around the centre, looking at it with +Z up."""
+    up = np.array([0.0, 0.0, 1.0])
+    return np.stack(
+        [look_at(center_in_model + distance_mm * d, center_in_model, up) for d in directions]
+    )
+
+
+def directions_in_range(view_range: ViewRange, subdivisions: int, margin_deg: float) -> Array:
+    """The icosphere's directions that the declared range, widened by the margin, contains.
+
+    A range so narrow that no direction falls in still gets its middle.
+    """
+    directions = icosphere_directions(subdivisions)
+    inside = view_range.contains_direction(directions, margin_deg)
+    if inside.any():
+        return directions[inside]
+    azimuth = np.deg2rad(0.5 * sum(view_range.azimuth_deg))
+    elevation = np.deg2rad(0.5 * sum(view_range.elevation_deg))
+    return np.array(
+        [[np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]]
+    )
