@@ -294,3 +294,80 @@ def obj_text(name: str, vertices: Array, faces: NDArray[np.int64], offset: int =
     lines = [f"o {name}"] + [f"v {x} {y} {z}" for x, y, z in vertices]
     lines += [f"f {a + 1 + offset} {b + 1 + offset} {c + 1 + offset}" for a, b, c in faces]
     return "\n".join(lines) + "\n"
+
+
+# --- the same nested box in several formats ------------------------------------------------------------
+
+# parent_from_child: a quarter turn about Z, and shifts in mm; the box is 10 × 20 × 30 mm at its origin.
+QUARTER_TURN = np.array([[0, -1, 0, 100], [1, 0, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1.0]])
+SHIFT = np.array([[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+# The box moved by SHIFT, then turned: x in [-22, -2] + 100, y in [1, 11], z in [3, 33] + 5.
+NESTED_BOUNDS = np.array([[78, 1, 8], [98, 11, 38]], dtype=np.float64)
+
+
+def scaled(matrix: np.ndarray, factor: float) -> np.ndarray:
+    result = matrix.copy()
+    result[:3, 3] *= factor
+    return result
+
+
+def nested_glb(folder: Path) -> Path:
+    nodes: list[dict[str, object]] = [
+        {"name": "frame", "children": [1], "matrix": scaled(QUARTER_TURN, 0.001).T.ravel().tolist()},
+        {"name": "lug", "mesh": 0, "translation": [0.001, 0.002, 0.003]},
+    ]
+    return glb_with_boxes(folder / "nested.glb", nodes, [0])
+
+
+def nested_trs_glb(folder: Path) -> Path:
+    half = float(np.sqrt(0.5))
+    nodes: list[dict[str, object]] = [
+        {"name": "frame", "children": [1], "rotation": [0, 0, half, half], "translation": [0.1, 0, 0.005]},
+        {"name": "lug", "mesh": 0, "translation": [0.001, 0.002, 0.003], "scale": [1, 1, 1]},
+    ]
+    return glb_with_boxes(folder / "nested_trs.glb", nodes, [0])
+
+
+def nested_scaled_glb(folder: Path) -> Path:
+    nodes: list[dict[str, object]] = [
+        {"name": "inches", "children": [1], "scale": [0.5, 0.5, 0.5]},
+        {"name": "frame", "children": [2], "matrix": scaled(QUARTER_TURN, 0.002).T.ravel().tolist()},
+        {"name": "lug", "mesh": 0, "translation": [0.002, 0.004, 0.006], "scale": [2, 2, 2]},
+    ]
+    return glb_with_boxes(folder / "nested_scaled.glb", nodes, [0])
+
+
+def nested_trimesh_glb(folder: Path) -> Path:
+    import trimesh
+
+    scene = trimesh.Scene()
+    scene.graph.update(frame_to="frame", frame_from="world", matrix=scaled(QUARTER_TURN, 0.001))
+    mesh = trimesh.Trimesh(*box((0, 0, 0), (0.01, 0.02, 0.03)), process=False)
+    scene.add_geometry(
+        mesh, node_name="lug", geom_name="block", parent_node_name="frame", transform=scaled(SHIFT, 0.001)
+    )
+    (folder / "nested_trimesh.glb").write_bytes(scene.export(file_type="glb"))
+    return folder / "nested_trimesh.glb"
+
+
+def nested_step(folder: Path, unit: str) -> Path:
+    per_mm = {"mm": 1.0, "m": 0.001, "inch": 1 / 25.4}[unit]
+    part = StepPart("block", (10 * per_mm, 20 * per_mm, 30 * per_mm))
+    frame = StepAssembly("frame_product", [("lug", part, scaled(SHIFT, per_mm))])
+    root = StepAssembly("root", [("frame", frame, scaled(QUARTER_TURN, per_mm))])
+    return StepWriter(unit).write(folder / f"nested_{unit}.step", root)
+
+
+def nested_3mf(folder: Path, unit: str = "millimeter") -> Path:
+    per_mm = {"millimeter": 1.0, "inch": 1 / 25.4}[unit]
+
+    def transform(matrix: np.ndarray) -> str:
+        return " ".join(f"{v:.12g}" for v in scaled(matrix, per_mm)[:3, :].T.ravel())
+
+    mesh = mesh_xml(*box((0, 0, 0), (10 * per_mm, 20 * per_mm, 30 * per_mm)))
+    resources = (
+        f'<object id="1" name="lug">{mesh}</object><object id="2" name="frame"><components>'
+        f'<component objectid="1" transform="{transform(SHIFT)}"/></components></object>'
+    )
+    item = f'<item objectid="2" transform="{transform(QUARTER_TURN)}"/>'
+    return write_3mf(folder / f"nested_{unit}.3mf", resources, item, unit)

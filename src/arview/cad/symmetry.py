@@ -15,7 +15,7 @@ ORDERS = (2, 3, 4, 5, 6, 8, 12)
 # Angles that no rotation group of a low order holds: a shape that takes all of them spins freely.
 _FREE_TURNS_RAD = np.deg2rad([7.3, 23.1, 41.9, 77.7, 131.3])
 
-_QUERY_COUNT = 800
+_QUERY_COUNT = 600
 _TARGET_COUNT = 30_000
 _NEIGHBOURS = 8
 _SEED = 20250
