@@ -299,7 +299,7 @@ def test_step_tolerance_is_in_mm_whatever_the_files_unit(unit, tmp_path):
         component = load_model(path, tol_linear_mm=tolerance_mm, tol_angular_deg=60).components[0]
         fitness = inspect_mesh(component)
         assert fitness.is_watertight
-        # n chords around a circle of 10 mm leave it by 10 (1 - cos(pi / n)): within the tolerance, not far below.
+        # n chords around a circle of 10 mm leave it by 10 (1 - cos(pi / n)): within the tolerance.
         rim = component.vertices_in_model[np.abs(component.vertices_in_model[:, 2]) < 1e-6]
         np.testing.assert_allclose(np.hypot(rim[:, 0], rim[:, 1]), 10.0, atol=1e-4)
         sag_mm = 10.0 * (1.0 - np.cos(np.pi / len(rim)))

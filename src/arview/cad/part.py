@@ -171,8 +171,8 @@ class Part:
 def default_view_range(model: Model) -> ViewRange:
     """Range for a part that declares none: every direction, every roll, 1.5 to 6 diameters away.
 
-    At 1.5 diameters the part just fits a picture of 1.2 focal lengths' width to its height's edge; at 6 it
-    is about 250 of 1280 pixels across, about as small as a tracker can use.
+    With a focal length of 1.2 times the picture's width the part is 0.8 of that width across at 1.5
+    diameters, and 0.2 of it (256 of 1280 px) at 6, where its components get too small to follow.
     """
     return ViewRange(distance_mm=(1.5 * model.diameter_mm, 6.0 * model.diameter_mm))
 
