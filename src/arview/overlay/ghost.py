@@ -19,8 +19,6 @@ NEAR_MM = 1.0
 CELL_PX = 8
 """Size of a cell of the coverage grid that the label layout avoids."""
 _WINDOW_MARGIN_PX = 4
-_PIECES_PER_DIAMETER = 12
-"""Under distortion no face or edge is longer than this fraction of the part: keeps curved edges to 0.1 px."""
 
 
 @dataclass(frozen=True)
@@ -46,22 +44,19 @@ class GhostView:
 class Ghost:
     """Z-buffer of a model at a pose, in the window of the image that the part covers.
 
-    Lens distortion is honoured by moving the vertices; faces are split beforehand where that needs it.
+    Lens distortion is honoured by drawing with the ideal camera and looking up, for every pixel of the real
+    image, the pixel of the ideal one.
     """
 
     def __init__(self, model: Model, camera: Camera, shapes: list[Topology]) -> None:
         """For a model and the topology of each of its components."""
         self.camera = camera
-        vertices, faces, component_of_face = model.mesh
-        if camera.is_distorted:
-            longest_mm = model.diameter_mm / _PIECES_PER_DIAMETER
-            vertices, faces, component_of_face = _split_long(vertices, faces, component_of_face, longest_mm)
-        self._vertices_in_model, self._faces = vertices, faces
-        self._component_of_face = component_of_face
+        self._vertices_in_model, self._faces, self._component_of_face = model.mesh
         # Of a closed mesh only faces turned to the camera can be seen: 1, -1 where it is wound inside out.
         winding = [(-1 if shape.is_inside_out else 1) if shape.is_closed else 0 for shape in shapes]
-        self._winding = np.array(winding, dtype=np.int8)[component_of_face]
+        self._winding = np.array(winding, dtype=np.int8)[self._component_of_face]
         self._distortion_limit_r2 = _monotone_limit_r2(camera)
+        self._ideal_pixels = _ideal_pixels(camera) if camera.is_distorted else None
 
     def bent(self, points_in_cam: Array) -> Array:
         """Points (N,3) moved sideways so that a pinhole projects them where the real lens would.
@@ -86,20 +81,34 @@ class Ghost:
     def view(self, cam_from_model: Array) -> GhostView | None:
         """What the camera sees from this pose; None when the part is outside the image."""
         camera = self.camera
-        points = self.bent(apply(cam_from_model, self._vertices_in_model))
-        window = _window(points, camera)
+        points = apply(cam_from_model, self._vertices_in_model)
+        window = _window(self.bent(points), camera)
         if window is None:
             return None
-        u0, v0, u1, v1 = window
         shade = np.empty(len(self._faces), dtype=np.float32)
         faces, components, count = _faces_to_draw(
             points, self._faces, self._winding, self._component_of_face, shade
+        )
+        u0, v0, u1, v1 = (
+            window if self._ideal_pixels is None else self._ideal_window(self._ideal_pixels, window)
         )
         inverse_depth, face_ids = rasterise(
             points, faces[:count], camera.fx, camera.fy, camera.cx, camera.cy,
             u1 - u0, v1 - v0, NEAR_MM, (u0, v0),
         )  # fmt: skip
-        return GhostView(u0, v0, inverse_depth, face_ids, shade[:count], components[:count])
+        if self._ideal_pixels is not None:
+            inverse_depth, face_ids = _look_up(self._ideal_pixels, window, (u0, v0), inverse_depth, face_ids)
+        return GhostView(window[0], window[1], inverse_depth, face_ids, shade[:count], components[:count])
+
+    def _ideal_window(
+        self, ideal_pixels: NDArray[np.int16], window: tuple[int, int, int, int]
+    ) -> tuple[int, int, int, int]:
+        """Window of the ideal image that holds all pixels of a window of the real one."""
+        u0, v0, u1, v1 = window
+        part = ideal_pixels[v0:v1, u0:u1]
+        rim = np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]])
+        (low_u, low_v), (high_u, high_v) = rim.min(axis=0), rim.max(axis=0)
+        return int(low_u), int(low_v), int(high_u) + 1, int(high_v) + 1
 
 
 def _window(points: Array, camera: Camera) -> tuple[int, int, int, int] | None:
@@ -134,28 +143,41 @@ def _monotone_limit_r2(camera: Camera) -> float:
     return float(r2[folded[0] - 1] if len(folded) else r2[-1])
 
 
-def _split_long(
-    vertices: Array, faces: NDArray[np.int32], component_of_face: NDArray[np.int32], longest_mm: float
-) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
-    """The same surface with every face that has an edge over ``longest_mm`` cut in four, repeatedly."""
-    done_faces, done_components = [], []
-    while True:
-        corners = vertices[faces]
-        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
-        long = lengths > longest_mm
-        done_faces.append(faces[~long])
-        done_components.append(component_of_face[~long])
-        if not long.any():
-            break
-        a, b, c = faces[long].T
-        count, start = int(long.sum()), len(vertices)
-        middles = 0.5 * (corners[long] + np.roll(corners[long], -1, axis=1))
-        vertices = np.concatenate([vertices, middles.transpose(1, 0, 2).reshape(-1, 3)])
-        ab, bc, ca = (np.arange(count, dtype=np.int32) + start + k * count for k in range(3))
-        quarters = [np.stack(q, axis=1) for q in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-        faces = np.concatenate(quarters).astype(np.int32)
-        component_of_face = np.tile(component_of_face[long], 4)
-    return vertices, np.ascontiguousarray(np.concatenate(done_faces)), np.concatenate(done_components)
+def _ideal_pixels(camera: Camera) -> NDArray[np.int16]:
+    """For every pixel of the image, the nearest pixel (H,W,2) u, v of a lens without distortion.
+
+    Worked out at nodes CELL_PX apart and interpolated between them.
+    """
+    nodes_u = np.arange(0, camera.width + CELL_PX, CELL_PX, dtype=np.float64)
+    nodes_v = np.arange(0, camera.height + CELL_PX, CELL_PX, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        rays = camera.unproject(np.stack(np.meshgrid(nodes_u, nodes_v), axis=-1))
+    ideal = rays[..., :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    # Where the lens model folds back no ray exists; such pixels are kept near the image.
+    low, high = [-camera.width, -camera.height], [2 * camera.width, 2 * camera.height]
+    ideal = np.clip(np.nan_to_num(ideal, nan=-1.0), low, high)
+    v, fraction_v = np.divmod(np.arange(camera.height), CELL_PX)
+    share_v = (fraction_v / CELL_PX)[:, None, None]
+    rows = ideal[v] * (1.0 - share_v) + ideal[v + 1] * share_v
+    u, fraction_u = np.divmod(np.arange(camera.width), CELL_PX)
+    share_u = (fraction_u / CELL_PX)[:, None]
+    return np.round(rows[:, u] * (1.0 - share_u) + rows[:, u + 1] * share_u).astype(np.int16)
+
+
+@njit(cache=True, nogil=True)
+def _look_up(ideal_pixels, window, origin, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
+    """Depth and faces of a window of the real image from those of the ideal image."""
+    u0, v0, u1, v1 = window
+    depth = np.zeros((v1 - v0, u1 - u0))
+    faces = np.full((v1 - v0, u1 - u0), -1, dtype=np.int32)
+    for row in range(v1 - v0):
+        for column in range(u1 - u0):
+            u = ideal_pixels[v0 + row, u0 + column, 0] - origin[0]
+            v = ideal_pixels[v0 + row, u0 + column, 1] - origin[1]
+            if 0 <= u < face_ids.shape[1] and 0 <= v < face_ids.shape[0]:
+                depth[row, column] = inverse_depth[v, u]
+                faces[row, column] = face_ids[v, u]
+    return depth, faces
 
 
 @njit(cache=True, nogil=True, fastmath=True)

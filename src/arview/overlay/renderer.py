@@ -28,6 +28,8 @@ _CRITICAL_DIMMING = 0.55
 """Ghost and edges fade while the tracker is not sure of the pose."""
 _PASS_DIMMING = 0.65
 """Ghosts of components that passed are fainter, so that the others stand out."""
+_PIECES = 16
+"""A lens bends edges, so they are cut to this fraction of the part's diameter: true to about 0.2 px."""
 _ARROW_RGB = (255, 255, 255)
 _SEEN_PX = 12
 """A component that shows fewer pixels gets a label only if it did not pass."""
@@ -56,7 +58,7 @@ class OverlayRenderer:
         self.options = options or OverlayOptions()
         shapes = [topology(component) for component in model.components]
         self._ghost = Ghost(model, camera, shapes)
-        self._edges = Edges(shapes, model.diameter_mm / 16 if camera.is_distorted else None)
+        self._edges = Edges(shapes, model.diameter_mm / _PIECES if camera.is_distorted else None)
         self._ghost_style, self._edge_style, self._weight = self._styles()
         self._anchors_in_model = np.stack(
             [
