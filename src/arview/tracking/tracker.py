@@ -1,0 +1,221 @@
+"""Tracker: refines the pose of a part from frame to frame on guide views, without rendering.
+
+Every iteration projects the nearest guide view's points, measures with each modality, adds all to one 6×6 system
+with a damping towards the prediction, and updates the pose; scales shrink from iteration to iteration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.camera import Camera
+from arview.errors import InputError, MismatchError
+from arview.geometry import Array, exp_se3, invert, log_se3, orthonormalise, rigid
+from arview.guideviews import GuideView, GuideViewSet
+from arview.tracking.edge import add_edges, measure_edges
+from arview.tracking.region import BINS, EDGE_FUNCTION, add_histograms, add_region, log_odds, measure_region
+from arview.tracking.solver import apply_twist, project_lines, solve_step
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One iteration of the solver: scales and reach of the modalities."""
+
+    region_scale: int
+    edge_reach: int
+    edge_step_px: float
+    edge_spread_px: float
+    updates: int = 2
+
+
+TRACK_STAGES = (
+    Stage(6, 12, 2.0, 10.0),
+    Stage(4, 12, 1.0, 5.0),
+    Stage(2, 8, 1.0, 3.0),
+    Stage(1, 6, 1.0, 1.5),
+    Stage(1, 5, 1.0, 1.0),
+)
+"""Coarse to fine, for motion of up to about 25 px between frames."""
+
+
+@dataclass(frozen=True)
+class TrackerOptions:
+    """Options of the tracker.
+
+    Attributes:
+        use_region, use_edge, use_feature: modalities to use.
+        region_weight, edge_weight: relative trust; neighbours along an outline are not independent.
+        edge_sigma_px: how far a good step lies from the CAD's edge.
+        edge_threshold: weakest step in grey levels over two pixels.
+        learning_rate: how quickly colour histograms follow the picture.
+        rotation_sigma_rad, translation_sigma: expected error of the prediction, the latter in diameters.
+    """
+
+    use_region: bool = True
+    use_edge: bool = True
+    use_feature: bool = True
+    region_weight: float = 0.5
+    edge_weight: float = 1.0
+    edge_sigma_px: float = 0.7
+    edge_threshold: float = 3.0
+    learning_rate: float = 0.2
+    rotation_sigma_rad: float = 0.3
+    translation_sigma: float = 0.3
+    stages: tuple[Stage, ...] = TRACK_STAGES
+
+    def __post_init__(self) -> None:
+        if not (self.use_region or self.use_edge or self.use_feature):
+            raise InputError("tracker: at least one modality must be on")
+
+
+@dataclass
+class Appearance:
+    """Colours of part and background, learned while tracking."""
+
+    fore: Array = field(default_factory=lambda: np.zeros(BINS**3))
+    back: Array = field(default_factory=lambda: np.zeros(BINS**3))
+    odds: Array = field(default_factory=lambda: np.zeros(BINS**3))
+    is_known: bool = False
+
+    def copy(self) -> Appearance:
+        """Independent copy."""
+        return Appearance(self.fore.copy(), self.back.copy(), self.odds.copy(), self.is_known)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Result of one refinement: pose, information matrix (6,6) about the model's centre, and evidence."""
+
+    cam_from_model: Array
+    information: Array
+    view_index: int
+
+
+class PartView:
+    """A guide-view set as the tracker needs it: contiguous arrays about the model's centre."""
+
+    def __init__(self, views: GuideViewSet) -> None:
+        self.views = views
+        self.model_from_body = rigid(np.eye(3), views.center_in_model)
+        self.body_from_model = invert(self.model_from_body)
+        self._decoded: dict[int, tuple[Array, ...]] = {}
+
+    def nearest(self, cam_from_body: Array) -> int:
+        """Index of the guide view whose direction is nearest."""
+        eye = -cam_from_body[:3, :3].T @ cam_from_body[:3, 3]
+        return int(np.argmax(self.views.directions @ eye))
+
+    def arrays(self, index: int) -> tuple[Array, ...]:
+        """Contour points, normals, runs, edge points, tangents of a view, points about the centre."""
+        found = self._decoded.get(index)
+        if found is None:
+            view: GuideView = self.views.view(index)
+            f = view.features
+            center = self.views.center_in_model
+            found = (
+                np.ascontiguousarray(f.contour_points - center),
+                np.ascontiguousarray(f.contour_normals),
+                np.ascontiguousarray(f.contour_runs_mm),
+                np.ascontiguousarray(f.edge_points - center),
+                np.ascontiguousarray(f.edge_tangents),
+            )
+            self._decoded[index] = found
+        return found
+
+
+def intrinsics_of(camera: Camera) -> Array:
+    """(10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted, as the kernels take it."""
+    return np.array(
+        [camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0]
+    )
+
+
+class Tracker:
+    """6-DoF tracking of one part with one camera."""
+
+    def __init__(self, views: GuideViewSet, camera: Camera, options: TrackerOptions | None = None) -> None:
+        self.options = options or TrackerOptions()
+        self.camera = camera
+        self.part = PartView(views)
+        self.diameter_mm = views.diameter_mm
+        self.appearance = Appearance()
+        self._intrinsics = intrinsics_of(camera)
+        self._cam_from_body: Array | None = None
+        self._velocity = np.zeros(6)
+
+    def start(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
+        """Begin at a pose: colours are learned from this frame, the motion is taken as none."""
+        self.appearance = Appearance()
+        self._cam_from_body = cam_from_model @ self.part.model_from_body
+        self._velocity = np.zeros(6)
+        self.learn(image, self._cam_from_body, 1.0)
+
+    def learn(self, image: NDArray[np.uint8], cam_from_body: Array, rate: float) -> None:
+        """Blend the colours along the contour at this pose into the histograms."""
+        contour, normals, runs, _, _ = self.part.arrays(self.part.nearest(cam_from_body))
+        pixels, normals_px, depths = project_lines(contour, normals, False, cam_from_body, self._intrinsics, 0.01 * self.diameter_mm)
+        fore, back = np.zeros(BINS**3), np.zeros(BINS**3)
+        add_histograms(image, pixels, normals_px, depths, runs, self.camera.fx, fore, back, 20.0, 1.5)
+        look = self.appearance
+        if fore.sum() < 50 or back.sum() < 50:
+            return
+        fore /= fore.sum()
+        back /= back.sum()
+        if look.is_known:
+            look.fore += rate * (fore - look.fore)
+            look.back += rate * (back - look.back)
+        else:
+            look.fore, look.back = fore, back
+        look.is_known = True
+        log_odds(look.fore, look.back, look.odds)
+
+    def refine(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...]) -> tuple[Array, Array]:
+        """Pose (``cam_from_body``) and information (6,6) after the given stages from a start."""
+        o = self.options
+        damping = np.empty(6)
+        damping[:3] = 1.0 / o.rotation_sigma_rad**2
+        damping[3:] = 1.0 / (o.translation_sigma * self.diameter_mm) ** 2
+        step_mm = 0.01 * self.diameter_mm
+        hessian = np.zeros((6, 6))
+        for stage in stages:
+            contour, normals, runs, edges, tangents = self.part.arrays(self.part.nearest(cam_from_body))
+            if o.use_region and self.appearance.is_known:
+                c_px, c_n, c_z = project_lines(contour, normals, False, cam_from_body, self._intrinsics, step_mm)
+                mean, information, _ = measure_region(
+                    image, c_px, c_n, c_z, runs, self.camera.fx, self.appearance.odds, EDGE_FUNCTION, stage.region_scale
+                )
+            if o.use_edge:
+                e_px, e_n, e_z = project_lines(edges, tangents, True, cam_from_body, self._intrinsics, step_mm)
+                positions, strengths, _ = measure_edges(
+                    gray, e_px, e_n, e_z, stage.edge_reach, stage.edge_step_px, o.edge_threshold
+                )
+            for _ in range(stage.updates):
+                hessian[:] = 0.0
+                gradient = np.zeros(6)
+                if o.use_region and self.appearance.is_known:
+                    add_region(hessian, gradient, contour, cam_from_body, self._intrinsics, c_px, c_n, mean, information, o.region_weight, 3.0 * stage.region_scale)
+                if o.use_edge:
+                    add_edges(
+                        hessian, gradient, edges, cam_from_body, self._intrinsics, e_px, e_n, positions, strengths,
+                        15.0, o.edge_sigma_px * max(1.0, 0.5 * stage.edge_spread_px), stage.edge_spread_px, o.edge_weight,
+                    )
+                cam_from_body = apply_twist(cam_from_body, solve_step(hessian, gradient, damping))
+        return cam_from_body, hessian + np.tril(hessian, -1).T
+
+    def track(self, image: NDArray[np.uint8]) -> Array:
+        """Pose of the next frame."""
+        assert self._cam_from_body is not None
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        before = self._cam_from_body
+        predicted = before @ exp_se3(self._velocity)
+        pose, information = self.refine(image, gray, predicted, self.options.stages)
+        pose = orthonormalise(pose)
+        self._velocity = 0.5 * log_se3(invert(before) @ pose)
+        self._cam_from_body = pose
+        if self.options.use_region:
+            self.learn(image, pose, self.options.learning_rate)
+        return pose @ self.part.body_from_model
