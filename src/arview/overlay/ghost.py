@@ -152,16 +152,17 @@ def _ideal_pixels(camera: Camera) -> NDArray[np.int16]:
     nodes_v = np.arange(0, camera.height + CELL_PX, CELL_PX, dtype=np.float64)
     with np.errstate(all="ignore"):
         rays = camera.unproject(np.stack(np.meshgrid(nodes_u, nodes_v), axis=-1))
-    ideal = rays[..., :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        ideal = rays[..., :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     # Where the lens model folds back no ray exists; such pixels are kept near the image.
-    low, high = [-camera.width, -camera.height], [2 * camera.width, 2 * camera.height]
-    ideal = np.clip(np.nan_to_num(ideal, nan=-1.0), low, high)
+    size = np.array([camera.width, camera.height])
+    ideal = np.clip(np.nan_to_num(ideal, nan=-1.0), -0.5 * size, 1.5 * size)
     v, fraction_v = np.divmod(np.arange(camera.height), CELL_PX)
     share_v = (fraction_v / CELL_PX)[:, None, None]
     rows = ideal[v] * (1.0 - share_v) + ideal[v + 1] * share_v
     u, fraction_u = np.divmod(np.arange(camera.width), CELL_PX)
     share_u = (fraction_u / CELL_PX)[:, None]
-    return np.round(rows[:, u] * (1.0 - share_u) + rows[:, u + 1] * share_u).astype(np.int16)
+    pixels: Array = rows[:, u] * (1.0 - share_u) + rows[:, u + 1] * share_u
+    return np.round(pixels).astype(np.int16)
 
 
 @njit(cache=True, nogil=True)
