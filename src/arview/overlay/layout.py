@@ -20,13 +20,16 @@ from arview.geometry import Array
 from arview.overlay.ghost import CELL_PX
 
 _ROW_PX = 4
+"""Step of the rows that are tried; goals nearer than this are not followed."""
 _FADE_FRAMES = 6
 _REST_FRAMES = 30
 """A label that has just moved to another column or order stays there for this long."""
 _GLIDE = 0.16
 """Fraction of the way to its goal that a label moves in a frame."""
 _COVER_COST = 60.0
+"""Cost of covering components wholly; for comparison, a tenth of the image's height off the anchor costs 1."""
 _SIDE_HYSTERESIS = 1.5
+"""How much better the other column must be, in the costs of ``_choose_side``."""
 
 
 @dataclass(frozen=True)
