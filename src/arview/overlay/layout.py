@@ -27,7 +27,7 @@ _REST_FRAMES = 30
 _GLIDE = 0.16
 """Fraction of the way to its goal that a label moves in a frame."""
 _COVER_COST = 60.0
-"""Cost of covering components wholly; for comparison, a tenth of the image's height off the anchor costs 1."""
+"""Cost of covering components wholly; in comparison a tenth of the image's height off costs 1."""
 _SIDE_HYSTERESIS = 1.5
 """How much better the other column must be, in the costs of ``_choose_side``."""
 
