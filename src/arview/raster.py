@@ -23,37 +23,32 @@ def _fill(u0, v0, w0, u1, v1, w1, u2, v2, w2, face, x_low, y_low, inverse_depth,
         return
     w_du = ((w1 - w0) * (v2 - v0) - (w2 - w0) * (v1 - v0)) / area
     w_dv = ((w2 - w0) * (u1 - u0) - (w1 - w0) * (u2 - u0)) / area
-    v_min = min(v0, min(v1, v2))
-    v_max = max(v0, max(v1, v2))
-    row_first = max(int(np.ceil(v_min)), y_low)
-    row_last = min(int(np.floor(v_max)), y_low + height - 1)
+    w_at_origin = w0 - u0 * w_du - v0 * w_dv
+    # Corner 0 on top, 2 at the bottom; the long side runs from 0 to 2, the short ones meet at 1.
+    if v1 < v0:
+        u0, v0, u1, v1 = u1, v1, u0, v0
+    if v2 < v0:
+        u0, v0, u2, v2 = u2, v2, u0, v0
+    if v2 < v1:
+        u1, v1, u2, v2 = u2, v2, u1, v1
+    long_slope = (u2 - u0) / (v2 - v0) if v2 > v0 else 0.0
+    upper_slope = (u1 - u0) / (v1 - v0) if v1 > v0 else 0.0
+    lower_slope = (u2 - u1) / (v2 - v1) if v2 > v1 else 0.0
+    row_first = max(int(np.ceil(v0)), y_low)
+    row_last = min(int(np.floor(v2)), y_low + height - 1)
     for row in range(row_first, row_last + 1):
-        left = 1e30
-        right = -1e30
-        for edge in range(3):
-            if edge == 0:
-                ua, va, ub, vb = u0, v0, u1, v1
-            elif edge == 1:
-                ua, va, ub, vb = u1, v1, u2, v2
-            else:
-                ua, va, ub, vb = u2, v2, u0, v0
-            if (va <= row and vb >= row) or (vb <= row and va >= row):
-                if va == vb:
-                    left = min(left, min(ua, ub))
-                    right = max(right, max(ua, ub))
-                else:
-                    x = ua + (row - va) * (ub - ua) / (vb - va)
-                    left = min(left, x)
-                    right = max(right, x)
-        if right < left:
+        long = u0 + (row - v0) * long_slope
+        short = u1 + (row - v1) * (upper_slope if row < v1 or v2 == v1 else lower_slope)
+        column_first = max(int(np.ceil(min(long, short))), x_low)
+        column_last = min(int(np.floor(max(long, short))), x_low + width - 1)
+        if column_first > column_last:
             continue
-        column_first = max(int(np.ceil(left)), x_low)
-        column_last = min(int(np.floor(right)), x_low + width - 1)
-        w = w0 + (column_first - u0) * w_du + (row - v0) * w_dv
-        for column in range(column_first, column_last + 1):
-            if w > inverse_depth[row - y_low, column - x_low]:
-                inverse_depth[row - y_low, column - x_low] = w
-                face_ids[row - y_low, column - x_low] = face
+        w = w_at_origin + column_first * w_du + row * w_dv
+        r = row - y_low
+        for c in range(column_first - x_low, column_last - x_low + 1):
+            if w > inverse_depth[r, c]:
+                inverse_depth[r, c] = w
+                face_ids[r, c] = face
             w += w_du
 
 

@@ -17,6 +17,7 @@ from arview.errors import InputError, MismatchError
 from arview.geometry import Array, exp_se3, invert, log_se3, orthonormalise, rigid
 from arview.guideviews import GuideView, GuideViewSet
 from arview.tracking.edge import add_edges, measure_edges
+from arview.tracking.quality import Evidence, edge_evidence, quality_of, region_evidence
 from arview.tracking.region import BINS, EDGE_FUNCTION, add_histograms, add_region, log_odds, measure_region
 from arview.tracking.solver import apply_twist, project_lines, solve_step
 
@@ -205,6 +206,39 @@ class Tracker:
                     )
                 cam_from_body = apply_twist(cam_from_body, solve_step(hessian, gradient, damping))
         return cam_from_body, hessian + np.tril(hessian, -1).T
+
+    def refine_fresh(
+        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...]
+    ) -> Array:
+        """Refine a pose of unknown worth: colours are learned at the start itself, nothing is remembered."""
+        kept = self.appearance
+        self.appearance = Appearance()
+        self.learn(image, cam_from_body, 1.0)
+        pose, _ = self.refine(image, gray, cam_from_body, stages)
+        self.appearance = kept
+        return pose
+
+    def evidence(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array) -> Evidence:
+        """What the picture says for a pose, with the colours learned so far."""
+        index = self.part.nearest(cam_from_body)
+        contour, normals, runs, edges, tangents = self.part.arrays(index)
+        step_mm = 0.01 * self.diameter_mm
+        pixels, normals_px, depths = project_lines(edges, tangents, True, cam_from_body, self._intrinsics, step_mm)
+        positions, strengths, seen = measure_edges(gray, pixels, normals_px, depths, 10, 1.0, self.options.edge_threshold)
+        kinds = self.part.views.view(index).features.edge_kinds
+        support, contour_support, sharpness, inside = edge_evidence(positions, strengths, seen, kinds, 10.0, 1.5)
+        region_support, region_information = -1.0, 0.0
+        if self.appearance.is_known:
+            pixels, normals_px, depths = project_lines(contour, normals, False, cam_from_body, self._intrinsics, step_mm)
+            mean, information, agreement = measure_region(
+                image, pixels, normals_px, depths, runs, self.camera.fx, self.appearance.odds, EDGE_FUNCTION, 2
+            )
+            region_support, region_information = region_evidence(mean, information, agreement, 2.0)
+        return Evidence(support, contour_support, sharpness, region_support, region_information, inside)
+
+    def judge(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array) -> float:
+        """Quality 0–1 of a pose from its evidence in this frame alone."""
+        return quality_of(self.evidence(image, gray, cam_from_body))
 
     def track(self, image: NDArray[np.uint8]) -> Array:
         """Pose of the next frame."""

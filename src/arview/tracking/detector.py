@@ -1,0 +1,242 @@
+"""Detector: finds the part in a single frame from its guide views, with no pose to start from.
+
+Candidates come from template matching over directions, rolls and distances of the declared range; the picture is
+resized for every distance so that the part always spans the same few pixels and one bank of templates serves all.
+The best candidates are refined by the tracker's edge modality and judged by the same evidence as a tracked pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.camera import Camera
+from arview.errors import InputError
+from arview.geometry import Array, exp_so3, rigid, rotation_angle_rad
+from arview.guideviews import GuideViewSet
+from arview.guideviews.mesh_edges import EDGE_CONTOUR
+from arview.guideviews.sphere import icosphere_directions
+from arview.tracking.matching import decimate, match_templates, orientation_bins, response_maps
+from arview.tracking.solver import project_lines
+from arview.tracking.tracker import Stage, Tracker, TrackerOptions
+
+COARSE_STAGES = (Stage(4, 12, 2.0, 8.0, 2), Stage(2, 10, 1.0, 4.0, 2), Stage(1, 8, 1.0, 2.5, 2))
+FINE_STAGES = (
+    Stage(4, 12, 1.5, 6.0, 2),
+    Stage(2, 10, 1.0, 4.0, 2),
+    Stage(1, 8, 1.0, 2.5, 2),
+    Stage(1, 6, 1.0, 1.5, 2),
+    Stage(1, 5, 1.0, 1.0, 2),
+)
+
+
+@dataclass(frozen=True)
+class DetectorOptions:
+    """Options of the detector.
+
+    Attributes:
+        radius_px: half the part's diameter in the resized picture.
+        points: per template.
+        roll_step_deg, distance_ratio: spacing of the templates; the spread of the responses covers half of it.
+        subdivisions: icosahedron level of the template directions (3: 642, about 9° apart).
+        refined: candidates that the tracker refines.
+        finalists: of those, how many are refined to the end.
+        min_quality: a weaker result is no detection.
+    """
+
+    radius_px: float = 26.0
+    points: int = 64
+    roll_step_deg: float = 12.0
+    distance_ratio: float = 1.16
+    subdivisions: int = 3
+    spread_px: int = 2
+    grid_px: int = 2
+    refined: int = 40
+    finalists: int = 6
+    min_quality: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 10 <= self.radius_px <= 60:
+            raise InputError(f"detector: radius_px = {self.radius_px}, expected 10 to 60")
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A place where the part was found: ``cam_from_model`` (4,4) mm, quality 0–1, template score 0–1."""
+
+    cam_from_model: Array
+    quality: float
+    score: float
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    score: float
+    cam_from_body: Array
+    place_px: Array
+    scale: float
+
+
+class Detector:
+    """Detection of one part with one camera over the declared range of its guide views."""
+
+    def __init__(self, views: GuideViewSet, camera: Camera, options: DetectorOptions | None = None) -> None:
+        self.options = options or DetectorOptions()
+        self.views = views
+        self.camera = camera
+        self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
+        self._make_templates()
+
+    def _make_templates(self) -> None:
+        o = self.options
+        wanted = icosphere_directions(o.subdivisions)
+        inside = self.views.view_range.contains_direction(wanted, 3.0)
+        if not inside.any():
+            chosen = np.arange(len(self.views))
+        else:
+            chosen = np.unique(np.argmax(wanted[inside] @ self.views.directions.T, axis=1))
+        rolls = np.deg2rad(self.views.view_range.rolls_deg(o.roll_step_deg))
+        focal = 1000.0
+        # Normalised camera: the bounding sphere has radius_px.
+        template_scale = o.radius_px / (0.5 * self.views.diameter_mm)
+        offsets = np.zeros((len(chosen) * len(rolls), o.points, 2), dtype=np.int32)
+        bins = np.zeros((len(chosen) * len(rolls), o.points), dtype=np.uint8)
+        counts = np.zeros(len(chosen) * len(rolls), dtype=np.int32)
+        origins = np.zeros((len(counts), 2))
+        rotations = np.zeros((len(counts), 3, 3))
+        intrinsics = np.array([focal, focal, 0.0, 0.0, 0, 0, 0, 0, 0, 0])
+        row = 0
+        for index in chosen:
+            view = self.views.view(int(index))
+            features = view.features
+            cam_from_body = view.cam_from_model @ self.tracker.part.model_from_body
+            contour, normals, _, edges, tangents = self.tracker.part.arrays(int(index))
+            distance = cam_from_body[2, 3]
+            c_px, c_n, c_z = project_lines(contour, normals, False, cam_from_body, intrinsics, 0.5)
+            inner = (features.edge_kinds & EDGE_CONTOUR) == 0
+            e_px, e_n, e_z = project_lines(edges[inner], tangents[inner], True, cam_from_body, intrinsics, 0.5)
+            c_px, c_n = c_px[c_z > 0], c_n[c_z > 0]
+            e_px, e_n = e_px[e_z > 0], e_n[e_z > 0]
+            inner_count = min(len(e_px), int(0.35 * o.points))
+            outer_count = min(len(c_px), o.points - inner_count)
+            if outer_count < 8:
+                continue
+            px = np.concatenate([c_px[_spread(len(c_px), outer_count)], e_px[_spread(len(e_px), inner_count)]])
+            n = np.concatenate([c_n[_spread(len(c_n), outer_count)], e_n[_spread(len(e_n), inner_count)]])
+            px *= distance / focal * template_scale
+            for roll in rolls:
+                c, s = np.cos(roll), np.sin(roll)
+                turn = np.array([[c, -s], [s, c]])
+                p, q = px @ turn.T, n @ turn.T
+                low = np.floor(p.min(axis=0))
+                origins[row] = -low
+                offsets[row, : len(p)] = np.round(p - low)
+                bins[row, : len(p)] = orientation_bins(q)
+                counts[row] = len(p)
+                rotations[row] = rigid(exp_so3([0, 0, roll]), np.zeros(3))[:3, :3] @ cam_from_body[:3, :3]
+                row += 1
+        if row == 0:
+            raise InputError("guide views: no view shows an outline; check the model and the declared distances")
+        self._offsets, self._bins, self._counts = offsets[:row], bins[:row], counts[:row]
+        self._origins, self._rotations = origins[:row], rotations[:row]
+
+    def detect(self, image: NDArray[np.uint8], max_results: int = 3) -> list[Detection]:
+        """Poses of the part in a frame, best first; an empty list when it is not found.
+
+        Args:
+            image: (H,W,3) uint8 RGB of the camera's size.
+            max_results: at most so many, all above the quality threshold and apart from each other.
+        """
+        o = self.options
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        candidates = self.candidates(image)
+        judged: list[tuple[float, _Candidate, Array]] = []
+        for candidate in candidates:
+            pose = self.tracker.refine_fresh(image, gray, candidate.cam_from_body, COARSE_STAGES)
+            judged.append((self.tracker.judge(image, gray, pose), candidate, pose))
+        judged.sort(key=lambda item: -item[0])
+        found: list[Detection] = []
+        finished: list[Array] = []
+        for _, candidate, start in judged:
+            if len(finished) >= o.finalists:
+                break
+            if any(self._same(start, other) for other in finished):
+                continue
+            pose = self.tracker.refine_fresh(image, gray, start, FINE_STAGES)
+            finished.append(pose)
+            quality = self.tracker.judge(image, gray, pose)
+            if quality >= o.min_quality and self._is_plausible(pose):
+                found.append(Detection(pose @ self.tracker.part.body_from_model, quality, candidate.score))
+        found.sort(key=lambda d: -d.quality)
+        return found[:max_results]
+
+    def _same(self, a: Array, b: Array) -> bool:
+        near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.05 * self.views.diameter_mm
+        return bool(near and rotation_angle_rad(a, b) < np.deg2rad(5.0))
+
+    def _is_plausible(self, cam_from_body: Array) -> bool:
+        """Within a margin of the declared distances and in front of the camera."""
+        low, high = self.views.view_range.distance_mm
+        distance = float(np.linalg.norm(cam_from_body[:3, 3]))
+        return bool(0.85 * low <= distance <= 1.18 * high and cam_from_body[2, 3] > 0)
+
+    def candidates(self, image: NDArray[np.uint8]) -> list[_Candidate]:
+        """The best template matches over the whole range, apart from each other, best first."""
+        o = self.options
+        camera = self.camera
+        focal = 0.5 * (camera.fx + camera.fy)
+        found: list[tuple[float, int, Array, float, float]] = []
+        for distance in self.views.view_range.distances_mm(o.distance_ratio):
+            scale = o.radius_px / (focal * 0.5 * self.views.diameter_mm / distance)
+            width, height = round(camera.width * scale), round(camera.height * scale)
+            if width < 24 or height < 24 or scale > 1.5:
+                continue
+            resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+            pad = round(0.6 * o.radius_px)
+            maps = response_maps(resized, o.spread_px, pad)
+            scores, places = match_templates(decimate(maps, o.grid_px), self._offsets, self._bins, self._counts, 3)
+            for t, n in zip(*np.nonzero(scores > 0.25), strict=True):
+                center = places[t, n] + self._origins[t] - pad
+                center_px = (center + 0.5) * [camera.width / width, camera.height / height] - 0.5
+                found.append((float(scores[t, n]), int(t), center_px, float(distance), scale))
+        found.sort(key=lambda item: -item[0])
+        kept: list[_Candidate] = []
+        for score, t, center_px, distance, scale in found[:4000]:
+            reach = 6.0 / scale
+            rotation = self._rotations[t]
+            clash = False
+            for other in kept:
+                if (
+                    abs(other.place_px[0] - center_px[0]) < reach
+                    and abs(other.place_px[1] - center_px[1]) < reach
+                    and abs(np.log(other.scale / scale)) < 0.2
+                    and np.trace(other.cam_from_body[:3, :3].T @ self._aligned(rotation, center_px)) > 1 + 2 * np.cos(0.3)
+                ):
+                    clash = True
+                    break
+            if clash:
+                continue
+            ray = camera.unproject(center_px)
+            ray /= np.linalg.norm(ray)
+            pose = rigid(self._aligned(rotation, center_px), ray * distance)
+            kept.append(_Candidate(score, pose, center_px, scale))
+            if len(kept) >= o.refined:
+                break
+        return kept
+
+    def _aligned(self, rotation: Array, center_px: Array) -> Array:
+        """Rotation of a view seen off the optical axis: turned with the ray."""
+        ray = self.camera.unproject(center_px)
+        ray /= np.linalg.norm(ray)
+        axis = np.cross([0.0, 0.0, 1.0], ray)
+        sine = np.linalg.norm(axis)
+        if sine < 1e-9:
+            return rotation
+        return exp_so3(axis / sine * np.arctan2(sine, ray[2])) @ rotation
+
+
+def _spread(available: int, wanted: int) -> NDArray[np.intp]:
+    return np.floor((np.arange(wanted) + 0.5) * available / max(wanted, 1)).astype(np.intp)

@@ -1,0 +1,128 @@
+"""Oriented-gradient template matching: the kernels behind the detector.
+
+The picture becomes a response map for each of eight edge orientations, spread so that small errors of the template
+do not matter; a template is a short list of (dx, dy, orientation) and its score at a place is the mean response
+under its points: Hinterstoisser et al., "Gradient Response Maps for Real-Time Detection of Textureless Objects"
+(PAMI 2012). Own here: responses are normalised by the local contrast and cleared of what all orientations share, so
+that texture and clutter, which answer to everything, do not win.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.geometry import Array
+
+ORIENTATIONS = 8
+"""Bins over 180°."""
+
+
+def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int) -> NDArray[np.uint8]:
+    """(8, H + 2 pad, W + 2 pad) uint8 responses of an RGB or gray picture, 255 = a clear edge of that orientation."""
+    smooth = cv2.GaussianBlur(image, (3, 3), 0)
+    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3)
+    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)
+    if image.ndim == 3:
+        # Per pixel the channel with the strongest gradient (Dalal & Triggs 2005).
+        strongest = np.argmax(gx * gx + gy * gy, axis=2)[..., None]
+        gx = np.take_along_axis(gx, strongest, axis=2)[..., 0]
+        gy = np.take_along_axis(gy, strongest, axis=2)[..., 0]
+    magnitude = cv2.magnitude(gx, gy) * 0.25
+    around = cv2.boxFilter(magnitude, -1, (21, 21), borderType=cv2.BORDER_REFLECT)
+    strength = magnitude / (magnitude + around + 3.0)
+    # Thin: only pixels that are a maximum of their neighbourhood in some direction say where the edge is.
+    strength[magnitude < 0.6 * cv2.dilate(magnitude, np.ones((3, 3), np.uint8))] = 0.0
+    position = np.arctan2(gy, gx) / np.pi * ORIENTATIONS
+    low = np.floor(position)
+    share = position - low
+    low_bin = low.astype(np.intp) % ORIENTATIONS
+    high_bin = (low_bin + 1) % ORIENTATIONS
+    size = (2 * spread_px + 1, 2 * spread_px + 1)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size)
+    spread = np.empty((ORIENTATIONS, *magnitude.shape), dtype=np.float32)
+    for o in range(ORIENTATIONS):
+        own = np.where(low_bin == o, strength * np.minimum(1.0, 2.0 * (1.0 - share)), 0.0)
+        own += np.where(high_bin == o, strength * np.minimum(1.0, 2.0 * share), 0.0)
+        spread[o] = cv2.dilate(own.astype(np.float32), kernel)
+    common = spread.mean(axis=0)
+    spread = np.clip((spread - common) * 1.6, 0.0, 1.0)
+    padding = ((0, 0), (pad_px, pad_px), (pad_px, pad_px))
+    return np.pad((spread * 255.0).astype(np.uint8), padding)
+
+
+def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
+    """(8, step, step, ceil(H/step), ceil(W/step)): every phase of the maps apart, so that a coarse grid is contiguous."""
+    count, height, width = maps.shape
+    rows, columns = -(-height // step), -(-width // step)
+    padded = np.zeros((count, rows * step, columns * step), dtype=np.uint8)
+    padded[:, :height, :width] = maps
+    return np.ascontiguousarray(
+        padded.reshape(count, rows, step, columns, step).transpose(0, 2, 4, 1, 3)
+    )
+
+
+@njit(cache=True, nogil=True)
+def match_templates(phases, offsets, bins, counts, top):  # type: ignore[no-untyped-def]
+    """Best places of each template on a grid of ``step`` px.
+
+    Args:
+        phases: from `decimate`.
+        offsets: (T,N,2) int dx, dy of the points, shifted to be ≥ 0; bins: (T,N) orientation; counts: (T,).
+        top: places kept per template, at least about a template's core apart.
+
+    Returns:
+        scores (T,top) 0–1 and places (T,top,2) of the shifted template's origin, in full pixels.
+    """
+    step = phases.shape[1]
+    rows, columns = phases.shape[3], phases.shape[4]
+    templates = offsets.shape[0]
+    scores = np.zeros((templates, top))
+    places = np.zeros((templates, top, 2), dtype=np.int32)
+    total = np.empty(rows * columns, dtype=np.uint16)
+    flat = phases.reshape((phases.shape[0], step, step, rows * columns))
+    for t in range(templates):
+        reach_x = 0
+        reach_y = 0
+        for i in range(counts[t]):
+            reach_x = max(reach_x, offsets[t, i, 0])
+            reach_y = max(reach_y, offsets[t, i, 1])
+        last_row = rows - reach_y // step - 1
+        last_column = columns - reach_x // step - 1
+        if last_row < 1 or last_column < 1:
+            continue
+        span = (last_row - 1) * columns + last_column
+        total[:] = 0
+        for i in range(counts[t]):
+            dx, dy = offsets[t, i, 0], offsets[t, i, 1]
+            source = flat[bins[t, i], dy % step, dx % step]
+            shift = (dy // step) * columns + dx // step
+            for k in range(span):
+                total[k] += source[k + shift]
+        for n in range(top):
+            best = 0
+            where = -1
+            for row in range(last_row):
+                for column in range(last_column):
+                    value = total[row * columns + column]
+                    if value > best:
+                        best = value
+                        where = row * columns + column
+            if where < 0:
+                break
+            row, column = where // columns, where % columns
+            scores[t, n] = best / (255.0 * counts[t])
+            places[t, n, 0] = column * step
+            places[t, n, 1] = row * step
+            for y in range(max(0, row - 4), min(last_row, row + 5)):
+                for x in range(max(0, column - 4), min(last_column, column + 5)):
+                    total[y * columns + x] = 0
+    return scores, places
+
+
+def orientation_bins(normals_px: Array) -> NDArray[np.uint8]:
+    """Orientation bin (N,) of image normals (N,2); the gradient of an edge runs along its normal."""
+    position = np.arctan2(normals_px[:, 1], normals_px[:, 0]) / np.pi * ORIENTATIONS
+    return (np.round(position).astype(np.intp) % ORIENTATIONS).astype(np.uint8)

@@ -1,0 +1,110 @@
+"""How well a pose is borne out by the picture: the evidence that separates right poses from wrong ones.
+
+Every CAD edge point is asked whether a step lies where the edge should be, against how often a step would lie there
+by chance (the density of steps along the same profile); every contour line whether the colours change there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from arview.guideviews.mesh_edges import EDGE_CONTOUR
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence for a pose.
+
+    Attributes:
+        edge_support: 0–1, edge points borne out beyond chance.
+        contour_support: the same for the outline alone.
+        sharpness: 0–1, how much stronger the steps are on the outline than beside it.
+        region_support: 0–1, contour lines whose colours change at the contour, by information; -1 if none says.
+        region_information: mean information of a line, 1/px².
+        points_in_picture: share of the outline inside the picture.
+    """
+
+    edge_support: float
+    contour_support: float
+    sharpness: float
+    region_support: float
+    region_information: float
+    points_in_picture: float
+
+
+@njit(cache=True, nogil=True)
+def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  # type: ignore[no-untyped-def]
+    """Support of all points, of outline points, sharpness, and share in the picture, see Evidence."""
+    hits = np.zeros(2)
+    chances = np.zeros(2)
+    counts = np.zeros(2)
+    sharp = 0.0
+    outline = 0.0
+    for i in range(positions.shape[0]):
+        is_contour = (kinds[i] & EDGE_CONTOUR) > 0
+        if is_contour:
+            outline += 1.0
+        if not seen[i]:
+            continue
+        steps = 0
+        best_near = 0.0
+        best_all = 0.0
+        for j in range(positions.shape[1]):
+            s = abs(strengths[i, j])
+            if s == 0.0:
+                break
+            if abs(positions[i, j]) > reach_px:
+                continue
+            steps += 1
+            best_all = max(best_all, s)
+            if abs(positions[i, j]) <= tolerance_px:
+                best_near = max(best_near, s)
+        chance = 1.0 - (1.0 - tolerance_px / reach_px) ** steps
+        for group in range(2):
+            if group == 1 and not is_contour:
+                continue
+            counts[group] += 1.0
+            chances[group] += chance
+            if best_near > 0.0:
+                hits[group] += 1.0
+        if is_contour and best_all > 0.0:
+            sharp += best_near / best_all
+    support = np.zeros(2)
+    for group in range(2):
+        if counts[group] > 0:
+            hit = hits[group] / counts[group]
+            chance = chances[group] / counts[group]
+            support[group] = max(0.0, (hit - chance) / (1.0 - chance + 1e-3))
+    inside = counts[1] / outline if outline > 0 else 0.0
+    return support[0], support[1], sharp / max(counts[1], 1.0), inside
+
+
+@njit(cache=True, nogil=True)
+def region_evidence(mean, information, agreement, tolerance_px):  # type: ignore[no-untyped-def]
+    """Support by information and mean information of the lines looked at; support -1 when there are none."""
+    total = 0.0
+    near = 0.0
+    lines = 0
+    for i in range(mean.shape[0]):
+        if agreement[i] < 0.0:
+            continue
+        lines += 1
+        total += information[i]
+        near += information[i] * np.exp(-0.5 * (mean[i] / tolerance_px) ** 2)
+    if lines < 8:
+        return -1.0, 0.0
+    return (near / total if total > 0 else 0.0), total / lines
+
+
+def quality_of(evidence: Evidence) -> float:
+    """Quality 0–1: about 0.5 where right and wrong poses part on the recorded sequences.
+
+    The outline counts most: inner edges may be faint, and texture answers to everything.
+    """
+    if evidence.points_in_picture <= 0.05:
+        return 0.0
+    worth = 0.5 * evidence.contour_support + 0.35 * evidence.sharpness + 0.15 * evidence.edge_support
+    return float(1.0 / (1.0 + np.exp(-(worth - 0.46) * 16.0)))
