@@ -20,12 +20,29 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR
 from arview.guideviews.sphere import icosphere_directions
 from arview.tracking.matching import decimate, match_templates, orientation_bins, response_maps
+from arview.tracking.quality import quality_of
 from arview.tracking.solver import project_lines
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions
 
-COARSE_STAGES = (Stage(4, 12, 2.0, 8.0, 2), Stage(2, 10, 1.0, 4.0, 2), Stage(1, 8, 1.0, 2.5, 2))
+
+
+def _coarse_stages(region_gain: float) -> tuple[Stage, ...]:
+    return (
+        Stage(6, 12, 2.0, 10.0, 2, region_gain),
+        Stage(4, 12, 2.0, 7.0, 2, region_gain),
+        Stage(4, 12, 1.5, 5.0, 2, region_gain),
+        Stage(3, 10, 1.0, 3.5, 2, region_gain),
+    )
+
+
+COARSE_STAGES = (_coarse_stages(1.0), _coarse_stages(20.0))
+"""Two tries from every start: edges lead on printed and grey parts, colours on plain and glossy ones."""
+SURE_WORTH = 0.8
+"""A pose worth this much is not searched around any more."""
+COARSE_TOLERANCE_PX = 3.5
+"""After the coarse stages edges are looked for this near."""
 FINE_STAGES = (
-    Stage(4, 12, 1.5, 6.0, 2),
+    Stage(2, 12, 1.5, 5.0, 2),
     Stage(2, 10, 1.0, 4.0, 2),
     Stage(1, 8, 1.0, 2.5, 2),
     Stage(1, 6, 1.0, 1.5, 2),
@@ -54,7 +71,7 @@ class DetectorOptions:
     subdivisions: int = 3
     spread_px: int = 2
     grid_px: int = 2
-    refined: int = 40
+    refined: int = 24
     finalists: int = 6
     min_quality: float = 0.5
 
@@ -65,11 +82,10 @@ class DetectorOptions:
 
 @dataclass(frozen=True)
 class Detection:
-    """A place where the part was found: ``cam_from_model`` (4,4) mm, quality 0–1, template score 0–1."""
+    """A place where the part was found: ``cam_from_model`` (4,4) mm, quality 0–1."""
 
     cam_from_model: Array
     quality: float
-    score: float
 
 
 @dataclass(frozen=True)
@@ -152,26 +168,60 @@ class Detector:
         """
         o = self.options
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        candidates = self.candidates(image)
-        judged: list[tuple[float, _Candidate, Array]] = []
-        for candidate in candidates:
-            pose = self.tracker.refine_fresh(image, gray, candidate.cam_from_body, COARSE_STAGES)
-            judged.append((self.tracker.judge(image, gray, pose), candidate, pose))
-        judged.sort(key=lambda item: -item[0])
-        found: list[Detection] = []
-        finished: list[Array] = []
-        for _, candidate, start in judged:
-            if len(finished) >= o.finalists:
-                break
-            if any(self._same(start, other) for other in finished):
-                continue
-            pose = self.tracker.refine_fresh(image, gray, start, FINE_STAGES)
-            finished.append(pose)
-            quality = self.tracker.judge(image, gray, pose)
-            if quality >= o.min_quality and self._is_plausible(pose):
-                found.append(Detection(pose @ self.tracker.part.body_from_model, quality, candidate.score))
-        found.sort(key=lambda d: -d.quality)
+        starts = [candidate.cam_from_body for candidate in self.candidates(image)]
+        settled = self._settle(image, gray, starts)
+        found = [
+            Detection(pose @ self.tracker.part.body_from_model, quality)
+            for quality, pose in settled
+            if quality >= o.min_quality and self._is_plausible(pose)
+        ]
         return found[:max_results]
+
+    def snap(self, image: NDArray[np.uint8], cam_from_model: Array) -> Detection:
+        """The best pose near a given one, up to about 15° and 5 % of distance away.
+
+        Its quality says whether it is right; it is returned even when that is low.
+        """
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        start = cam_from_model @ self.tracker.part.model_from_body
+        settled = self._settle(image, gray, [start, *_around(start, 0.15)])
+        quality, pose = settled[0]
+        return Detection(pose @ self.tracker.part.body_from_model, quality)
+
+    def _settle(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Array]) -> list[tuple[float, Array]]:
+        """Refine starts, keep the best, search around them; (quality, cam_from_body) best first."""
+        o = self.options
+        coarse: list[tuple[float, Array]] = []
+        for start in starts:
+            for stages in COARSE_STAGES:
+                pose = self.tracker.refine_fresh(image, gray, start, stages)
+                coarse.append((self.tracker.evidence(image, gray, pose, COARSE_TOLERANCE_PX).worth, pose))
+        coarse.sort(key=lambda item: -item[0])
+        finished: list[tuple[float, Array]] = []
+        tried: list[Array] = []
+        for _, start in coarse:
+            if len(tried) >= o.finalists:
+                break
+            if any(self._same(start, other) for other in tried):
+                continue
+            tried.append(start)
+            finished.append(self._finish(image, gray, start))
+        finished.sort(key=lambda item: -item[0])
+        for spread_rad in (0.10, 0.05):
+            if not finished or finished[0][0] >= SURE_WORTH:
+                break
+            for start in _around(finished[0][1], spread_rad):
+                finished.append(self._finish(image, gray, start))
+            finished.sort(key=lambda item: -item[0])
+        result: list[tuple[float, Array]] = []
+        for _, pose in finished:
+            if not any(self._same(pose, other) for _, other in result):
+                result.append((quality_of(self.tracker.evidence(image, gray, pose)), pose))
+        return result
+
+    def _finish(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], start: Array) -> tuple[float, Array]:
+        pose = self.tracker.refine_fresh(image, gray, start, FINE_STAGES)
+        return self.tracker.evidence(image, gray, pose).worth, pose
 
     def _same(self, a: Array, b: Array) -> bool:
         near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.05 * self.views.diameter_mm
@@ -236,6 +286,18 @@ class Detector:
         if sine < 1e-9:
             return rotation
         return exp_so3(axis / sine * np.arctan2(sine, ray[2])) @ rotation
+
+
+def _around(cam_from_body: Array, angle_rad: float) -> list[Array]:
+    """Poses turned by an angle about 14 axes through the part's centre: the coordinate axes and the diagonals."""
+    axes = [np.array(a, dtype=np.float64) for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    axes += [np.array([1.0, b, c]) for b in (-1, 1) for c in (-1, 1)]
+    turned = []
+    for axis in axes:
+        for sign in (-1.0, 1.0):
+            turn = exp_so3(axis / np.linalg.norm(axis) * sign * angle_rad)
+            turned.append(rigid(turn @ cam_from_body[:3, :3], cam_from_body[:3, 3]))
+    return turned
 
 
 def _spread(available: int, wanted: int) -> NDArray[np.intp]:

@@ -34,6 +34,11 @@ class Evidence:
     region_information: float
     points_in_picture: float
 
+    @property
+    def worth(self) -> float:
+        """0–1, for ranking poses of one picture: outline and inner edges alike."""
+        return 0.3 * self.contour_support + 0.2 * self.sharpness + 0.5 * self.edge_support
+
 
 @njit(cache=True, nogil=True)
 def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  # type: ignore[no-untyped-def]

@@ -6,7 +6,7 @@ with a damping towards the prediction, and updates the pose; scales shrink from 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -31,6 +31,18 @@ class Stage:
     edge_step_px: float
     edge_spread_px: float
     updates: int = 2
+    region_gain: float = 1.0
+
+    def widened(self, factor: float) -> Stage:
+        """The same stage for a part that is larger in the picture; fine stages stay fine."""
+        if self.region_scale <= 1 or factor == 1.0:
+            return self
+        return replace(
+            self,
+            region_scale=round(self.region_scale * factor),
+            edge_step_px=self.edge_step_px * factor,
+            edge_spread_px=self.edge_spread_px * factor,
+        )
 
 
 TRACK_STAGES = (
@@ -198,7 +210,7 @@ class Tracker:
                 hessian[:] = 0.0
                 gradient = np.zeros(6)
                 if o.use_region and self.appearance.is_known:
-                    add_region(hessian, gradient, contour, cam_from_body, self._intrinsics, c_px, c_n, mean, information, o.region_weight, 3.0 * stage.region_scale)
+                    add_region(hessian, gradient, contour, cam_from_body, self._intrinsics, c_px, c_n, mean, information, o.region_weight * stage.region_gain, 3.0 * stage.region_scale)
                 if o.use_edge:
                     add_edges(
                         hessian, gradient, edges, cam_from_body, self._intrinsics, e_px, e_n, positions, strengths,
@@ -212,21 +224,27 @@ class Tracker:
     ) -> Array:
         """Refine a pose of unknown worth: colours are learned at the start itself, nothing is remembered."""
         kept = self.appearance
-        self.appearance = Appearance()
-        self.learn(image, cam_from_body, 1.0)
-        pose, _ = self.refine(image, gray, cam_from_body, stages)
+        unit = max(1.0, self.radius_px(cam_from_body) / 80.0)
+        for stage in stages:
+            self.appearance = Appearance()
+            self.learn(image, cam_from_body, 1.0)
+            cam_from_body, _ = self.refine(image, gray, cam_from_body, (stage.widened(unit),))
         self.appearance = kept
-        return pose
+        return cam_from_body
 
-    def evidence(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array) -> Evidence:
-        """What the picture says for a pose, with the colours learned so far."""
+    def radius_px(self, cam_from_body: Array) -> float:
+        """Half the part's diameter in the picture."""
+        return 0.5 * self.diameter_mm * self.camera.fx / max(float(cam_from_body[2, 3]), 1.0)
+
+    def evidence(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, tolerance_px: float = 1.5) -> Evidence:
+        """What the picture says for a pose, with the colours learned so far; steps count within a tolerance."""
         index = self.part.nearest(cam_from_body)
         contour, normals, runs, edges, tangents = self.part.arrays(index)
         step_mm = 0.01 * self.diameter_mm
         pixels, normals_px, depths = project_lines(edges, tangents, True, cam_from_body, self._intrinsics, step_mm)
         positions, strengths, seen = measure_edges(gray, pixels, normals_px, depths, 10, 1.0, self.options.edge_threshold)
         kinds = self.part.views.view(index).features.edge_kinds
-        support, contour_support, sharpness, inside = edge_evidence(positions, strengths, seen, kinds, 10.0, 1.5)
+        support, contour_support, sharpness, inside = edge_evidence(positions, strengths, seen, kinds, 10.0, tolerance_px)
         region_support, region_information = -1.0, 0.0
         if self.appearance.is_known:
             pixels, normals_px, depths = project_lines(contour, normals, False, cam_from_body, self._intrinsics, step_mm)
