@@ -3,6 +3,7 @@
 from arview.evaluation.bop import Scene, SceneFrame, find_scenes, load_scene
 from arview.evaluation.metrics import PoseError, PoseMeter
 from arview.evaluation.ranges import covering_range, viewpoint
+from arview.evaluation.report import format_result
 from arview.evaluation.run import (
     FrameResult,
     SceneResult,
@@ -25,6 +26,7 @@ __all__ = [
     "covering_range",
     "evaluate_scene",
     "find_scenes",
+    "format_result",
     "load_scene",
     "scene_guide_views",
     "summarise",

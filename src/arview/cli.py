@@ -1,0 +1,514 @@
+"""The command line: parse, call one function, print. Everything heavy is imported inside the commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import click
+
+from arview import __version__
+from arview.errors import ArviewError, InputError, OutputError
+
+if TYPE_CHECKING:
+    from arview.camera import Camera
+    from arview.geometry import Array
+    from arview.pipeline import AnnotateSummary
+    from arview.tracking import SessionOptions
+    from arview.video import FrameSource
+
+EXIT_ERROR, EXIT_BUG, EXIT_INTERRUPTED = 2, 1, 130
+MODALITIES = ("region", "edge", "feature")
+Progress = Callable[[int, int], None]
+
+
+class _Group(click.Group):
+    """Turns exceptions of the commands into one line on stderr and an exit code."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the chosen command."""
+        try:
+            return super().invoke(ctx)
+        except ArviewError as error:
+            _say(f"error: {error}")
+            ctx.exit(EXIT_ERROR)
+        except KeyboardInterrupt:
+            _say("interrupted")
+            ctx.exit(EXIT_INTERRUPTED)
+        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
+            raise
+        except Exception as error:
+            if os.environ.get("ARVIEW_DEBUG"):
+                traceback.print_exc()
+            hint = "" if os.environ.get("ARVIEW_DEBUG") else " with what ARVIEW_DEBUG=1 prints"
+            _say(f"internal error: {type(error).__name__}: {error}; please report this{hint}")
+            ctx.exit(EXIT_BUG)
+
+
+class _CheckCommand(click.Command):
+    """Its help ends with a complete part file."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples, then the part file."""
+        from arview.cad import PART_FILE_EXAMPLE
+
+        super().format_epilog(ctx, formatter)
+        formatter.write("\n" + PART_FILE_EXAMPLE)
+
+
+def _say(text: str) -> None:
+    """One line on stderr, whatever the text holds."""
+    click.echo("arview: " + " ".join(text.split()), err=True)
+
+
+@click.group(
+    cls=_Group,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="""\b
+Examples:
+  arview check bracket.step
+  arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json
+  arview evaluate bop/castle --init truth
+
+\b
+PART is a part file (part.toml; `arview check --help` shows one) or a CAD file (STEP, glTF, OBJ, STL,
+PLY, 3MF). Exit codes: 0 done, 2 bad input, 130 interrupted (files are finished), 1 a bug in arview.""",
+)
+@click.version_option(__version__, prog_name="arview")
+def main() -> None:
+    """AR inspection of assemblies: find and track a part in video by its CAD, draw what was measured."""
+
+
+UNIT = click.option(
+    "--unit", type=click.Choice(["mm", "cm", "m", "inch"]), help="Unit of the numbers in the CAD file."
+)
+RENDERER = click.option(
+    "--renderer",
+    type=click.Choice(["auto", "pyrender", "zbuffer"]),
+    default="auto",
+    show_default=True,
+    help="What draws guide views: pyrender needs a GL library, zbuffer nothing.",
+)
+
+
+def _parse_modalities(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in value.split(",") if name.strip())
+    unknown = [name for name in names if name not in MODALITIES]
+    if unknown or not names:
+        raise click.BadParameter(f"{value!r}: expected some of {','.join(MODALITIES)}")
+    return names
+
+
+MODALITY = click.option(
+    "--modalities",
+    callback=_parse_modalities,
+    default=",".join(MODALITIES),
+    show_default=True,
+    metavar="LIST",
+    help="What the tracker measures with, separated by commas.",
+)
+
+
+# --- check ----------------------------------------------------------------------------------------------
+
+
+@main.command(
+    cls=_CheckCommand,
+    short_help="Print what is in a part, and what will be hard.",
+    epilog="""\b
+Examples:
+  arview check part.toml
+  arview check housing.stl --unit mm --camera fov:65
+
+A part file is a TOML file like this one:""",
+)
+@click.argument("part")
+@UNIT
+@click.option(
+    "--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG, for sizes in pixels."
+)
+def check(part: str, unit: str | None, camera_spec: str | None) -> None:
+    """Print what is in PART, and what will be hard about finding and tracking it.
+
+    Symmetric or ambiguous shapes, components too small to be seen from the declared distance, thin or open
+    geometry. Findings are not errors: the exit code is 0.
+    """
+    from arview.cad import check_part, load_part
+    from arview.camera_files import load_camera
+
+    loaded = load_part(part, unit)
+    camera = None
+    if camera_spec is not None:
+        size = (1280, 720) if camera_spec.startswith("fov:") else (None, None)
+        camera = load_camera(camera_spec, *size)
+    click.echo(check_part(loaded, camera).format())
+
+
+# --- guideviews -----------------------------------------------------------------------------------------
+
+
+@main.command(
+    short_help="Render the guide views of a part into a file.",
+    epilog="""\b
+Examples:
+  arview guideviews part.toml -o bracket.guideviews
+  arview guideviews part.toml -o post.guideviews --component post_1""",
+)
+@click.argument("part")
+@click.option("-o", "--output", required=True, metavar="SET", help="File to write.")
+@click.option("--component", metavar="NAME", help="Views of this component alone.")
+@UNIT
+@RENDERER
+def guideviews(part: str, output: str, component: str | None, unit: str | None, renderer: str) -> None:
+    """Render the guide views of PART over its declared range of viewpoints, and store them in a file.
+
+    `annotate` makes (and keeps) guide views by itself; a file saves that step on another machine.
+    """
+    from arview.cad import load_part
+    from arview.guideviews import GuideViewOptions, make_guide_views
+
+    loaded = load_part(part, unit)
+    path = _output_path(output, [loaded.path, loaded.cad_path])
+    model = loaded.model.only([component]) if component else loaded.model
+    began = time.perf_counter()
+    with _progress("guide views") as progress:
+        views = make_guide_views(
+            model, loaded.effective_view_range, GuideViewOptions(renderer=renderer), progress
+        )
+    views.save(path)
+    seconds = time.perf_counter() - began
+    size_mb = path.stat().st_size / 1e6
+    click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB")
+
+
+# --- annotate -------------------------------------------------------------------------------------------
+
+
+def _parse_moment(ctx: click.Context, parameter: click.Parameter, value: str | None) -> int | float | None:
+    """A frame number as int, ``2.5s`` as float seconds."""
+    if value is None:
+        return None
+    try:
+        moment: int | float = float(value[:-1]) if value.endswith("s") else int(value)
+    except ValueError:
+        moment = -1
+    if not 0 <= moment < float("inf"):
+        raise click.BadParameter(f"{value!r}: expected a frame number like 75, or seconds like 2.5s")
+    return moment
+
+
+@main.command(
+    short_help="Track a part in a video and draw on it.",
+    epilog="""\b
+Examples:
+  arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json -o out.mp4
+  arview annotate clip.mov --part housing.step --camera fov:65 --poses poses.jsonl
+  arview annotate "shots/*.jpg" --part part.toml --camera exif --start 10 --end 200
+  arview annotate rtsp://camera.local/1 --part part.toml --camera camera.json -o live.mp4
+
+\b
+CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt), fov:DEG
+(field of view along the longer side), or exif. Each line of a poses file is a JSON object: index, time_s,
+state, quality, cam_from_model (4x4 row-major, mm), covariance (6x6), ms.
+Ctrl-C ends the run and finishes the files.""",
+)
+@click.argument("source")
+@click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
+@click.option(
+    "--guideviews", "views_path", metavar="SET", help="Guide views; without it they are made and kept."
+)
+@click.option(
+    "--camera", "camera_spec", metavar="CAMERA", help="See below; without it the camera is guessed."
+)
+@click.option(
+    "--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are drawn."
+)
+@click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
+@click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
+@click.option("--init", "init_path", metavar="POSE.json", help='{"cam_from_model": 4x4} of the first frame.')
+@click.option(
+    "--start", callback=_parse_moment, metavar="S", help="First frame: number, or seconds like 2.5s."
+)
+@click.option("--end", callback=_parse_moment, metavar="S", help="Where to stop: number, or seconds like 8s.")
+@click.option("--stride", type=click.IntRange(min=1), default=1, help="Take every N-th frame.", metavar="N")
+@click.option(
+    "--fps", type=float, default=30.0, show_default=True, help="Rate of a folder or glob of pictures."
+)
+@click.option(
+    "--show-edges", type=click.Choice(["none", "visible", "all"]), default="visible", show_default=True
+)
+@click.option("--no-ghost", is_flag=True, help="Leave out the translucent components.")
+@click.option("--no-labels", is_flag=True, help="Leave out the labels.")
+@click.option("--opacity", type=click.FloatRange(0.0, 1.0), help="Of the translucent components, 0 to 1.")
+@MODALITY
+@RENDERER
+@UNIT
+@click.pass_context
+def annotate(
+    ctx: click.Context,
+    source: str,
+    part_path: str,
+    views_path: str | None,
+    camera_spec: str | None,
+    inspection_path: str | None,
+    output: str | None,
+    poses_path: str | None,
+    init_path: str | None,
+    start: int | float | None,
+    end: int | float | None,
+    stride: int,
+    fps: float,
+    show_edges: str,
+    no_ghost: bool,
+    no_labels: bool,
+    opacity: float | None,
+    modalities: tuple[str, ...],
+    renderer: str,
+    unit: str | None,
+) -> None:
+    """Find and track the part in SOURCE, and write the annotated video and/or the poses.
+
+    SOURCE is a video file, a picture, a folder or glob of pictures, a camera number or an RTSP/HTTP address.
+    """
+    from arview import pipeline
+    from arview.cad import load_part
+    from arview.guideview_cache import cached_guide_views
+    from arview.guideviews import GuideViewOptions, load_guide_views
+    from arview.inspection import load_inspection
+    from arview.overlay import OverlayOptions, OverlayRenderer
+    from arview.overlay.options import EdgeMode
+    from arview.tracking import TrackingSession
+    from arview.video import VideoSink, open_source
+
+    if output is None and poses_path is None:
+        output = _default_output(source)
+        _say(f"no -o or --poses given: writing {output}")
+    part = load_part(part_path, unit)
+    first_pose = _load_pose(init_path) if init_path else None
+    inspection = load_inspection(inspection_path, part.model) if inspection_path else None
+    inputs = [source, part.path, part.cad_path, views_path, camera_spec, inspection_path, init_path]
+    video_path = _output_path(output, inputs) if output else None
+    poses_file = _output_path(poses_path, [*inputs, output]) if poses_path else None
+    first = start if isinstance(start, int) else None
+    last = end if isinstance(end, int) else None
+    with open_source(source, first, last, stride, fps) as frames:
+        camera = _camera_for(frames, camera_spec, source)
+        if views_path:
+            views = load_guide_views(Path(views_path), part.model)
+        else:
+            with _progress("guide views") as progress:
+                views = cached_guide_views(
+                    part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress
+                )
+        session = TrackingSession(
+            views, part.model, camera, _session_options(modalities), initial_cam_from_model=first_pose
+        )
+        overlay = sink = None
+        if video_path is not None:
+            looks = OverlayOptions(
+                show_ghost=not no_ghost,
+                show_labels=not no_labels,
+                show_edges=cast(EdgeMode, show_edges),
+                opacity=OverlayOptions.opacity if opacity is None else opacity,
+            )
+            overlay = OverlayRenderer(part.model, camera, inspection, looks)
+            sink = VideoSink(video_path, frames.width, frames.height, frames.fps, frames)
+        with _progress("frames", frames.frame_count) as progress:
+            summary = pipeline.annotate(
+                frames,
+                session,
+                overlay,
+                sink,
+                poses_file,
+                lambda done, pose: progress(done, frames.frame_count or 0),
+                start if isinstance(start, float) else None,
+                end if isinstance(end, float) else None,
+            )
+    if sink is not None and sink.audio_note:
+        _say(f"warning: {sink.audio_note}")
+    _print_annotated(summary, [path for path in (video_path, poses_file) if path is not None])
+    if summary.is_interrupted:
+        _say("interrupted")
+        ctx.exit(EXIT_INTERRUPTED)
+
+
+def _print_annotated(summary: AnnotateSummary, written: list[Path]) -> None:
+    if summary.ended_reason:
+        _say(f"warning: {summary.ended_reason}")
+    if summary.frames == 0:
+        click.echo("no frame was processed; nothing is written")
+        return
+    for path in written:
+        click.echo(f"wrote {path}")
+    states = ", ".join(f"{count} {state}" for state, count in sorted(summary.states.items()))
+    skipped = f", {summary.skipped} broken frames skipped" if summary.skipped else ""
+    tracking_ms = sorted(summary.ms)[len(summary.ms) // 2]
+    click.echo(
+        f"{summary.frames} frames in {summary.seconds:.1f} s ({summary.fps:.1f} fps end to end, tracking "
+        f"{tracking_ms:.1f} ms a frame): {states}{skipped}"
+    )
+
+
+# --- evaluate -------------------------------------------------------------------------------------------
+
+
+@main.command(
+    short_help="Measure the tracker on BOP scenes.",
+    epilog="""\b
+Examples:
+  arview evaluate bop/castle --init truth
+  arview evaluate bop/castle/test/000001 --init detect --modalities region,edge --json castle.json
+  arview evaluate lm/test/000001 --part duck.toml
+
+Translation errors are those of the middle of the part's bounding box. Without a view range in a part file,
+the range is what covers the scene's poses with a margin of 20 %.""",
+)
+@click.argument("scenes", nargs=-1, required=True, metavar="SCENE...")
+@click.option("--init", type=click.Choice(["truth", "detect"]), default="truth", show_default=True,
+              help="Start from the first reference pose, or find the part.")  # fmt: skip
+@click.option("--json", "json_path", metavar="OUT", help="Write the errors of every frame and the summary.")
+@click.option("--per-frame", is_flag=True, help="Print a line for every frame.")
+@click.option("--part", "part_path", metavar="PART", help="Part or CAD file; default: the dataset's model.")
+@click.option("--reference", metavar="FILE", help="Poses for frames without truth; default: peer_visp.json.")
+@click.option("--object", "object_id", type=int, metavar="ID", help="Which object of a scene with several.")
+@MODALITY
+@RENDERER
+@UNIT
+def evaluate(
+    scenes: tuple[str, ...],
+    init: str,
+    json_path: str | None,
+    per_frame: bool,
+    part_path: str | None,
+    reference: str | None,
+    object_id: int | None,
+    modalities: tuple[str, ...],
+    renderer: str,
+    unit: str | None,
+) -> None:
+    """Track the part through BOP scenes and print how far the poses are from the reference.
+
+    SCENE is a scene folder (with scene_camera.json) or a dataset folder, whose test scenes are all taken.
+    """
+    from arview.cad import load_part
+    from arview.evaluation import evaluate_scene, find_scenes, format_result, load_scene, scene_guide_views
+    from arview.evaluation.run import Init
+    from arview.guideviews import GuideViewOptions
+
+    folders = [folder for path in scenes for folder in find_scenes(path)]
+    output = _output_path(json_path, [part_path, reference]) if json_path else None
+    part = load_part(part_path, unit) if part_path else None
+    loaded = [load_scene(folder, part, reference, object_id) for folder in folders]
+    results = []
+    for scene in loaded:
+        if scene.reference is not None and reference is None:
+            _say(f"{scene.name}: frames without truth are compared with {scene.reference}")
+        with _progress(f"{scene.name} guide views") as progress:
+            views = scene_guide_views(scene, GuideViewOptions(renderer=renderer), progress)
+        with _progress(scene.name) as progress:
+            result = evaluate_scene(scene, cast(Init, init), _session_options(modalities), views, progress)
+        click.echo(format_result(result, per_frame))
+        results.append(result.to_dict())
+    if output is not None:
+        content = {"version": __version__, "modalities": list(modalities), "scenes": results}
+        _write_text(output, json.dumps(content, indent=1) + "\n")
+        click.echo(f"wrote {output}")
+
+
+# --- shared ---------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _progress(label: str, total: int | None = None) -> Iterator[Progress]:
+    """A bar on stderr, shown only on a terminal; yields a function of (done, in all)."""
+    from tqdm import tqdm
+
+    with tqdm(desc=label, total=total, disable=None, leave=False, unit="") as bar:
+
+        def update(done: int, in_all: int) -> None:
+            bar.total = in_all or None
+            bar.update(done - bar.n)
+
+        yield update
+
+
+def _session_options(modalities: tuple[str, ...]) -> SessionOptions:
+    from arview.tracking import SessionOptions
+
+    return SessionOptions(
+        use_region="region" in modalities, use_edge="edge" in modalities, use_feature="feature" in modalities
+    )
+
+
+def _camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
+    """Camera of a source's frames; a guessed one is announced."""
+    from arview.camera_files import guess_camera, load_camera
+
+    if spec is not None:
+        return load_camera(spec, frames.width, frames.height, source, frames.quarter_turns_clockwise)
+    camera = guess_camera(frames.width, frames.height)
+    _say(
+        f"WARNING: no --camera given: GUESSING a focal length of {camera.fx:.0f} px (1.2 × the longer side)"
+        " and no distortion; distances will be wrong by as much. Give a camera file, fov:DEG or exif"
+    )
+    return camera
+
+
+def _load_pose(path: str) -> Array:
+    """``cam_from_model`` (4,4) of a POSE.json."""
+    from arview.geometry import check_rigid
+
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except ValueError as error:
+        raise InputError(f"{path}: not valid JSON ({error})") from error
+    if not isinstance(content, dict) or "cam_from_model" not in content:
+        raise InputError(f'{path}: expected {{"cam_from_model": 4×4 row-major, mm}}')
+    return check_rigid(content["cam_from_model"], f"{path}: cam_from_model")
+
+
+def _default_output(source: str) -> str:
+    """Name in the current folder for the annotated video of a source."""
+    if source.isdecimal():
+        return f"camera_{source}_annotated.mp4"
+    stem = "".join(letter for letter in Path(source).stem if letter.isalnum() or letter in "-_. ")
+    return f"{stem.strip(' .') or 'video'}_annotated.mp4"
+
+
+def _output_path(path: str, inputs: list[Any]) -> Path:
+    """The path of an output, after making sure that it can be one and overwrites no input."""
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise OutputError(f"{path}: there is no folder {target.parent}; create it first")
+    if target.is_dir():
+        raise OutputError(f"{path}: is a folder; give the name of a file")
+    if not os.access(target.parent, os.W_OK):
+        raise OutputError(f"{path}: the folder {target.parent} cannot be written to; choose another")
+    for other in inputs:
+        if other is not None and target.resolve() == Path(other).resolve():
+            raise OutputError(f"{path}: would overwrite an input or another output; choose another name")
+    return target
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Write a file that appears complete or not at all."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    main()
