@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from arview.geometry import Array
 from arview.tracking.solver import add_line, project
@@ -31,8 +32,13 @@ def _edge_function() -> Array:
 EDGE_FUNCTION = _edge_function()
 
 
+def value_bins(gain: float) -> NDArray[np.int64]:
+    """(256,) histogram bin of a channel value in a picture ``gain`` times brighter than the colours learned."""
+    return np.minimum(np.arange(256) / gain / (256 / BINS), BINS - 1).astype(np.int64)
+
+
 @njit(cache=True, nogil=True)
-def add_histograms(image, pixels, normals, depths, runs_mm, focal, fore, back, reach_px, gap_px):  # type: ignore[no-untyped-def]
+def add_histograms(image, bin_of, pixels, normals, depths, runs_mm, focal, fore, back, reach_px, gap_px):  # type: ignore[no-untyped-def]
     """Count the colours within ``reach_px`` inside and outside of the contour into fore and back (4096,)."""
     height, width = image.shape[0], image.shape[1]
     for i in range(pixels.shape[0]):
@@ -48,7 +54,7 @@ def add_histograms(image, pixels, normals, depths, runs_mm, focal, fore, back, r
                 x = int(np.round(pixels[i, 0] + sign * step * normals[i, 0]))
                 y = int(np.round(pixels[i, 1] + sign * step * normals[i, 1]))
                 if 0 <= x < width and 0 <= y < height:
-                    index = (image[y, x, 0] >> 4) * 256 + (image[y, x, 1] >> 4) * 16 + (image[y, x, 2] >> 4)
+                    index = bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]
                     if side == 0:
                         fore[index] += 1.0
                     else:
@@ -69,8 +75,10 @@ def log_odds(fore, back, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def measure_region(image, pixels, normals, depths, runs_mm, focal, odds, edge_function, scale):  # type: ignore[no-untyped-def]
+def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds, edge_function, scale):  # type: ignore[no-untyped-def]
     """Displacement of the contour along each line.
+
+    ``bin_of`` (256,) gives the histogram bin of a channel's value, exposure taken out.
 
     Returns mean (N,) px along the outward normal, information (N,) 1/px² (0 = the line says nothing), and agreement
     (N,) 0–1: how much better the colours fit a contour than no contour, -1 for lines that were not looked at.
@@ -110,7 +118,7 @@ def measure_region(image, pixels, normals, depths, runs_mm, focal, odds, edge_fu
                     continue
                 x = int(u + t * nu + 0.5)
                 y = int(v + t * nv + 0.5)
-                total += odds[(image[y, x, 0] >> 4) * 256 + (image[y, x, 1] >> 4) * 16 + (image[y, x, 2] >> 4)]
+                total += odds[bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]]
             total = min(max(total / np.sqrt(scale), -4.0), 4.0)
             fore[s] = 1.0 / (1.0 + np.exp(-total))
         norm = 0.0

@@ -12,13 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, exp_se3, invert, log_se3, orthonormalise, rigid
 from arview.guideviews import GuideView, GuideViewSet
 from arview.tracking.edge import add_edges, measure_edges
 from arview.tracking.quality import Evidence, edge_evidence, quality_of, region_evidence
-from arview.tracking.region import BINS, EDGE_FUNCTION, add_histograms, add_region, log_odds, measure_region
+from arview.tracking.region import BINS, EDGE_FUNCTION, add_histograms, add_region, log_odds, measure_region, value_bins
 from arview.tracking.solver import apply_twist, project_lines, solve_step
 
 
@@ -46,13 +47,20 @@ class Stage:
 
 
 TRACK_STAGES = (
-    Stage(6, 12, 2.0, 10.0),
-    Stage(4, 12, 1.0, 5.0),
-    Stage(2, 8, 1.0, 3.0),
-    Stage(1, 6, 1.0, 1.5),
-    Stage(1, 5, 1.0, 1.0),
+    Stage(4, 12, 1.0, 5.0, 2, 0.5),
+    Stage(2, 8, 1.0, 3.0, 2, 0.2),
+    Stage(1, 6, 1.0, 1.5, 2, 0.1),
+    Stage(1, 5, 1.0, 1.0, 2, 0.1),
 )
-"""Coarse to fine, for motion of up to about 25 px between frames."""
+"""Coarse to fine for the usual frame. Colours help to find the outline, the edges say where it is."""
+
+WIDE_STAGES = (
+    Stage(8, 12, 2.5, 12.0, 2, 4.0),
+    Stage(6, 12, 2.0, 8.0, 2, 2.0),
+    Stage(4, 12, 1.5, 5.0, 2, 1.0),
+    *TRACK_STAGES[1:],
+)
+"""Tried when the usual stages end in a poor pose: fast motion, up to about 30 px between frames."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,8 @@ class TrackerOptions:
         edge_sigma_px: how far a good step lies from the CAD's edge.
         edge_threshold: weakest step in grey levels over two pixels.
         learning_rate: how quickly colour histograms follow the picture.
+        correlated_points: how many neighbouring edge points err together.
+        doubtful_quality: below it the wide stages are tried and colours are not learned.
         rotation_sigma_rad, translation_sigma: expected error of the prediction, the latter in diameters.
     """
 
@@ -79,6 +89,8 @@ class TrackerOptions:
     rotation_sigma_rad: float = 0.3
     translation_sigma: float = 0.3
     stages: tuple[Stage, ...] = TRACK_STAGES
+    doubtful_quality: float = 0.4
+    correlated_points: float = 8.0
 
     def __post_init__(self) -> None:
         if not (self.use_region or self.use_edge or self.use_feature):
@@ -101,11 +113,12 @@ class Appearance:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Result of one refinement: pose, information matrix (6,6) about the model's centre, and evidence."""
+    """Result of one frame: ``cam_from_model`` (4,4), information (6,6) about the model's centre, quality, evidence."""
 
     cam_from_model: Array
     information: Array
-    view_index: int
+    quality: float
+    evidence: Evidence
 
 
 class PartView:
@@ -150,7 +163,9 @@ def intrinsics_of(camera: Camera) -> Array:
 class Tracker:
     """6-DoF tracking of one part with one camera."""
 
-    def __init__(self, views: GuideViewSet, camera: Camera, options: TrackerOptions | None = None) -> None:
+    def __init__(
+        self, views: GuideViewSet, camera: Camera, options: TrackerOptions | None = None, model: Model | None = None
+    ) -> None:
         self.options = options or TrackerOptions()
         self.camera = camera
         self.part = PartView(views)
@@ -159,12 +174,17 @@ class Tracker:
         self._intrinsics = intrinsics_of(camera)
         self._cam_from_body: Array | None = None
         self._velocity = np.zeros(6)
+        self._gain = 1.0
+        self._bin_of = value_bins(1.0)
+        self._sparse_gray: NDArray[np.float64] | None = None
 
     def start(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
         """Begin at a pose: colours are learned from this frame, the motion is taken as none."""
         self.appearance = Appearance()
         self._cam_from_body = cam_from_model @ self.part.model_from_body
         self._velocity = np.zeros(6)
+        self._gain, self._sparse_gray = 1.0, None
+        self._bin_of = value_bins(1.0)
         self.learn(image, self._cam_from_body, 1.0)
 
     def learn(self, image: NDArray[np.uint8], cam_from_body: Array, rate: float) -> None:
@@ -172,7 +192,7 @@ class Tracker:
         contour, normals, runs, _, _ = self.part.arrays(self.part.nearest(cam_from_body))
         pixels, normals_px, depths = project_lines(contour, normals, False, cam_from_body, self._intrinsics, 0.01 * self.diameter_mm)
         fore, back = np.zeros(BINS**3), np.zeros(BINS**3)
-        add_histograms(image, pixels, normals_px, depths, runs, self.camera.fx, fore, back, 20.0, 1.5)
+        add_histograms(image, self._bin_of, pixels, normals_px, depths, runs, self.camera.fx, fore, back, 20.0, 1.5)
         look = self.appearance
         if fore.sum() < 50 or back.sum() < 50:
             return
@@ -199,7 +219,7 @@ class Tracker:
             if o.use_region and self.appearance.is_known:
                 c_px, c_n, c_z = project_lines(contour, normals, False, cam_from_body, self._intrinsics, step_mm)
                 mean, information, _ = measure_region(
-                    image, c_px, c_n, c_z, runs, self.camera.fx, self.appearance.odds, EDGE_FUNCTION, stage.region_scale
+                    image, self._bin_of, c_px, c_n, c_z, runs, self.camera.fx, self.appearance.odds, EDGE_FUNCTION, stage.region_scale
                 )
             if o.use_edge:
                 e_px, e_n, e_z = project_lines(edges, tangents, True, cam_from_body, self._intrinsics, step_mm)
@@ -249,7 +269,7 @@ class Tracker:
         if self.appearance.is_known:
             pixels, normals_px, depths = project_lines(contour, normals, False, cam_from_body, self._intrinsics, step_mm)
             mean, information, agreement = measure_region(
-                image, pixels, normals_px, depths, runs, self.camera.fx, self.appearance.odds, EDGE_FUNCTION, 2
+                image, self._bin_of, pixels, normals_px, depths, runs, self.camera.fx, self.appearance.odds, EDGE_FUNCTION, 2
             )
             region_support, region_information = region_evidence(mean, information, agreement, 2.0)
         return Evidence(support, contour_support, sharpness, region_support, region_information, inside)
@@ -258,16 +278,51 @@ class Tracker:
         """Quality 0–1 of a pose from its evidence in this frame alone."""
         return quality_of(self.evidence(image, gray, cam_from_body))
 
-    def track(self, image: NDArray[np.uint8]) -> Array:
-        """Pose of the next frame."""
-        assert self._cam_from_body is not None
+    def _follow_exposure(self, gray: NDArray[np.uint8]) -> None:
+        """Take a change of exposure against the last frame out of the colours.
+
+        The factor is the median ratio of the brightness on a coarse grid; saturated and black pixels do not count.
+        """
+        sparse = gray[8::16, 8::16].astype(np.float64)
+        if self._sparse_gray is not None:
+            usable = (sparse > 8) & (sparse < 250) & (self._sparse_gray > 8) & (self._sparse_gray < 250)
+            if np.count_nonzero(usable) > 50:
+                ratio = float(np.median(sparse[usable] / self._sparse_gray[usable]))
+                # The histograms follow slow changes by themselves: the factor fades.
+                self._gain = min(max(self._gain**0.9 * ratio, 0.2), 5.0)
+                self._bin_of = value_bins(self._gain)
+        self._sparse_gray = sparse
+
+    def track(self, image: NDArray[np.uint8]) -> Estimate:
+        """Pose in the next frame, with its evidence."""
+        if self._cam_from_body is None:
+            raise RuntimeError("Tracker.track was called before Tracker.start")
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        self._follow_exposure(gray)
         before = self._cam_from_body
         predicted = before @ exp_se3(self._velocity)
         pose, information = self.refine(image, gray, predicted, self.options.stages)
+        evidence = self.evidence(image, gray, pose)
+        if quality_of(evidence) < self.options.doubtful_quality:
+            for start in (predicted, before):
+                other, other_information = self.refine(image, gray, start, WIDE_STAGES)
+                other_evidence = self.evidence(image, gray, other)
+                if other_evidence.worth > evidence.worth:
+                    pose, information, evidence = other, other_information, other_evidence
         pose = orthonormalise(pose)
         self._velocity = 0.5 * log_se3(invert(before) @ pose)
         self._cam_from_body = pose
-        if self.options.use_region:
+        quality = quality_of(evidence)
+        if self.options.use_region and quality > self.options.doubtful_quality:
             self.learn(image, pose, self.options.learning_rate)
-        return pose @ self.part.body_from_model
+        return Estimate(pose @ self.part.body_from_model, information, quality, evidence)
+
+    def covariance(self, estimate: Estimate) -> Array:
+        """(6,6) covariance of the twist (rad, mm) about the model's centre.
+
+        The inverse information, widened by the number of neighbours that err together: edge points every few pixels
+        along one line share the line's error.
+        """
+        scale = self.options.correlated_points / max(estimate.quality, 0.05)
+        widest = np.array([0.5] * 3 + [0.5 * self.diameter_mm] * 3)
+        return np.linalg.inv(estimate.information / scale + np.diag(1.0 / widest**2))
