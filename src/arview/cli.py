@@ -407,7 +407,7 @@ def evaluate(
     loaded = [load_scene(folder, part, reference, object_id) for folder in folders]
     results = []
     for scene in loaded:
-        if scene.reference is not None and reference is None:
+        if reference is None and any(f.cam_from_model is not None and not f.is_truth for f in scene.frames):
             _say(f"{scene.name}: frames without truth are compared with {scene.reference}")
         with _progress(f"{scene.name} guide views") as progress:
             views = scene_guide_views(scene, GuideViewOptions(renderer=renderer), progress)

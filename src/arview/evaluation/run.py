@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -18,10 +18,8 @@ from arview.geometry import Array
 from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.pose import Pose, TrackingState
+from arview.tracking import SessionOptions, TrackingSession
 from arview.video import Image
-
-if TYPE_CHECKING:
-    from arview.tracking import SessionOptions
 
 Init = Literal["truth", "detect"]
 
@@ -201,8 +199,6 @@ def evaluate_scene(
     views = views or scene_guide_views(scene)
     model = scene.part.model
     if make_session is None:
-        from arview.tracking import SessionOptions, TrackingSession
-
         session: Session = TrackingSession(
             views, model, scene.camera, options or SessionOptions(), initial_cam_from_model=first_pose
         )

@@ -21,6 +21,9 @@ EDGE_CREASE = 2
 """Kind bit: the two faces meet at an angle."""
 EDGE_SILHOUETTE = 4
 """Kind bit: one face is turned away, or the edge is open."""
+EDGE_SHARP = 8
+"""Kind bit: a crease so sharp that it is a design edge, not the facets of a curved surface."""
+SHARP_ANGLE_DEG = 50.0
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class MeshEdges:
         ends: (E,2) vertex indices.
         faces: (E,2) adjacent faces, the second -1 for an open edge.
         is_crease: (E,) dihedral angle above the threshold, or open, or shared by more than two faces.
+        is_sharp: (E,) dihedral angle above SHARP_ANGLE_DEG, or open.
         face_normals: (F,3) unit normals.
         component: (E,) component index.
     """
@@ -40,6 +44,7 @@ class MeshEdges:
     ends: NDArray[np.int32]
     faces: NDArray[np.int32]
     is_crease: NDArray[np.bool_]
+    is_sharp: NDArray[np.bool_]
     face_normals: Array
     component: NDArray[np.int32]
 
@@ -76,13 +81,14 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
         ends=np.ascontiguousarray(ends, dtype=np.int32),
         faces=np.ascontiguousarray(np.stack([face_a, face_b], axis=1), dtype=np.int32),
         is_crease=is_crease,
+        is_sharp=(count != 2) | (cosine < np.cos(np.deg2rad(SHARP_ANGLE_DEG))),
         face_normals=np.ascontiguousarray(normals),
         component=component_of_face[face_a].astype(np.int32),
     )
 
 
 @njit(cache=True, nogil=True)
-def _sample_visible(vertices, ends, faces, is_crease, normals, component, cam_from_model, fx, fy, cx, cy,
+def _sample_visible(vertices, ends, faces, is_crease, is_sharp, normals, component, cam_from_model, fx, fy, cx, cy,
                     depth, spacing_px, depth_tolerance):  # type: ignore[no-untyped-def]  # fmt: skip
     height, width = depth.shape
     rotation = cam_from_model[:3, :3]
@@ -164,6 +170,8 @@ def _sample_visible(vertices, ends, faces, is_crease, normals, component, cam_fr
             pixels[found, 1] = v
             lengths[found] = length
             kinds[found] = (1 if contour else 0) + (2 if crease else 0) + (4 if silhouette else 0)
+            if crease and is_sharp[e]:
+                kinds[found] += 8
             owners[found] = component[e]
             found += 1
     return points[:found], pixels[:found], tangents[:found], lengths[:found], kinds[:found], owners[:found]
@@ -212,7 +220,7 @@ def sample_visible_edges(
     tolerance = 3.0 * float(np.median(seen)) / fx if seen.size else 1.0
     return EdgeSamples(
         *_sample_visible(
-            edges.vertices_in_model, edges.ends, edges.faces, edges.is_crease, edges.face_normals,
+            edges.vertices_in_model, edges.ends, edges.faces, edges.is_crease, edges.is_sharp, edges.face_normals,
             edges.component, cam_from_model, fx, fy, cx, cy, depth_mm, spacing_px, tolerance,
         )
     )  # fmt: skip

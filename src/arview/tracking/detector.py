@@ -20,7 +20,6 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR
 from arview.guideviews.sphere import icosphere_directions
 from arview.tracking.matching import decimate, match_templates, orientation_bins, response_maps
-from arview.tracking.quality import quality_of
 from arview.tracking.solver import project_lines
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions
 
@@ -61,6 +60,7 @@ class DetectorOptions:
         subdivisions: icosahedron level of the template directions (3: 642, about 9° apart).
         refined: candidates that the tracker refines.
         finalists: of those, how many are refined to the end.
+        min_in_picture: less of the outline inside the picture is no detection.
         min_quality: a weaker result is no detection.
     """
 
@@ -74,6 +74,7 @@ class DetectorOptions:
     refined: int = 24
     finalists: int = 6
     min_quality: float = 0.5
+    min_in_picture: float = 0.4
 
     def __post_init__(self) -> None:
         if not 10 <= self.radius_px <= 60:
@@ -216,7 +217,8 @@ class Detector:
         result: list[tuple[float, Array]] = []
         for _, pose in finished:
             if not any(self._same(pose, other) for _, other in result):
-                result.append((quality_of(self.tracker.evidence(image, gray, pose)), pose))
+                evidence = self.tracker.evidence(image, gray, pose)
+                result.append((evidence.quality if evidence.points_in_picture >= o.min_in_picture else 0.0, pose))
         return result
 
     def _finish(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], start: Array) -> tuple[float, Array]:

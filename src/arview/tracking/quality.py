@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from arview.guideviews.mesh_edges import EDGE_CONTOUR
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 
 
 @dataclass(frozen=True)
@@ -19,16 +19,18 @@ class Evidence:
     """Evidence for a pose.
 
     Attributes:
-        edge_support: 0–1, edge points borne out beyond chance.
-        contour_support: the same for the outline alone.
+        contour_support: 0–1, outline points borne out beyond chance.
+        inner_support: the same for the design edges inside the outline.
+        inner_share: share of the design edges among the points looked at, 0 for organic shapes.
         sharpness: 0–1, how much stronger the steps are on the outline than beside it.
         region_support: 0–1, contour lines whose colours change at the contour, by information; -1 if none says.
         region_information: mean information of a line, 1/px².
         points_in_picture: share of the outline inside the picture.
     """
 
-    edge_support: float
     contour_support: float
+    inner_support: float
+    inner_share: float
     sharpness: float
     region_support: float
     region_information: float
@@ -36,13 +38,22 @@ class Evidence:
 
     @property
     def worth(self) -> float:
-        """0–1, for ranking poses of one picture: outline and inner edges alike."""
-        return 0.3 * self.contour_support + 0.2 * self.sharpness + 0.5 * self.edge_support
+        """0–1: outline and, as far as the part has them, design edges; right and wrong poses part at about 0.45."""
+        outline = 0.6 * self.contour_support + 0.4 * self.sharpness
+        share = min(0.5, self.inner_share)
+        return (1.0 - share) * outline + share * self.inner_support
+
+    @property
+    def quality(self) -> float:
+        """0–1, 0.5 where right and wrong poses part on the recorded sequences."""
+        if self.points_in_picture <= 0.05:
+            return 0.0
+        return float(1.0 / (1.0 + np.exp(-(self.worth - 0.45) * 20.0)))
 
 
 @njit(cache=True, nogil=True)
 def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  # type: ignore[no-untyped-def]
-    """Support of all points, of outline points, sharpness, and share in the picture, see Evidence."""
+    """contour_support, inner_support, inner_share, sharpness and points_in_picture, see Evidence."""
     hits = np.zeros(2)
     chances = np.zeros(2)
     counts = np.zeros(2)
@@ -52,6 +63,8 @@ def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  #
         is_contour = (kinds[i] & EDGE_CONTOUR) > 0
         if is_contour:
             outline += 1.0
+        elif (kinds[i] & EDGE_SHARP) == 0:
+            continue
         if not seen[i]:
             continue
         steps = 0
@@ -67,14 +80,11 @@ def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  #
             best_all = max(best_all, s)
             if abs(positions[i, j]) <= tolerance_px:
                 best_near = max(best_near, s)
-        chance = 1.0 - (1.0 - tolerance_px / reach_px) ** steps
-        for group in range(2):
-            if group == 1 and not is_contour:
-                continue
-            counts[group] += 1.0
-            chances[group] += chance
-            if best_near > 0.0:
-                hits[group] += 1.0
+        group = 0 if is_contour else 1
+        counts[group] += 1.0
+        chances[group] += 1.0 - (1.0 - tolerance_px / reach_px) ** steps
+        if best_near > 0.0:
+            hits[group] += 1.0
         if is_contour and best_all > 0.0:
             sharp += best_near / best_all
     support = np.zeros(2)
@@ -83,8 +93,9 @@ def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  #
             hit = hits[group] / counts[group]
             chance = chances[group] / counts[group]
             support[group] = max(0.0, (hit - chance) / (1.0 - chance + 1e-3))
-    inside = counts[1] / outline if outline > 0 else 0.0
-    return support[0], support[1], sharp / max(counts[1], 1.0), inside
+    inside = counts[0] / outline if outline > 0 else 0.0
+    share = counts[1] / max(counts[0] + counts[1], 1.0)
+    return support[0], support[1], share, sharp / max(counts[0], 1.0), inside
 
 
 @njit(cache=True, nogil=True)
@@ -102,14 +113,3 @@ def region_evidence(mean, information, agreement, tolerance_px):  # type: ignore
     if lines < 8:
         return -1.0, 0.0
     return (near / total if total > 0 else 0.0), total / lines
-
-
-def quality_of(evidence: Evidence) -> float:
-    """Quality 0–1: about 0.5 where right and wrong poses part on the recorded sequences.
-
-    The outline counts most: inner edges may be faint, and texture answers to everything.
-    """
-    if evidence.points_in_picture <= 0.05:
-        return 0.0
-    worth = 0.5 * evidence.contour_support + 0.35 * evidence.sharpness + 0.15 * evidence.edge_support
-    return float(1.0 / (1.0 + np.exp(-(worth - 0.46) * 16.0)))

@@ -1,7 +1,7 @@
 """Rays against a triangle mesh: a bounding-volume hierarchy built once, cast by numba.
 
-Binned surface-area heuristic (Wald, "On fast construction of SAH-based bounding volume hierarchies", 2007) and the
-ray-triangle test of Möller & Trumbore (1997). Both sides of a triangle are hit.
+Binned surface-area heuristic (Wald, "On fast construction of SAH-based bounding volume hierarchies", 2007)
+and the ray-triangle test of Möller & Trumbore (1997). Both sides of a triangle are hit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ class Hierarchy(NamedTuple):
 
     Attributes:
         bounds: (M,6) low xyz, high xyz of every node, mm.
-        links: (M,2) int32; a leaf's first triangle and count, an inner node's left child (right is next) and 0.
+        links: (M,2) int32; a leaf's first triangle and count, an inner node's left child (right is next) and
+        0.
         triangles: (F,9) corner and two edge vectors, in the order of the leaves.
         order: (F,) int32 face index of every triangle.
     """
@@ -220,11 +221,13 @@ class RayCaster:
         self.hierarchy = Hierarchy(bounds, links, np.ascontiguousarray(triangles[order]), order)
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Array, NDArray[np.int32]]:
-        """Distance (N,) in lengths of the direction (inf = no hit) and face (N,) (-1 = no hit) of rays (N,3)."""
+        """Distance (N,) in lengths of the direction (inf = none) and face (N,) (-1 = none) of rays (N,3)."""
         start = np.ascontiguousarray(origins, dtype=np.float64)
         toward = np.ascontiguousarray(directions, dtype=np.float64)
         if start.shape != toward.shape or start.ndim != 2 or start.shape[1] != 3:
-            raise InputError(f"rays: origins {start.shape} and directions {toward.shape}, expected (N, 3) both")
+            raise InputError(
+                f"rays: origins {start.shape} and directions {toward.shape}, expected (N, 3) both"
+            )
         distances = np.empty(len(start))
         faces = np.empty(len(start), dtype=np.int32)
         _cast_rays(self.hierarchy, start, toward, distances, faces)

@@ -18,7 +18,7 @@ from arview.errors import InputError, MismatchError
 from arview.geometry import Array, exp_se3, invert, log_se3, orthonormalise, rigid
 from arview.guideviews import GuideView, GuideViewSet
 from arview.tracking.edge import add_edges, measure_edges
-from arview.tracking.quality import Evidence, edge_evidence, quality_of, region_evidence
+from arview.tracking.quality import Evidence, edge_evidence, region_evidence
 from arview.tracking.region import BINS, EDGE_FUNCTION, add_histograms, add_region, log_odds, measure_region, value_bins
 from arview.tracking.solver import apply_twist, project_lines, solve_step
 
@@ -264,7 +264,7 @@ class Tracker:
         pixels, normals_px, depths = project_lines(edges, tangents, True, cam_from_body, self._intrinsics, step_mm)
         positions, strengths, seen = measure_edges(gray, pixels, normals_px, depths, 10, 1.0, self.options.edge_threshold)
         kinds = self.part.views.view(index).features.edge_kinds
-        support, contour_support, sharpness, inside = edge_evidence(positions, strengths, seen, kinds, 10.0, tolerance_px)
+        outline = edge_evidence(positions, strengths, seen, kinds, 10.0, tolerance_px)
         region_support, region_information = -1.0, 0.0
         if self.appearance.is_known:
             pixels, normals_px, depths = project_lines(contour, normals, False, cam_from_body, self._intrinsics, step_mm)
@@ -272,11 +272,7 @@ class Tracker:
                 image, self._bin_of, pixels, normals_px, depths, runs, self.camera.fx, self.appearance.odds, EDGE_FUNCTION, 2
             )
             region_support, region_information = region_evidence(mean, information, agreement, 2.0)
-        return Evidence(support, contour_support, sharpness, region_support, region_information, inside)
-
-    def judge(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array) -> float:
-        """Quality 0–1 of a pose from its evidence in this frame alone."""
-        return quality_of(self.evidence(image, gray, cam_from_body))
+        return Evidence(*outline[:4], region_support, region_information, outline[4])
 
     def _follow_exposure(self, gray: NDArray[np.uint8]) -> None:
         """Take a change of exposure against the last frame out of the colours.
@@ -303,7 +299,7 @@ class Tracker:
         predicted = before @ exp_se3(self._velocity)
         pose, information = self.refine(image, gray, predicted, self.options.stages)
         evidence = self.evidence(image, gray, pose)
-        if quality_of(evidence) < self.options.doubtful_quality:
+        if evidence.quality < self.options.doubtful_quality:
             for start in (predicted, before):
                 other, other_information = self.refine(image, gray, start, WIDE_STAGES)
                 other_evidence = self.evidence(image, gray, other)
@@ -312,7 +308,7 @@ class Tracker:
         pose = orthonormalise(pose)
         self._velocity = 0.5 * log_se3(invert(before) @ pose)
         self._cam_from_body = pose
-        quality = quality_of(evidence)
+        quality = evidence.quality
         if self.options.use_region and quality > self.options.doubtful_quality:
             self.learn(image, pose, self.options.learning_rate)
         return Estimate(pose @ self.part.body_from_model, information, quality, evidence)
