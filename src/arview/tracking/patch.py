@@ -50,8 +50,8 @@ def sample_patch(image, u, v, warp, half, out):  # type: ignore[no-untyped-def]
 def prepare_template(patch, side, template, across, down):  # type: ignore[no-untyped-def]
     """Zero-mean template of unit norm and its gradients made orthogonal to it and to a constant.
 
-    From a patch (side+2)² with a border. Returns the inverse of the (2,2) normal matrix as (a, b, c), and the
-    norm of the template; a norm of 0 says that the patch has no usable texture.
+    From a patch (side+2)² with a border. Returns the inverse of the (2,2) normal matrix as its (0,0), (0,1)
+    and (1,1) entries, and the norm of the template; a norm of 0 says that the patch has no usable texture.
     """
     count = side * side
     mean_t, mean_x, mean_y = np.float32(0.0), np.float32(0.0), np.float32(0.0)
@@ -77,7 +77,7 @@ def prepare_template(patch, side, template, across, down):  # type: ignore[no-un
         tx += template[k] * across[k]
         ty += template[k] * down[k]
     if tt < count:
-        return 0.0, 0.0, 0.0, 0.0
+        return (0.0, 0.0, 0.0), 0.0
     tx /= tt
     ty /= tt
     xx, xy, yy = np.float32(0.0), np.float32(0.0), np.float32(0.0)
@@ -89,15 +89,15 @@ def prepare_template(patch, side, template, across, down):  # type: ignore[no-un
         yy += down[k] * down[k]
     det = xx * yy - xy * xy
     if det < 1e-3 * xx * yy or det <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0
+        return (0.0, 0.0, 0.0), 0.0
     norm = np.sqrt(tt)
     for k in range(count):
         template[k] /= norm
-    return yy / det, -xy / det, xx / det, norm
+    return (yy / det, -xy / det, xx / det), norm
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def align_template(image, u, v, side, template, across, down, a, b, c, norm, steps, stop_px):  # type: ignore[no-untyped-def]
+def align_template(image, u, v, side, template, across, down, normal, norm, steps, stop_px):  # type: ignore[no-untyped-def]
     """Shift a prepared template onto the image from (u, v); returns u, v, correlation (-1 = failed).
 
     The gradients are orthogonal to template and constant, so gain and offset need no estimate in the
@@ -137,8 +137,8 @@ def align_template(image, u, v, side, template, across, down, a, b, c, norm, ste
         gain = gt / norm
         if gain < 0.1:
             return u, v, -1.0
-        du = (a * gx + b * gy) / gain
-        dv = (b * gx + c * gy) / gain
+        du = (normal[0] * gx + normal[1] * gy) / gain
+        dv = (normal[1] * gx + normal[2] * gy) / gain
         if du * du + dv * dv < stop_px * stop_px:
             return u - du, v - dv, correlation
         length = np.sqrt(du * du + dv * dv)
