@@ -19,7 +19,9 @@ from arview.geometry import Array, exp_so3, rigid, rotation_angle_rad
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR
 from arview.guideviews.sphere import icosphere_directions
+from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
 from arview.tracking.matching import decimate, match_templates, orientation_bins, response_maps
+from arview.tracking.quality import quality_of
 from arview.tracking.solver import project_lines
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions
 
@@ -36,7 +38,7 @@ def _coarse_stages(region_gain: float) -> tuple[Stage, ...]:
 
 COARSE_STAGES = (_coarse_stages(1.0), _coarse_stages(20.0))
 """Two tries from every start: edges lead on printed and grey parts, colours on plain and glossy ones."""
-SURE_WORTH = 0.8
+SURE_WORTH = 1.0
 """A pose worth this much is not searched around any more."""
 COARSE_TOLERANCE_PX = 3.5
 """After the coarse stages edges are looked for this near."""
@@ -196,7 +198,7 @@ class Detector:
         for start in starts:
             for stages in COARSE_STAGES:
                 pose = self.tracker.refine_fresh(image, gray, start, stages)
-                coarse.append((self.tracker.evidence(image, gray, pose, COARSE_TOLERANCE_PX).worth, pose))
+                coarse.append((self.tracker.evidence_fresh(image, gray, pose, COARSE_TOLERANCE_PX).worth, pose))
         coarse.sort(key=lambda item: -item[0])
         finished: list[tuple[float, Array]] = []
         tried: list[Array] = []
@@ -215,15 +217,22 @@ class Detector:
                 finished.append(self._finish(image, gray, start))
             finished.sort(key=lambda item: -item[0])
         result: list[tuple[float, Array]] = []
-        for _, pose in finished:
+        for worth, pose in finished:
             if not any(self._same(pose, other) for _, other in result):
-                evidence = self.tracker.evidence(image, gray, pose)
-                result.append((evidence.quality if evidence.points_in_picture >= o.min_in_picture else 0.0, pose))
+                result.append((self._quality(worth, pose), pose))
         return result
+
+    def _quality(self, worth: float, cam_from_body: Array) -> float:
+        """Quality of a pose found without history: a view of few lines must be borne out the better."""
+        index = self.tracker.part.nearest(cam_from_body)
+        lines = view_lines(self.views.view(index), self.views.diameter_mm)
+        plainness = max(1.0 - lines / (2.0 * PLAIN_LINES), 0.0)
+        return quality_of(worth - 0.3 * plainness)
 
     def _finish(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], start: Array) -> tuple[float, Array]:
         pose = self.tracker.refine_fresh(image, gray, start, FINE_STAGES)
-        return self.tracker.evidence(image, gray, pose).worth, pose
+        evidence = self.tracker.evidence_fresh(image, gray, pose)
+        return (evidence.worth if evidence.points_in_picture >= self.options.min_in_picture else 0.0), pose
 
     def _same(self, a: Array, b: Array) -> bool:
         near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.05 * self.views.diameter_mm

@@ -274,6 +274,17 @@ class Tracker:
             region_support, region_information = region_evidence(mean, information, agreement, 2.0)
         return Evidence(*outline[:4], region_support, region_information, outline[4])
 
+    def evidence_fresh(
+        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, tolerance_px: float = 1.5
+    ) -> Evidence:
+        """What the picture says for a pose, with the colours found at the pose itself."""
+        kept = self.appearance
+        self.appearance = Appearance()
+        self.learn(image, cam_from_body, 1.0)
+        evidence = self.evidence(image, gray, cam_from_body, tolerance_px)
+        self.appearance = kept
+        return evidence
+
     def _follow_exposure(self, gray: NDArray[np.uint8]) -> None:
         """Take a change of exposure against the last frame out of the colours.
 

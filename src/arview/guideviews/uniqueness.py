@@ -1,0 +1,156 @@
+"""Can the part be told from its surroundings and from itself by its guide views?
+
+Two measures per view. *Distinct lines*: the points of outline and design edges vote for the straight line they lie
+on; the perplexity (exponential of the entropy) of the votes counts the lines that matter. A plain block shows about
+nine, and any box-like thing in a workshop shows the same nine. *Confusability*: the likeness of the view to any view
+from elsewhere, at the roll that makes it greatest; a part that looks the same from two sides cannot say which it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.geometry import Array
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.guideviews.views import GuideView, GuideViewSet
+
+PLAIN_LINES = 12.0
+"""Views with fewer distinct lines are plain: boxes, plates and cylinders by themselves."""
+MOST_PLAIN = 0.6
+"""A larger share of plain or of confusable views makes the set insufficient: many parts are plain from below."""
+CONFUSABLE_LIKENESS = 0.94
+"""Views at least this alike cannot be told apart in a picture with noise."""
+APART_DEG = 30.0
+"""Views nearer than this are alike for a good reason."""
+_RADII, _ANGLES, _ORIENTATIONS = 6, 36, 6
+
+
+@dataclass(frozen=True)
+class Uniqueness:
+    """Verdict on a set.
+
+    Attributes:
+        distinct_lines: (N,) per view.
+        likeness: (N,) 0–1 to the most alike view from elsewhere; NaN where the set has no view far enough away.
+        confused_with: (N,) index of that view, -1 where there is none.
+        is_sufficient: the part can be detected without being taken for something else.
+        reason: one sentence.
+    """
+
+    distinct_lines: Array
+    likeness: Array
+    confused_with: NDArray[np.int64]
+    is_sufficient: bool
+    reason: str
+
+    @property
+    def score(self) -> float:
+        """0–1: share of views that are neither plain nor confusable."""
+        fine = (self.distinct_lines >= PLAIN_LINES) & ~(self.likeness >= CONFUSABLE_LIKENESS)
+        return float(np.mean(fine))
+
+
+def view_lines(view: GuideView, diameter_mm: float) -> float:
+    """Number of distinct lines that a view shows."""
+    pixels, normals = _edge_picture(view, diameter_mm)
+    if len(pixels) == 0:
+        return 0.0
+    angle = np.arctan2(normals[:, 1], normals[:, 0]) % np.pi
+    offset = pixels[:, 0] * np.cos(angle) + pixels[:, 1] * np.sin(angle)
+    cell = np.stack([np.floor(angle / np.pi * 18), np.floor((offset + 1.0) * 12)], axis=1).astype(np.int64)
+    _, votes = np.unique(cell[:, 0] * 64 + cell[:, 1], return_counts=True)
+    share = votes / votes.sum()
+    return float(np.exp(-np.sum(share * np.log(share))))
+
+
+def assess(views: GuideViewSet, most_views: int = 642) -> Uniqueness:
+    """Uniqueness of a set; at most about ``most_views`` of its views are compared with each other."""
+    step = max(1, len(views) // most_views)
+    index = np.arange(0, len(views), step)
+    looked_at = [views.view(int(i)) for i in index]
+    lines = np.array([view_lines(view, views.diameter_mm) for view in looked_at])
+    likeness, partner = _likeness(np.stack([_descriptor(v, views.diameter_mm) for v in looked_at]), views.directions[index])
+    nearest = np.argmax(views.directions @ views.directions[index].T, axis=1)
+    confused = np.where(partner[nearest] >= 0, index[np.maximum(partner[nearest], 0)], -1)
+    plain_share = float(np.mean(lines < PLAIN_LINES))
+    confusable = float(np.mean(likeness >= CONFUSABLE_LIKENESS))
+    if plain_share > MOST_PLAIN:
+        reason = (
+            f"insufficient: {plain_share:.0%} of the views show fewer than {PLAIN_LINES:.0f} distinct lines "
+            f"(median {np.median(lines):.0f}), as any plain block or plate does; add components around it to the part"
+        )
+    elif confusable > MOST_PLAIN:
+        reason = (
+            f"insufficient: {confusable:.0%} of the views look like a view from another side; "
+            "declare the symmetry or narrow the range of viewpoints"
+        )
+    else:
+        reason = (
+            f"sufficient: median of {np.median(lines):.0f} distinct lines a view; "
+            f"{plain_share:.0%} of the views plain, {confusable:.0%} confusable"
+        )
+    return Uniqueness(
+        distinct_lines=lines[nearest],
+        likeness=likeness[nearest],
+        confused_with=confused,
+        is_sufficient=plain_share <= MOST_PLAIN and confusable <= MOST_PLAIN,
+        reason=reason,
+    )
+
+
+def _edge_picture(view: GuideView, diameter_mm: float) -> tuple[Array, Array]:
+    """Places (N,2) of outline and design edge points in half diameters, and their normals (N,2) in the picture."""
+    f = view.features
+    pose = view.cam_from_model
+    kept = (f.edge_kinds & (EDGE_CONTOUR | EDGE_SHARP)) > 0
+    points = f.edge_points[kept] @ pose[:3, :3].T + pose[:3, 3]
+    tangents = f.edge_tangents[kept] @ pose[:3, :3].T
+    distance = float(np.linalg.norm(pose[:3, 3])) if len(points) == 0 else float(np.median(points[:, 2]))
+    pixels = points[:, :2] / points[:, 2:] * distance / (0.5 * diameter_mm)
+    across = tangents[:, :2] - points[:, :2] / points[:, 2:] * tangents[:, 2:]
+    length = np.linalg.norm(across, axis=1)
+    usable = length > 0.05
+    across = across[usable] / length[usable, None]
+    return pixels[usable], np.stack([-across[:, 1], across[:, 0]], axis=1)
+
+
+def _descriptor(view: GuideView, diameter_mm: float) -> Array:
+    """(angles, radii · orientations) unit histogram of edges on a polar grid, orientation relative to the radius."""
+    pixels, normals = _edge_picture(view, diameter_mm)
+    histogram = np.zeros((_ANGLES, _RADII, _ORIENTATIONS))
+    if len(pixels):
+        pixels = pixels - pixels.mean(axis=0)
+        angle = np.arctan2(pixels[:, 1], pixels[:, 0])
+        radius = np.clip(np.linalg.norm(pixels, axis=1) * _RADII, 0, _RADII - 1e-6).astype(np.intp)
+        turn = (np.arctan2(normals[:, 1], normals[:, 0]) - angle) % np.pi
+        orientation = np.floor(turn / np.pi * _ORIENTATIONS + 0.5).astype(np.intp) % _ORIENTATIONS
+        place = (angle / (2 * np.pi) * _ANGLES) % _ANGLES
+        low = np.floor(place).astype(np.intp)
+        share = place - low
+        np.add.at(histogram, (low % _ANGLES, radius, orientation), 1.0 - share)
+        np.add.at(histogram, ((low + 1) % _ANGLES, radius, orientation), share)
+        histogram = histogram + 0.5 * (np.roll(histogram, 1, 0) + np.roll(histogram, -1, 0))
+    flat = histogram.reshape(_ANGLES, -1)
+    flat = flat - flat.mean()
+    return flat / max(float(np.linalg.norm(flat)), 1e-12)
+
+
+def _likeness(descriptors: Array, directions: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Largest correlation (N,) over all rolls with a view more than APART_DEG away, and its index (-1: none)."""
+    spectra = np.fft.rfft(descriptors, axis=1)
+    count = len(descriptors)
+    best = np.full(count, np.nan)
+    partner = np.full(count, -1, dtype=np.int64)
+    far = directions @ directions.T < np.cos(np.deg2rad(APART_DEG))
+    for i in range(count):
+        others = np.flatnonzero(far[i])
+        if len(others) == 0:
+            continue
+        product = np.einsum("jak,ak->ja", spectra[others].conj(), spectra[i])
+        correlation = np.fft.irfft(product, n=_ANGLES, axis=1).max(axis=1)
+        best[i] = correlation.max()
+        partner[i] = others[int(np.argmax(correlation))]
+    return best, partner
