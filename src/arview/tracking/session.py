@@ -44,8 +44,8 @@ class SessionOptions:
     use_feature: bool = True
     lock_quality: float = 0.8
     tracked_quality: float = 0.5
-    critical_quality: float = 0.35
-    lost_quality: float = 0.15
+    critical_quality: float = 0.25
+    lost_quality: float = 0.1
     lost_frames: int = 2
     critical_frames: int = 12
     min_in_picture: float = 0.25

@@ -18,7 +18,9 @@ from arview.errors import InputError, MismatchError
 from arview.geometry import Array, exp_se3, invert, log_se3, orthonormalise, rigid
 from arview.guideviews import GuideView, GuideViewSet
 from arview.tracking.edge import add_edges, measure_edges
-from arview.tracking.quality import Evidence, edge_evidence, region_evidence
+from arview.tracking.feature import FeatureModality, Matches, add_features
+from arview.tracking.patch import Pyramid
+from arview.tracking.quality import quality_of, Evidence, edge_evidence, region_evidence
 from arview.tracking.region import BINS, EDGE_FUNCTION, add_histograms, add_region, log_odds, measure_region, value_bins
 from arview.tracking.solver import apply_twist, project_lines, solve_step
 
@@ -72,6 +74,8 @@ class TrackerOptions:
         region_weight, edge_weight: relative trust; neighbours along an outline are not independent.
         edge_sigma_px: how far a good step lies from the CAD's edge.
         edge_threshold: weakest step in grey levels over two pixels.
+        feature_sigma_px: how far a matched piece of texture lies from its place.
+        feature_min_count, feature_min_share: fewer matches, or a smaller share of those tried, are not believed.
         learning_rate: how quickly colour histograms follow the picture.
         correlated_points: how many neighbouring edge points err together.
         doubtful_quality: below it the wide stages are tried and colours are not learned.
@@ -85,6 +89,9 @@ class TrackerOptions:
     edge_weight: float = 1.0
     edge_sigma_px: float = 0.7
     edge_threshold: float = 3.0
+    feature_sigma_px: float = 1.0
+    feature_min_count: int = 12
+    feature_min_share: float = 0.4
     learning_rate: float = 0.2
     rotation_sigma_rad: float = 0.3
     translation_sigma: float = 0.3
@@ -177,6 +184,11 @@ class Tracker:
         self._gain = 1.0
         self._bin_of = value_bins(1.0)
         self._sparse_gray: NDArray[np.float64] | None = None
+        self._best_contour_support = 0.0
+        self._features: FeatureModality | None = None
+        if self.options.use_feature and model is not None:
+            vertices, faces, _ = model.mesh
+            self._features = FeatureModality(vertices - views.center_in_model, faces, camera)
 
     def start(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
         """Begin at a pose: colours are learned from this frame, the motion is taken as none."""
@@ -184,6 +196,9 @@ class Tracker:
         self._cam_from_body = cam_from_model @ self.part.model_from_body
         self._velocity = np.zeros(6)
         self._gain, self._sparse_gray = 1.0, None
+        self._best_contour_support = 0.0
+        if self._features is not None:
+            self._features.clear()
         self._bin_of = value_bins(1.0)
         self.learn(image, self._cam_from_body, 1.0)
 
@@ -206,8 +221,13 @@ class Tracker:
         look.is_known = True
         log_odds(look.fore, look.back, look.odds)
 
-    def refine(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...]) -> tuple[Array, Array]:
-        """Pose (``cam_from_body``) and information (6,6) after the given stages from a start."""
+    def refine(
+        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...], matches: Matches | None = None
+    ) -> tuple[Array, Array]:
+        """Pose (``cam_from_body``) and information (6,6) after the given stages from a start.
+
+        ``matches`` are the part's own texture found in this frame, measured once for all stages.
+        """
         o = self.options
         damping = np.empty(6)
         damping[:3] = 1.0 / o.rotation_sigma_rad**2
@@ -235,6 +255,11 @@ class Tracker:
                     add_edges(
                         hessian, gradient, edges, cam_from_body, self._intrinsics, e_px, e_n, positions, strengths,
                         15.0, o.edge_sigma_px * max(1.0, 0.5 * stage.edge_spread_px), stage.edge_spread_px, o.edge_weight,
+                    )
+                if matches is not None:
+                    add_features(
+                        hessian, gradient, matches.points_in_body, cam_from_body, self._intrinsics, matches.pixels,
+                        matches.weights, o.feature_sigma_px, max(4.0, 2.0 * stage.edge_spread_px),
                     )
                 cam_from_body = apply_twist(cam_from_body, solve_step(hessian, gradient, damping))
         return cam_from_body, hessian + np.tril(hessian, -1).T
@@ -306,23 +331,51 @@ class Tracker:
             raise RuntimeError("Tracker.track was called before Tracker.start")
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         self._follow_exposure(gray)
+        o = self.options
         before = self._cam_from_body
         predicted = before @ exp_se3(self._velocity)
-        pose, information = self.refine(image, gray, predicted, self.options.stages)
+        matches, found_share = None, 0.0
+        starts = [predicted]
+        if self._features is not None:
+            pyramid = self._features.pyramid(gray)
+            matches = self._features.measure(pyramid, predicted)
+            found_share = len(matches.weights) / max(matches.tried, 1)
+            if len(matches.weights) >= o.feature_min_count and found_share >= o.feature_min_share:
+                starts[0] = self._features.align(matches, predicted)
+            else:
+                matches = None
+        pose, information = self.refine(image, gray, starts[0], o.stages, matches)
         evidence = self.evidence(image, gray, pose)
-        if evidence.quality < self.options.doubtful_quality:
+        if evidence.quality < o.doubtful_quality:
             for start in (predicted, before):
                 other, other_information = self.refine(image, gray, start, WIDE_STAGES)
                 other_evidence = self.evidence(image, gray, other)
                 if other_evidence.worth > evidence.worth:
-                    pose, information, evidence = other, other_information, other_evidence
+                    pose, information, evidence, matches = other, other_information, other_evidence, None
         pose = orthonormalise(pose)
         self._velocity = 0.5 * log_se3(invert(before) @ pose)
         self._cam_from_body = pose
         quality = evidence.quality
-        if self.options.use_region and quality > self.options.doubtful_quality:
-            self.learn(image, pose, self.options.learning_rate)
+        if matches is not None and evidence.points_in_picture > 0.05:
+            # The part's own texture bears the pose out where a hand hides the outline.
+            quality = quality_of(evidence.worth + 0.3 * found_share)
+        if quality > o.doubtful_quality:
+            if o.use_region:
+                self.learn(image, pose, o.learning_rate)
+            if self._features is not None:
+                self._remember_texture(pyramid, pose, matches, evidence)
         return Estimate(pose @ self.part.body_from_model, information, quality, evidence)
+
+    def _remember_texture(self, pyramid: Pyramid, cam_from_body: Array, matches: Matches | None, evidence: Evidence) -> None:
+        """Settle the features seen, and take a new keyframe where one is missing and nothing hides the outline."""
+        assert self._features is not None
+        if matches is not None:
+            self._features.settle(cam_from_body)
+        self._best_contour_support = max(0.99 * self._best_contour_support, evidence.contour_support)
+        unhidden = evidence.contour_support > 0.85 * self._best_contour_support
+        tracked_count = 0 if matches is None else len(matches.weights)
+        if unhidden and evidence.quality > 0.6 and self._features.wants_keyframe(cam_from_body, tracked_count):
+            self._features.add_keyframe(pyramid, cam_from_body)
 
     def covariance(self, estimate: Estimate) -> Array:
         """(6,6) covariance of the twist (rad, mm) about the model's centre.
