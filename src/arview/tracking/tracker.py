@@ -89,7 +89,7 @@ class TrackerOptions:
     edge_weight: float = 1.0
     edge_sigma_px: float = 0.7
     edge_threshold: float = 3.0
-    feature_sigma_px: float = 1.0
+    feature_sigma_px: float = 0.5
     feature_min_count: int = 12
     feature_min_share: float = 0.4
     learning_rate: float = 0.2
