@@ -23,7 +23,7 @@ from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
 from arview.tracking.matching import decimate, match_templates, orientation_bins, response_maps
 from arview.tracking.quality import quality_of
 from arview.tracking.solver import project_lines
-from arview.tracking.tracker import Stage, Tracker, TrackerOptions
+from arview.tracking.tracker import Stage, Tracker, TrackerOptions, smoothed
 
 
 
@@ -132,7 +132,9 @@ class Detector:
             view = self.views.view(int(index))
             features = view.features
             cam_from_body = view.cam_from_model @ self.tracker.part.model_from_body
-            contour, normals, _, edges, tangents = self.tracker.part.arrays(int(index))
+            center = self.views.center_in_model
+            contour, normals = features.contour_points - center, features.contour_normals
+            edges, tangents = features.edge_points - center, features.edge_tangents
             distance = cam_from_body[2, 3]
             c_px, c_n, c_z = project_lines(contour, normals, False, cam_from_body, intrinsics, 0.5)
             inner = (features.edge_kinds & EDGE_CONTOUR) == 0
@@ -170,7 +172,7 @@ class Detector:
             max_results: at most so many, all above the quality threshold and apart from each other.
         """
         o = self.options
-        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         starts = [candidate.cam_from_body for candidate in self.candidates(image)]
         settled = self._settle(image, gray, starts)
         found = [
@@ -185,7 +187,7 @@ class Detector:
 
         Its quality says whether it is right; it is returned even when that is low.
         """
-        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         start = cam_from_model @ self.tracker.part.model_from_body
         settled = self._settle(image, gray, [start, *_around(start, 0.15)])
         quality, pose = settled[0]

@@ -1,9 +1,8 @@
 """Edge modality: intensity steps across the projected CAD edges, several hypotheses a point, robust.
 
 RAPID (Harris 1990) and its successors with multiple hypotheses (Vacchetti, Lepetit & Fua, ISMAR 2004) and
-M-estimators (Drummond & Cipolla 2002; Comport et al. 2006). The profile across an edge is averaged over three
-parallel lines; its local extrema are the hypotheses; at every solver step a point takes the one that best joins
-nearness and strength.
+M-estimators (Drummond & Cipolla 2002; Comport et al. 2006). The local extrema of the slope across an edge are the
+hypotheses; at every solver step a point takes the one that best joins nearness and strength.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # 
     """Intensity steps along the normal of each point.
 
     Args:
-        gray: (H,W) uint8.
+        gray: (H,W) uint8, smoothed by 3×3: it stands for averaging over neighbouring lines.
         pixels, normals, depths: of the projected points, see `project_lines`.
         reach: samples to either side.
         step_px: distance between samples.
@@ -51,21 +50,14 @@ def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # 
         half = 0.5 * (size - 1)
         for k in range(size):
             t = (k - half) * step_px
-            total = 0.0
-            inside = True
-            for side in range(-1, 2):
-                x = u + t * nu - side * nv
-                y = v + t * nv + side * nu
-                ix, iy = int(x), int(y)
-                if x < 0 or y < 0 or ix >= width - 1 or iy >= height - 1:
-                    inside = False
-                    break
+            x = u + t * nu
+            y = v + t * nv
+            ix, iy = int(x), int(y)
+            if x >= 0 and y >= 0 and ix < width - 1 and iy < height - 1:
                 ax, ay = x - ix, y - iy
                 top = gray[iy, ix] * (1.0 - ax) + gray[iy, ix + 1] * ax
                 bottom = gray[iy + 1, ix] * (1.0 - ax) + gray[iy + 1, ix + 1] * ax
-                total += top * (1.0 - ay) + bottom * ay
-            if inside:
-                profile[k] = total / 3.0
+                profile[k] = top * (1.0 - ay) + bottom * ay
             elif k < half:
                 first = k + 1
             else:

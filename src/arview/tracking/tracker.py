@@ -7,6 +7,7 @@ with a damping towards the prediction, and updates the pose; scales shrink from 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -15,14 +16,13 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError, MismatchError
-from arview.geometry import Array, exp_se3, invert, log_se3, orthonormalise, rigid
-from arview.guideviews import GuideView, GuideViewSet
-from arview.tracking.edge import add_edges, measure_edges
-from arview.tracking.feature import FeatureModality, Matches, add_features
+from arview.geometry import Array, exp_se3, invert, log_se3, rigid
+from arview.guideviews import GuideViewSet
+from arview.tracking.feature import FeatureModality, Matches
 from arview.tracking.patch import Pyramid
-from arview.tracking.quality import quality_of, Evidence, edge_evidence, region_evidence
-from arview.tracking.region import BINS, EDGE_FUNCTION, add_histograms, add_region, log_odds, measure_region, value_bins
-from arview.tracking.solver import apply_twist, project_lines, solve_step
+from arview.tracking.quality import Evidence, quality_of
+from arview.tracking.refine import count_colours, median_brightness_ratio, nearest_view, run_evidence, run_stages
+from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,19 @@ class Stage:
     edge_spread_px: float
     updates: int = 2
     region_gain: float = 1.0
+    stride: int = 1
+
+    def row(self) -> tuple[float, ...]:
+        """As `run_stages` takes it."""
+        return (
+            self.region_scale,
+            self.edge_reach,
+            self.edge_step_px,
+            self.edge_spread_px,
+            self.updates,
+            self.region_gain,
+            self.stride,
+        )
 
     def widened(self, factor: float) -> Stage:
         """The same stage for a part that is larger in the picture; fine stages stay fine."""
@@ -49,8 +62,8 @@ class Stage:
 
 
 TRACK_STAGES = (
-    Stage(4, 12, 1.0, 5.0, 2, 0.5),
-    Stage(2, 8, 1.0, 3.0, 2, 0.2),
+    Stage(4, 12, 1.0, 5.0, 2, 0.5, 2),
+    Stage(2, 8, 1.0, 3.0, 2, 0.2, 2),
     Stage(1, 6, 1.0, 1.5, 2, 0.1),
     Stage(1, 5, 1.0, 1.0, 2, 0.1),
 )
@@ -129,35 +142,34 @@ class Estimate:
 
 
 class PartView:
-    """A guide-view set as the tracker needs it: contiguous arrays about the model's centre."""
+    """A guide-view set as the kernels need it: flat float32 arrays about the model's centre.
+
+    ``arrays`` holds directions (N,3), contour starts (N+1), points, normals, runs, edge starts (N+1), points,
+    tangents, kinds.
+    """
 
     def __init__(self, views: GuideViewSet) -> None:
         self.views = views
         self.model_from_body = rigid(np.eye(3), views.center_in_model)
         self.body_from_model = invert(self.model_from_body)
-        self._decoded: dict[int, tuple[Array, ...]] = {}
+        raw = views.arrays
+        unit16 = np.float32(1.0 / 32767.0)
+        center = views.center_in_model
+        self.arrays = (
+            np.ascontiguousarray(views.directions),
+            np.array(raw["contour_start"]),
+            (raw["contour_points"] - center).astype(np.float32),
+            raw["contour_normals"] * unit16,
+            np.array(raw["contour_runs_mm"]),
+            np.array(raw["edge_start"]),
+            (raw["edge_points"] - center).astype(np.float32),
+            raw["edge_tangents"] * unit16,
+            np.array(raw["edge_kinds"]),
+        )
 
     def nearest(self, cam_from_body: Array) -> int:
         """Index of the guide view whose direction is nearest."""
-        eye = -cam_from_body[:3, :3].T @ cam_from_body[:3, 3]
-        return int(np.argmax(self.views.directions @ eye))
-
-    def arrays(self, index: int) -> tuple[Array, ...]:
-        """Contour points, normals, runs, edge points, tangents of a view, points about the centre."""
-        found = self._decoded.get(index)
-        if found is None:
-            view: GuideView = self.views.view(index)
-            f = view.features
-            center = self.views.center_in_model
-            found = (
-                np.ascontiguousarray(f.contour_points - center),
-                np.ascontiguousarray(f.contour_normals),
-                np.ascontiguousarray(f.contour_runs_mm),
-                np.ascontiguousarray(f.edge_points - center),
-                np.ascontiguousarray(f.edge_tangents),
-            )
-            self._decoded[index] = found
-        return found
+        return int(nearest_view(self.arrays[0], cam_from_body))
 
 
 def intrinsics_of(camera: Camera) -> Array:
@@ -165,6 +177,19 @@ def intrinsics_of(camera: Camera) -> Array:
     return np.array(
         [camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0]
     )
+
+
+def smoothed(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A gray picture as the edge modality takes it: averaged over 3×3."""
+    return np.asarray(cv2.blur(gray, (3, 3)))
+
+
+@lru_cache(maxsize=64)
+def _stage_table(stages: tuple[Stage, ...]) -> Array:
+    return np.array([stage.row() for stage in stages], dtype=np.float64)
+
+
+_NO_MATCHES = Matches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
 
 
 class Tracker:
@@ -179,6 +204,11 @@ class Tracker:
         self.diameter_mm = views.diameter_mm
         self.appearance = Appearance()
         self._intrinsics = intrinsics_of(camera)
+        self._step_mm = 0.01 * self.diameter_mm
+        o = self.options
+        self._damping = np.concatenate(
+            [np.full(3, 1.0 / o.rotation_sigma_rad**2), np.full(3, 1.0 / (o.translation_sigma * self.diameter_mm) ** 2)]
+        )
         self._cam_from_body: Array | None = None
         self._velocity = np.zeros(6)
         self._gain = 1.0
@@ -204,10 +234,8 @@ class Tracker:
 
     def learn(self, image: NDArray[np.uint8], cam_from_body: Array, rate: float) -> None:
         """Blend the colours along the contour at this pose into the histograms."""
-        contour, normals, runs, _, _ = self.part.arrays(self.part.nearest(cam_from_body))
-        pixels, normals_px, depths = project_lines(contour, normals, False, cam_from_body, self._intrinsics, 0.01 * self.diameter_mm)
         fore, back = np.zeros(BINS**3), np.zeros(BINS**3)
-        add_histograms(image, self._bin_of, pixels, normals_px, depths, runs, self.camera.fx, fore, back, 20.0, 1.5)
+        count_colours(image, self._bin_of, self.part.arrays, cam_from_body, self._intrinsics, self._step_mm, fore, back)
         look = self.appearance
         if fore.sum() < 50 or back.sum() < 50:
             return
@@ -229,40 +257,16 @@ class Tracker:
         ``matches`` are the part's own texture found in this frame, measured once for all stages.
         """
         o = self.options
-        damping = np.empty(6)
-        damping[:3] = 1.0 / o.rotation_sigma_rad**2
-        damping[3:] = 1.0 / (o.translation_sigma * self.diameter_mm) ** 2
-        step_mm = 0.01 * self.diameter_mm
-        hessian = np.zeros((6, 6))
-        for stage in stages:
-            contour, normals, runs, edges, tangents = self.part.arrays(self.part.nearest(cam_from_body))
-            if o.use_region and self.appearance.is_known:
-                c_px, c_n, c_z = project_lines(contour, normals, False, cam_from_body, self._intrinsics, step_mm)
-                mean, information, _ = measure_region(
-                    image, self._bin_of, c_px, c_n, c_z, runs, self.camera.fx, self.appearance.odds, EDGE_FUNCTION, stage.region_scale
-                )
-            if o.use_edge:
-                e_px, e_n, e_z = project_lines(edges, tangents, True, cam_from_body, self._intrinsics, step_mm)
-                positions, strengths, _ = measure_edges(
-                    gray, e_px, e_n, e_z, stage.edge_reach, stage.edge_step_px, o.edge_threshold
-                )
-            for _ in range(stage.updates):
-                hessian[:] = 0.0
-                gradient = np.zeros(6)
-                if o.use_region and self.appearance.is_known:
-                    add_region(hessian, gradient, contour, cam_from_body, self._intrinsics, c_px, c_n, mean, information, o.region_weight * stage.region_gain, 3.0 * stage.region_scale)
-                if o.use_edge:
-                    add_edges(
-                        hessian, gradient, edges, cam_from_body, self._intrinsics, e_px, e_n, positions, strengths,
-                        15.0, o.edge_sigma_px * max(1.0, 0.5 * stage.edge_spread_px), stage.edge_spread_px, o.edge_weight,
-                    )
-                if matches is not None:
-                    add_features(
-                        hessian, gradient, matches.points_in_body, cam_from_body, self._intrinsics, matches.pixels,
-                        matches.weights, o.feature_sigma_px, max(4.0, 2.0 * stage.edge_spread_px),
-                    )
-                cam_from_body = apply_twist(cam_from_body, solve_step(hessian, gradient, damping))
-        return cam_from_body, hessian + np.tril(hessian, -1).T
+        if matches is None:
+            matches = _NO_MATCHES
+        pose, information = run_stages(
+            image, gray, self._bin_of, self.appearance.odds, EDGE_FUNCTION, self.part.arrays, cam_from_body,
+            self._intrinsics, self._step_mm, _stage_table(stages), self._damping,
+            o.region_weight if o.use_region and self.appearance.is_known else 0.0,
+            o.edge_weight if o.use_edge else 0.0, o.edge_sigma_px, o.edge_threshold,
+            matches.points_in_body, matches.pixels, matches.weights, o.feature_sigma_px,
+        )  # fmt: skip
+        return pose, information
 
     def refine_fresh(
         self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...]
@@ -283,21 +287,13 @@ class Tracker:
 
     def evidence(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, tolerance_px: float = 1.5) -> Evidence:
         """What the picture says for a pose, with the colours learned so far; steps count within a tolerance."""
-        index = self.part.nearest(cam_from_body)
-        contour, normals, runs, edges, tangents = self.part.arrays(index)
-        step_mm = 0.01 * self.diameter_mm
-        pixels, normals_px, depths = project_lines(edges, tangents, True, cam_from_body, self._intrinsics, step_mm)
-        positions, strengths, seen = measure_edges(gray, pixels, normals_px, depths, 10, 1.0, self.options.edge_threshold)
-        kinds = self.part.views.view(index).features.edge_kinds
-        outline = edge_evidence(positions, strengths, seen, kinds, 10.0, tolerance_px)
-        region_support, region_information = -1.0, 0.0
-        if self.appearance.is_known:
-            pixels, normals_px, depths = project_lines(contour, normals, False, cam_from_body, self._intrinsics, step_mm)
-            mean, information, agreement = measure_region(
-                image, self._bin_of, pixels, normals_px, depths, runs, self.camera.fx, self.appearance.odds, EDGE_FUNCTION, 2
+        return Evidence(
+            *run_evidence(
+                image, gray, self._bin_of, self.appearance.odds, self.appearance.is_known, EDGE_FUNCTION,
+                self.part.arrays, cam_from_body, self._intrinsics, self._step_mm, self.options.edge_threshold,
+                tolerance_px,
             )
-            region_support, region_information = region_evidence(mean, information, agreement, 2.0)
-        return Evidence(*outline[:4], region_support, region_information, outline[4])
+        )  # fmt: skip
 
     def evidence_fresh(
         self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, tolerance_px: float = 1.5
@@ -315,21 +311,20 @@ class Tracker:
 
         The factor is the median ratio of the brightness on a coarse grid; saturated and black pixels do not count.
         """
-        sparse = gray[8::16, 8::16].astype(np.float64)
-        if self._sparse_gray is not None:
-            usable = (sparse > 8) & (sparse < 250) & (self._sparse_gray > 8) & (self._sparse_gray < 250)
-            if np.count_nonzero(usable) > 50:
-                ratio = float(np.median(sparse[usable] / self._sparse_gray[usable]))
-                # The histograms follow slow changes by themselves: the factor fades.
-                self._gain = min(max(self._gain**0.9 * ratio, 0.2), 5.0)
-                self._bin_of = value_bins(self._gain)
-        self._sparse_gray = sparse
+        if self._sparse_gray is None:
+            self._sparse_gray = np.zeros((gray.shape[0] // 16, gray.shape[1] // 16))
+        ratio = median_brightness_ratio(gray, self._sparse_gray, 16)
+        if ratio != 1.0 or self._gain != 1.0:
+            # The histograms follow slow changes by themselves: the factor fades.
+            self._gain = min(max(self._gain**0.9 * ratio, 0.2), 5.0)
+            self._bin_of = value_bins(self._gain)
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
         """Pose in the next frame, with its evidence."""
         if self._cam_from_body is None:
             raise RuntimeError("Tracker.track was called before Tracker.start")
-        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        plain_gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        gray = smoothed(plain_gray)
         self._follow_exposure(gray)
         o = self.options
         before = self._cam_from_body
@@ -337,7 +332,7 @@ class Tracker:
         matches, found_share = None, 0.0
         starts = [predicted]
         if self._features is not None:
-            pyramid = self._features.pyramid(gray)
+            pyramid = self._features.pyramid(plain_gray)
             matches = self._features.measure(pyramid, predicted)
             found_share = len(matches.weights) / max(matches.tried, 1)
             if len(matches.weights) >= o.feature_min_count and found_share >= o.feature_min_share:
@@ -352,7 +347,6 @@ class Tracker:
                 other_evidence = self.evidence(image, gray, other)
                 if other_evidence.worth > evidence.worth:
                     pose, information, evidence, matches = other, other_information, other_evidence, None
-        pose = orthonormalise(pose)
         self._velocity = 0.5 * log_se3(invert(before) @ pose)
         self._cam_from_body = pose
         quality = evidence.quality
