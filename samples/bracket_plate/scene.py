@@ -481,10 +481,17 @@ def undistortion_maps(camera: dict, film: tuple[int, int]):
 
 
 def subframes(camera: dict, index: int) -> int:
-    """How many sub-frames, so that the picture moves at most about 3 px between two of them."""
-    before, after = (motion.cam_from_model(index + sign * SHUTTER / 2)[:3, :3] for sign in (-1, 1))
-    angle = np.arccos(np.clip((np.trace(after @ before.T) - 1) / 2, -1, 1))
-    return next((n for n in (2, 4) if n >= angle * camera["fx"] / 3), 8)
+    """How many sub-frames: enough that picture and card move at most about 3 px between two of them.
+
+    (The hand may move 7 px: it is soft enough for that.)
+    """
+    times = (index - SHUTTER / 2, index + SHUTTER / 2)
+    before, after = (motion.cam_from_model(t)[:3, :3] for t in times)
+    flow_px = np.arccos(np.clip((np.trace(after @ before.T) - 1) / 2, -1, 1)) * camera["fx"]
+    cards = [card[:3, 3] for card in map(motion.card_in_cam, times) if card is not None]
+    if len(cards) == 2:
+        flow_px = max(flow_px, np.linalg.norm(cards[1] - cards[0]) / cards[0][2] * camera["fx"])
+    return next((n for n in (2, 4) if n >= flow_px / 3), 8)
 
 
 def develop(linear: np.ndarray, index: int) -> np.ndarray:

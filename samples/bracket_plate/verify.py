@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-FRAMES = (0, 30, 60, 125, 150, 190, 200, 260, 275, 299)
+FRAMES = (0, 40, 85, 125, 185, 200, 255, 265, 280, 299)
 REACH_PX = 6.0
 
 
