@@ -172,6 +172,7 @@ def guideviews(part: str, output: str, component: str | None, unit: str | None, 
     """
     from arview.cad import load_part
     from arview.guideviews import GuideViewOptions, make_guide_views
+    from arview.guideviews.uniqueness import assess
 
     loaded = load_part(part, unit)
     path = _output_path(output, [loaded.path, loaded.cad_path])
@@ -185,6 +186,8 @@ def guideviews(part: str, output: str, component: str | None, unit: str | None, 
     seconds = time.perf_counter() - began
     size_mb = path.stat().st_size / 1e6
     click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB")
+    unique = assess(views)
+    click.echo(f"{'sufficient' if unique.is_sufficient else 'INSUFFICIENT'}: {unique.reason}")
 
 
 # --- annotate -------------------------------------------------------------------------------------------

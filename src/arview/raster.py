@@ -82,7 +82,20 @@ def _rasterise(points, faces, fx, fy, cx, cy, near, x_low, y_low, inverse_depth,
             ):
                 continue
             _fill(
-                u[a], v[a], w[a], u[b], v[b], w[b], u[c], v[c], w[c], face, x_low, y_low, inverse_depth, face_ids
+                u[a],
+                v[a],
+                w[a],
+                u[b],
+                v[b],
+                w[b],
+                u[c],
+                v[c],
+                w[c],
+                face,
+                x_low,
+                y_low,
+                inverse_depth,
+                face_ids,
             )
             continue
         corners = 0

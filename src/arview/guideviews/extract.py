@@ -179,10 +179,14 @@ def extract_features(
     if len(samples.pixels):
         is_short = samples.lengths_px < 6.0
         smooth_px = _smooth_tangents(samples.pixels, tangents_px, (height, width))
-        smooth_in_cam = np.stack([smooth_px[:, 0] / fx, smooth_px[:, 1] / fy, np.zeros(len(smooth_px))], axis=1)
+        smooth_in_cam = np.stack(
+            [smooth_px[:, 0] / fx, smooth_px[:, 1] / fy, np.zeros(len(smooth_px))], axis=1
+        )
         smooth_in_cam /= np.linalg.norm(smooth_in_cam, axis=1, keepdims=True)
         edge_tangents = np.where(is_short[:, None], smooth_in_cam @ cam_from_model[:3, :3], edge_tangents)
-    usable = np.flatnonzero(~along_sight | (samples.lengths_px < 6.0)) if len(samples.pixels) else np.zeros(0, int)
+    usable = (
+        np.flatnonzero(~along_sight | (samples.lengths_px < 6.0)) if len(samples.pixels) else np.zeros(0, int)
+    )
     chosen = usable[_evenly(len(usable), edge_count)]
 
     mask = rendering.silhouette

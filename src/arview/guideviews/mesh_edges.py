@@ -62,7 +62,11 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     keep = length > 1e-12
-    faces, normals, component_of_face = faces[keep], normals[keep] / length[keep, None], component_of_face[keep]
+    faces, normals, component_of_face = (
+        faces[keep],
+        normals[keep] / length[keep, None],
+        component_of_face[keep],
+    )
 
     half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     face_of_half = np.tile(np.arange(len(faces)), 3)
@@ -88,8 +92,10 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
 
 
 @njit(cache=True, nogil=True)
-def _sample_visible(vertices, ends, faces, is_crease, is_sharp, normals, component, cam_from_model, fx, fy, cx, cy,
-                    depth, spacing_px, depth_tolerance):  # type: ignore[no-untyped-def]  # fmt: skip
+def _sample_visible(  # type: ignore[no-untyped-def]
+    vertices, ends, faces, is_crease, is_sharp, normals, component, cam_from_model, fx, fy, cx, cy, depth,
+    spacing_px, depth_tolerance
+):  # fmt: skip
     height, width = depth.shape
     rotation = cam_from_model[:3, :3]
     translation = cam_from_model[:3, 3]

@@ -11,9 +11,7 @@ from arview.geometry import Array, look_at
 def icosphere_directions(subdivisions: int) -> Array:
     """(10 · 4^n + 2, 3) unit vectors of an icosahedron subdivided n times: 4 gives 2,562, about 4° apart."""
     golden = (1.0 + 5.0**0.5) / 2.0
-    vertices = [
-        (s1 * a, s2 * b, 0.0) for s1 in (1, -1) for s2 in (1, -1) for a, b in ((1.0, golden),)
-    ]
+    vertices = [(s1 * a, s2 * b, 0.0) for s1 in (1, -1) for s2 in (1, -1) for a, b in ((1.0, golden),)]
     points = np.array([np.roll(v, k) for v in vertices for k in range(3)], dtype=np.float64)
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     distances = np.linalg.norm(points[:, None] - points[None], axis=-1)
@@ -28,7 +26,9 @@ def icosphere_directions(subdivisions: int) -> Array:
     ]
     triangles = np.array(faces)
     for _ in range(subdivisions):
-        edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+        edges = np.sort(
+            np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1
+        )
         unique, inverse = np.unique(edges, axis=0, return_inverse=True)
         middles = points[unique].sum(axis=1)
         middles /= np.linalg.norm(middles, axis=1, keepdims=True)
@@ -44,9 +44,7 @@ def icosphere_directions(subdivisions: int) -> Array:
 def view_poses(directions: Array, distance_mm: float, center_in_model: Array) -> Array:
     """(N,4,4) ``cam_from_model`` of cameras on a sphere around the centre, looking at it with +Z up."""
     up = np.array([0.0, 0.0, 1.0])
-    return np.stack(
-        [look_at(center_in_model + distance_mm * d, center_in_model, up) for d in directions]
-    )
+    return np.stack([look_at(center_in_model + distance_mm * d, center_in_model, up) for d in directions])
 
 
 def directions_in_range(view_range: ViewRange, subdivisions: int, margin_deg: float) -> Array:

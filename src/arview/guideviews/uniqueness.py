@@ -72,7 +72,9 @@ def assess(views: GuideViewSet, most_views: int = 642) -> Uniqueness:
     index = np.arange(0, len(views), step)
     looked_at = [views.view(int(i)) for i in index]
     lines = np.array([view_lines(view, views.diameter_mm) for view in looked_at])
-    likeness, partner = _likeness(np.stack([_descriptor(v, views.diameter_mm) for v in looked_at]), views.directions[index])
+    likeness, partner = _likeness(
+        np.stack([_descriptor(v, views.diameter_mm) for v in looked_at]), views.directions[index]
+    )
     nearest = np.argmax(views.directions @ views.directions[index].T, axis=1)
     confused = np.where(partner[nearest] >= 0, index[np.maximum(partner[nearest], 0)], -1)
     plain_share = float(np.mean(lines < PLAIN_LINES))

@@ -259,12 +259,16 @@ def make_guide_views(
     arrays: dict[str, NDArray[Any]] = {
         "contour_start": starts([len(f.contour_points) for f in found]),
         "contour_points": np.concatenate([f.contour_points for f in found]).astype(np.float32),
-        "contour_normals": np.round(np.concatenate([f.contour_normals for f in found]) * _UNIT16).astype(np.int16),
+        "contour_normals": np.round(np.concatenate([f.contour_normals for f in found]) * _UNIT16).astype(
+            np.int16
+        ),
         "contour_runs_mm": np.concatenate([f.contour_runs_mm for f in found]).astype(np.float32),
         "contour_component": np.concatenate([f.contour_component for f in found]).astype(np.int16),
         "edge_start": starts([len(f.edge_points) for f in found]),
         "edge_points": np.concatenate([f.edge_points for f in found]).astype(np.float32),
-        "edge_tangents": np.round(np.concatenate([f.edge_tangents for f in found]) * _UNIT16).astype(np.int16),
+        "edge_tangents": np.round(np.concatenate([f.edge_tangents for f in found]) * _UNIT16).astype(
+            np.int16
+        ),
         "edge_kinds": np.concatenate([f.edge_kinds for f in found]),
         "edge_component": np.concatenate([f.edge_component for f in found]).astype(np.int16),
     }

@@ -26,7 +26,6 @@ from arview.tracking.solver import project_lines
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions, smoothed
 
 
-
 def _coarse_stages(region_gain: float) -> tuple[Stage, ...]:
     return (
         Stage(6, 12, 2.0, 10.0, 2, region_gain),
@@ -138,14 +137,18 @@ class Detector:
             distance = cam_from_body[2, 3]
             c_px, c_n, c_z = project_lines(contour, normals, False, cam_from_body, intrinsics, 0.5)
             inner = (features.edge_kinds & EDGE_CONTOUR) == 0
-            e_px, e_n, e_z = project_lines(edges[inner], tangents[inner], True, cam_from_body, intrinsics, 0.5)
+            e_px, e_n, e_z = project_lines(
+                edges[inner], tangents[inner], True, cam_from_body, intrinsics, 0.5
+            )
             c_px, c_n = c_px[c_z > 0], c_n[c_z > 0]
             e_px, e_n = e_px[e_z > 0], e_n[e_z > 0]
             inner_count = min(len(e_px), int(0.35 * o.points))
             outer_count = min(len(c_px), o.points - inner_count)
             if outer_count < 8:
                 continue
-            px = np.concatenate([c_px[_spread(len(c_px), outer_count)], e_px[_spread(len(e_px), inner_count)]])
+            px = np.concatenate(
+                [c_px[_spread(len(c_px), outer_count)], e_px[_spread(len(e_px), inner_count)]]
+            )
             n = np.concatenate([c_n[_spread(len(c_n), outer_count)], e_n[_spread(len(e_n), inner_count)]])
             px *= distance / focal * template_scale
             for roll in rolls:
@@ -160,7 +163,9 @@ class Detector:
                 rotations[row] = rigid(exp_so3([0, 0, roll]), np.zeros(3))[:3, :3] @ cam_from_body[:3, :3]
                 row += 1
         if row == 0:
-            raise InputError("guide views: no view shows an outline; check the model and the declared distances")
+            raise InputError(
+                "guide views: no view shows an outline; check the model and the declared distances"
+            )
         self._offsets, self._bins, self._counts = offsets[:row], bins[:row], counts[:row]
         self._origins, self._rotations = origins[:row], rotations[:row]
 
@@ -193,14 +198,18 @@ class Detector:
         quality, pose = settled[0]
         return Detection(pose @ self.tracker.part.body_from_model, quality)
 
-    def _settle(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Array]) -> list[tuple[float, Array]]:
+    def _settle(
+        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Array]
+    ) -> list[tuple[float, Array]]:
         """Refine starts, keep the best, search around them; (quality, cam_from_body) best first."""
         o = self.options
         coarse: list[tuple[float, Array]] = []
         for start in starts:
             for stages in COARSE_STAGES:
                 pose = self.tracker.refine_fresh(image, gray, start, stages)
-                coarse.append((self.tracker.evidence_fresh(image, gray, pose, COARSE_TOLERANCE_PX).worth, pose))
+                coarse.append(
+                    (self.tracker.evidence_fresh(image, gray, pose, COARSE_TOLERANCE_PX).worth, pose)
+                )
         coarse.sort(key=lambda item: -item[0])
         finished: list[tuple[float, Array]] = []
         tried: list[Array] = []
@@ -260,7 +269,9 @@ class Detector:
             resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
             pad = round(0.6 * o.radius_px)
             maps = response_maps(resized, o.spread_px, pad)
-            scores, places = match_templates(decimate(maps, o.grid_px), self._offsets, self._bins, self._counts, 3)
+            scores, places = match_templates(
+                decimate(maps, o.grid_px), self._offsets, self._bins, self._counts, 3
+            )
             for t, n in zip(*np.nonzero(scores > 0.25), strict=True):
                 center = places[t, n] + self._origins[t] - pad
                 center_px = (center + 0.5) * [camera.width / width, camera.height / height] - 0.5
@@ -276,7 +287,8 @@ class Detector:
                     abs(other.place_px[0] - center_px[0]) < reach
                     and abs(other.place_px[1] - center_px[1]) < reach
                     and abs(np.log(other.scale / scale)) < 0.2
-                    and np.trace(other.cam_from_body[:3, :3].T @ self._aligned(rotation, center_px)) > 1 + 2 * np.cos(0.3)
+                    and np.trace(other.cam_from_body[:3, :3].T @ self._aligned(rotation, center_px))
+                    > 1 + 2 * np.cos(0.3)
                 ):
                     clash = True
                     break

@@ -94,8 +94,10 @@ def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # 
 
 
 @njit(cache=True, nogil=True)
-def add_edges(hessian, gradient, points, cam_from_body, intrinsics, pixels, normals, positions, strengths,
-              strength_half, sigma_px, spread_px, weight):  # type: ignore[no-untyped-def]  # fmt: skip
+def add_edges(  # type: ignore[no-untyped-def]
+    hessian, gradient, points, cam_from_body, intrinsics, pixels, normals, positions, strengths,
+    strength_half, sigma_px, spread_px, weight
+):  # fmt: skip
     """Add the chosen hypothesis of each point to the 6×6 system.
 
     ``spread_px`` is how far the pose may still be off: hypotheses are judged by strength × Gaussian of that width,

@@ -59,9 +59,7 @@ def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
     rows, columns = -(-height // step), -(-width // step)
     padded = np.zeros((count, rows * step, columns * step), dtype=np.uint8)
     padded[:, :height, :width] = maps
-    return np.ascontiguousarray(
-        padded.reshape(count, rows, step, columns, step).transpose(0, 2, 4, 1, 3)
-    )
+    return np.ascontiguousarray(padded.reshape(count, rows, step, columns, step).transpose(0, 2, 4, 1, 3))
 
 
 @njit(cache=True, nogil=True)

@@ -30,9 +30,11 @@ def nearest_view(directions, cam_from_body):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def run_stages(image, gray, bin_of, odds, edge_function, part, cam_from_body, intrinsics, step_mm, stages, damping,
-               region_weight, edge_weight, edge_sigma_px, edge_threshold, match_points, match_pixels, match_weights,
-               feature_sigma_px):  # type: ignore[no-untyped-def]  # fmt: skip
+def run_stages(  # type: ignore[no-untyped-def]
+    image, gray, bin_of, odds, edge_function, part, cam_from_body, intrinsics, step_mm, stages, damping,
+    region_weight, edge_weight, edge_sigma_px, edge_threshold, match_points, match_pixels, match_weights,
+    feature_sigma_px
+):  # fmt: skip
     """Pose and information after all stages.
 
     Args:
@@ -80,7 +82,19 @@ def run_stages(image, gray, bin_of, odds, edge_function, part, cam_from_body, in
             hessian[:] = 0.0
             gradient[:] = 0.0
             if region_gain > 0:
-                add_region(hessian, gradient, contour, pose, intrinsics, c_px, c_n, mean, information, region_gain, 3.0 * scale)
+                add_region(
+                    hessian,
+                    gradient,
+                    contour,
+                    pose,
+                    intrinsics,
+                    c_px,
+                    c_n,
+                    mean,
+                    information,
+                    region_gain,
+                    3.0 * scale,
+                )
             if edge_gain > 0:
                 add_edges(
                     hessian, gradient, edges, pose, intrinsics, e_px, e_n, positions, strengths,
@@ -108,13 +122,17 @@ def run_stages(image, gray, bin_of, odds, edge_function, part, cam_from_body, in
 
 
 @njit(cache=True, nogil=True)
-def run_evidence(image, gray, bin_of, odds, has_colours, edge_function, part, cam_from_body, intrinsics, step_mm,
-                 edge_threshold, tolerance_px):  # type: ignore[no-untyped-def]  # fmt: skip
+def run_evidence(  # type: ignore[no-untyped-def]
+    image, gray, bin_of, odds, has_colours, edge_function, part, cam_from_body, intrinsics, step_mm,
+    edge_threshold, tolerance_px
+):  # fmt: skip
     """The seven numbers of `Evidence` at a pose."""
     directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
     view = nearest_view(directions, cam_from_body)
     first, last = e_start[view], e_start[view + 1]
-    pixels, normals, depths = project_lines(e_points[first:last], e_tangents[first:last], True, cam_from_body, intrinsics, step_mm)
+    pixels, normals, depths = project_lines(
+        e_points[first:last], e_tangents[first:last], True, cam_from_body, intrinsics, step_mm
+    )
     positions, strengths, seen = measure_edges(gray, pixels, normals, depths, 10, 1.0, edge_threshold)
     contour, inner, share, sharpness, inside = edge_evidence(
         positions, strengths, seen, e_kinds[first:last], 10.0, tolerance_px
@@ -122,7 +140,9 @@ def run_evidence(image, gray, bin_of, odds, has_colours, edge_function, part, ca
     region, region_information = -1.0, 0.0
     if has_colours:
         first, last = c_start[view], c_start[view + 1]
-        pixels, normals, depths = project_lines(c_points[first:last], c_normals[first:last], False, cam_from_body, intrinsics, step_mm)
+        pixels, normals, depths = project_lines(
+            c_points[first:last], c_normals[first:last], False, cam_from_body, intrinsics, step_mm
+        )
         mean, information, agreement = measure_region(
             image, bin_of, pixels, normals, depths, c_runs[first:last], intrinsics[0], odds, edge_function, 2
         )
@@ -136,8 +156,12 @@ def count_colours(image, bin_of, part, cam_from_body, intrinsics, step_mm, fore,
     directions, c_start, c_points, c_normals, c_runs, _, _, _, _ = part
     view = nearest_view(directions, cam_from_body)
     first, last = c_start[view], c_start[view + 1]
-    pixels, normals, depths = project_lines(c_points[first:last], c_normals[first:last], False, cam_from_body, intrinsics, step_mm)
-    add_histograms(image, bin_of, pixels, normals, depths, c_runs[first:last], intrinsics[0], fore, back, 20.0, 1.5)
+    pixels, normals, depths = project_lines(
+        c_points[first:last], c_normals[first:last], False, cam_from_body, intrinsics, step_mm
+    )
+    add_histograms(
+        image, bin_of, pixels, normals, depths, c_runs[first:last], intrinsics[0], fore, back, 20.0, 1.5
+    )
 
 
 @njit(cache=True, nogil=True)

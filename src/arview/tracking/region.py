@@ -54,7 +54,9 @@ def add_histograms(image, bin_of, pixels, normals, depths, runs_mm, focal, fore,
                 x = int(np.round(pixels[i, 0] + sign * step * normals[i, 0]))
                 y = int(np.round(pixels[i, 1] + sign * step * normals[i, 1]))
                 if 0 <= x < width and 0 <= y < height:
-                    index = bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]
+                    index = (
+                        bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]
+                    )
                     if side == 0:
                         fore[index] += 1.0
                     else:
@@ -120,7 +122,9 @@ def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds,
                     continue
                 x = int(u + t * nu + 0.5)
                 y = int(v + t * nv + 0.5)
-                total += odds[bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]]
+                total += odds[
+                    bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]
+                ]
             # A soft sign in place of tanh: probability of "part" less that of "background".
             total *= soften
             lean = total / np.sqrt(1.0 + total * total)
@@ -150,7 +154,19 @@ def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds,
 
 
 @njit(cache=True, nogil=True)
-def add_region(hessian, gradient, points, cam_from_body, intrinsics, pixels, normals, mean, information, weight, robust_px):  # type: ignore[no-untyped-def]
+def add_region(
+    hessian,
+    gradient,
+    points,
+    cam_from_body,
+    intrinsics,
+    pixels,
+    normals,
+    mean,
+    information,
+    weight,
+    robust_px,
+):  # type: ignore[no-untyped-def]
     """Add the lines' Gaussians to the 6×6 system at the current pose; returns cost and number of lines."""
     r = cam_from_body
     used = 0

@@ -98,7 +98,9 @@ class TrackingSession:
             model,
         )
         self._detector: Detector | None = None
-        self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
+        self._initial = (
+            None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
+        )
         self.reset()
 
     @property
@@ -157,7 +159,9 @@ class TrackingSession:
         poor = outside or quality < o.lost_quality
         self._poor = self._poor + 1 if poor else 0
         if self._poor >= o.lost_frames or (poor and not self._confirmed):
-            return self._lose("the part left the picture" if outside else "the part is hidden or moved too fast")
+            return self._lose(
+                "the part left the picture" if outside else "the part is hidden or moved too fast"
+            )
         was_tracked = self.state == TrackingState.TRACKED
         if not poor and quality >= (o.critical_quality if was_tracked else o.tracked_quality):
             self.state = TrackingState.TRACKED

@@ -15,13 +15,19 @@ from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
-from arview.errors import InputError, MismatchError
+from arview.errors import InputError
 from arview.geometry import Array, exp_se3, invert, log_se3, rigid
 from arview.guideviews import GuideViewSet
 from arview.tracking.feature import FeatureModality, Matches
 from arview.tracking.patch import Pyramid
 from arview.tracking.quality import Evidence, quality_of
-from arview.tracking.refine import count_colours, median_brightness_ratio, nearest_view, run_evidence, run_stages
+from arview.tracking.refine import (
+    count_colours,
+    median_brightness_ratio,
+    nearest_view,
+    run_evidence,
+    run_stages,
+)
 from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
 
 
@@ -196,7 +202,11 @@ class Tracker:
     """6-DoF tracking of one part with one camera."""
 
     def __init__(
-        self, views: GuideViewSet, camera: Camera, options: TrackerOptions | None = None, model: Model | None = None
+        self,
+        views: GuideViewSet,
+        camera: Camera,
+        options: TrackerOptions | None = None,
+        model: Model | None = None,
     ) -> None:
         self.options = options or TrackerOptions()
         self.camera = camera
@@ -207,7 +217,10 @@ class Tracker:
         self._step_mm = 0.01 * self.diameter_mm
         o = self.options
         self._damping = np.concatenate(
-            [np.full(3, 1.0 / o.rotation_sigma_rad**2), np.full(3, 1.0 / (o.translation_sigma * self.diameter_mm) ** 2)]
+            [
+                np.full(3, 1.0 / o.rotation_sigma_rad**2),
+                np.full(3, 1.0 / (o.translation_sigma * self.diameter_mm) ** 2),
+            ]
         )
         self._cam_from_body: Array | None = None
         self._velocity = np.zeros(6)
@@ -235,7 +248,9 @@ class Tracker:
     def learn(self, image: NDArray[np.uint8], cam_from_body: Array, rate: float) -> None:
         """Blend the colours along the contour at this pose into the histograms."""
         fore, back = np.zeros(BINS**3), np.zeros(BINS**3)
-        count_colours(image, self._bin_of, self.part.arrays, cam_from_body, self._intrinsics, self._step_mm, fore, back)
+        count_colours(
+            image, self._bin_of, self.part.arrays, cam_from_body, self._intrinsics, self._step_mm, fore, back
+        )
         look = self.appearance
         if fore.sum() < 50 or back.sum() < 50:
             return
@@ -250,7 +265,12 @@ class Tracker:
         log_odds(look.fore, look.back, look.odds)
 
     def refine(
-        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...], matches: Matches | None = None
+        self,
+        image: NDArray[np.uint8],
+        gray: NDArray[np.uint8],
+        cam_from_body: Array,
+        stages: tuple[Stage, ...],
+        matches: Matches | None = None,
     ) -> tuple[Array, Array]:
         """Pose (``cam_from_body``) and information (6,6) after the given stages from a start.
 
@@ -269,7 +289,11 @@ class Tracker:
         return pose, information
 
     def refine_fresh(
-        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...]
+        self,
+        image: NDArray[np.uint8],
+        gray: NDArray[np.uint8],
+        cam_from_body: Array,
+        stages: tuple[Stage, ...],
     ) -> Array:
         """Refine a pose of unknown worth: colours are learned at the start itself, nothing is remembered."""
         kept = self.appearance
@@ -285,7 +309,13 @@ class Tracker:
         """Half the part's diameter in the picture."""
         return 0.5 * self.diameter_mm * self.camera.fx / max(float(cam_from_body[2, 3]), 1.0)
 
-    def evidence(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, tolerance_px: float = 1.5) -> Evidence:
+    def evidence(
+        self,
+        image: NDArray[np.uint8],
+        gray: NDArray[np.uint8],
+        cam_from_body: Array,
+        tolerance_px: float = 1.5,
+    ) -> Evidence:
         """What the picture says for a pose, with the colours learned so far; steps count within a tolerance."""
         return Evidence(
             *run_evidence(
@@ -296,7 +326,11 @@ class Tracker:
         )  # fmt: skip
 
     def evidence_fresh(
-        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, tolerance_px: float = 1.5
+        self,
+        image: NDArray[np.uint8],
+        gray: NDArray[np.uint8],
+        cam_from_body: Array,
+        tolerance_px: float = 1.5,
     ) -> Evidence:
         """What the picture says for a pose, with the colours found at the pose itself."""
         kept = self.appearance
@@ -360,7 +394,9 @@ class Tracker:
                 self._remember_texture(pyramid, pose, matches, evidence)
         return Estimate(pose @ self.part.body_from_model, information, quality, evidence)
 
-    def _remember_texture(self, pyramid: Pyramid, cam_from_body: Array, matches: Matches | None, evidence: Evidence) -> None:
+    def _remember_texture(
+        self, pyramid: Pyramid, cam_from_body: Array, matches: Matches | None, evidence: Evidence
+    ) -> None:
         """Settle the features seen, and take a new keyframe where one is missing and nothing hides the outline."""
         assert self._features is not None
         if matches is not None:
@@ -368,7 +404,11 @@ class Tracker:
         self._best_contour_support = max(0.99 * self._best_contour_support, evidence.contour_support)
         unhidden = evidence.contour_support > 0.85 * self._best_contour_support
         tracked_count = 0 if matches is None else len(matches.weights)
-        if unhidden and evidence.quality > 0.6 and self._features.wants_keyframe(cam_from_body, tracked_count):
+        if (
+            unhidden
+            and evidence.quality > 0.6
+            and self._features.wants_keyframe(cam_from_body, tracked_count)
+        ):
             self._features.add_keyframe(pyramid, cam_from_body)
 
     def covariance(self, estimate: Estimate) -> Array:
