@@ -168,6 +168,7 @@ def test_guideviews_are_written_and_used(room: Path) -> None:
     result = run("guideviews", "part.toml", "-o", "set.bin", "--renderer", "zbuffer", "--component", "brick")
     assert result.exit_code == 0, result.output
     assert "views of" in result.stdout and " s, " in result.stdout and " MB" in result.stdout
+    assert "insufficient: " in result.stdout  # a lone plain block
     assert run("guideviews", "part.toml", "-o", "set.bin", "--renderer", "zbuffer").exit_code == 0
     result = run("annotate", "clip.mp4", *ANNOTATE, "--guideviews", "set.bin", "--poses", "poses.jsonl")
     assert result.exit_code == 0, result.output

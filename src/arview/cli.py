@@ -186,8 +186,7 @@ def guideviews(part: str, output: str, component: str | None, unit: str | None, 
     seconds = time.perf_counter() - began
     size_mb = path.stat().st_size / 1e6
     click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB")
-    unique = assess(views)
-    click.echo(f"{'sufficient' if unique.is_sufficient else 'INSUFFICIENT'}: {unique.reason}")
+    click.echo(assess(views).reason)
 
 
 # --- annotate -------------------------------------------------------------------------------------------
