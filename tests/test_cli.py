@@ -47,9 +47,7 @@ POSE = look_at([320.0, 30.0, 250.0], [30.0, 30.0, 5.0], [0.0, 0.0, 1.0])
 class FakeSession:
     """Stands still where it is told to, or at POSE; takes the time of a slow tracker when asked to."""
 
-    def __init__(
-        self, views: Any, model: Any, camera: Any, options: Any, initial_cam_from_model: Any = None
-    ) -> None:
+    def __init__(self, views: Any, model: Any, camera: Any, options: Any, initial_cam_from_model: Any = None) -> None:
         self.pose = POSE if initial_cam_from_model is None else initial_cam_from_model
         self.seconds = float(os.environ.get("FAKE_SESSION_S", "0"))
 
@@ -204,9 +202,7 @@ def test_evaluate_prints_errors_and_writes_them(room: Path) -> None:
     # The session stays where it began and the truth moves 1 mm a frame.
     assert "3 frames (3 tracked), 3 judged" in result.stdout
     (scene,) = json.loads((room / "out.json").read_text())["scenes"]
-    assert [frame["error"]["translation_mm"] for frame in scene["frames"]] == pytest.approx(
-        [0, 1, 2], abs=1e-9
-    )
+    assert [frame["error"]["translation_mm"] for frame in scene["frames"]] == pytest.approx([0, 1, 2], abs=1e-9)
     assert scene["summary"]["errors"]["translation_mm"]["max"] == pytest.approx(2.0)
 
 
@@ -319,9 +315,7 @@ def test_inputs_are_never_overwritten(room: Path) -> None:
     assert (room / "clip.mp4").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    "option", ["--start=x", "--end=-1", "--stride=0", "--modalities=edge,colour", "--opacity=2"]
-)
+@pytest.mark.parametrize("option", ["--start=x", "--end=-1", "--stride=0", "--modalities=edge,colour", "--opacity=2"])
 def test_bad_options(room: Path, option: str) -> None:
     result = run("annotate", "clip.mp4", *ANNOTATE, option)
     assert result.exit_code == 2

@@ -359,9 +359,7 @@ def test_tracked_while_out_of_view_is_false_and_not_judged() -> None:
     summary = summarise([gone])
     assert (summary.judged, summary.lost, summary.false_tracked) == (0, 0, 1)
     assert summary.within_5cm_5deg is None and not summary.errors
-    searching = replace(
-        gone, pose=replace(pose, cam_from_model=None, state=TrackingState.SEARCHING), error=None
-    )
+    searching = replace(gone, pose=replace(pose, cam_from_model=None, state=TrackingState.SEARCHING), error=None)
     assert summarise([searching]).false_tracked == 0
 
 

@@ -85,9 +85,7 @@ def main() -> None:
     """AR inspection of assemblies: find and track a part in video by its CAD, draw what was measured."""
 
 
-UNIT = click.option(
-    "--unit", type=click.Choice(["mm", "cm", "m", "inch"]), help="Unit of the numbers in the CAD file."
-)
+UNIT = click.option("--unit", type=click.Choice(["mm", "cm", "m", "inch"]), help="Unit of the numbers in the CAD file.")
 RENDERER = click.option(
     "--renderer",
     type=click.Choice(["auto", "pyrender", "zbuffer"]),
@@ -130,9 +128,7 @@ A part file is a TOML file like this one:""",
 )
 @click.argument("part")
 @UNIT
-@click.option(
-    "--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG, for sizes in pixels."
-)
+@click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG, for sizes in pixels.")
 def check(part: str, unit: str | None, camera_spec: str | None) -> None:
     """Print what is in PART, and what will be hard about finding and tracking it.
 
@@ -179,9 +175,7 @@ def guideviews(part: str, output: str, component: str | None, unit: str | None, 
     model = loaded.model.only([component]) if component else loaded.model
     began = time.perf_counter()
     with _progress("guide views") as progress:
-        views = make_guide_views(
-            model, loaded.effective_view_range, GuideViewOptions(renderer=renderer), progress
-        )
+        views = make_guide_views(model, loaded.effective_view_range, GuideViewOptions(renderer=renderer), progress)
     views.save(path)
     seconds = time.perf_counter() - began
     size_mb = path.stat().st_size / 1e6
@@ -222,29 +216,17 @@ Ctrl-C ends the run and finishes the files.""",
 )
 @click.argument("source")
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
-@click.option(
-    "--guideviews", "views_path", metavar="SET", help="Guide views; without it they are made and kept."
-)
-@click.option(
-    "--camera", "camera_spec", metavar="CAMERA", help="See below; without it the camera is guessed."
-)
-@click.option(
-    "--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are drawn."
-)
+@click.option("--guideviews", "views_path", metavar="SET", help="Guide views; without it they are made and kept.")
+@click.option("--camera", "camera_spec", metavar="CAMERA", help="See below; without it the camera is guessed.")
+@click.option("--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are drawn.")
 @click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
 @click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
 @click.option("--init", "init_path", metavar="POSE.json", help='{"cam_from_model": 4x4} of the first frame.')
-@click.option(
-    "--start", callback=_parse_moment, metavar="S", help="First frame: number, or seconds like 2.5s."
-)
+@click.option("--start", callback=_parse_moment, metavar="S", help="First frame: number, or seconds like 2.5s.")
 @click.option("--end", callback=_parse_moment, metavar="S", help="Where to stop: number, or seconds like 8s.")
 @click.option("--stride", type=click.IntRange(min=1), default=1, help="Take every N-th frame.", metavar="N")
-@click.option(
-    "--fps", type=float, default=30.0, show_default=True, help="Rate of a folder or glob of pictures."
-)
-@click.option(
-    "--show-edges", type=click.Choice(["none", "visible", "all"]), default="visible", show_default=True
-)
+@click.option("--fps", type=float, default=30.0, show_default=True, help="Rate of a folder or glob of pictures.")
+@click.option("--show-edges", type=click.Choice(["none", "visible", "all"]), default="visible", show_default=True)
 @click.option("--no-ghost", is_flag=True, help="Leave out the translucent components.")
 @click.option("--no-labels", is_flag=True, help="Leave out the labels.")
 @click.option("--opacity", type=click.FloatRange(0.0, 1.0), help="Of the translucent components, 0 to 1.")

@@ -154,9 +154,7 @@ def load_scene(
             info = infos.get(key) or []
             frame = replace(
                 frame,
-                cam_from_model=_pose(
-                    truths[key][place], "cam_R_m2c", "cam_t_m2c", f"{truth_file}: frame {key}"
-                ),
+                cam_from_model=_pose(truths[key][place], "cam_R_m2c", "cam_t_m2c", f"{truth_file}: frame {key}"),
                 is_truth=True,
                 visible=_visibility(info[place] if place < len(info) else {}),
             )

@@ -102,9 +102,7 @@ class PoseMeter:
     def nearest_equivalent(self, estimate: Array, truth: Array) -> Array:
         """The pose (4,4) least rotated against the estimate, of those that look the same as the true one."""
         candidates = [truth @ turn for turn in self._turns]
-        candidates += [
-            pose @ free_turn(symmetry, pose, estimate) for pose in candidates for symmetry in self._free
-        ]
+        candidates += [pose @ free_turn(symmetry, pose, estimate) for pose in candidates for symmetry in self._free]
         return min(candidates, key=lambda pose: rotation_angle_rad(pose, estimate))
 
     def _contour_px(self, estimate: Array, truth: Array) -> Array:

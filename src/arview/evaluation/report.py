@@ -41,10 +41,7 @@ def _row(spread: Spread, digits: int) -> str:
 def _shares(summary: Summary) -> str:
     if summary.within_5cm_5deg is None or summary.within_2cm_2deg is None:
         return ""
-    return (
-        f", within 5 cm/5° {100 * summary.within_5cm_5deg:.1f} %,"
-        f" 2 cm/2° {100 * summary.within_2cm_2deg:.1f} %"
-    )
+    return f", within 5 cm/5° {100 * summary.within_5cm_5deg:.1f} %, 2 cm/2° {100 * summary.within_2cm_2deg:.1f} %"
 
 
 def _frame_line(frame: FrameResult) -> str:

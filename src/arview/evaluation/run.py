@@ -191,8 +191,7 @@ def evaluate_scene(
         start = next((k for k, frame in enumerate(frames) if frame.cam_from_model is not None), None)
         if start is None:
             raise InputError(
-                f"{scene.folder}: no frame has a reference pose to start from; give --reference FILE or "
-                "--init detect"
+                f"{scene.folder}: no frame has a reference pose to start from; give --reference FILE or --init detect"
             )
         frames = frames[start:]
         first_pose = frames[0].cam_from_model
