@@ -163,9 +163,11 @@ def test_annotate_takes_a_part_of_the_frames_and_a_first_pose(room: Path) -> Non
 
 
 def test_guideviews_are_written_and_used(room: Path) -> None:
-    result = run("guideviews", "part.toml", "-o", "set.bin", "--renderer", "zbuffer", "--component", "brick")
+    options = ("--renderer", "zbuffer", "--component", "brick", "--preview", "sheet.png")
+    result = run("guideviews", "part.toml", "-o", "set.bin", *options)
     assert result.exit_code == 0, result.output
     assert "views of" in result.stdout and " s, " in result.stdout and " MB" in result.stdout
+    assert (room / "sheet.png").read_bytes().startswith(b"\x89PNG")
     assert "insufficient: " in result.stdout  # a lone plain block
     assert run("guideviews", "part.toml", "-o", "set.bin", "--renderer", "zbuffer").exit_code == 0
     result = run("annotate", "clip.mp4", *ANNOTATE, "--guideviews", "set.bin", "--poses", "poses.jsonl")
@@ -302,6 +304,7 @@ def test_outputs_that_cannot_be(room: Path) -> None:
     refused(run("annotate", "clip.mp4", *ANNOTATE, "-o", "none/out.mp4"), "no folder")
     refused(run("annotate", "clip.mp4", *ANNOTATE, "-o", "out.avi"), ".mp4")
     refused(run("guideviews", "part.toml", "-o", "camera.json/set.bin"), "no folder")
+    refused(run("guideviews", "part.toml", "-o", "set.bin", "--preview", "sheet.bmp"), ".png")
     refused(run("evaluate", "none", "--json", "x.json"), "no such folder")
 
 

@@ -154,14 +154,18 @@ def check(part: str, unit: str | None, camera_spec: str | None) -> None:
     epilog="""\b
 Examples:
   arview guideviews part.toml -o bracket.guideviews
+  arview guideviews part.toml -o bracket.guideviews --preview sheet.png
   arview guideviews part.toml -o post.guideviews --component post_1""",
 )
 @click.argument("part")
 @click.option("-o", "--output", required=True, metavar="SET", help="File to write.")
 @click.option("--component", metavar="NAME", help="Views of this component alone.")
+@click.option("--preview", metavar="PNG", help="Picture of a choice of the views, weak ones marked.")
 @UNIT
 @RENDERER
-def guideviews(part: str, output: str, component: str | None, unit: str | None, renderer: str) -> None:
+def guideviews(
+    part: str, output: str, component: str | None, preview: str | None, unit: str | None, renderer: str
+) -> None:
     """Render the guide views of PART over its declared range of viewpoints, and store them in a file.
 
     `annotate` makes (and keeps) guide views by itself; a file saves that step on another machine.
@@ -172,6 +176,9 @@ def guideviews(part: str, output: str, component: str | None, unit: str | None, 
 
     loaded = load_part(part, unit)
     path = _output_path(output, [loaded.path, loaded.cad_path])
+    preview_path = _output_path(preview, [loaded.path, loaded.cad_path, path]) if preview else None
+    if preview_path is not None and preview_path.suffix.lower() != ".png":
+        raise OutputError(f"{preview}: the name of the preview must end in .png")
     model = loaded.model.only([component]) if component else loaded.model
     began = time.perf_counter()
     with _progress("guide views") as progress:
@@ -181,6 +188,14 @@ def guideviews(part: str, output: str, component: str | None, unit: str | None, 
     size_mb = path.stat().st_size / 1e6
     click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB")
     click.echo(assess(views).reason)
+    if preview_path is not None:
+        import cv2
+
+        from arview.guideviews.sheet import contact_sheet
+
+        _, png = cv2.imencode(".png", cv2.cvtColor(contact_sheet(model, views), cv2.COLOR_RGB2BGR))
+        _write_bytes(preview_path, png.tobytes())
+        click.echo(f"wrote {preview_path}")
 
 
 # --- annotate -------------------------------------------------------------------------------------------
@@ -401,7 +416,7 @@ def evaluate(
         results.append(result.to_dict())
     if output is not None:
         content = {"version": __version__, "modalities": list(modalities), "scenes": results}
-        _write_text(output, json.dumps(content, indent=1) + "\n")
+        _write_bytes(output, (json.dumps(content, indent=1) + "\n").encode())
         click.echo(f"wrote {output}")
 
 
@@ -482,11 +497,11 @@ def _output_path(path: str, inputs: list[Any]) -> Path:
     return target
 
 
-def _write_text(path: Path, text: str) -> None:
+def _write_bytes(path: Path, content: bytes) -> None:
     """Write a file that appears complete or not at all."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(content)
         part.replace(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
