@@ -142,17 +142,18 @@ def _descriptor(view: GuideView, diameter_mm: float) -> Array:
 
 def _likeness(descriptors: Array, directions: Array) -> tuple[Array, NDArray[np.int64]]:
     """Largest correlation (N,) over all rolls with a view more than APART_DEG away, and its index (-1: none)."""
-    spectra = np.fft.rfft(descriptors, axis=1)
+    spectra = np.moveaxis(np.fft.rfft(descriptors, axis=1), 1, 0)
+    conjugates = spectra.conj().transpose(0, 2, 1)
     count = len(descriptors)
     best = np.full(count, np.nan)
     partner = np.full(count, -1, dtype=np.int64)
     far = directions @ directions.T < np.cos(np.deg2rad(APART_DEG))
-    for i in range(count):
-        others = np.flatnonzero(far[i])
-        if len(others) == 0:
-            continue
-        product = np.einsum("jak,ak->ja", spectra[others].conj(), spectra[i])
-        correlation = np.fft.irfft(product, n=_ANGLES, axis=1).max(axis=1)
-        best[i] = correlation.max()
-        partner[i] = others[int(np.argmax(correlation))]
+    for first in range(0, count, 64):
+        rows = np.arange(first, min(first + 64, count))
+        correlation = np.fft.irfft(spectra[:, rows] @ conjugates, n=_ANGLES, axis=0).max(axis=0)
+        correlation[~far[rows]] = -np.inf
+        nearest = np.argmax(correlation, axis=1)
+        has_any = far[rows].any(axis=1)
+        partner[rows[has_any]] = nearest[has_any]
+        best[rows[has_any]] = correlation[np.arange(len(rows)), nearest][has_any]
     return best, partner
