@@ -137,13 +137,15 @@ def check(part: str, unit: str | None, camera_spec: str | None) -> None:
     """
     from arview.cad import check_part, load_part
     from arview.camera_files import load_camera
+    from arview.guideviews.findings import uniqueness_findings
 
     loaded = load_part(part, unit)
     camera = None
     if camera_spec is not None:
         size = (1280, 720) if camera_spec.startswith("fov:") else (None, None)
         camera = load_camera(camera_spec, *size)
-    click.echo(check_part(loaded, camera).format())
+    findings = uniqueness_findings(loaded.model, loaded.effective_view_range)
+    click.echo(check_part(loaded, camera).with_findings(findings).format())
 
 
 # --- guideviews -----------------------------------------------------------------------------------------
@@ -172,6 +174,7 @@ def guideviews(
     """
     from arview.cad import load_part
     from arview.guideviews import GuideViewOptions, make_guide_views
+    from arview.guideviews.findings import most_confusable
     from arview.guideviews.uniqueness import assess
 
     loaded = load_part(part, unit)
@@ -187,13 +190,17 @@ def guideviews(
     seconds = time.perf_counter() - began
     size_mb = path.stat().st_size / 1e6
     click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB")
-    click.echo(assess(views).reason)
+    unique = assess(views)
+    click.echo(f"{unique.reason} (score {unique.score:.2f})")
+    alike = most_confusable(views, unique)
+    if alike:
+        click.echo(alike)
     if preview_path is not None:
         import cv2
 
         from arview.guideviews.sheet import contact_sheet
 
-        _, png = cv2.imencode(".png", cv2.cvtColor(contact_sheet(model, views), cv2.COLOR_RGB2BGR))
+        _, png = cv2.imencode(".png", cv2.cvtColor(contact_sheet(model, views, unique=unique), cv2.COLOR_RGB2BGR))
         _write_bytes(preview_path, png.tobytes())
         click.echo(f"wrote {preview_path}")
 
