@@ -104,8 +104,7 @@ def load_cad(
     if not components:
         raise InputError(f"{path}: all triangles are degenerate (they have no area)")
     model = make_model(path.stem, tuple(components))
-    if unit is None:
-        _check_size(model, path)
+    _check_size(model, path)
     return LoadedCad(model, factor_mm, tuple(raw.notes + notes))
 
 
