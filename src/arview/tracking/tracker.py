@@ -180,9 +180,7 @@ class PartView:
 
 def intrinsics_of(camera: Camera) -> Array:
     """(10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted, as the kernels take it."""
-    return np.array(
-        [camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0]
-    )
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0])
 
 
 def smoothed(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -244,23 +242,39 @@ class Tracker:
             self._features.clear()
         self._bin_of = value_bins(1.0)
         self.learn(image, self._cam_from_body, 1.0)
+        if self._features is not None and not (self.options.use_region or self.options.use_edge):
+            # Nothing else could bear the pose out before texture is remembered.
+            gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+            self._features.add_keyframe(self._features.pyramid(gray), self._cam_from_body)
+
+    def colours_at(self, image: NDArray[np.uint8], cam_from_body: Array) -> tuple[Array, Array] | None:
+        """Normalised histograms (part, background) along the contour at a pose; None where it is too short."""
+        fore, back = np.zeros(BINS**3), np.zeros(BINS**3)
+        count_colours(image, self._bin_of, self.part.arrays, cam_from_body, self._intrinsics, self._step_mm, fore, back)
+        fore_count, back_count = fore.sum(), back.sum()
+        if fore_count < 50 or back_count < 50:
+            return None
+        return fore / fore_count, back / back_count
+
+    def fresh_appearance(self, image: NDArray[np.uint8], cam_from_body: Array) -> Appearance:
+        """The colours found at a pose of unknown worth."""
+        look = Appearance()
+        colours = self.colours_at(image, cam_from_body)
+        if colours is not None:
+            look.fore, look.back = colours
+            look.is_known = True
+            log_odds(look.fore, look.back, look.odds)
+        return look
 
     def learn(self, image: NDArray[np.uint8], cam_from_body: Array, rate: float) -> None:
         """Blend the colours along the contour at this pose into the histograms."""
-        fore, back = np.zeros(BINS**3), np.zeros(BINS**3)
-        count_colours(
-            image, self._bin_of, self.part.arrays, cam_from_body, self._intrinsics, self._step_mm, fore, back
-        )
-        look = self.appearance
-        if fore.sum() < 50 or back.sum() < 50:
+        colours = self.colours_at(image, cam_from_body)
+        if colours is None:
             return
-        fore /= fore.sum()
-        back /= back.sum()
-        if look.is_known:
-            look.fore += rate * (fore - look.fore)
-            look.back += rate * (back - look.back)
-        else:
-            look.fore, look.back = fore, back
+        look = self.appearance
+        blend = rate if look.is_known else 1.0
+        look.fore += blend * (colours[0] - look.fore)
+        look.back += blend * (colours[1] - look.back)
         look.is_known = True
         log_odds(look.fore, look.back, look.odds)
 
@@ -270,39 +284,33 @@ class Tracker:
         gray: NDArray[np.uint8],
         cam_from_body: Array,
         stages: tuple[Stage, ...],
-        matches: Matches | None = None,
+        appearance: Appearance | None = None,
+        matches: Matches = _NO_MATCHES,
     ) -> tuple[Array, Array]:
         """Pose (``cam_from_body``) and information (6,6) after the given stages from a start.
 
-        ``matches`` are the part's own texture found in this frame, measured once for all stages.
+        ``appearance`` stands for the learned one; ``matches`` are the part's own texture found in this frame,
+        measured once for all stages. Changes nothing in the tracker.
         """
         o = self.options
-        if matches is None:
-            matches = _NO_MATCHES
+        look = appearance or self.appearance
         pose, information = run_stages(
-            image, gray, self._bin_of, self.appearance.odds, EDGE_FUNCTION, self.part.arrays, cam_from_body,
+            image, gray, self._bin_of, look.odds, EDGE_FUNCTION, self.part.arrays, cam_from_body,
             self._intrinsics, self._step_mm, _stage_table(stages), self._damping,
-            o.region_weight if o.use_region and self.appearance.is_known else 0.0,
+            o.region_weight if o.use_region and look.is_known else 0.0,
             o.edge_weight if o.use_edge else 0.0, o.edge_sigma_px, o.edge_threshold,
             matches.points_in_body, matches.pixels, matches.weights, o.feature_sigma_px,
         )  # fmt: skip
         return pose, information
 
     def refine_fresh(
-        self,
-        image: NDArray[np.uint8],
-        gray: NDArray[np.uint8],
-        cam_from_body: Array,
-        stages: tuple[Stage, ...],
+        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...]
     ) -> Array:
-        """Refine a pose of unknown worth: colours are learned at the start itself, nothing is remembered."""
-        kept = self.appearance
+        """Refine a pose of unknown worth: colours are learned anew before every stage, nothing is remembered."""
         unit = max(1.0, self.radius_px(cam_from_body) / 80.0)
         for stage in stages:
-            self.appearance = Appearance()
-            self.learn(image, cam_from_body, 1.0)
-            cam_from_body, _ = self.refine(image, gray, cam_from_body, (stage.widened(unit),))
-        self.appearance = kept
+            look = self.fresh_appearance(image, cam_from_body)
+            cam_from_body, _ = self.refine(image, gray, cam_from_body, (stage.widened(unit),), look)
         return cam_from_body
 
     def radius_px(self, cam_from_body: Array) -> float:
@@ -315,30 +323,17 @@ class Tracker:
         gray: NDArray[np.uint8],
         cam_from_body: Array,
         tolerance_px: float = 1.5,
+        appearance: Appearance | None = None,
     ) -> Evidence:
-        """What the picture says for a pose, with the colours learned so far; steps count within a tolerance."""
+        """What the picture says for a pose; steps count within a tolerance, colours as learned or as given."""
+        look = appearance or self.appearance
         return Evidence(
             *run_evidence(
-                image, gray, self._bin_of, self.appearance.odds, self.appearance.is_known, EDGE_FUNCTION,
+                image, gray, self._bin_of, look.odds, look.is_known, EDGE_FUNCTION,
                 self.part.arrays, cam_from_body, self._intrinsics, self._step_mm, self.options.edge_threshold,
                 tolerance_px,
             )
         )  # fmt: skip
-
-    def evidence_fresh(
-        self,
-        image: NDArray[np.uint8],
-        gray: NDArray[np.uint8],
-        cam_from_body: Array,
-        tolerance_px: float = 1.5,
-    ) -> Evidence:
-        """What the picture says for a pose, with the colours found at the pose itself."""
-        kept = self.appearance
-        self.appearance = Appearance()
-        self.learn(image, cam_from_body, 1.0)
-        evidence = self.evidence(image, gray, cam_from_body, tolerance_px)
-        self.appearance = kept
-        return evidence
 
     def _follow_exposure(self, gray: NDArray[np.uint8]) -> None:
         """Take a change of exposure against the last frame out of the colours.
@@ -364,16 +359,16 @@ class Tracker:
         before = self._cam_from_body
         predicted = before @ exp_se3(self._velocity)
         matches, found_share = None, 0.0
-        starts = [predicted]
+        start = predicted
         if self._features is not None:
             pyramid = self._features.pyramid(plain_gray)
             matches = self._features.measure(pyramid, predicted)
             found_share = len(matches.weights) / max(matches.tried, 1)
             if len(matches.weights) >= o.feature_min_count and found_share >= o.feature_min_share:
-                starts[0] = self._features.align(matches, predicted)
+                start = self._features.align(matches, predicted)
             else:
                 matches = None
-        pose, information = self.refine(image, gray, starts[0], o.stages, matches)
+        pose, information = self.refine(image, gray, start, o.stages, matches=matches or _NO_MATCHES)
         evidence = self.evidence(image, gray, pose)
         if evidence.quality < o.doubtful_quality:
             for start in (predicted, before):
@@ -404,11 +399,7 @@ class Tracker:
         self._best_contour_support = max(0.99 * self._best_contour_support, evidence.contour_support)
         unhidden = evidence.contour_support > 0.85 * self._best_contour_support
         tracked_count = 0 if matches is None else len(matches.weights)
-        if (
-            unhidden
-            and evidence.quality > 0.6
-            and self._features.wants_keyframe(cam_from_body, tracked_count)
-        ):
+        if unhidden and evidence.quality > 0.6 and self._features.wants_keyframe(cam_from_body, tracked_count):
             self._features.add_keyframe(pyramid, cam_from_body)
 
     def covariance(self, estimate: Estimate) -> Array:
