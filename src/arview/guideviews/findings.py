@@ -7,7 +7,6 @@ import numpy as np
 from arview.cad.check import Finding
 from arview.cad.model import Model
 from arview.cad.view_range import ViewRange
-from arview.errors import InputError
 from arview.geometry import Array
 from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, Uniqueness, assess
 from arview.guideviews.views import GuideViewOptions, GuideViewSet, make_guide_views
@@ -47,16 +46,10 @@ def most_confusable(views: GuideViewSet, unique: Uniqueness) -> str:
 
 
 def uniqueness_findings(model: Model, view_range: ViewRange) -> list[Finding]:
-    """Findings of a coarse set of guide views made now, for `PartCheck.with_findings`.
-
-    Empty where the declared range does not allow guide views, which `check_part` reports by itself.
-    """
-    try:
-        views = make_guide_views(model, view_range, COARSE_OPTIONS)
-        if len(views) < FEWEST_VIEWS:
-            views = make_guide_views(model, view_range, FINER_OPTIONS)
-    except InputError:
-        return []
+    """Findings of a coarse set of guide views made now, for `PartCheck.with_findings`."""
+    views = make_guide_views(model, view_range, COARSE_OPTIONS)
+    if len(views) < FEWEST_VIEWS:
+        views = make_guide_views(model, view_range, FINER_OPTIONS)
     unique = assess(views)
     alike = most_confusable(views, unique)
     text = f"guide views {unique.reason} (score {unique.score:.2f}{f'; {alike}' if alike else ''})"

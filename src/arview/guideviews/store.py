@@ -61,31 +61,28 @@ def read_arrays(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         size = path.stat().st_size
         with path.open("rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC:
-                raise InputError(
-                    f"{path}: not a guide-view set; make one with `arview guideviews PART -o {path}`"
-                )
+                raise InputError(f"{path}: not a guide-view set; make one with `arview guideviews PART -o {path}`")
             length = int.from_bytes(file.read(8), "little")
             if length > size:
-                raise InputError(
-                    f"{path}: the guide-view set is damaged; make it again with `arview guideviews`"
-                )
+                raise InputError(f"{path}: the guide-view set is damaged; make it again with `arview guideviews`")
             header = json.loads(file.read(length))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: the guide-view set is damaged; make it again with `arview guideviews`"
-        ) from error
+        raise InputError(f"{path}: the guide-view set is damaged; make it again with `arview guideviews`") from error
+    damaged = f"{path}: the guide-view set is damaged; make it again with `arview guideviews`"
     start = len(_MAGIC) + 8 + length
     mapped = np.memmap(path, dtype=np.uint8, mode="r")
     arrays = {}
-    for name, entry in header["arrays"].items():
-        dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
-        first = start + entry["offset"]
-        last = first + dtype.itemsize * int(np.prod(shape, dtype=np.int64))
-        if last > size:
-            raise InputError(
-                f"{path}: the guide-view set is truncated; make it again with `arview guideviews`"
-            )
-        arrays[name] = mapped[first:last].view(dtype).reshape(shape)
-    return header["meta"], arrays
+    try:
+        meta, layout = dict(header["meta"]), dict(header["arrays"])
+        for name, entry in layout.items():
+            dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
+            first = start + entry["offset"]
+            last = first + dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+            if last > size:
+                raise InputError(f"{path}: the guide-view set is truncated; make it again with `arview guideviews`")
+            arrays[name] = mapped[first:last].view(dtype).reshape(shape)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(damaged) from error
+    return meta, arrays

@@ -130,12 +130,13 @@ class GuideViewSet:
 
     def save(self, path: Path) -> None:
         """Write the set to one file, atomically. Raises OutputError."""
+        camera = self.camera
         meta = {
             "format_version": FORMAT_VERSION,
             "model_name": self.model_name,
             "model_hash": self.model_hash,
             "component_names": list(self.component_names),
-            "camera": [self.camera.width, self.camera.height, self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy],
+            "camera": [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy],
             "view_range": asdict(self.view_range),
             "options": asdict(self.options),
             "center_in_model": self.center_in_model.tolist(),
@@ -157,11 +158,19 @@ def load_guide_views(path: Path, model: Model | None = None) -> GuideViewSet:
             f"{path}: guide views of format {meta.get('format_version')}, this arview reads {FORMAT_VERSION}; "
             "make them again with `arview guideviews`"
         )
-    if model is not None and meta["model_hash"] != model.source_hash:
+    if model is not None and meta.get("model_hash") != model.source_hash:
         raise MismatchError(
-            f"{path}: guide views of model {meta['model_name']!r} ({meta['model_hash'][:12]}), but the part is "
-            f"{model.name!r} ({model.source_hash[:12]}); make them again with `arview guideviews`"
+            f"{path}: guide views of model {meta.get('model_name')!r} ({str(meta.get('model_hash'))[:12]}), "
+            f"but the part is {model.name!r} ({model.source_hash[:12]}); make them again with `arview guideviews`"
         )
+    try:
+        return _from_parts(meta, arrays)
+    except (KeyError, TypeError, ValueError, InputError) as error:
+        raise InputError(f"{path}: the guide-view set is damaged; make it again with `arview guideviews`") from error
+
+
+def _from_parts(meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> GuideViewSet:
+    """The set of a file's metadata and arrays."""
     width, height, fx, fy, cx, cy = meta["camera"]
     arrays = dict(arrays)
     return GuideViewSet(
@@ -259,16 +268,12 @@ def make_guide_views(
     arrays: dict[str, NDArray[Any]] = {
         "contour_start": starts([len(f.contour_points) for f in found]),
         "contour_points": np.concatenate([f.contour_points for f in found]).astype(np.float32),
-        "contour_normals": np.round(np.concatenate([f.contour_normals for f in found]) * _UNIT16).astype(
-            np.int16
-        ),
+        "contour_normals": np.round(np.concatenate([f.contour_normals for f in found]) * _UNIT16).astype(np.int16),
         "contour_runs_mm": np.concatenate([f.contour_runs_mm for f in found]).astype(np.float32),
         "contour_component": np.concatenate([f.contour_component for f in found]).astype(np.int16),
         "edge_start": starts([len(f.edge_points) for f in found]),
         "edge_points": np.concatenate([f.edge_points for f in found]).astype(np.float32),
-        "edge_tangents": np.round(np.concatenate([f.edge_tangents for f in found]) * _UNIT16).astype(
-            np.int16
-        ),
+        "edge_tangents": np.round(np.concatenate([f.edge_tangents for f in found]) * _UNIT16).astype(np.int16),
         "edge_kinds": np.concatenate([f.edge_kinds for f in found]),
         "edge_component": np.concatenate([f.edge_component for f in found]).astype(np.int16),
     }
