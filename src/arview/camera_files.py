@@ -269,9 +269,7 @@ def _entry(get: Callable[[str], list[float] | None], model: str = "", label: str
         return None
 
     if model.lower() not in PLAIN_MODELS:
-        raise InputError(
-            f"lens model '{model}' is not supported; calibrate with the pinhole model and k1 k2 p1 p2 k3"
-        )
+        raise InputError(f"lens model '{model}' is not supported; calibrate with the pinhole model and k1 k2 p1 p2 k3")
     matrix = first(MATRIX_KEYS, 9)
     if matrix is not None:
         fx, fy, cx, cy = matrix[0], matrix[4], matrix[2], matrix[5]
@@ -280,9 +278,7 @@ def _entry(get: Callable[[str], list[float] | None], model: str = "", label: str
                 f"the camera matrix {matrix} is not fx 0 cx / 0 fy cy / 0 0 1 in row-major order; correct it"
             )
         if abs(matrix[1]) > 1e-3 * abs(matrix[0]):
-            raise InputError(
-                f"the camera matrix has skew {matrix[1]:g}, which is not supported; calibrate again"
-            )
+            raise InputError(f"the camera matrix has skew {matrix[1]:g}, which is not supported; calibrate again")
     else:
         values = {name: first((name,), 1) for name in ("fx", "fy", "cx", "cy")}
         missing = [name for name, value in values.items() if value is None]
@@ -337,9 +333,7 @@ def _entries_from_json(text: str) -> list[_Entry]:
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
-        raise InputError(
-            f"is not valid JSON (line {error.lineno}: {error.msg}); correct or export it again"
-        ) from error
+        raise InputError(f"is not valid JSON (line {error.lineno}: {error.msg}); correct or export it again") from error
     if not isinstance(data, dict):
         raise InputError(f"the JSON is a {type(data).__name__}, expected an object with fx, fy, cx, cy")
     frames = {key: value for key, value in data.items() if isinstance(value, dict) and "cam_K" in value}
@@ -387,9 +381,7 @@ def _entry_from_yaml(text: str) -> _Entry:
         raise InputError(f"is not a camera file; expected {FORMATS}")
 
     def block(key: str, inside: str) -> str | None:
-        match = re.search(
-            rf"^([ \t]*)[\"']?{key}[\"']?[ \t]*:(.*(?:\n(?:\1[ \t]+|\1- ).*)*)", inside, re.MULTILINE
-        )
+        match = re.search(rf"^([ \t]*)[\"']?{key}[\"']?[ \t]*:(.*(?:\n(?:\1[ \t]+|\1- ).*)*)", inside, re.MULTILINE)
         return match.group(2) if match else None
 
     def get(key: str) -> list[float] | None:
@@ -437,16 +429,12 @@ def _entry_from_colmap(line: str) -> _Entry:
     fields = line.split()
     label, model = f"camera {fields[0]}", fields[1] if len(fields) > 1 else ""
     if model not in _COLMAP_MODELS:
-        raise InputError(
-            f"{label}: lens model {model} is not supported; use one of {', '.join(_COLMAP_MODELS)}"
-        )
+        raise InputError(f"{label}: lens model {model} is not supported; use one of {', '.join(_COLMAP_MODELS)}")
     try:
         width, height = int(fields[2]), int(fields[3])
         params = [float(value) for value in fields[4:]]
     except (ValueError, IndexError) as error:
-        raise InputError(
-            f"{label}: '{line[:60]}' is not ID MODEL WIDTH HEIGHT PARAMS; export it again"
-        ) from error
+        raise InputError(f"{label}: '{line[:60]}' is not ID MODEL WIDTH HEIGHT PARAMS; export it again") from error
     places, dist_places = _COLMAP_MODELS[model]
     expected = max(*places, *dist_places) + 1
     if len(params) != expected:
@@ -462,9 +450,7 @@ def _entry_from_colmap(line: str) -> _Entry:
 def _camera_from_exif(source: str | Path | None, width: int | None, height: int | None) -> Camera:
     """Camera of photos from the focal length that the phone or camera wrote into the first one."""
     if source is None:
-        raise InputError(
-            "camera 'exif': no source to read it from; give a photo, a folder or a glob of photos"
-        )
+        raise InputError("camera 'exif': no source to read it from; give a photo, a folder or a glob of photos")
     photo = _first_photo(Path(source))
     exif = read_exif(photo)
     if width is None or height is None:
@@ -496,7 +482,6 @@ def _first_photo(source: Path) -> Path:
     photos = [path for path in candidates if path.suffix.lower() in PHOTO_SUFFIXES]
     if not photos:
         raise InputError(
-            f"{source}: no photo with EXIF data there (a video holds no focal length); "
-            "give a camera file or fov:DEG"
+            f"{source}: no photo with EXIF data there (a video holds no focal length); give a camera file or fov:DEG"
         )
     return photos[0]

@@ -85,9 +85,7 @@ def exp_se3(twist: ArrayLike) -> Array:
     if theta < 1e-6:
         left_jacobian = np.eye(3) + 0.5 * k
     else:
-        left_jacobian = (
-            np.eye(3) + (1.0 - np.cos(theta)) / theta**2 * k + (theta - np.sin(theta)) / theta**3 * k @ k
-        )
+        left_jacobian = np.eye(3) + (1.0 - np.cos(theta)) / theta**2 * k + (theta - np.sin(theta)) / theta**3 * k @ k
     return rigid(exp_so3(w), left_jacobian @ v)
 
 
@@ -124,9 +122,7 @@ def look_at(camera_in_model: ArrayLike, target_in_model: ArrayLike, up_in_model:
     up = np.asarray(up_in_model, dtype=np.float64)
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-6 * np.linalg.norm(up):
-        right = np.cross(
-            forward, np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0, 0])
-        )
+        right = np.cross(forward, np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0, 0]))
     right = right / np.linalg.norm(right)
     down = np.cross(forward, right)
     rotation = np.stack([right, down, forward])

@@ -55,12 +55,8 @@ class Rendering:
         forward_u, backward_u = np.roll(points, -1, axis=1) - points, points - np.roll(points, 1, axis=1)
         forward_v, backward_v = np.roll(points, -1, axis=0) - points, points - np.roll(points, 1, axis=0)
         # Of both one-sided differences the one with the smaller jump in depth stays on the surface.
-        du = np.where(
-            (np.abs(forward_u[..., 2]) < np.abs(backward_u[..., 2]))[..., None], forward_u, backward_u
-        )
-        dv = np.where(
-            (np.abs(forward_v[..., 2]) < np.abs(backward_v[..., 2]))[..., None], forward_v, backward_v
-        )
+        du = np.where((np.abs(forward_u[..., 2]) < np.abs(backward_u[..., 2]))[..., None], forward_u, backward_u)
+        dv = np.where((np.abs(forward_v[..., 2]) < np.abs(backward_v[..., 2]))[..., None], forward_v, backward_v)
         normals = np.cross(dv, du)
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         normals = np.where(same[..., None] & (length > 0), normals / np.maximum(length, 1e-12), 0.0)
@@ -180,9 +176,7 @@ def _import_pyrender() -> Any:
     try:
         import pyrender
     except Exception as error:
-        raise MissingDependencyError(
-            f"pyrender cannot be imported ({error}); run: {GL_INSTALL_COMMAND}"
-        ) from error
+        raise MissingDependencyError(f"pyrender cannot be imported ({error}); run: {GL_INSTALL_COMMAND}") from error
     return pyrender
 
 

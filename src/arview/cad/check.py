@@ -103,9 +103,7 @@ class PartCheck:
             f"  camera{' (guessed)' if self.is_camera_guessed else ''}: "
             f"{self.camera.width}×{self.camera.height}, focal length {self.camera.fx:.0f} px",
         ]
-        lines += [
-            f"  datum {datum.label}: {datum.feature} of {datum.component}" for datum in self.part.datums
-        ]
+        lines += [f"  datum {datum.label}: {datum.feature} of {datum.component}" for datum in self.part.datums]
         lines += ["", *self._table(), ""]
         lines += [f"{finding.severity}: {finding.text}" for finding in self.findings]
         if not self.findings:
@@ -141,10 +139,7 @@ class PartCheck:
             )
         ignored = [settings.name for settings in self.part.settings if settings.role == "ignore"]
         widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
-        table = [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in rows
-        ]
+        table = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
         return [*table, *([f"ignored: {', '.join(ignored)}"] if ignored else [])]
 
 
@@ -156,9 +151,7 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
     is_guessed = camera is None
     camera = GUESSED_CAMERA if camera is None else camera
     view_range = part.effective_view_range
-    components = tuple(
-        _check_component(part, component, camera, view_range) for component in part.model.components
-    )
+    components = tuple(_check_component(part, component, camera, view_range) for component in part.model.components)
     vertices, faces, owners = part.model.mesh
     symmetries = find_symmetries(vertices, faces.astype(np.int64), owners.astype(np.int64))
     findings = [
@@ -187,9 +180,7 @@ def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda finding: order.index(finding.severity)))
 
 
-def _check_component(
-    part: Part, component: Component, camera: Camera, view_range: ViewRange
-) -> ComponentCheck:
+def _check_component(part: Part, component: Component, camera: Camera, view_range: ViewRange) -> ComponentCheck:
     fitness = inspect_mesh(component)
     near_mm, far_mm = view_range.distance_mm
     middle_mm = fitness.extents_mm[1]
@@ -198,9 +189,7 @@ def _check_component(
         settings=part.component_settings(component.name),
         fitness=fitness,
         pixels_across=(camera.fx * middle_mm / far_mm, camera.fx * middle_mm / near_mm),
-        symmetries=find_symmetries(
-            component.vertices_in_model, component.faces.astype(np.int64), near_share=0.0
-        ),
+        symmetries=find_symmetries(component.vertices_in_model, component.faces.astype(np.int64), near_share=0.0),
     )
 
 
@@ -240,9 +229,7 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Fi
     return findings
 
 
-def _symmetry_findings(
-    part: Part, view_range: ViewRange, symmetries: tuple[FoundSymmetry, ...]
-) -> list[Finding]:
+def _symmetry_findings(part: Part, view_range: ViewRange, symmetries: tuple[FoundSymmetry, ...]) -> list[Finding]:
     """Turns of the whole part that look the same, or nearly, judged by what the view range lets happen."""
     findings = []
     for declared in part.symmetries:
@@ -330,9 +317,7 @@ def _size_findings(check: ComponentCheck, view_range: ViewRange) -> list[Finding
         return [Finding("problem" if is_judged else "warning", text)]
     if far_px < SMALL_PX:
         limit_mm = near_mm * near_px / SMALL_PX
-        text = (
-            f"{name} is small: {far_px:.1f} px across at {far_mm:.0f} mm; well seen up to {limit_mm:.0f} mm"
-        )
+        text = f"{name} is small: {far_px:.1f} px across at {far_mm:.0f} mm; well seen up to {limit_mm:.0f} mm"
         return [Finding("warning", text)]
     thin_px = far_px * check.fitness.extents_mm[2] / check.fitness.extents_mm[1]
     if thin_px < THIN_PX:
@@ -368,14 +353,10 @@ def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[Finding]:
         exact = [found.symmetry for found in check.symmetries]
         if declared is not None and not any(_covers(symmetry, declared) for symmetry in exact):
             name, what = check.component.name, declared.describe()
-            findings.append(
-                Finding("warning", f"{name}: the declared symmetry, {what}, is not in its geometry")
-            )
+            findings.append(Finding("warning", f"{name}: the declared symmetry, {what}, is not in its geometry"))
         spins = [symmetry for symmetry in exact if symmetry.order is None]
         if check.settings.role == "inspect" and declared is None and spins:
-            spinning.append(
-                f"{check.component.name} ({spins[0].describe().removeprefix('any angle about ')})"
-            )
+            spinning.append(f"{check.component.name} ({spins[0].describe().removeprefix('any angle about ')})")
     if spinning:
         text = f"bodies of revolution, whose turn about their axis cannot be measured: {_listed(spinning, 8)}"
         findings.append(Finding("note", text))
@@ -383,9 +364,7 @@ def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[Finding]:
 
 
 def _tolerance_findings(part: Part) -> list[Finding]:
-    open_ended = [
-        name for name in part.inspected if part.component_settings(name).position_tolerance_mm is None
-    ]
+    open_ended = [name for name in part.inspected if part.component_settings(name).position_tolerance_mm is None]
     if not open_ended:
         return []
     names = _listed(open_ended, 6)

@@ -73,9 +73,7 @@ class _Gltf:
             if version != 2:
                 raise InputError(f"{path}: glTF version {version}; only 2 is supported")
             if length > len(data):
-                raise InputError(
-                    f"{path}: truncated: {len(data)} of {length} bytes are there; copy or export it again"
-                )
+                raise InputError(f"{path}: truncated: {len(data)} of {length} bytes are there; copy or export it again")
             text, offset = b"", 12
             while offset + 8 <= length:
                 size, kind = struct.unpack_from("<II", data, offset)
@@ -233,9 +231,7 @@ class _Gltf:
         units = {unit_in_mm(tag) for tag in tags}
         if len(units) == 1 and None not in units:
             self.model.unit_mm = units.pop()
-            self.model.notes.append(
-                f"trimesh tagged its numbers as {tags.pop()!r}: used instead of glTF's metres"
-            )
+            self.model.notes.append(f"trimesh tagged its numbers as {tags.pop()!r}: used instead of glTF's metres")
         else:
             self.model.unit_mm = None
             self.model.notes.append(f"its meshes are tagged with the units {', '.join(sorted(tags))}")

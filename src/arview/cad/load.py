@@ -72,9 +72,7 @@ def load_cad(
     if not path.is_file():
         raise InputError(f"{path}: is not a file")
     if suffix not in SUFFIXES:
-        raise InputError(
-            f"{path}: CAD of type {suffix or '(none)'!s} is not read; give one of {' '.join(SUFFIXES)}"
-        )
+        raise InputError(f"{path}: CAD of type {suffix or '(none)'!s} is not read; give one of {' '.join(SUFFIXES)}")
     if unit is not None and unit not in UNIT_MM:
         raise InputError(f"unit {unit!r} is not known; give one of {', '.join(UNIT_MM)}")
     if not (tol_linear_mm > 0 and tol_angular_deg > 0):
@@ -108,9 +106,7 @@ def load_cad(
     return LoadedCad(model, factor_mm, tuple(raw.notes + notes))
 
 
-def _read(
-    path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool
-) -> RawModel:
+def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
     if suffix in (".step", ".stp"):
         return _read_step(path, tol_linear_mm, tol_angular_deg, is_overridden)
     if suffix in (".glb", ".gltf"):
@@ -155,9 +151,7 @@ def _read_step(path: Path, tol_linear_mm: float, tol_angular_deg: float, is_over
     if not data:
         said = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + "\n" + done.stderr).splitlines()
         reason = next((line.strip(" *") for line in said if "ERR" in line), "")
-        reason = reason or (
-            f"OpenCASCADE crashed, code {done.returncode}" if done.returncode else "no shape in it"
-        )
+        reason = reason or (f"OpenCASCADE crashed, code {done.returncode}" if done.returncode else "no shape in it")
         raise InputError(f"{path}: broken or truncated STEP ({reason}); export it again")
     raw = parse_gltf(data, path)
     if is_overridden:
@@ -179,9 +173,7 @@ def _step_unit_mm(path: Path) -> float:
         found = re.findall(r"LENGTH_UNIT\s*\(\s*\)[^;]*?SI_UNIT\s*\(\s*([^,\s]*)\s*,\s*\.METRE\.", text)
         units = {prefixes.get(prefix) for prefix in found}
     if len(units) != 1 or None in units:
-        raise InputError(
-            f"{path}: its length unit cannot be told, so unit cannot be overridden; leave unit out"
-        )
+        raise InputError(f"{path}: its length unit cannot be told, so unit cannot be overridden; leave unit out")
     return float(next(value for value in units if value is not None))
 
 
@@ -240,15 +232,11 @@ def _check_finite(component: RawComponent, path: Path) -> None:
     if bad:
         name = "/".join(component.path) or path.stem
         total = len(component.vertices)
-        raise InputError(
-            f"{path}: {bad} of {total} vertices of {name!r} are NaN or infinite; export it again"
-        )
+        raise InputError(f"{path}: {bad} of {total} vertices of {name!r} are NaN or infinite; export it again")
 
 
 def _bounding_size(raw: RawModel) -> Array:
-    used = [
-        component.vertices[np.unique(component.faces)] for component in raw.components if len(component.faces)
-    ]
+    used = [component.vertices[np.unique(component.faces)] for component in raw.components if len(component.faces)]
     return np.ptp(np.concatenate([np.stack([v.min(axis=0), v.max(axis=0)]) for v in used]), axis=0)
 
 

@@ -32,22 +32,14 @@ class Component:
         vertices = np.ascontiguousarray(self.vertices_in_model, dtype=np.float64)
         faces = np.ascontiguousarray(self.faces, dtype=np.int32)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
-            raise InputError(
-                f"component {self.name!r}: vertices have shape {vertices.shape}, expected (V, 3)"
-            )
+            raise InputError(f"component {self.name!r}: vertices have shape {vertices.shape}, expected (V, 3)")
         if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-            raise InputError(
-                f"component {self.name!r}: faces have shape {faces.shape}, expected (F, 3), F > 0"
-            )
+            raise InputError(f"component {self.name!r}: faces have shape {faces.shape}, expected (F, 3), F > 0")
         if not np.all(np.isfinite(vertices)):
             bad = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
-            raise InputError(
-                f"component {self.name!r}: {bad} of {len(vertices)} vertices are NaN or infinite"
-            )
+            raise InputError(f"component {self.name!r}: {bad} of {len(vertices)} vertices are NaN or infinite")
         if faces.min() < 0 or faces.max() >= len(vertices):
-            raise InputError(
-                f"component {self.name!r}: a face refers to vertex {faces.max()} of {len(vertices)}"
-            )
+            raise InputError(f"component {self.name!r}: a face refers to vertex {faces.max()} of {len(vertices)}")
         object.__setattr__(self, "vertices_in_model", vertices)
         object.__setattr__(self, "faces", faces)
 

@@ -52,9 +52,7 @@ def read_obj(path: Path) -> RawModel:
             elif words[0] == "mtllib":
                 materials.update(_read_materials(path.parent / " ".join(words[1:])))
         except (ValueError, IndexError) as error:
-            raise InputError(
-                f"{path}: line {number} is not valid OBJ: {line.strip()[:60]!r} ({error})"
-            ) from error
+            raise InputError(f"{path}: line {number} is not valid OBJ: {line.strip()[:60]!r} ({error})") from error
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     model = RawModel()
     for name, polygons, uses in groups:

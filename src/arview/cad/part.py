@@ -190,9 +190,7 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
     if path.is_dir():
         path = path / "part.toml"
     if not path.is_file():
-        raise InputError(
-            f"{path}: no such file; give a part file (.toml) or a CAD file ({' '.join(SUFFIXES)})"
-        )
+        raise InputError(f"{path}: no such file; give a part file (.toml) or a CAD file ({' '.join(SUFFIXES)})")
     if path.suffix.lower() != ".toml":
         cad = load_cad(path, unit)
         settings = tuple(ComponentSettings(component.name) for component in cad.model.components)
@@ -305,9 +303,7 @@ def _read_datums(tables: _Table, names: list[str]) -> tuple[Datum, ...]:
     datums = []
     for label in tables.content:
         table = tables.table(label)
-        feature = cast(
-            Literal["plane", "hole", "pin"], table.choice("feature", DATUM_FEATURES, required=True)
-        )
+        feature = cast(Literal["plane", "hole", "pin"], table.choice("feature", DATUM_FEATURES, required=True))
         component = table.text("component")
         if component not in names:
             raise InputError(f"{table.path}: [{table.name}] {_unknown_component(component, names)}")

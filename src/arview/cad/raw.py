@@ -87,9 +87,7 @@ def unit_in_mm(name: str) -> float | None:
     return None
 
 
-def place(
-    parent_from_mesh: Array, vertices: Array, faces: NDArray[np.int64]
-) -> tuple[Array, NDArray[np.int64]]:
+def place(parent_from_mesh: Array, vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
     """Vertices (V,3) under an affine (4,4) transform; faces are turned over when it mirrors."""
     placed = vertices @ parent_from_mesh[:3, :3].T + parent_from_mesh[:3, 3]
     if np.linalg.det(parent_from_mesh[:3, :3]) < 0:

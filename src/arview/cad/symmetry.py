@@ -143,9 +143,7 @@ def find_symmetries(
         centers.append(middle)
     counts = np.bincount(samples.query_groups, minlength=int(groups.max()) + 1)
 
-    def judge(
-        axis: Array, center: Array, angles_rad: NDArray[np.float64], order: int | None
-    ) -> FoundSymmetry | None:
+    def judge(axis: Array, center: Array, angles_rad: NDArray[np.float64], order: int | None) -> FoundSymmetry | None:
         unmatched = np.zeros(len(samples.queries), dtype=bool)
         is_exact = True
         for angle in angles_rad:

@@ -128,9 +128,7 @@ class _Archive:
         triangles = list(element.iterfind("{*}mesh/{*}triangles/{*}triangle"))
         faces = [(int(t.attrib["v1"]), int(t.attrib["v2"]), int(t.attrib["v3"])) for t in triangles]
         if faces and not 0 <= min(map(min, faces)) <= max(map(max, faces)) < len(vertices):
-            raise ValueError(
-                f"a triangle of object {element.attrib['id']} refers to a vertex that does not exist"
-            )
+            raise ValueError(f"a triangle of object {element.attrib['id']} refers to a vertex that does not exist")
         # The property of most triangles; a triangle without one has its object's.
         uses: dict[tuple[str | None, str | None], int] = {}
         for triangle in triangles:
@@ -149,9 +147,7 @@ class _Archive:
             ],
         )
 
-    def _instantiate(
-        self, key: Key, root_from_object: Array, path: tuple[str, ...], name: str | None
-    ) -> None:
+    def _instantiate(self, key: Key, root_from_object: Array, path: tuple[str, ...], name: str | None) -> None:
         if len(path) > _MAX_DEPTH:
             raise ValueError("objects are nested in a circle")
         if key not in self.objects:

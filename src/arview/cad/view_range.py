@@ -48,9 +48,7 @@ class ViewRange:
         """For unit vectors (N,3) from the centre to the camera: which are inside, with a margin in deg."""
         d = np.asarray(directions, dtype=np.float64)
         elevation = np.rad2deg(np.arcsin(np.clip(d[..., 2], -1.0, 1.0)))
-        inside = (elevation >= self.elevation_deg[0] - margin_deg) & (
-            elevation <= self.elevation_deg[1] + margin_deg
-        )
+        inside = (elevation >= self.elevation_deg[0] - margin_deg) & (elevation <= self.elevation_deg[1] + margin_deg)
         low, high = self.azimuth_deg
         if high - low < 360:
             azimuth = np.rad2deg(np.arctan2(d[..., 1], d[..., 0]))

@@ -133,8 +133,7 @@ def _smooth_tangents(pixels: Array, tangents_px: Array, shape: tuple[int, int]) 
     size = shape[0] * shape[1]
     products = (tangents_px[:, 0] ** 2, tangents_px[:, 0] * tangents_px[:, 1], tangents_px[:, 1] ** 2)
     xx, xy, yy = (
-        cv2.boxFilter(np.bincount(flat, p, size).reshape(shape), -1, (7, 7), normalize=False)[y, x]
-        for p in products
+        cv2.boxFilter(np.bincount(flat, p, size).reshape(shape), -1, (7, 7), normalize=False)[y, x] for p in products
     )
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -169,9 +168,12 @@ def extract_features(
     x = (samples.pixels[:, 0] - cx) / fx
     y = (samples.pixels[:, 1] - cy) / fy
     tangents_px = np.stack(
-        [fx * (tangents_in_cam[:, 0] - x * tangents_in_cam[:, 2]), fy * (tangents_in_cam[:, 1] - y * tangents_in_cam[:, 2])],
+        [
+            fx * (tangents_in_cam[:, 0] - x * tangents_in_cam[:, 2]),
+            fy * (tangents_in_cam[:, 1] - y * tangents_in_cam[:, 2]),
+        ],
         axis=1,
-    )  # fmt: skip
+    )
     norms = np.linalg.norm(tangents_px, axis=1)
     along_sight = norms < 0.05 * fx
     tangents_px /= np.maximum(norms, 1e-12)[:, None]
@@ -179,14 +181,10 @@ def extract_features(
     if len(samples.pixels):
         is_short = samples.lengths_px < 6.0
         smooth_px = _smooth_tangents(samples.pixels, tangents_px, (height, width))
-        smooth_in_cam = np.stack(
-            [smooth_px[:, 0] / fx, smooth_px[:, 1] / fy, np.zeros(len(smooth_px))], axis=1
-        )
+        smooth_in_cam = np.stack([smooth_px[:, 0] / fx, smooth_px[:, 1] / fy, np.zeros(len(smooth_px))], axis=1)
         smooth_in_cam /= np.linalg.norm(smooth_in_cam, axis=1, keepdims=True)
         edge_tangents = np.where(is_short[:, None], smooth_in_cam @ cam_from_model[:3, :3], edge_tangents)
-    usable = (
-        np.flatnonzero(~along_sight | (samples.lengths_px < 6.0)) if len(samples.pixels) else np.zeros(0, int)
-    )
+    usable = np.flatnonzero(~along_sight | (samples.lengths_px < 6.0)) if len(samples.pixels) else np.zeros(0, int)
     chosen = usable[_evenly(len(usable), edge_count)]
 
     mask = rendering.silhouette

@@ -101,9 +101,7 @@ def _sample_visible(  # type: ignore[no-untyped-def]
     translation = cam_from_model[:3, 3]
     eye = np.empty(3)
     for k in range(3):
-        eye[k] = -(
-            rotation[0, k] * translation[0] + rotation[1, k] * translation[1] + rotation[2, k] * translation[2]
-        )
+        eye[k] = -(rotation[0, k] * translation[0] + rotation[1, k] * translation[1] + rotation[2, k] * translation[2])
     capacity = 4096
     points = np.empty((capacity, 3))
     pixels = np.empty((capacity, 2))

@@ -26,17 +26,13 @@ def icosphere_directions(subdivisions: int) -> Array:
     ]
     triangles = np.array(faces)
     for _ in range(subdivisions):
-        edges = np.sort(
-            np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1
-        )
+        edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
         unique, inverse = np.unique(edges, axis=0, return_inverse=True)
         middles = points[unique].sum(axis=1)
         middles /= np.linalg.norm(middles, axis=1, keepdims=True)
         ab, bc, ca = np.split(inverse.ravel() + len(points), 3)
         a, b, c = triangles.T
-        triangles = np.concatenate(
-            [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
-        )
+        triangles = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
         points = np.concatenate([points, middles])
     return points
 
@@ -58,6 +54,4 @@ def directions_in_range(view_range: ViewRange, subdivisions: int, margin_deg: fl
         return directions[inside]
     azimuth = np.deg2rad(0.5 * sum(view_range.azimuth_deg))
     elevation = np.deg2rad(0.5 * sum(view_range.elevation_deg))
-    return np.array(
-        [[np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]]
-    )
+    return np.array([[np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]])

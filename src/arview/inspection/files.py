@@ -89,9 +89,7 @@ def _read_json(path: Path) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_object_without_repeats)
     except json.JSONDecodeError as error:
-        raise InputError(
-            f"{path}: is not JSON, line {error.lineno} column {error.colno}: {error.msg}"
-        ) from error
+        raise InputError(f"{path}: is not JSON, line {error.lineno} column {error.colno}: {error.msg}") from error
     except RecursionError as error:
         raise InputError(f"{path}: is nested too deeply to be an inspection") from error
     except InputError as error:

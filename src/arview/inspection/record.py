@@ -80,10 +80,7 @@ class ComponentDeviation:
         for field, value in numbers.items():
             if value is not None and not math.isfinite(value):
                 raise InputError(f"{field}: is {value}, expected a finite number or null")
-            if (
-                field in ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg")
-                and (value or 0.0) < 0.0
-            ):
+            if field in ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg") and (value or 0.0) < 0.0:
                 raise InputError(f"{field}: is {value}, must not be negative")
 
     def _check_observable(self) -> None:
@@ -96,8 +93,7 @@ class ComponentDeviation:
                 )
             if value is None and seen:
                 raise InputError(
-                    f"displacement_mm[{index}]: is null, but observable[{index + 3}] says that d{axis} is"
-                    " determined"
+                    f"displacement_mm[{index}]: is null, but observable[{index + 3}] says that d{axis} is determined"
                 )
         if not any(self.observable[:3]) and (self.tilt_deg is not None or self.twist_deg is not None):
             raise InputError("rotation: holds a number, but observable says that no rotation is determined")
@@ -112,9 +108,7 @@ class ComponentDeviation:
         if self.distance_mm is None:
             raise InputError(f"distance_mm: is null, but displacement_mm has the length {length:.3f} mm")
         if abs(self.distance_mm - length) > _DISTANCE_SLACK_MM + 1e-3 * length:
-            raise InputError(
-                f"distance_mm: is {self.distance_mm}, but displacement_mm has the length {length:.3f} mm"
-            )
+            raise InputError(f"distance_mm: is {self.distance_mm}, but displacement_mm has the length {length:.3f} mm")
         if self.uncertainty_mm is None:
             raise InputError("uncertainty_mm: is null, but a distance is given; a measured value needs its U")
 
@@ -135,8 +129,7 @@ class ComponentDeviation:
                 raise InputError("distance_mm: is null, but the verdict is pass")
             if self.tolerance_mm is not None and self.distance_mm > self.tolerance_mm:
                 raise InputError(
-                    f"verdict: is pass, but distance_mm {self.distance_mm} exceeds tolerance_mm"
-                    f" {self.tolerance_mm}"
+                    f"verdict: is pass, but distance_mm {self.distance_mm} exceeds tolerance_mm {self.tolerance_mm}"
                 )
 
 

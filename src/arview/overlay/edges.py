@@ -32,9 +32,7 @@ class Edges:
         points, normals, face_points, ends, faces, creases, closed, owners = [], [], [], [], [], [], [], []
         vertex_offset = face_offset = 0
         for index, shape in enumerate(shapes):
-            cosine = np.sum(
-                shape.normals[shape.edge_faces[:, 0]] * shape.normals[shape.edge_faces[:, 1]], axis=1
-            )
+            cosine = np.sum(shape.normals[shape.edge_faces[:, 0]] * shape.normals[shape.edge_faces[:, 1]], axis=1)
             is_crease = (shape.edge_faces[:, 1] < 0) | (cosine < _CREASE_COS)
             keep = is_crease | (cosine < _FLAT_COS)
             points.append(shape.vertices)

@@ -86,12 +86,8 @@ class Ghost:
         if window is None:
             return None
         shade = np.empty(len(self._faces), dtype=np.float32)
-        faces, components, count = _faces_to_draw(
-            points, self._faces, self._winding, self._component_of_face, shade
-        )
-        u0, v0, u1, v1 = (
-            window if self._ideal_pixels is None else self._ideal_window(self._ideal_pixels, window)
-        )
+        faces, components, count = _faces_to_draw(points, self._faces, self._winding, self._component_of_face, shade)
+        u0, v0, u1, v1 = window if self._ideal_pixels is None else self._ideal_window(self._ideal_pixels, window)
         inverse_depth, face_ids = rasterise(
             points, faces[:count], camera.fx, camera.fy, camera.cx, camera.cy,
             u1 - u0, v1 - v0, NEAR_MM, (u0, v0),
@@ -132,9 +128,7 @@ def _window(points: Array, camera: Camera) -> tuple[int, int, int, int] | None:
 
 def _monotone_limit_r2(camera: Camera) -> float:
     """Largest squared normalised radius, to 1.5 × the corner's radius, where the lens does not fold back."""
-    corners = np.array(
-        [[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], dtype=float
-    )
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], dtype=float)
     rays = (corners - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     r2 = np.linspace(0.0, 2.25 * float(np.max(np.sum(rays * rays, axis=1))), 400)
     k1, k2, _, _, k3 = camera.dist

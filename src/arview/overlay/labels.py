@@ -94,9 +94,7 @@ def text_size_px(image_height: int) -> int:
     return max(11, round(4.5 + image_height / 72))
 
 
-def label_sprite(
-    deviation: ComponentDeviation, options: OverlayOptions, size_px: int, widest_px: int
-) -> paint.Sprite:
+def label_sprite(deviation: ComponentDeviation, options: OverlayOptions, size_px: int, widest_px: int) -> paint.Sprite:
     """Picture of a label: name, distance and verdict; a second line of details unless it passed."""
     color = VERDICT_RGB[deviation.verdict]
     small_px = max(10, round(0.86 * size_px))

@@ -85,9 +85,7 @@ class LabelLayout:
     None of them is wider than ``widest_px``, which must leave room for two side by side.
     """
 
-    def __init__(
-        self, width: int, top_px: int, bottom_px: int, margin_px: int, gap_px: int, widest_px: int
-    ) -> None:
+    def __init__(self, width: int, top_px: int, bottom_px: int, margin_px: int, gap_px: int, widest_px: int) -> None:
         self._width, self._top, self._bottom = width, top_px, bottom_px
         self._limits = (width - margin_px - widest_px - gap_px, margin_px + widest_px + gap_px)
         self._margin, self._gap = margin_px, gap_px
@@ -131,9 +129,7 @@ class LabelLayout:
         if self._edges is None:
             left, right = goal_left, goal_right
         else:
-            left, right = (
-                self._glide(*pair) for pair in zip(self._edges, (goal_left, goal_right), strict=True)
-            )
+            left, right = (self._glide(*pair) for pair in zip(self._edges, (goal_left, goal_right), strict=True))
         left, right = min(left, limit_left), max(right, limit_right)
         if right - left < self._gap:
             left, right = goal_left, goal_right
@@ -180,9 +176,7 @@ class LabelLayout:
         for column in (self._left, self._right):
             self._mark_disorder(column)
 
-    def _choose_side(
-        self, request: LabelRequest, present: _Slot | None, free_px: dict[bool, float]
-    ) -> bool | None:
+    def _choose_side(self, request: LabelRequest, present: _Slot | None, free_px: dict[bool, float]) -> bool | None:
         """True for left, False for right, None when neither column has room."""
         assert self._edges is not None
         room = [side for side in (True, False) if free_px[side] >= request.height + self._gap]
@@ -239,16 +233,12 @@ class LabelLayout:
             if slot.opacity > 0 or slot.is_leaving:
                 continue
             above = all(self._is_above(other, slot) for other in column[:place] if other.opacity > 0)
-            if above and all(
-                self._is_above(slot, other) for other in column[place + 1 :] if other.opacity > 0
-            ):
+            if above and all(self._is_above(slot, other) for other in column[place + 1 :] if other.opacity > 0):
                 slot.opacity = 1.0 if is_first else 1.0 / _FADE_FRAMES
 
     def _drop_overflow(self, column: list[_Slot]) -> None:
         """Labels on their way out may overfill a column: the newcomers then wait."""
-        while sum(s.request.height + self._gap for s in column) > self._bottom - self._top - _ROW_PX * len(
-            column
-        ):
+        while sum(s.request.height + self._gap for s in column) > self._bottom - self._top - _ROW_PX * len(column):
             hidden = [slot for slot in column if slot.opacity == 0]
             column.remove(max(hidden or column, key=lambda slot: slot.urgency))
 

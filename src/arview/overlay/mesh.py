@@ -52,22 +52,16 @@ def topology(component: Component) -> Topology:
 
     half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     face_of_half = np.tile(np.arange(len(faces)), 3)
-    ends, edge_of_half, count = np.unique(
-        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
+    ends, edge_of_half, count = np.unique(np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True)
     edge_of_half = edge_of_half.reshape(-1)
     order = np.argsort(edge_of_half, kind="stable")
     start = np.cumsum(count) - count
     second = np.minimum(start + 1, max(0, len(order) - 1))
-    edge_faces = np.stack(
-        [face_of_half[order[start]], np.where(count == 2, face_of_half[order[second]], -1)], axis=1
-    )
+    edge_faces = np.stack([face_of_half[order[start]], np.where(count == 2, face_of_half[order[second]], -1)], axis=1)
     direction = np.bincount(edge_of_half, weights=np.where(half[:, 0] < half[:, 1], 1.0, -1.0))
     is_closed = len(faces) > 0 and bool(np.all(count == 2) and np.all(direction == 0))
     is_inside_out = is_closed and float(np.sum(corners[:, 0] * cross)) < 0.0
-    return Topology(
-        vertices, faces, -normals if is_inside_out else normals, ends, edge_faces, is_closed, is_inside_out
-    )
+    return Topology(vertices, faces, -normals if is_inside_out else normals, ends, edge_faces, is_closed, is_inside_out)
 
 
 def anchor_in_model(component: Component, shape: Topology) -> Array:

@@ -56,9 +56,7 @@ def text_mask(text: str, size_px: int, bold: bool = False) -> NDArray[np.uint8]:
         width = int(end[0])
     else:
         text, scale, thickness = text.translate(_HERSHEY_ASCII), size_px / 26.0, 2 if bold else 1
-        cv2.putText(
-            canvas, text, (0, baseline), cv2.FONT_HERSHEY_SIMPLEX, scale, white, thickness, cv2.LINE_AA
-        )
+        cv2.putText(canvas, text, (0, baseline), cv2.FONT_HERSHEY_SIMPLEX, scale, white, thickness, cv2.LINE_AA)
         width = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)[0][0]
     return np.ascontiguousarray(canvas[:, : max(1, width), 0])
 
@@ -119,9 +117,7 @@ def line(image: Image, points_px: Array, rgb: Rgb, width_px: int) -> None:
     cv2.polylines(image, [fixed], False, rgb, width_px, cv2.LINE_AA, _SHIFT)
 
 
-def dot(
-    image: Image, point_px: Array | tuple[float, float], rgb: Rgb, radius_px: float, hollow: bool
-) -> None:
+def dot(image: Image, point_px: Array | tuple[float, float], rgb: Rgb, radius_px: float, hollow: bool) -> None:
     """An outlined disc, or a ring."""
     centre = (round(float(point_px[0]) * 2**_SHIFT), round(float(point_px[1]) * 2**_SHIFT))
     radius = round(radius_px * 2**_SHIFT)

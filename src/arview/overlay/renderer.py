@@ -61,19 +61,14 @@ class OverlayRenderer:
         self._edges = Edges(shapes, model.diameter_mm / _PIECES if camera.is_distorted else None)
         self._ghost_style, self._edge_style, self._weight = self._styles()
         self._anchors_in_model = np.stack(
-            [
-                anchor_in_model(component, shape)
-                for component, shape in zip(model.components, shapes, strict=True)
-            ]
+            [anchor_in_model(component, shape) for component, shape in zip(model.components, shapes, strict=True)]
         )
         self._line_px = max(1.0, 0.7 + camera.height / 800)
 
         size_px = labels.text_size_px(camera.height)
         self._size_px = size_px
         urgent = labels.by_urgency(inspection) if inspection else []
-        self._arrow_scale = (
-            labels.arrow_scale(inspection, model.diameter_mm, self.options) if inspection else 1.0
-        )
+        self._arrow_scale = labels.arrow_scale(inspection, model.diameter_mm, self.options) if inspection else 1.0
         self._arrows = self._arrow_list(urgent) if self.options.show_arrows else []
         self._status = StatusLine(
             camera.width, camera.height, round(0.95 * size_px), inspection,
@@ -115,9 +110,7 @@ class OverlayRenderer:
         """
         expected = (self.camera.height, self.camera.width, 3)
         if image.shape != expected or image.dtype != np.uint8:
-            raise MismatchError(
-                f"overlay: image is {image.dtype} {image.shape}, the camera expects uint8 {expected}"
-            )
+            raise MismatchError(f"overlay: image is {image.dtype} {image.shape}, the camera expects uint8 {expected}")
         canvas = image if in_place else np.array(image, order="C")
         view = self._ghost.view(pose.cam_from_model) if pose.cam_from_model is not None else None
         if pose.cam_from_model is None or view is None:
@@ -152,9 +145,7 @@ class OverlayRenderer:
             np.array(weight, dtype=np.float32),
         )
 
-    def _draw_model(
-        self, canvas: paint.Image, view: GhostView, cam_from_model: Array, state: TrackingState
-    ) -> None:
+    def _draw_model(self, canvas: paint.Image, view: GhostView, cam_from_model: Array, state: TrackingState) -> None:
         options = self.options
         if options.show_edges == "none":
             cover = np.zeros(view.face_ids.shape, dtype=np.uint8)
@@ -163,9 +154,7 @@ class OverlayRenderer:
             cover, owner = self._edges.draw(
                 self._ghost, view, cam_from_model, self._line_px, options.show_edges == "all"
             )
-        dimming = np.array(
-            [1, 1, 1, _CRITICAL_DIMMING if state is TrackingState.CRITICAL else 1], dtype=np.float32
-        )
+        dimming = np.array([1, 1, 1, _CRITICAL_DIMMING if state is TrackingState.CRITICAL else 1], dtype=np.float32)
         blend(
             canvas, view.u0, view.v0, view.face_ids, view.shade, view.components,
             self._ghost_style * dimming, cover, owner, self._edge_style * dimming,
@@ -182,9 +171,7 @@ class OverlayRenderer:
         for label in placed:
             paint.put_sprite(canvas, self._sprites[label.key], label.x, label.y, label.opacity)
 
-    def _place_labels(
-        self, view: GhostView, anchors_px: Array
-    ) -> tuple[NDArray[np.int64], list[PlacedLabel]]:
+    def _place_labels(self, view: GhostView, anchors_px: Array) -> tuple[NDArray[np.int64], list[PlacedLabel]]:
         """Visible pixels (C,) per component, and the boxes of the labels."""
         camera = self.camera
         cells = np.zeros((-(-camera.height // CELL_PX), -(-camera.width // CELL_PX)), dtype=np.float32)

@@ -33,9 +33,7 @@ def age_text(age_s: float) -> str:
 class StatusLine:
     """A bar at the lower edge of the image; what does not fit in one row goes to a second."""
 
-    def __init__(
-        self, width: int, height: int, size_px: int, inspection: Inspection | None, scale: float | None
-    ):
+    def __init__(self, width: int, height: int, size_px: int, inspection: Inspection | None, scale: float | None):
         self._width, self._height, self._size = width, height, size_px
         self._inspection, self._scale = inspection, scale
         self._row_px = round(1.75 * size_px)

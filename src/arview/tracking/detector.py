@@ -7,7 +7,10 @@ The best candidates are refined by the tracker's edge modality and judged by the
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -28,15 +31,19 @@ from arview.tracking.tracker import Stage, Tracker, TrackerOptions, smoothed
 
 def _coarse_stages(region_gain: float) -> tuple[Stage, ...]:
     return (
-        Stage(6, 12, 2.0, 10.0, 2, region_gain),
-        Stage(4, 12, 2.0, 7.0, 2, region_gain),
-        Stage(4, 12, 1.5, 5.0, 2, region_gain),
-        Stage(3, 10, 1.0, 3.5, 2, region_gain),
+        Stage(6, 12, 2.0, 10.0, 2, region_gain, 2),
+        Stage(4, 12, 2.0, 7.0, 2, region_gain, 2),
+        Stage(4, 12, 1.5, 5.0, 2, region_gain, 2),
+        Stage(3, 10, 1.0, 3.5, 2, region_gain, 2),
     )
 
 
 COARSE_STAGES = (_coarse_stages(1.0), _coarse_stages(20.0))
 """Two tries from every start: edges lead on printed and grey parts, colours on plain and glossy ones."""
+LOWEST_SCORE = 0.25
+"""Template matches below this are noise."""
+HOPELESS_WORTH = 0.35
+"""A pose worth less is not searched around: the part is not there."""
 SURE_WORTH = 1.0
 """A pose worth this much is not searched around any more."""
 COARSE_TOLERANCE_PX = 3.5
@@ -60,7 +67,8 @@ class DetectorOptions:
         roll_step_deg, distance_ratio: spacing of the templates; the spread of the responses covers half of it.
         subdivisions: icosahedron level of the template directions (3: 642, about 9° apart).
         refined: candidates that the tracker refines.
-        finalists: of those, how many are refined to the end.
+        likeliest: of those, how many are tried first, and alone if they settle the matter.
+        finalists: how many of either are refined to the end.
         min_in_picture: less of the outline inside the picture is no detection.
         min_quality: a weaker result is no detection.
     """
@@ -73,7 +81,8 @@ class DetectorOptions:
     spread_px: int = 2
     grid_px: int = 2
     refined: int = 24
-    finalists: int = 6
+    likeliest: int = 6
+    finalists: int = 4
     min_quality: float = 0.5
     min_in_picture: float = 0.4
 
@@ -91,11 +100,11 @@ class Detection:
 
 
 @dataclass(frozen=True)
-class _Candidate:
+class Candidate:
+    """A template match: score 0–1 and the pose it stands for, about the model's centre."""
+
     score: float
     cam_from_body: Array
-    place_px: Array
-    scale: float
 
 
 class Detector:
@@ -137,18 +146,14 @@ class Detector:
             distance = cam_from_body[2, 3]
             c_px, c_n, c_z = project_lines(contour, normals, False, cam_from_body, intrinsics, 0.5)
             inner = (features.edge_kinds & EDGE_CONTOUR) == 0
-            e_px, e_n, e_z = project_lines(
-                edges[inner], tangents[inner], True, cam_from_body, intrinsics, 0.5
-            )
+            e_px, e_n, e_z = project_lines(edges[inner], tangents[inner], True, cam_from_body, intrinsics, 0.5)
             c_px, c_n = c_px[c_z > 0], c_n[c_z > 0]
             e_px, e_n = e_px[e_z > 0], e_n[e_z > 0]
             inner_count = min(len(e_px), int(0.35 * o.points))
             outer_count = min(len(c_px), o.points - inner_count)
             if outer_count < 8:
                 continue
-            px = np.concatenate(
-                [c_px[_spread(len(c_px), outer_count)], e_px[_spread(len(e_px), inner_count)]]
-            )
+            px = np.concatenate([c_px[_spread(len(c_px), outer_count)], e_px[_spread(len(e_px), inner_count)]])
             n = np.concatenate([c_n[_spread(len(c_n), outer_count)], e_n[_spread(len(e_n), inner_count)]])
             px *= distance / focal * template_scale
             for roll in rolls:
@@ -163,9 +168,7 @@ class Detector:
                 rotations[row] = rigid(exp_so3([0, 0, roll]), np.zeros(3))[:3, :3] @ cam_from_body[:3, :3]
                 row += 1
         if row == 0:
-            raise InputError(
-                "guide views: no view shows an outline; check the model and the declared distances"
-            )
+            raise InputError("guide views: no view shows an outline; check the model and the declared distances")
         self._offsets, self._bins, self._counts = offsets[:row], bins[:row], counts[:row]
         self._origins, self._rotations = origins[:row], rotations[:row]
 
@@ -203,29 +206,28 @@ class Detector:
     ) -> list[tuple[float, Array]]:
         """Refine starts, keep the best, search around them; (quality, cam_from_body) best first."""
         o = self.options
-        coarse: list[tuple[float, Array]] = []
-        for start in starts:
-            for stages in COARSE_STAGES:
-                pose = self.tracker.refine_fresh(image, gray, start, stages)
-                coarse.append(
-                    (self.tracker.evidence_fresh(image, gray, pose, COARSE_TOLERANCE_PX).worth, pose)
-                )
-        coarse.sort(key=lambda item: -item[0])
         finished: list[tuple[float, Array]] = []
         tried: list[Array] = []
-        for _, start in coarse:
-            if len(tried) >= o.finalists:
+        # The likeliest starts first: when they settle the matter, the others are not looked at.
+        for first, last in ((0, o.likeliest), (o.likeliest, len(starts))):
+            tries = [(start, stages) for start in starts[first:last] for stages in COARSE_STAGES]
+            coarse = list(_pool().map(lambda item: self._approach(image, gray, *item), tries))
+            coarse.sort(key=lambda item: -item[0])
+            finalists: list[Array] = []
+            for _, start in coarse:
+                if len(finalists) >= o.finalists:
+                    break
+                if not any(self._same(start, other) for other in tried):
+                    tried.append(start)
+                    finalists.append(start)
+            finished += self._finish_all(image, gray, finalists)
+            if finished and finished[0][0] >= SURE_WORTH:
                 break
-            if any(self._same(start, other) for other in tried):
-                continue
-            tried.append(start)
-            finished.append(self._finish(image, gray, start))
-        finished.sort(key=lambda item: -item[0])
+            finished.sort(key=lambda item: -item[0])
         for spread_rad in (0.10, 0.05):
-            if not finished or finished[0][0] >= SURE_WORTH:
+            if not finished or not HOPELESS_WORTH <= finished[0][0] < SURE_WORTH:
                 break
-            for start in _around(finished[0][1], spread_rad):
-                finished.append(self._finish(image, gray, start))
+            finished += self._finish_all(image, gray, _around(finished[0][1], spread_rad))
             finished.sort(key=lambda item: -item[0])
         result: list[tuple[float, Array]] = []
         for worth, pose in finished:
@@ -233,17 +235,32 @@ class Detector:
                 result.append((self._quality(worth, pose), pose))
         return result
 
+    def _approach(
+        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], start: Array, stages: tuple[Stage, ...]
+    ) -> tuple[float, Array]:
+        pose = self.tracker.refine_fresh(image, gray, start, stages)
+        look = self.tracker.fresh_appearance(image, pose)
+        return self.tracker.evidence(image, gray, pose, COARSE_TOLERANCE_PX, look).worth, pose
+
+    def _finish_all(
+        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Array]
+    ) -> list[tuple[float, Array]]:
+        """Refine to the end; (worth, cam_from_body) best first, worth 0 where too little is in the picture."""
+
+        def finish(start: Array) -> tuple[float, Array]:
+            pose = self.tracker.refine_fresh(image, gray, start, FINE_STAGES)
+            look = self.tracker.fresh_appearance(image, pose)
+            evidence = self.tracker.evidence(image, gray, pose, appearance=look)
+            return (evidence.worth if evidence.points_in_picture >= self.options.min_in_picture else 0.0), pose
+
+        return sorted(_pool().map(finish, starts), key=lambda item: -item[0])
+
     def _quality(self, worth: float, cam_from_body: Array) -> float:
         """Quality of a pose found without history: a view of few lines must be borne out the better."""
         index = self.tracker.part.nearest(cam_from_body)
         lines = view_lines(self.views.view(index), self.views.diameter_mm)
         plainness = max(1.0 - lines / (2.0 * PLAIN_LINES), 0.0)
         return quality_of(worth - 0.3 * plainness)
-
-    def _finish(self, image: NDArray[np.uint8], gray: NDArray[np.uint8], start: Array) -> tuple[float, Array]:
-        pose = self.tracker.refine_fresh(image, gray, start, FINE_STAGES)
-        evidence = self.tracker.evidence_fresh(image, gray, pose)
-        return (evidence.worth if evidence.points_in_picture >= self.options.min_in_picture else 0.0), pose
 
     def _same(self, a: Array, b: Array) -> bool:
         near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.05 * self.views.diameter_mm
@@ -255,62 +272,74 @@ class Detector:
         distance = float(np.linalg.norm(cam_from_body[:3, 3]))
         return bool(0.85 * low <= distance <= 1.18 * high and cam_from_body[2, 3] > 0)
 
-    def candidates(self, image: NDArray[np.uint8]) -> list[_Candidate]:
+    def candidates(self, image: NDArray[np.uint8]) -> list[Candidate]:
         """The best template matches over the whole range, apart from each other, best first."""
+        o = self.options
+        distances = self.views.view_range.distances_mm(o.distance_ratio)
+        matches = [m for m in _pool().map(lambda d: self._match_at(image, float(d)), distances) if m is not None]
+        if not matches:
+            return []
+        scores = np.concatenate([m[0] for m in matches])
+        order = np.argsort(-scores, kind="stable")[:1000]
+        scores = scores[order]
+        templates = np.concatenate([m[1] for m in matches])[order]
+        centers_px = np.concatenate([m[2] for m in matches])[order]
+        distance_mm = np.concatenate([np.full(len(m[0]), m[3]) for m in matches])[order]
+        reach_px = np.concatenate([np.full(len(m[0]), 6.0 / m[4]) for m in matches])[order]
+        rays = self.camera.unproject(centers_px)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rotations = _turned_with_rays(self._rotations[templates], rays)
+        kept: list[int] = []
+        free = np.ones(len(scores), dtype=bool)
+        for i in range(len(scores)):
+            if not free[i]:
+                continue
+            kept.append(i)
+            if len(kept) >= o.refined:
+                break
+            near = np.all(np.abs(centers_px - centers_px[i]) < reach_px[i], axis=1)
+            near &= np.abs(np.log(distance_mm / distance_mm[i])) < 0.2
+            near &= np.einsum("jk,njk->n", rotations[i], rotations) > 1.0 + 2.0 * np.cos(0.3)
+            free &= ~near
+        return [Candidate(float(scores[i]), rigid(rotations[i], rays[i] * distance_mm[i])) for i in kept]
+
+    def _match_at(
+        self, image: NDArray[np.uint8], distance_mm: float
+    ) -> tuple[Array, NDArray[np.intp], Array, float, float] | None:
+        """Scores, templates and centres (px) of the matches at one distance, with the distance and the scale."""
         o = self.options
         camera = self.camera
         focal = 0.5 * (camera.fx + camera.fy)
-        found: list[tuple[float, int, Array, float, float]] = []
-        for distance in self.views.view_range.distances_mm(o.distance_ratio):
-            scale = o.radius_px / (focal * 0.5 * self.views.diameter_mm / distance)
-            width, height = round(camera.width * scale), round(camera.height * scale)
-            if width < 24 or height < 24 or scale > 1.5:
-                continue
-            resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-            pad = round(0.6 * o.radius_px)
-            maps = response_maps(resized, o.spread_px, pad)
-            scores, places = match_templates(
-                decimate(maps, o.grid_px), self._offsets, self._bins, self._counts, 3
-            )
-            for t, n in zip(*np.nonzero(scores > 0.25), strict=True):
-                center = places[t, n] + self._origins[t] - pad
-                center_px = (center + 0.5) * [camera.width / width, camera.height / height] - 0.5
-                found.append((float(scores[t, n]), int(t), center_px, float(distance), scale))
-        found.sort(key=lambda item: -item[0])
-        kept: list[_Candidate] = []
-        for score, t, center_px, distance, scale in found[:4000]:
-            reach = 6.0 / scale
-            rotation = self._rotations[t]
-            clash = False
-            for other in kept:
-                if (
-                    abs(other.place_px[0] - center_px[0]) < reach
-                    and abs(other.place_px[1] - center_px[1]) < reach
-                    and abs(np.log(other.scale / scale)) < 0.2
-                    and np.trace(other.cam_from_body[:3, :3].T @ self._aligned(rotation, center_px))
-                    > 1 + 2 * np.cos(0.3)
-                ):
-                    clash = True
-                    break
-            if clash:
-                continue
-            ray = camera.unproject(center_px)
-            ray /= np.linalg.norm(ray)
-            pose = rigid(self._aligned(rotation, center_px), ray * distance)
-            kept.append(_Candidate(score, pose, center_px, scale))
-            if len(kept) >= o.refined:
-                break
-        return kept
+        scale = o.radius_px / (focal * 0.5 * self.views.diameter_mm / distance_mm)
+        width, height = round(camera.width * scale), round(camera.height * scale)
+        if width < 24 or height < 24 or scale > 1.5:
+            return None
+        resized = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+        pad = round(0.6 * o.radius_px)
+        phases = decimate(response_maps(resized, o.spread_px, pad), o.grid_px)
+        scores, places = match_templates(phases, self._offsets, self._bins, self._counts, 3, LOWEST_SCORE)
+        templates, ranks = np.nonzero(scores)
+        centers = places[templates, ranks] + self._origins[templates] - pad
+        centers_px = (centers + 0.5) * [camera.width / width, camera.height / height] - 0.5
+        return scores[templates, ranks], templates, centers_px, distance_mm, scale
 
-    def _aligned(self, rotation: Array, center_px: Array) -> Array:
-        """Rotation of a view seen off the optical axis: turned with the ray."""
-        ray = self.camera.unproject(center_px)
-        ray /= np.linalg.norm(ray)
-        axis = np.cross([0.0, 0.0, 1.0], ray)
-        sine = np.linalg.norm(axis)
-        if sine < 1e-9:
-            return rotation
-        return exp_so3(axis / sine * np.arctan2(sine, ray[2])) @ rotation
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    """Threads for candidates: the kernels release the interpreter."""
+    return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)), thread_name_prefix="arview-detector")
+
+
+def _turned_with_rays(rotations: Array, rays: Array) -> Array:
+    """Rotations (N,3,3) of views seen along the optical axis, turned to be seen along unit rays (N,3)."""
+    # The smallest rotation that takes +Z to the ray (Rodrigues with the axis z × ray).
+    x, y, z = rays.T
+    turn = np.empty((len(rays), 3, 3))
+    k = 1.0 / (1.0 + z)
+    turn[:, 0] = np.stack([1.0 - k * x * x, -k * x * y, x], axis=1)
+    turn[:, 1] = np.stack([-k * x * y, 1.0 - k * y * y, y], axis=1)
+    turn[:, 2] = np.stack([-x, -y, z], axis=1)
+    return turn @ rotations
 
 
 def _around(cam_from_body: Array, angle_rad: float) -> list[Array]:

@@ -131,9 +131,7 @@ def _align_pose(points, cam_from_body, intrinsics, pixels, weights, damping, sig
     for _ in range(8):
         hessian[:] = 0.0
         gradient[:] = 0.0
-        add_features(
-            hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px
-        )
+        add_features(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px)
         cam_from_body = apply_twist(cam_from_body, solve_step(hessian, gradient, damping))
         robust_px = max(3.0, 0.6 * robust_px)
     return cam_from_body
@@ -192,9 +190,7 @@ def _predict(anchors, cam_from_body, intrinsics, width, height, wanted, predicte
         if not wanted[i]:
             continue
         wanted[i] = False
-        u, v, z = tangent_jacobian(
-            anchors.points[i], anchors.tangents[i], cam_from_body, intrinsics, jacobian
-        )
+        u, v, z = tangent_jacobian(anchors.points[i], anchors.tangents[i], cam_from_body, intrinsics, jacobian)
         if z <= 0.0 or u < 6 or v < 6 or u > width - 7 or v > height - 7:
             continue
         det = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
@@ -410,9 +406,7 @@ class FeatureModality:
     def align(self, matches: Matches, cam_from_body: Array) -> Array:
         """Pose (4,4) from the matches alone, started at and held towards a pose: a pre-alignment."""
         points, pixels, weights, _ = matches
-        return np.asarray(
-            _align_pose(points, cam_from_body, self._intrinsics, pixels, weights, self._damping, 1.0)
-        )
+        return np.asarray(_align_pose(points, cam_from_body, self._intrinsics, pixels, weights, self._damping, 1.0))
 
     def settle(self, cam_from_body: Array, limit_px: float = 2.0) -> None:
         """Learn from the frame's accepted pose which features of the last `measure` can be trusted.

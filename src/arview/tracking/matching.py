@@ -54,7 +54,7 @@ def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int) -> NDAr
 
 
 def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-    """(8, step, step, ceil(H/step), ceil(W/step)): every phase of the maps apart, so that a coarse grid is contiguous."""
+    """(8, step, step, ceil(H/step), ceil(W/step)): phases of the maps apart, a coarse grid is contiguous."""
     count, height, width = maps.shape
     rows, columns = -(-height // step), -(-width // step)
     padded = np.zeros((count, rows * step, columns * step), dtype=np.uint8)
@@ -63,12 +63,13 @@ def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
 
 
 @njit(cache=True, nogil=True)
-def match_templates(phases, offsets, bins, counts, top):  # type: ignore[no-untyped-def]
+def match_templates(phases, offsets, bins, counts, top, lowest):  # type: ignore[no-untyped-def]
     """Best places of each template on a grid of ``step`` px.
 
     Args:
         phases: from `decimate`.
         offsets: (T,N,2) int dx, dy of the points, shifted to be ≥ 0; bins: (T,N) orientation; counts: (T,).
+        lowest: templates that nowhere score this much are skipped.
         top: places kept per template, at least about a template's core apart.
 
     Returns:
@@ -97,17 +98,28 @@ def match_templates(phases, offsets, bins, counts, top):  # type: ignore[no-unty
             dx, dy = offsets[t, i, 0], offsets[t, i, 1]
             source = flat[bins[t, i], dy % step, dx % step]
             shift = (dy // step) * columns + dx // step
+            moved = source[shift : shift + span]
             for k in range(span):
-                total[k] += source[k + shift]
+                total[k] += moved[k]
+        highest = 0
+        for k in range(span):
+            highest = max(highest, total[k])
+        if highest < lowest * 255.0 * counts[t]:
+            continue
         for n in range(top):
             best = 0
             where = -1
             for row in range(last_row):
-                for column in range(last_column):
-                    value = total[row * columns + column]
-                    if value > best:
-                        best = value
-                        where = row * columns + column
+                line = total[row * columns : row * columns + last_column]
+                peak = 0
+                for k in range(last_column):
+                    peak = max(peak, line[k])
+                if peak > best:
+                    best = peak
+                    for k in range(last_column):
+                        if line[k] == peak:
+                            where = row * columns + k
+                            break
             if where < 0:
                 break
             row, column = where // columns, where % columns

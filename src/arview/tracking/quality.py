@@ -41,7 +41,8 @@ class Evidence:
         """Sum of what speaks for the pose, 0 to about 1.5; right and wrong poses part at about RIGHT_WORTH.
 
         Outline and, as far as the part has them, design edges count; colours that change along the outline add
-        to it, by how sure they are, where design edges are few: on soft or blurred outlines they are the better witness.
+        to it, by how sure they are, where design edges are few: on soft or blurred
+        outlines they are the better witness.
         """
         outline = 0.6 * self.contour_support + 0.4 * self.sharpness
         share = min(0.5, self.inner_share)

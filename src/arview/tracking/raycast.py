@@ -225,9 +225,7 @@ class RayCaster:
         start = np.ascontiguousarray(origins, dtype=np.float64)
         toward = np.ascontiguousarray(directions, dtype=np.float64)
         if start.shape != toward.shape or start.ndim != 2 or start.shape[1] != 3:
-            raise InputError(
-                f"rays: origins {start.shape} and directions {toward.shape}, expected (N, 3) both"
-            )
+            raise InputError(f"rays: origins {start.shape} and directions {toward.shape}, expected (N, 3) both")
         distances = np.empty(len(start))
         faces = np.empty(len(start), dtype=np.int32)
         _cast_rays(self.hierarchy, start, toward, distances, faces)

@@ -159,9 +159,7 @@ def count_colours(image, bin_of, part, cam_from_body, intrinsics, step_mm, fore,
     pixels, normals, depths = project_lines(
         c_points[first:last], c_normals[first:last], False, cam_from_body, intrinsics, step_mm
     )
-    add_histograms(
-        image, bin_of, pixels, normals, depths, c_runs[first:last], intrinsics[0], fore, back, 20.0, 1.5
-    )
+    add_histograms(image, bin_of, pixels, normals, depths, c_runs[first:last], intrinsics[0], fore, back, 20.0, 1.5)
 
 
 @njit(cache=True, nogil=True)

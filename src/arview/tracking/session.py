@@ -35,6 +35,7 @@ class SessionOptions:
         lost_quality: below this the pose is dropped after ``lost_frames`` frames.
         lost_frames: frames in a row.
         critical_frames: so many critical frames in a row end in ``lost`` too.
+        eager_frames, search_every: a lost part is looked for in so many frames at once, then in every n-th.
         min_in_picture: less of the outline inside the picture cannot hold a pose.
         detector: see DetectorOptions.
     """
@@ -47,7 +48,9 @@ class SessionOptions:
     critical_quality: float = 0.25
     lost_quality: float = 0.1
     lost_frames: int = 2
-    critical_frames: int = 12
+    critical_frames: int = 45
+    eager_frames: int = 5
+    search_every: int = 3
     min_in_picture: float = 0.25
     detector: DetectorOptions = field(default_factory=DetectorOptions)
 
@@ -98,9 +101,7 @@ class TrackingSession:
             model,
         )
         self._detector: Detector | None = None
-        self._initial = (
-            None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
-        )
+        self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self.reset()
 
     @property
@@ -115,7 +116,9 @@ class TrackingSession:
         self.state = TrackingState.SEARCHING
         self._poor = 0
         self._critical = 0
+        self._lost_frames = 0
         self._confirmed = False
+        self._why = ""
 
     def process(self, image: NDArray[np.uint8], index: int, time_s: float) -> Pose:
         """Pose and state of the next frame.
@@ -159,9 +162,7 @@ class TrackingSession:
         poor = outside or quality < o.lost_quality
         self._poor = self._poor + 1 if poor else 0
         if self._poor >= o.lost_frames or (poor and not self._confirmed):
-            return self._lose(
-                "the part left the picture" if outside else "the part is hidden or moved too fast"
-            )
+            return self._lose("the part left the picture" if outside else "the part is hidden or moved too fast")
         was_tracked = self.state == TrackingState.TRACKED
         if not poor and quality >= (o.critical_quality if was_tracked else o.tracked_quality):
             self.state = TrackingState.TRACKED
@@ -176,8 +177,9 @@ class TrackingSession:
 
     def _lose(self, reason: str) -> tuple[None, str]:
         self.state = TrackingState.LOST
-        self._poor = self._critical = 0
+        self._poor = self._critical = self._lost_frames = 0
         self._confirmed = False
+        self._why = reason
         return None, reason
 
     def _is_possible(self, estimate: Estimate) -> bool:
@@ -192,9 +194,14 @@ class TrackingSession:
             detection = self.detector.snap(image, self._initial)
             self._initial = None
         else:
+            self._lost_frames += 1
+            rests = self._lost_frames > o.eager_frames and self._lost_frames % o.search_every != 0
+            if self.state == TrackingState.LOST and rests:
+                return None, self._why
             detections = self.detector.detect(image, max_results=1)
             if not detections:
-                return None, self._why_not(image)
+                self._why = self._why_not(image)
+                return None, self._why
             detection = detections[0]
         self.tracker.start(image, detection.cam_from_model)
         estimate = self.tracker.track(image)

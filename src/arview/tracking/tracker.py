@@ -376,12 +376,12 @@ class Tracker:
                 other_evidence = self.evidence(image, gray, other)
                 if other_evidence.worth > evidence.worth:
                     pose, information, evidence, matches = other, other_information, other_evidence, None
-        self._velocity = 0.5 * log_se3(invert(before) @ pose)
+        self._velocity = 0.9 * log_se3(invert(before) @ pose)
         self._cam_from_body = pose
         quality = evidence.quality
         if matches is not None and evidence.points_in_picture > 0.05:
             # The part's own texture bears the pose out where a hand hides the outline.
-            quality = quality_of(evidence.worth + 0.3 * found_share)
+            quality = quality_of(evidence.worth + 0.5 * found_share)
         if quality > o.doubtful_quality:
             if o.use_region:
                 self.learn(image, pose, o.learning_rate)
@@ -410,4 +410,5 @@ class Tracker:
         """
         scale = self.options.correlated_points / max(estimate.quality, 0.05)
         widest = np.array([0.5] * 3 + [0.5 * self.diameter_mm] * 3)
-        return np.linalg.inv(estimate.information / scale + np.diag(1.0 / widest**2))
+        covariance = np.linalg.inv(estimate.information / scale + np.diag(1.0 / widest**2))
+        return np.asarray(covariance, dtype=np.float64)

@@ -54,9 +54,7 @@ class VideoFileSource(FrameSource):
         with self._opened() as (container, stream):
             first = next(self._decoded(container, stream), None)
             if first is None:
-                raise InputError(
-                    f"{path}: the video holds no frame that can be decoded; record or copy it again"
-                )
+                raise InputError(f"{path}: the video holds no frame that can be decoded; record or copy it again")
             frame = first[1]
             rate = stream.average_rate or stream.guessed_rate
             self.fps = float(rate) if rate else None
@@ -178,9 +176,7 @@ class PictureSource(FrameSource):
             if first is not None:
                 break
         else:
-            raise InputError(
-                f"{name}: none of the {len(paths)} pictures can be read; save them as JPEG or PNG"
-            )
+            raise InputError(f"{name}: none of the {len(paths)} pictures can be read; save them as JPEG or PNG")
         self.height, self.width = first.shape[:2]
         self.quarter_turns_clockwise = _turns_of_picture(path)
 

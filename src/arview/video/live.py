@@ -82,9 +82,7 @@ class LiveSource(FrameSource):
             while self._newest is None and not self._finished:
                 patience_s = self._heard_s + self._read_timeout_s - time.monotonic()
                 if patience_s <= 0:
-                    self.ended_reason = (
-                        f"{self.name}: no frame for {self._read_timeout_s:g} s; is it still connected?"
-                    )
+                    self.ended_reason = f"{self.name}: no frame for {self._read_timeout_s:g} s; is it still connected?"
                     self._closing = True
                     return None
                 self._changed.wait(patience_s)

@@ -179,9 +179,7 @@ class VideoSink:
         template = self._sound.streams.audio[0]
         codec = template.codec_context.name if template.codec_context else "unknown"
         if codec not in container.supported_codecs:
-            self.audio_note = (
-                f"the sound ({codec}) cannot be copied into {self.path.suffix}; the video is silent"
-            )
+            self.audio_note = f"the sound ({codec}) cannot be copied into {self.path.suffix}; the video is silent"
             return None
         return container.add_stream_from_template(template)
 
@@ -268,9 +266,7 @@ class VideoSink:
             return OutputError(f"{self.path}: the disk is full; free some space or choose another folder")
         if code in (errno.EACCES, errno.EPERM, errno.EROFS):
             return OutputError(f"{self.path}: the folder cannot be written to; choose another folder with -o")
-        return OutputError(
-            f"{self.path}: cannot write the video: {getattr(error, 'strerror', None) or error}"
-        )
+        return OutputError(f"{self.path}: cannot write the video: {getattr(error, 'strerror', None) or error}")
 
 
 def _open_sound(source: FrameSource | str | Path | None) -> InputContainer | None:

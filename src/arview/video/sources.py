@@ -55,15 +55,11 @@ def open_source(
     camera = _CAMERA_INDEX.fullmatch(text)
     if camera and (text.startswith("/dev/") or not path.exists()):
         index = int(camera.group(1))
-        return LiveSource(
-            f"camera {index}", lambda: CameraGrabber(index), wanted, open_timeout_s, read_timeout_s
-        )
+        return LiveSource(f"camera {index}", lambda: CameraGrabber(index), wanted, open_timeout_s, read_timeout_s)
     if path.is_dir():
         pictures = picture_paths(path)
         if not pictures:
-            raise InputError(
-                f"{path}: the folder holds no pictures ({_suffixes()}); give another folder or file"
-            )
+            raise InputError(f"{path}: the folder holds no pictures ({_suffixes()}); give another folder or file")
         return PictureSource(text, pictures, wanted, fps)
     if path.exists():
         if path.suffix.lower() in PHOTO_SUFFIXES:
