@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.geometry import Array, exp_so3, rigid, rotation_angle_rad
+from arview.geometry import Array, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR
 from arview.guideviews.sphere import icosphere_directions
 from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
-from arview.tracking.matching import decimate, match_templates, orientation_bins, response_maps
-from arview.tracking.quality import quality_of
+from arview.tracking.matching import decimate, match_templates, orientation_bins, response_maps, score_around
+from arview.tracking.quality import RIGHT_WORTH, quality_of
 from arview.tracking.solver import project_lines
-from arview.tracking.tracker import Stage, Tracker, TrackerOptions, smoothed
+from arview.tracking.tracker import Stage, Tracker, TrackerOptions, intrinsics_of, smoothed
 
 
 def _coarse_stages(region_gain: float) -> tuple[Stage, ...]:
@@ -38,14 +38,14 @@ def _coarse_stages(region_gain: float) -> tuple[Stage, ...]:
     )
 
 
-COARSE_STAGES = (_coarse_stages(1.0), _coarse_stages(20.0))
-"""Two tries from every start: edges lead on printed and grey parts, colours on plain and glossy ones."""
+COARSE_STAGES: tuple[tuple[Stage, ...], ...] = ((), _coarse_stages(1.0), _coarse_stages(20.0))
+"""Tries from every start: it is near enough already; edges lead; colours lead, on plain and glossy parts."""
 LOWEST_SCORE = 0.25
 """Template matches below this are noise."""
 HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
-SURE_WORTH = 1.0
-"""A pose worth this much is not searched around any more."""
+SURE_QUALITY = 0.95
+"""A pose of this quality ends the search."""
 COARSE_TOLERANCE_PX = 3.5
 """After the coarse stages edges are looked for this near."""
 FINE_STAGES = (
@@ -57,6 +57,38 @@ FINE_STAGES = (
 )
 
 
+def _turn_grid(reach_deg: float, step_deg: float) -> Array:
+    """(R,3,3) rotations on a grid of rotation vectors inside a ball."""
+    axis = np.arange(-reach_deg, reach_deg + 0.5 * step_deg, step_deg)
+    vectors = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    vectors = vectors[np.linalg.norm(vectors, axis=1) <= 1.3 * reach_deg]
+    return np.stack([exp_so3(np.deg2rad(v)) for v in vectors])
+
+
+@dataclass(frozen=True)
+class SearchGrid:
+    """Poses tried around a pose: turns (R,3,3), factors of the distance (D,), and how sharply they are looked at.
+
+    ``magnification`` is the part's size against that of the templates, ``kept_each`` and ``kept`` how many of the
+    best are kept around one pose and in all, apart from each other by ``apart_deg``.
+    """
+
+    turns: Array
+    stretches: Array
+    magnification: float
+    kept_each: int
+    kept: int
+    apart_deg: float
+
+
+NEAR_GRID = SearchGrid(_turn_grid(9.0, 4.5), np.array([0.93, 0.965, 1.0, 1.035, 1.07]), 2.0, 2, 14, 4.0)
+"""Between the templates of the first search."""
+WIDE_GRID = SearchGrid(_turn_grid(16.0, 4.0), np.array([0.92, 0.96, 1.0, 1.04, 1.08]), 2.0, 10, 10, 4.0)
+"""Around a pose given by hand or a guess."""
+FINE_GRID = SearchGrid(_turn_grid(3.0, 1.5), np.array([0.976, 0.988, 1.0, 1.012, 1.024]), 4.0, 1, 14, 1.5)
+"""Between the poses of the grids above."""
+
+
 @dataclass(frozen=True)
 class DetectorOptions:
     """Options of the detector.
@@ -66,7 +98,7 @@ class DetectorOptions:
         points: per template.
         roll_step_deg, distance_ratio: spacing of the templates; the spread of the responses covers half of it.
         subdivisions: icosahedron level of the template directions (3: 642, about 9° apart).
-        refined: candidates that the tracker refines.
+        refined: template matches that are searched around.
         likeliest: of those, how many are tried first, and alone if they settle the matter.
         finalists: how many of either are refined to the end.
         min_in_picture: less of the outline inside the picture is no detection.
@@ -80,9 +112,9 @@ class DetectorOptions:
     subdivisions: int = 3
     spread_px: int = 2
     grid_px: int = 2
-    refined: int = 24
+    refined: int = 18
     likeliest: int = 6
-    finalists: int = 4
+    finalists: int = 5
     min_quality: float = 0.5
     min_in_picture: float = 0.4
 
@@ -181,8 +213,15 @@ class Detector:
         """
         o = self.options
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        starts = [candidate.cam_from_body for candidate in self.candidates(image)]
-        settled = self._settle(image, gray, starts)
+        candidates = self.candidates(image)
+        settled: list[tuple[float, Array]] = []
+        # The likeliest first: when they settle the matter, the others are not looked at.
+        for batch in (candidates[: o.likeliest], candidates[o.likeliest :]):
+            near = self._sharpen(image, batch, NEAR_GRID)
+            settled += self._settle(image, gray, self._sharpen(image, near, FINE_GRID))
+            settled.sort(key=lambda item: -item[0])
+            if settled and settled[0][0] >= SURE_QUALITY and self._is_plausible(settled[0][1]):
+                break
         found = [
             Detection(pose @ self.tracker.part.body_from_model, quality)
             for quality, pose in settled
@@ -197,37 +236,82 @@ class Detector:
         """
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         start = cam_from_model @ self.tracker.part.model_from_body
-        settled = self._settle(image, gray, [start, *_around(start, 0.15)])
+        wide = self._sharpen(image, [Candidate(1.0, start)], WIDE_GRID)
+        settled = self._settle(image, gray, [Candidate(1.0, start), *self._sharpen(image, wide, FINE_GRID)])
         quality, pose = settled[0]
         return Detection(pose @ self.tracker.part.body_from_model, quality)
 
+    def _sharpen(
+        self,
+        image: NDArray[np.uint8],
+        candidates: list[Candidate],
+        grid: SearchGrid,
+    ) -> list[Candidate]:
+        """Poses around candidates that fit the picture best at a higher resolution, likeliest first.
+
+        One score over the whole outline is not misled by print or texture that draws single edge points away.
+        """
+        o = self.options
+        camera = self.camera
+        pad = round(0.6 * o.radius_px)
+        by_scale: dict[int, list[Candidate]] = {}
+        for candidate in candidates:
+            step = round(np.log(float(candidate.cam_from_body[2, 3])) / np.log(o.distance_ratio))
+            by_scale.setdefault(step, []).append(candidate)
+
+        def maps_at(group: list[Candidate]) -> tuple[NDArray[np.uint8], Array] | None:
+            radius_px = self.tracker.radius_px(group[0].cam_from_body)
+            scale = min(1.0, grid.magnification * o.radius_px / radius_px)
+            width, height = round(camera.width * scale), round(camera.height * scale)
+            if width < 24 or height < 24:
+                return None
+            small = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+            intrinsics = intrinsics_of(camera.scaled(width, height))
+            intrinsics[2:4] += pad
+            return response_maps(small, o.spread_px, pad), intrinsics
+
+        def search(item: tuple[Candidate, NDArray[np.uint8], Array]) -> list[Candidate]:
+            candidate, maps, intrinsics = item
+            scores, poses = score_around(
+                maps, self.tracker.part.arrays, candidate.cam_from_body, intrinsics,
+                0.01 * self.views.diameter_mm, grid.turns, grid.stretches, 4, 2, 64, 32,
+            )  # fmt: skip
+            best: list[Candidate] = []
+            for index in np.argsort(-scores)[:200]:
+                if not any(self._same(poses[index], other.cam_from_body, grid.apart_deg) for other in best):
+                    best.append(Candidate(float(scores[index]), poses[index]))
+                    if len(best) >= grid.kept_each:
+                        break
+            return best
+
+        jobs: list[tuple[Candidate, NDArray[np.uint8], Array]] = []
+        for group, made in zip(by_scale.values(), _pool().map(maps_at, by_scale.values()), strict=True):
+            if made is not None:
+                jobs += [(candidate, *made) for candidate in group]
+        found = [candidate for best in _pool().map(search, jobs) for candidate in best]
+        found.sort(key=lambda item: -item.score)
+        apart: list[Candidate] = []
+        for candidate in found:
+            if not any(self._same(candidate.cam_from_body, other.cam_from_body, grid.apart_deg) for other in apart):
+                apart.append(candidate)
+        return apart[: grid.kept]
+
     def _settle(
-        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Array]
+        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Candidate]
     ) -> list[tuple[float, Array]]:
         """Refine starts, keep the best, search around them; (quality, cam_from_body) best first."""
         o = self.options
-        finished: list[tuple[float, Array]] = []
-        tried: list[Array] = []
-        # The likeliest starts first: when they settle the matter, the others are not looked at.
-        for first, last in ((0, o.likeliest), (o.likeliest, len(starts))):
-            tries = [(start, stages) for start in starts[first:last] for stages in COARSE_STAGES]
-            coarse = list(_pool().map(lambda item: self._approach(image, gray, *item), tries))
-            coarse.sort(key=lambda item: -item[0])
-            finalists: list[Array] = []
-            for _, start in coarse:
-                if len(finalists) >= o.finalists:
-                    break
-                if not any(self._same(start, other) for other in tried):
-                    tried.append(start)
-                    finalists.append(start)
-            finished += self._finish_all(image, gray, finalists)
-            if finished and finished[0][0] >= SURE_WORTH:
+        tries = [(start.cam_from_body, stages) for start in starts for stages in COARSE_STAGES]
+        coarse = sorted(_pool().map(lambda item: self._approach(image, gray, *item), tries), key=lambda item: -item[0])
+        finalists: list[Array] = []
+        for _, start in coarse:
+            if len(finalists) >= o.finalists:
                 break
-            finished.sort(key=lambda item: -item[0])
-        for spread_rad in (0.10, 0.05):
-            if not finished or not HOPELESS_WORTH <= finished[0][0] < SURE_WORTH:
-                break
-            finished += self._finish_all(image, gray, _around(finished[0][1], spread_rad))
+            if not any(self._same(start, other, 3.0) for other in finalists):
+                finalists.append(start)
+        finished = self._finish_all(image, gray, finalists)
+        if finished and HOPELESS_WORTH <= finished[0][0] < RIGHT_WORTH:
+            finished += self._finish_all(image, gray, _around(finished[0][1], 0.05))
             finished.sort(key=lambda item: -item[0])
         result: list[tuple[float, Array]] = []
         for worth, pose in finished:
@@ -262,9 +346,11 @@ class Detector:
         plainness = max(1.0 - lines / (2.0 * PLAIN_LINES), 0.0)
         return quality_of(worth - 0.3 * plainness)
 
-    def _same(self, a: Array, b: Array) -> bool:
-        near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.05 * self.views.diameter_mm
-        return bool(near and rotation_angle_rad(a, b) < np.deg2rad(5.0))
+    def _same(self, a: Array, b: Array, angle_deg: float = 5.0) -> bool:
+        near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.01 * angle_deg * self.views.diameter_mm
+        # cos of the angle between them from the trace: cheap, it is asked often.
+        cosine = 0.5 * (float(np.sum(a[:3, :3] * b[:3, :3])) - 1.0)
+        return bool(near and cosine > np.cos(np.deg2rad(angle_deg)))
 
     def _is_plausible(self, cam_from_body: Array) -> bool:
         """Within a margin of the declared distances and in front of the camera."""

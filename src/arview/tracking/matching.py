@@ -15,6 +15,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from arview.geometry import Array
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.tracking.refine import nearest_view
+from arview.tracking.solver import project_lines
 
 ORIENTATIONS = 8
 """Bins over 180°."""
@@ -136,3 +139,98 @@ def orientation_bins(normals_px: Array) -> NDArray[np.uint8]:
     """Orientation bin (N,) of image normals (N,2); the gradient of an edge runs along its normal."""
     position = np.arctan2(normals_px[:, 1], normals_px[:, 0]) / np.pi * ORIENTATIONS
     return (np.round(position).astype(np.intp) % ORIENTATIONS).astype(np.uint8)
+
+
+@njit(cache=True, nogil=True)
+def score_around(  # type: ignore[no-untyped-def]
+    maps, part, cam_from_body, intrinsics, step_mm, turns, stretches, shift_px, shift_step, contour_count, edge_count
+):
+    """Score poses around one pose by the responses under their projected outline and design edges.
+
+    Args:
+        maps: (8,H,W) from `response_maps`, padded.
+        part: arrays of all guide views, see `PartView.arrays`.
+        cam_from_body: (4,4) the pose to search around.
+        intrinsics: (10,) of the picture that the maps were made from, padding included.
+        step_mm: length over which directions are projected.
+        turns: (R,3,3) rotations about the part's centre, applied on the camera's side.
+        stretches: (D,) factors of the distance.
+        shift_px, shift_step: every turned and stretched pose is tried at shifts of ± shift_px.
+        contour_count, edge_count: about so many points are looked at.
+
+    Returns:
+        scores (R·D,) 0–1 and poses (R·D,4,4), the best shift applied.
+    """
+    directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
+    height, width = maps.shape[1], maps.shape[2]
+    total = turns.shape[0] * stretches.shape[0]
+    scores = np.zeros(total)
+    poses = np.zeros((total, 4, 4))
+    steps = 2 * (shift_px // shift_step) + 1
+    columns = np.empty(contour_count + edge_count + 64, dtype=np.int64)
+    rows = np.empty(contour_count + edge_count + 64, dtype=np.int64)
+    bins = np.empty(contour_count + edge_count + 64, dtype=np.int64)
+    for t in range(turns.shape[0]):
+        pose = cam_from_body.copy()
+        for i in range(3):
+            for j in range(3):
+                pose[i, j] = (
+                    turns[t, i, 0] * cam_from_body[0, j]
+                    + turns[t, i, 1] * cam_from_body[1, j]
+                    + turns[t, i, 2] * cam_from_body[2, j]
+                )
+        view = nearest_view(directions, pose)
+        c_size = c_start[view + 1] - c_start[view]
+        e_size = e_start[view + 1] - e_start[view]
+        c_stride = max(1, c_size // contour_count)
+        e_stride = max(1, e_size // (2 * edge_count))
+        contour = c_points[c_start[view] : c_start[view + 1] : c_stride]
+        contour_normals = c_normals[c_start[view] : c_start[view + 1] : c_stride]
+        edges = e_points[e_start[view] : e_start[view + 1] : e_stride]
+        edge_tangents = e_tangents[e_start[view] : e_start[view + 1] : e_stride]
+        kinds = e_kinds[e_start[view] : e_start[view + 1] : e_stride]
+        for d in range(stretches.shape[0]):
+            index = t * stretches.shape[0] + d
+            for i in range(3):
+                pose[i, 3] = cam_from_body[i, 3] * stretches[d]
+            poses[index] = pose
+            count = 0
+            for group in range(2):
+                if group == 0:
+                    px, normals, depths = project_lines(contour, contour_normals, False, pose, intrinsics, step_mm)
+                else:
+                    px, normals, depths = project_lines(edges, edge_tangents, True, pose, intrinsics, step_mm)
+                limit = contour_count + 32 if group == 0 else contour_count + edge_count + 64
+                for i in range(px.shape[0]):
+                    if group == 1 and ((kinds[i] & EDGE_CONTOUR) > 0 or (kinds[i] & EDGE_SHARP) == 0):
+                        continue
+                    if depths[i] <= 0 or count >= limit:
+                        continue
+                    columns[count] = int(np.round(px[i, 0]))
+                    rows[count] = int(np.round(px[i, 1]))
+                    turn = np.arctan2(normals[i, 1], normals[i, 0]) / np.pi * 8.0
+                    bins[count] = int(np.round(turn)) % 8
+                    count += 1
+            if count < 16:
+                continue
+            best = -1
+            best_dx = 0
+            best_dy = 0
+            for sy in range(steps):
+                dy = (sy - steps // 2) * shift_step
+                for sx in range(steps):
+                    dx = (sx - steps // 2) * shift_step
+                    value = 0
+                    for i in range(count):
+                        x = columns[i] + dx
+                        y = rows[i] + dy
+                        if 0 <= x < width and 0 <= y < height:
+                            value += maps[bins[i], y, x]
+                    if value > best:
+                        best = value
+                        best_dx = dx
+                        best_dy = dy
+            scores[index] = best / (255.0 * count)
+            poses[index, 0, 3] += best_dx * pose[2, 3] / intrinsics[0]
+            poses[index, 1, 3] += best_dy * pose[2, 3] / intrinsics[1]
+    return scores, poses
