@@ -52,21 +52,15 @@ class StepWriter:
         self.product_of: dict[int, tuple[int, int, int]] = {}
         self.styled: list[int] = []
         self.app = self.add("APPLICATION_CONTEXT('core data for automotive mechanical design processes')")
-        self.add(
-            f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,#{self.app})"
-        )
+        self.add(f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,#{self.app})")
         self.product_context = self.add(f"PRODUCT_CONTEXT('',#{self.app},'mechanical')")
-        self.definition_context = self.add(
-            f"PRODUCT_DEFINITION_CONTEXT('part definition',#{self.app},'design')"
-        )
+        self.definition_context = self.add(f"PRODUCT_DEFINITION_CONTEXT('part definition',#{self.app},'design')")
         prefix = "$" if unit == "m" else ".MILLI."
         length = self.add(f"( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT({prefix},.METRE.) )")
         if unit == "inch":
             measure = self.add(f"LENGTH_MEASURE_WITH_UNIT(LENGTH_MEASURE(25.4),#{length})")
             dims = self.add("DIMENSIONAL_EXPONENTS(1.,0.,0.,0.,0.,0.,0.)")
-            length = self.add(
-                f"( CONVERSION_BASED_UNIT('INCH',#{measure}) LENGTH_UNIT() NAMED_UNIT(#{dims}) )"
-            )
+            length = self.add(f"( CONVERSION_BASED_UNIT('INCH',#{measure}) LENGTH_UNIT() NAMED_UNIT(#{dims}) )")
         angle = self.add("( NAMED_UNIT(*) PLANE_ANGLE_UNIT() SI_UNIT($,.RADIAN.) )")
         solid = self.add("( NAMED_UNIT(*) SI_UNIT($,.STERADIAN.) SOLID_ANGLE_UNIT() )")
         accuracy = self.add(
@@ -154,17 +148,11 @@ class StepWriter:
         return definition
 
     def part(self, part: StepPart) -> tuple[int, int, int]:
-        faces = (
-            self.box_faces(part.size)
-            if part.radius is None
-            else self.cylinder_faces(part.radius, part.size[2])
-        )
+        faces = self.box_faces(part.size) if part.radius is None else self.cylinder_faces(part.radius, part.size[2])
         shell = self.add(f"CLOSED_SHELL('',{self.refs(faces)})")
         brep = self.add(f"MANIFOLD_SOLID_BREP('{part.name}',#{shell})")
         place = self.axis(np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]))
-        representation = self.add(
-            f"ADVANCED_BREP_SHAPE_REPRESENTATION('',(#{place},#{brep}),#{self.context})"
-        )
+        representation = self.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',(#{place},#{brep}),#{self.context})")
         if part.color is not None:
             red, green, blue = part.color
             last = self.add(f"COLOUR_RGB('',{red},{green},{blue})")
@@ -193,12 +181,8 @@ class StepWriter:
         items = self.refs([origin, *places])
         representation = self.add(f"SHAPE_REPRESENTATION('',{items},#{self.context})")
         definition = self.product(assembly.name, representation)
-        for number, ((name, (child, child_rep, child_axis), _), place) in enumerate(
-            zip(children, places, strict=True)
-        ):
-            usage = self.add(
-                f"NEXT_ASSEMBLY_USAGE_OCCURRENCE('{number + 1}','{name}','',#{definition},#{child},$)"
-            )
+        for number, ((name, (child, child_rep, child_axis), _), place) in enumerate(zip(children, places, strict=True)):
+            usage = self.add(f"NEXT_ASSEMBLY_USAGE_OCCURRENCE('{number + 1}','{name}','',#{definition},#{child},$)")
             shape = self.add(f"PRODUCT_DEFINITION_SHAPE('Placement','',#{usage})")
             transform = self.add(f"ITEM_DEFINED_TRANSFORMATION('','',#{child_axis},#{place})")
             relation = self.add(
@@ -213,8 +197,7 @@ class StepWriter:
         self.item(item)
         if self.styled:
             self.add(
-                "MECHANICAL_DESIGN_GEOMETRIC_PRESENTATION_REPRESENTATION"
-                f"('',{self.refs(self.styled)},#{self.context})"
+                f"MECHANICAL_DESIGN_GEOMETRIC_PRESENTATION_REPRESENTATION('',{self.refs(self.styled)},#{self.context})"
             )
         header = (
             "ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION((''),'2;1');\n"
@@ -248,9 +231,7 @@ def glb_with_boxes(path: Path, nodes: list[dict[str, object]], roots: list[int],
         "nodes": nodes,
         "scenes": [{"nodes": roots}],
         "scene": 0,
-        "meshes": [
-            {"name": "box", "primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}
-        ],
+        "meshes": [{"name": "box", "primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": {"baseColorFactor": [0.21404114, 0.05087609, 1.0, 1.0]}}],
         "accessors": [
             {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"},

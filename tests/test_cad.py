@@ -203,9 +203,7 @@ def test_3mf_and_ply_colours(tmp_path):
     block = trimesh.Trimesh(*box((0, 0, 0), (10, 10, 10)), process=False)
     block.visual.vertex_colors = np.tile([0, 51, 255, 255], (8, 1))
     block.export(tmp_path / "c.ply")
-    np.testing.assert_allclose(
-        load_model(tmp_path / "c.ply", unit="mm").components[0].color, (0, 0.2, 1), atol=1e-3
-    )
+    np.testing.assert_allclose(load_model(tmp_path / "c.ply", unit="mm").components[0].color, (0, 0.2, 1), atol=1e-3)
 
 
 # --- units --------------------------------------------------------------------------------------------
@@ -222,12 +220,8 @@ def test_trimesh_unit_tag_is_believed_only_from_trimesh(tmp_path):
     np.testing.assert_allclose(cad.model.bounds_in_model[1], [10, 20, 30], atol=1e-4)
     assert any("tagged" in note for note in cad.notes)
     # The same bytes from another program are metres by the specification: 30 m, fine as such.
-    (tmp_path / "foreign.glb").write_bytes(
-        data.replace(b"github.com/mikedh/trimesh", b"github.com/mikedh/notrims")
-    )
-    np.testing.assert_allclose(
-        load_model(tmp_path / "foreign.glb").bounds_in_model[1], [1e4, 2e4, 3e4], rtol=1e-6
-    )
+    (tmp_path / "foreign.glb").write_bytes(data.replace(b"github.com/mikedh/trimesh", b"github.com/mikedh/notrims"))
+    np.testing.assert_allclose(load_model(tmp_path / "foreign.glb").bounds_in_model[1], [1e4, 2e4, 3e4], rtol=1e-6)
 
 
 def test_mixed_trimesh_tags_ask_for_the_unit(tmp_path):
@@ -253,12 +247,8 @@ def test_unit_overrides_the_files_own(file_unit, tmp_path):
 
 
 def test_unit_overrides_glb_and_3mf(tmp_path):
-    np.testing.assert_allclose(
-        load_model(nested_glb(tmp_path), unit="inch").bounds_in_model, NESTED_BOUNDS * 0.0254
-    )
-    np.testing.assert_allclose(
-        load_model(nested_3mf(tmp_path), unit="cm").bounds_in_model, NESTED_BOUNDS * 10.0
-    )
+    np.testing.assert_allclose(load_model(nested_glb(tmp_path), unit="inch").bounds_in_model, NESTED_BOUNDS * 0.0254)
+    np.testing.assert_allclose(load_model(nested_3mf(tmp_path), unit="cm").bounds_in_model, NESTED_BOUNDS * 10.0)
 
 
 def test_no_unit_is_asked_for_with_the_size_under_each(tmp_path):
@@ -432,9 +422,7 @@ def test_gltf_with_external_buffer(tmp_path):
 
 
 def test_importing_the_room_is_light():
-    code = (
-        "import sys, arview.cad; print([m for m in ('trimesh', 'scipy', 'cv2', 'lxml') if m in sys.modules])"
-    )
+    code = "import sys, arview.cad; print([m for m in ('trimesh', 'scipy', 'cv2', 'lxml') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -448,9 +436,7 @@ def test_plate_glb_is_in_metres_with_17_named_components():
     assert len(model.components) == 17
     assert model.components[0].name == "base_plate"
     np.testing.assert_allclose(model.bounds_in_model, [[-150, -150, -8], [150, 150, 40]], atol=1e-3)
-    np.testing.assert_allclose(
-        model.component("post_1").bounds_in_model, [[-78, 62, 0], [-62, 78, 40]], atol=2e-3
-    )
+    np.testing.assert_allclose(model.component("post_1").bounds_in_model, [[-78, 62, 0], [-62, 78, 40]], atol=2e-3)
     assert all(inspect_mesh(component).is_watertight for component in model.components)
 
 

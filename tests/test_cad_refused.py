@@ -74,9 +74,7 @@ def point_ply(folder: Path) -> Path:
 
 def nan_ply(folder: Path) -> Path:
     text = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-    text += (
-        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 nan 0\n0 1 0\n3 0 1 2\n"
-    )
+    text += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 nan 0\n0 1 0\n3 0 1 2\n"
     (folder / "nan.ply").write_text(text)
     return folder / "nan.ply"
 
@@ -118,9 +116,7 @@ REFUSED = [
     (text_file("t.gltf", '{"asset": {"version": "1.0"}}'), r"glTF version 1\.0"),
     (text_file("t.gltf", '{"asset": {"version": "2.0"}}'), "no triangles"),
     (
-        text_file(
-            "d.gltf", '{"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]}'
-        ),
+        text_file("d.gltf", '{"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]}'),
         "Draco",
     ),
     (text_file("t.step"), "not a STEP file"),

@@ -38,23 +38,17 @@ def prism(sides: int, radius: float, height: float, twist: float = 0.0) -> tuple
     return vertices, np.array(faces)
 
 
-def component(
-    name: str, mesh: tuple[np.ndarray, np.ndarray], at: tuple[float, float, float] = (0, 0, 0)
-) -> Component:
+def component(name: str, mesh: tuple[np.ndarray, np.ndarray], at: tuple[float, float, float] = (0, 0, 0)) -> Component:
     return Component(name, mesh[0] + np.asarray(at, dtype=np.float64), mesh[1].astype(np.int32))
 
 
-def part_of(
-    *components: Component, view_range: ViewRange | None = None, **settings: ComponentSettings
-) -> Part:
+def part_of(*components: Component, view_range: ViewRange | None = None, **settings: ComponentSettings) -> Part:
     return Part(
         name="p",
         path=Path("p.toml"),
         cad_path=Path("p.glb"),
         model=make_model("p", components),
-        settings=tuple(
-            settings.get(c.name, ComponentSettings(c.name, position_tolerance_mm=1.0)) for c in components
-        ),
+        settings=tuple(settings.get(c.name, ComponentSettings(c.name, position_tolerance_mm=1.0)) for c in components),
         view_range=view_range,
     )
 
@@ -194,9 +188,7 @@ def test_sizes_in_pixels():
 
 def test_distances_that_cannot_work():
     plate = component("plate", box((0, 0, 0), (200, 120, 10)))
-    assert "lies inside the part" in texts(
-        check_part(part_of(plate, view_range=ViewRange((50, 900)))), "problem"
-    )
+    assert "lies inside the part" in texts(check_part(part_of(plate, view_range=ViewRange((50, 900)))), "problem")
     far = check_part(part_of(plate, view_range=ViewRange((5000, 9000))))
     assert "the whole part is 40 px across; come nearer" in texts(far, "problem")
     close = check_part(part_of(plate, view_range=ViewRange((120, 500))))
@@ -205,9 +197,7 @@ def test_distances_that_cannot_work():
 
 def test_sheets_open_and_non_manifold_meshes():
     vertices, faces = box((0, 0, 0), (100, 60, 20))
-    sheet = Component(
-        "sheet", np.array([[0, 0, 0], [90, 0, 0], [0, 70, 0.0]]), np.array([[0, 1, 2]], dtype=np.int32)
-    )
+    sheet = Component("sheet", np.array([[0, 0, 0], [90, 0, 0], [0, 70, 0.0]]), np.array([[0, 1, 2]], dtype=np.int32))
     open_box = component("tray", (vertices, faces[2:]))
     fin = np.concatenate([faces, [[0, 1, 8]]])
     finned = component("finned", (np.concatenate([vertices, [[-40.0, 0, 10]]]), fin))
@@ -221,9 +211,7 @@ def test_sheets_open_and_non_manifold_meshes():
 
 def test_the_report_is_text(tmp_path):
     settings = ComponentSettings("post", role="inspect", position_tolerance_mm=0.5, angle_tolerance_deg=2.0)
-    part = part_of(
-        component("base", box((0, 0, -10), (120, 80, 0))), component("post", prism(6, 8, 40)), post=settings
-    )
+    part = part_of(component("base", box((0, 0, -10), (120, 80, 0))), component("post", prism(6, 8, 40)), post=settings)
     text = check_part(replace(part, serial="S-9", notes=("renamed something",))).format()
     assert "p  serial S-9" in text
     assert "128 × 86.93 × 50 mm, 2 components, 36 triangles" in text

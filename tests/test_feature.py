@@ -99,9 +99,7 @@ def test_ray_caster_equals_brute_force():
     directions = rng.normal(size=(300, 3)) * 30 - origins
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     distances, hit = RayCaster(vertices, faces).cast(origins, directions)
-    expected = np.array(
-        [brute_force(vertices, faces, o, d) for o, d in zip(origins, directions, strict=True)]
-    )
+    expected = np.array([brute_force(vertices, faces, o, d) for o, d in zip(origins, directions, strict=True)])
     assert 100 < np.count_nonzero(hit >= 0) < 300
     np.testing.assert_array_equal(np.isfinite(expected), hit >= 0)
     seen = hit >= 0

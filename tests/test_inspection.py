@@ -224,18 +224,14 @@ def test_refuses_what_is_no_text_or_not_there(tmp_path: Path) -> None:
 
 def test_refuses_another_model(model: Model, write: Callable[[Any], Path]) -> None:
     path = write(document(model))
-    moved = make_model(
-        "part", tuple(replace(c, vertices_in_model=c.vertices_in_model + 0.5) for c in model.components)
-    )
+    moved = make_model("part", tuple(replace(c, vertices_in_model=c.vertices_in_model + 0.5) for c in model.components))
     with pytest.raises(MismatchError, match="another model: model_hash"):
         load_inspection(path, moved)
     with pytest.raises(MismatchError, match="'post_2'"):
         load_inspection(path, model.only(["post_0", "post_1"]))
 
 
-def test_save_leaves_the_old_file_when_it_fails(
-    model: Model, write: Callable[[Any], Path], tmp_path: Path
-) -> None:
+def test_save_leaves_the_old_file_when_it_fails(model: Model, write: Callable[[Any], Path], tmp_path: Path) -> None:
     inspection = load_inspection(write(document(model)))
     with pytest.raises(OutputError, match="cannot write"):
         save_inspection(inspection, tmp_path / "absent" / "inspection.json")

@@ -48,9 +48,7 @@ def post(name: str, x: float, y: float, radius: float = 8.0, height: float = 40.
     return Component(name, mesh.vertices + np.array([x, y, height / 2]), mesh.faces)
 
 
-def pose(
-    cam_from_model: Array | None, state: TrackingState = TrackingState.TRACKED, reason: str = ""
-) -> Pose:
+def pose(cam_from_model: Array | None, state: TrackingState = TrackingState.TRACKED, reason: str = "") -> Pose:
     return Pose(cam_from_model, None, 0.9, state, 0.0, 0, 0.0, reason)
 
 
@@ -69,9 +67,7 @@ def deviation(
 
 def inspection(model: Model, *components: ComponentDeviation, note: str = "") -> Inspection:
     created = datetime(2026, 3, 1, 12, tzinfo=UTC)
-    return Inspection(
-        "plate", "SN 7", model.source_hash, created, components, Provenance("t", "1", "m", note)
-    )
+    return Inspection("plate", "SN 7", model.source_hash, created, components, Provenance("t", "1", "m", note))
 
 
 @pytest.fixture(scope="module")
@@ -173,9 +169,7 @@ def test_cylinder_shows_its_silhouette_and_no_facets() -> None:
 def test_colours_tell_the_verdict() -> None:
     centers = [(-90, 0, 0), (-30, 0, 0), (30, 0, 0), (90, 0, 0)]
     model = make_model("m", tuple(box(f"b{i}", c, (40, 40, 40)) for i, c in enumerate(centers)))
-    unmeasured = ComponentDeviation(
-        "b3", (None, None, None), None, (False,) * 6, None, 0.5, Verdict.NOT_MEASURED
-    )
+    unmeasured = ComponentDeviation("b3", (None, None, None), None, (False,) * 6, None, 0.5, Verdict.NOT_MEASURED)
     result = inspection(
         model,
         deviation("b0", (0.0, 0.0, 0.1), "pass"),
@@ -237,9 +231,7 @@ def test_arrow_shows_the_way() -> None:
     assert u.min() > 319.5 - 6.0
     assert abs(v.mean() - 239.5) < 1.5
     within_u = inspection(model, deviation("a", (0.05, 0.0, 0.0), "undecided", 0.1))
-    assert not changed(
-        OverlayRenderer(model, CAMERA, within_u, options).draw(GREY, pose(cam_from_model))
-    ).any()
+    assert not changed(OverlayRenderer(model, CAMERA, within_u, options).draw(GREY, pose(cam_from_model))).any()
 
 
 def test_arrow_scale_is_round_and_fits() -> None:
@@ -448,9 +440,7 @@ def test_edges_lie_on_the_edges_of_a_real_frame(index: int) -> None:
     smooth = cv2.GaussianBlur(frame.astype(np.float64), (0, 0), 1.0)
     gradient = np.hypot(cv2.Sobel(smooth, cv2.CV_64F, 1, 0), cv2.Sobel(smooth, cv2.CV_64F, 0, 1))
     strength = {
-        (u, v): float(np.sum(drawn * np.roll(gradient, (-v, -u), axis=(0, 1))))
-        for u in (-3, 0, 3)
-        for v in (-3, 0, 3)
+        (u, v): float(np.sum(drawn * np.roll(gradient, (-v, -u), axis=(0, 1)))) for u in (-3, 0, 3) for v in (-3, 0, 3)
     }
     best = strength.pop((0, 0))
     assert best > 1.1 * max(strength.values())

@@ -371,9 +371,7 @@ class FakeCapture:
     def read(self) -> tuple[bool, np.ndarray]:
         self.left -= 1
         threading.Event().wait(0.02)
-        return (
-            (True, cv2.cvtColor(quarters(160, 120), cv2.COLOR_RGB2BGR)) if self.left >= 0 else (False, None)
-        )
+        return (True, cv2.cvtColor(quarters(160, 120), cv2.COLOR_RGB2BGR)) if self.left >= 0 else (False, None)
 
     def release(self) -> None:
         pass
@@ -411,9 +409,7 @@ def test_sink_writes_playable_h264(tmp_path: Path) -> None:
     with av.open(str(tmp_path / "out.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
-        assert stream.frames == 15 and float(stream.duration * stream.time_base) == pytest.approx(
-            0.5, abs=1e-3
-        )
+        assert stream.frames == 15 and float(stream.duration * stream.time_base) == pytest.approx(0.5, abs=1e-3)
     frames = list(open_source(tmp_path / "out.mp4"))
     assert [number_of(frame.image) for frame in frames] == list(range(15))
     np.testing.assert_allclose(corner_colors(frames[7].image), COLORS, atol=8)

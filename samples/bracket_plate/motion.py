@@ -43,9 +43,7 @@ def cam_from_model(t: float):
     azimuth = np.deg2rad(-122.0 + 76.0 * (u + 0.045 * np.sin(4 * np.pi * u)))
     elevation = np.deg2rad(41.0 + 8.5 * np.sin(2 * np.pi * (0.9 * u + 0.12)) + 2.0 * np.sin(9.0 * u))
     distance = 510.0 + 34.0 * np.sin(2 * np.pi * (1.1 * u + 0.30)) + 6.0 * np.sin(17.0 * u)
-    out = np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
+    out = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     shake = _tremor(t, 11)
     position = CENTER + distance * out + 0.9 * shake[:3]
     target = CENTER + 9.0 * np.array((np.sin(7 * u + 1), np.cos(5 * u), 0.0))
@@ -72,9 +70,7 @@ def hand_in_model(t: float):
     u = np.clip((t - HAND[0]) / (HAND[1] - HAND[0]), 0, 1)
     # Wrist: comes from the right front, rests over the right half of the part, leaves the way it came.
     keys_u = [0.0, 0.22, 0.40, 0.55, 0.72, 1.0]
-    keys = np.array(
-        [(420, -330, 120), (190, -170, 75), (70, -85, 62), (40, -95, 58), (95, -120, 66), (430, -340, 130)]
-    )
+    keys = np.array([(420, -330, 120), (190, -170, 75), (70, -85, 62), (40, -95, 58), (95, -120, 66), (430, -340, 130)])
     from scipy.interpolate import PchipInterpolator
 
     wrist = PchipInterpolator(keys_u, keys)(u) + 0.8 * _tremor(t, 23)[:3]

@@ -134,9 +134,7 @@ def mesh(name, vertices, faces, surface, tile_mm=(240.0, 240.0), offset_mm=(0.0,
     normals = _corner_normals(vertices, faces, crease_deg)
     props = mi.Properties()
     props["surface"] = surface
-    out = mi.Mesh(
-        name, 3 * len(faces), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=props
-    )
+    out = mi.Mesh(name, 3 * len(faces), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=props)
     params = mi.traverse(out)
     params["vertex_positions"] = mi.Float(corner.reshape(-1).astype(np.float32))
     params["vertex_normals"] = mi.Float(normals.reshape(-1).astype(np.float32))
@@ -153,9 +151,7 @@ def _part(shapes, rng):
     chalk = np.zeros(plate_color.shape[:2], np.uint8)
     # Texture rows run with v upwards flipped by Mitsuba: row 0 is the largest v.
     for text, u, v, size in (("BP-0417", 0.10, 0.80, 1.0), ("7", 0.53, 0.90, 1.5)):
-        cv2.putText(
-            chalk, text, (int(u * 1350), int(v * 1000)), cv2.FONT_HERSHEY_SCRIPT_SIMPLEX, size, 255, 3
-        )
+        cv2.putText(chalk, text, (int(u * 1350), int(v * 1000)), cv2.FONT_HERSHEY_SCRIPT_SIMPLEX, size, 255, 3)
     dust = (chalk / 255.0) * (0.35 + 0.6 * tx.fft_noise(*chalk.shape, 0.6, rng))
     plate_color[:] = plate_color + (0.72 - plate_color) * dust[..., None]
     tile = (240.0, 240.0)
@@ -196,12 +192,8 @@ def _clutter(shapes, rng):
         (2000.0, 1500.0), (1000.0, 750.0),
     )  # fmt: skip
     wall = tx.painted(1024, 1024, rng, (0.46, 0.48, 0.47), 0.12)
-    shapes["wall_x"] = mesh(
-        "wall_x", *tx.box((20, 5000, 3000), (1500, 0, 300)), matte(wall), (3000.0, 3000.0)
-    )
-    shapes["wall_y"] = mesh(
-        "wall_y", *tx.box((5000, 20, 3000), (0, 1500, 300)), matte(wall), (3100.0, 2900.0)
-    )
+    shapes["wall_x"] = mesh("wall_x", *tx.box((20, 5000, 3000), (1500, 0, 300)), matte(wall), (3000.0, 3000.0))
+    shapes["wall_y"] = mesh("wall_y", *tx.box((5000, 20, 3000), (0, 1500, 300)), matte(wall), (3100.0, 2900.0))
     bright = steel(tx.machined(512, 512, rng), 0.85, 0.012)
     dark = steel(tx.mill_scale(512, 512, rng), 0.5, 0.03)
     nut = plain["nut_1"][0] * (1, 1, 1) - (-66, -38, 0)
@@ -267,9 +259,7 @@ def _clutter(shapes, rng):
         params.update()
         shapes[f"sheet_{k}"] = paper
     s = np.linspace(0, 1, 120)
-    cable = np.column_stack(
-        [-420 + 330 * s, -330 + 190 * np.sin(2.2 * s) + 30 * np.sin(11 * s), floor + 4 + 0 * s]
-    )
+    cable = np.column_stack([-420 + 330 * s, -330 + 190 * np.sin(2.2 * s) + 30 * np.sin(11 * s), floor + 4 + 0 * s])
     add("cable_green", tx.sweep(cable, 4.0, 12), matte((0.03, 0.33, 0.09), 0.35), crease=60)
     cable = np.column_stack([140 + 620 * s, 120 + 190 * s**2 + 40 * np.sin(7 * s), floor + 5 + 0 * s])
     add("cable_black", tx.sweep(cable, 5.0, 12), matte((0.02, 0.02, 0.022), 0.4), crease=60)
@@ -305,9 +295,7 @@ def build(width_height=MARGIN_FILM, focal_px=1130.0):
     width, height = width_height
 
     def lamp(origin, target, size, radiance):
-        to_world = look(origin, target, [0, 0.01, 1]) @ mi.ScalarTransform4f().scale(
-            [size[0] / 2, size[1] / 2, 1]
-        )
+        to_world = look(origin, target, [0, 0.01, 1]) @ mi.ScalarTransform4f().scale([size[0] / 2, size[1] / 2, 1])
         light = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
         return {"type": "rectangle", "to_world": to_world, "emitter": light}
 
@@ -372,15 +360,11 @@ class Shot:
         for k in range(steps):
             self.pose_all(index + SHUTTER * ((k + 0.5) / steps - 0.5))
             seed = SEED + index * 64 + k
-            color = (
-                color + np.array(mi.render(self.scene, integrator=self.light, spp=samples, seed=seed)) / steps
-            )
+            color = color + np.array(mi.render(self.scene, integrator=self.light, spp=samples, seed=seed)) / steps
             seed += 1 << 20
             guide = guide + np.array(mi.render(self.scene, integrator=self.guides, spp=2, seed=seed)) / steps
         color = np.minimum(np.nan_to_num(color), 30.0).astype(np.float32)
-        albedo, normal = (
-            np.ascontiguousarray(part, np.float32) for part in np.split(guide[..., -6:], 2, axis=2)
-        )
+        albedo, normal = (np.ascontiguousarray(part, np.float32) for part in np.split(guide[..., -6:], 2, axis=2))
         albedo = np.clip(albedo, 0, 1)
         clean = mitsuba_oidn.denoise(
             np.ascontiguousarray(color),
@@ -443,9 +427,7 @@ class Sight:
         a, b = np.meshgrid(self.slopes, self.slopes)
         direction = ahead + a.reshape(-1, 1) * side + b.reshape(-1, 1) * np.cross(side, ahead)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        ray = mi.Ray3f(
-            mi.Point3f(*(float(x) for x in position)), mi.Vector3f(*direction.T.astype(np.float32))
-        )
+        ray = mi.Ray3f(mi.Point3f(*(float(x) for x in position)), mi.Vector3f(*direction.T.astype(np.float32)))
         to_part = np.array(self.part.ray_intersect_preliminary(ray).t)
         to_hiding = np.array(self.hiding.ray_intersect_preliminary(ray).t)
         on_part = np.isfinite(to_part)
@@ -462,9 +444,7 @@ class Sight:
 
 def undistortion_maps(camera: dict, film: tuple[int, int]):
     """Where in the undistorted film each pixel of the distorted picture lies (cv2.remap maps)."""
-    u, v = np.meshgrid(
-        np.arange(camera["width"], dtype=np.float64), np.arange(camera["height"], dtype=np.float64)
-    )
+    u, v = np.meshgrid(np.arange(camera["width"], dtype=np.float64), np.arange(camera["height"], dtype=np.float64))
     k1, k2, *others = camera["dist"]
     assert not any(others), "only radial distortion k1, k2 is rendered"
     distorted = (u - camera["cx"]) / camera["fx"], (v - camera["cy"]) / camera["fy"]

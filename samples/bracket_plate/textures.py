@@ -120,9 +120,7 @@ def bench_top(width_mm: float, depth_mm: float, px_per_mm: float, rng, stamp: st
             x = (12.5 + 25 * i + rng.normal(0, 0.05)) * px_per_mm
             y = (12.5 + 25 * j + rng.normal(0, 0.05)) * px_per_mm
             center = (round(x * 16), round(y * 16))
-            cv2.circle(
-                rims, center, round(4.1 * px_per_mm * 16), int(rng.uniform(90, 255)), -1, cv2.LINE_AA, 4
-            )
+            cv2.circle(rims, center, round(4.1 * px_per_mm * 16), int(rng.uniform(90, 255)), -1, cv2.LINE_AA, 4)
             cv2.circle(holes, center, round(3.2 * px_per_mm * 16), 255, -1, cv2.LINE_AA, 4)
     color = _mix(color, (0.66, 0.66, 0.66), 0.45 * rims / 255.0)
     color = _mix(color, (0.012, 0.012, 0.013), holes / 255.0)
@@ -166,9 +164,7 @@ def printed_sheet(height: int, width: int, rng, title: str, tint=(0.78, 0.77, 0.
     for _ in range(9):
         y += int(0.034 * height)
         cv2.line(page, (margin, y), (width - margin, y), 150, 1)
-        cv2.putText(
-            page, f"{rng.uniform(0, 99):.2f}", (width // 2, y - 3), 0, width / 1250, 230, 1, cv2.LINE_AA
-        )
+        cv2.putText(page, f"{rng.uniform(0, 99):.2f}", (width // 2, y - 3), 0, width / 1250, 230, 1, cv2.LINE_AA)
     cv2.circle(page, (int(0.28 * width), int(0.80 * height)), int(0.09 * width), 200, 2, cv2.LINE_AA)
     paper = np.ones((height, width, 3)) * np.asarray(tint)
     paper = paper * (0.86 + 0.25 * fft_noise(height, width, 1.2, rng))[..., None]

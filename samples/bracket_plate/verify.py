@@ -62,9 +62,7 @@ def verify(folder: Path, draw: Path | None, clip: Path | None = None) -> None:
     points, _, _ = _edges()
     sight = scene.Sight(camera, rays=8)
     with av.open(str(clip or folder / "clip.mp4")) as container:
-        pictures = {
-            i: f.to_ndarray(format="bgr24") for i, f in enumerate(container.decode(video=0)) if i in FRAMES
-        }
+        pictures = {i: f.to_ndarray(format="bgr24") for i, f in enumerate(container.decode(video=0)) if i in FRAMES}
     everything = []
     for index, picture in pictures.items():
         pose = np.array(truth[index]["cam_from_model"])
@@ -102,9 +100,7 @@ def verify(folder: Path, draw: Path | None, clip: Path | None = None) -> None:
         shift = np.zeros(2)
         for _ in range(10):
             weight = 1.0 / (1.0 + ((offset - normal @ shift) / 0.5) ** 2)
-            shift = np.linalg.solve(
-                (normal * weight[:, None]).T @ normal, (normal * weight[:, None]).T @ offset
-            )
+            shift = np.linalg.solve((normal * weight[:, None]).T @ normal, (normal * weight[:, None]).T @ offset)
         everything.append(shift)
         off = np.abs(offset)
         print(

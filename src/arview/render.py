@@ -168,7 +168,7 @@ def _import_pyrender() -> Any:
             ) from error
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     if not hasattr(np, "infty"):
-        np.inf = np.inf  # type: ignore[attr-defined]
+        vars(np)["infty"] = np.inf  # pyrender reads it; numpy 2 has dropped it
     if "pyrender.viewer" not in sys.modules:
         stub = types.ModuleType("pyrender.viewer")
         stub.Viewer = None  # type: ignore[attr-defined]

@@ -123,6 +123,30 @@ class DetectorOptions:
             raise InputError(f"detector: radius_px = {self.radius_px}, expected 10 to 60")
 
 
+BROAD_OPTIONS = DetectorOptions(
+    radius_px=16.0,
+    points=48,
+    roll_step_deg=18.0,
+    distance_ratio=1.22,
+    subdivisions=2,
+    refined=40,
+    likeliest=8,
+)
+"""For ranges up to the full sphere at all rolls: fewer and coarser templates, more of them searched around."""
+MOST_MATCHES = 6000
+"""More templates times distances than this make a range broad."""
+
+
+def options_for(views: GuideViewSet) -> DetectorOptions:
+    """The options that suit the declared range."""
+    usual = DetectorOptions()
+    view_range = views.view_range
+    directions = np.count_nonzero(view_range.contains_direction(icosphere_directions(usual.subdivisions), 3.0))
+    rolls = len(view_range.rolls_deg(usual.roll_step_deg))
+    matches = directions * rolls * len(view_range.distances_mm(usual.distance_ratio))
+    return usual if matches <= MOST_MATCHES else BROAD_OPTIONS
+
+
 @dataclass(frozen=True)
 class Detection:
     """A place where the part was found: ``cam_from_model`` (4,4) mm, quality 0–1."""
@@ -143,11 +167,15 @@ class Detector:
     """Detection of one part with one camera over the declared range of its guide views."""
 
     def __init__(self, views: GuideViewSet, camera: Camera, options: DetectorOptions | None = None) -> None:
-        self.options = options or DetectorOptions()
+        self.options = options or options_for(views)
         self.views = views
         self.camera = camera
         self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
         self._make_templates()
+        self._lines: dict[int, float] = {}
+        looked_at = range(0, len(views), max(1, len(views) // 50))
+        lines = [view_lines(views.view(i), views.diameter_mm) for i in looked_at]
+        self._telling_lines = 0.7 * float(np.percentile(lines, 75))
 
     def _make_templates(self) -> None:
         o = self.options
@@ -219,8 +247,8 @@ class Detector:
         for batch in (candidates[: o.likeliest], candidates[o.likeliest :]):
             near = self._sharpen(image, batch, NEAR_GRID)
             settled += self._settle(image, gray, self._sharpen(image, near, FINE_GRID))
-            settled.sort(key=lambda item: -item[0])
-            if settled and settled[0][0] >= SURE_QUALITY and self._is_plausible(settled[0][1]):
+            settled.sort(key=lambda item: -self._rank(*item))
+            if settled and self._is_sure(*settled[0]):
                 break
         found = [
             Detection(pose @ self.tracker.part.body_from_model, quality)
@@ -302,7 +330,9 @@ class Detector:
         """Refine starts, keep the best, search around them; (quality, cam_from_body) best first."""
         o = self.options
         tries = [(start.cam_from_body, stages) for start in starts for stages in COARSE_STAGES]
-        coarse = sorted(_pool().map(lambda item: self._approach(image, gray, *item), tries), key=lambda item: -item[0])
+        coarse = sorted(
+            _pool().map(lambda item: self._approach(image, gray, *item), tries), key=lambda item: -self._rank(*item)
+        )
         finalists: list[Array] = []
         for _, start in coarse:
             if len(finalists) >= o.finalists:
@@ -314,10 +344,27 @@ class Detector:
             finished += self._finish_all(image, gray, _around(finished[0][1], 0.05))
             finished.sort(key=lambda item: -item[0])
         result: list[tuple[float, Array]] = []
-        for worth, pose in finished:
+        # Of two poses that both fit, the one that explains more of the picture is right: a plain back fits any outline.
+        for worth, pose in sorted(finished, key=lambda item: -self._rank(*item)):
             if not any(self._same(pose, other) for _, other in result):
                 result.append((self._quality(worth, pose), pose))
         return result
+
+    def _view_lines(self, cam_from_body: Array) -> float:
+        """Distinct lines of the view nearest to a pose."""
+        index = self.tracker.part.nearest(cam_from_body)
+        if index not in self._lines:
+            self._lines[index] = max(view_lines(self.views.view(index), self.views.diameter_mm), 1.0)
+        return self._lines[index]
+
+    def _is_sure(self, quality: float, cam_from_body: Array) -> bool:
+        """So good that nothing else need be looked at: plausible, and not a plain side of a part that has others."""
+        is_telling = self._view_lines(cam_from_body) >= self._telling_lines
+        return quality >= SURE_QUALITY and is_telling and self._is_plausible(cam_from_body)
+
+    def _rank(self, worth: float, cam_from_body: Array) -> float:
+        """For comparing poses of one picture by worth or quality, see `_settle`."""
+        return worth * float(np.sqrt(self._view_lines(cam_from_body)))
 
     def _approach(
         self, image: NDArray[np.uint8], gray: NDArray[np.uint8], start: Array, stages: tuple[Stage, ...]
@@ -341,8 +388,7 @@ class Detector:
 
     def _quality(self, worth: float, cam_from_body: Array) -> float:
         """Quality of a pose found without history: a view of few lines must be borne out the better."""
-        index = self.tracker.part.nearest(cam_from_body)
-        lines = view_lines(self.views.view(index), self.views.diameter_mm)
+        lines = self._view_lines(cam_from_body)
         plainness = max(1.0 - lines / (2.0 * PLAIN_LINES), 0.0)
         return quality_of(worth - 0.3 * plainness)
 

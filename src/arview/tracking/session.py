@@ -7,7 +7,7 @@ hardly does, ``lost`` when it no longer does; from ``searching`` and ``lost`` th
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -37,7 +37,7 @@ class SessionOptions:
         critical_frames: so many critical frames in a row end in ``lost`` too.
         eager_frames, search_every: a lost part is looked for in so many frames at once, then in every n-th.
         min_in_picture: less of the outline inside the picture cannot hold a pose.
-        detector: see DetectorOptions.
+        detector: None chooses by the declared range.
     """
 
     use_region: bool = True
@@ -52,7 +52,7 @@ class SessionOptions:
     eager_frames: int = 5
     search_every: int = 3
     min_in_picture: float = 0.25
-    detector: DetectorOptions = field(default_factory=DetectorOptions)
+    detector: DetectorOptions | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.lost_quality <= self.critical_quality <= self.tracked_quality <= 1:
