@@ -240,14 +240,15 @@ def test_mixed_trimesh_tags_ask_for_the_unit(tmp_path):
 
 @pytest.mark.parametrize("file_unit", ["mm", "m", "inch"])
 def test_unit_overrides_the_files_own(file_unit, tmp_path):
-    # The numbers in the STEP file are those of mm / m / inch; read as cm they scale as numbers.
+    # The numbers in the STEP file are those of mm / m / inch; read as metres they scale as numbers.
     per_mm = {"mm": 1.0, "m": 0.001, "inch": 1 / 25.4}[file_unit]
-    model = load_model(nested_step(tmp_path, file_unit), unit="cm")
-    np.testing.assert_allclose(model.bounds_in_model, NESTED_BOUNDS * per_mm * 10.0, rtol=1e-5, atol=1e-4)
+    model = load_model(nested_step(tmp_path, file_unit), unit="m")
+    np.testing.assert_allclose(model.bounds_in_model, NESTED_BOUNDS * per_mm * 1000.0, rtol=1e-5, atol=5e-3)
 
 
 def test_unit_overrides_glb_and_3mf(tmp_path):
-    np.testing.assert_allclose(load_model(nested_glb(tmp_path), unit="inch").bounds_in_model, NESTED_BOUNDS * 0.0254)
+    with pytest.raises(InputError, match=r"is it really 0.508 × 0.254 × 0.762 mm\?"):
+        load_model(nested_glb(tmp_path), unit="inch")
     np.testing.assert_allclose(load_model(nested_3mf(tmp_path), unit="cm").bounds_in_model, NESTED_BOUNDS * 10.0)
 
 
@@ -264,13 +265,18 @@ def test_no_unit_is_asked_for_with_the_size_under_each(tmp_path):
 
 
 @pytest.mark.parametrize("factor,size", [(1e-5, "0.1 × 0.2 × 0.3 mm"), (1e4, "100 × 200 × 300 m")])
-def test_absurd_sizes_are_questioned_and_a_unit_settles_it(factor, size, tmp_path):
+def test_absurd_sizes_are_questioned_whatever_the_unit(factor, size, tmp_path):
     nodes: list[dict[str, object]] = [{"name": "a", "mesh": 0, "scale": [factor * 1000] * 3}]
     nodes[0]["scale"] = [0.01 if factor < 1 else 1e4] * 3
     path = glb_with_boxes(tmp_path / "odd.glb", nodes, [0])
     with pytest.raises(InputError, match=f"is it really {size}.*--unit mm"):
         load_model(path)
-    assert load_model(path, unit="cm").diameter_mm > 0
+    if factor > 1:
+        # The numbers are 100, 200 and 300: centimetres make sense of them.
+        np.testing.assert_allclose(np.ptp(load_model(path, unit="cm").bounds_in_model, axis=0), [1000, 2000, 3000])
+    else:
+        with pytest.raises(InputError, match="is it really"):
+            load_model(path, unit="cm")
 
 
 def test_unknown_unit(tmp_path):

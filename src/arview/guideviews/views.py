@@ -226,6 +226,11 @@ def make_guide_views(
         InputError: the range puts the camera inside the part.
     """
     options = options or GuideViewOptions()
+    if view_range.distance_mm[1] <= 0.5 * model.diameter_mm:
+        raise InputError(
+            f"view range: at {view_range.distance_mm[1]:.0f} mm from its centre the camera is inside the part "
+            f"({model.diameter_mm:.0f} mm across); distance_mm must be larger"
+        )
     distance_mm = view_distance_mm(view_range, model)
     camera = guide_camera(model, distance_mm, options.resolution_px)
     directions = directions_in_range(view_range, options.subdivisions, options.margin_deg)

@@ -459,7 +459,7 @@ class Detector:
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
     """Threads for candidates: the kernels release the interpreter."""
-    return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)), thread_name_prefix="arview-detector")
+    return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)), thread_name_prefix="detector")
 
 
 def _turned_with_rays(rotations: Array, rays: Array) -> Array:
