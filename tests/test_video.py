@@ -209,9 +209,10 @@ def test_hdr_clips_become_8_bit(tmp_path: Path) -> None:
     np.testing.assert_allclose(bars[[0, 2, 3, 4], 0], [0, 141, 245, 255], atol=2)
     assert np.all(np.diff(bars[:, 0]) > 0)
     # PQ 0.58 is 203 cd/m².
-    clip = write_hdr_clip(tmp_path / "pq.mp4", [64, 64 + round(0.58 * 876)], int(ColorTrc.SMPTE2084))
+    white = 64 + round(0.58 * 876)
+    clip = write_hdr_clip(tmp_path / "pq.mp4", [64, white, 64, white, 64], int(ColorTrc.SMPTE2084))
     bars = next(iter(open_source(clip))).image[32, 32::64].astype(int)
-    np.testing.assert_allclose(bars[:, 0], [0, 246], atol=2)
+    np.testing.assert_allclose(bars[:, 0], [0, 246, 0, 246, 0], atol=2)
 
 
 # --- Pictures ---
