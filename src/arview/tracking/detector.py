@@ -44,8 +44,10 @@ LOWEST_SCORE = 0.25
 """Template matches below this are noise."""
 HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
-SURE_QUALITY = 0.95
+SURE_QUALITY = 0.985
 """A pose of this quality ends the search."""
+HOPELESS_QUALITY = 0.1
+"""When the likeliest matches end below this the part is hardly there."""
 COARSE_TOLERANCE_PX = 3.5
 """After the coarse stages edges are looked for this near."""
 FINE_STAGES = (
@@ -232,12 +234,13 @@ class Detector:
         self._offsets, self._bins, self._counts = offsets[:row], bins[:row], counts[:row]
         self._origins, self._rotations = origins[:row], rotations[:row]
 
-    def detect(self, image: NDArray[np.uint8], max_results: int = 3) -> list[Detection]:
+    def detect(self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True) -> list[Detection]:
         """Poses of the part in a frame, best first; an empty list when it is not found.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             max_results: at most so many, all above the quality threshold and apart from each other.
+            is_thorough: look at the less likely template matches too when the likeliest come to nothing at all.
         """
         o = self.options
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
@@ -248,11 +251,12 @@ class Detector:
             near = self._sharpen(image, batch, NEAR_GRID)
             settled += self._settle(image, gray, self._sharpen(image, near, FINE_GRID))
             settled.sort(key=lambda item: -self._rank(*item))
-            if settled and self._is_sure(*settled[0]):
+            hopeless = not settled or self._quality(*settled[0]) < HOPELESS_QUALITY
+            if (hopeless and not is_thorough) or (settled and self._is_sure(settled[0][1], self._quality(*settled[0]))):
                 break
         found = [
             Detection(pose @ self.tracker.part.body_from_model, quality)
-            for quality, pose in settled
+            for quality, pose in ((self._quality(worth, pose), pose) for worth, pose in settled)
             if quality >= o.min_quality and self._is_plausible(pose)
         ]
         return found[:max_results]
@@ -266,8 +270,8 @@ class Detector:
         start = cam_from_model @ self.tracker.part.model_from_body
         wide = self._sharpen(image, [Candidate(1.0, start)], WIDE_GRID)
         settled = self._settle(image, gray, [Candidate(1.0, start), *self._sharpen(image, wide, FINE_GRID)])
-        quality, pose = settled[0]
-        return Detection(pose @ self.tracker.part.body_from_model, quality)
+        worth, pose = settled[0]
+        return Detection(pose @ self.tracker.part.body_from_model, self._quality(worth, pose))
 
     def _sharpen(
         self,
@@ -327,7 +331,7 @@ class Detector:
     def _settle(
         self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Candidate]
     ) -> list[tuple[float, Array]]:
-        """Refine starts, keep the best, search around them; (quality, cam_from_body) best first."""
+        """Refine starts, keep the best, search around them; (worth, cam_from_body) best first."""
         o = self.options
         tries = [(start.cam_from_body, stages) for start in starts for stages in COARSE_STAGES]
         coarse = sorted(
@@ -347,7 +351,7 @@ class Detector:
         # Of two poses that both fit, the one that explains more of the picture is right: a plain back fits any outline.
         for worth, pose in sorted(finished, key=lambda item: -self._rank(*item)):
             if not any(self._same(pose, other) for _, other in result):
-                result.append((self._quality(worth, pose), pose))
+                result.append((worth, pose))
         return result
 
     def _view_lines(self, cam_from_body: Array) -> float:
@@ -357,13 +361,13 @@ class Detector:
             self._lines[index] = max(view_lines(self.views.view(index), self.views.diameter_mm), 1.0)
         return self._lines[index]
 
-    def _is_sure(self, quality: float, cam_from_body: Array) -> bool:
+    def _is_sure(self, cam_from_body: Array, quality: float) -> bool:
         """So good that nothing else need be looked at: plausible, and not a plain side of a part that has others."""
         is_telling = self._view_lines(cam_from_body) >= self._telling_lines
         return quality >= SURE_QUALITY and is_telling and self._is_plausible(cam_from_body)
 
     def _rank(self, worth: float, cam_from_body: Array) -> float:
-        """For comparing poses of one picture by worth or quality, see `_settle`."""
+        """For comparing poses of one picture, see `_settle`."""
         return worth * float(np.sqrt(self._view_lines(cam_from_body)))
 
     def _approach(

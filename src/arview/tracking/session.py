@@ -49,8 +49,8 @@ class SessionOptions:
     lost_quality: float = 0.1
     lost_frames: int = 2
     critical_frames: int = 45
-    eager_frames: int = 5
-    search_every: int = 3
+    eager_frames: int = 2
+    search_every: int = 5
     min_in_picture: float = 0.25
     detector: DetectorOptions | None = None
 
@@ -198,7 +198,8 @@ class TrackingSession:
             rests = self._lost_frames > o.eager_frames and self._lost_frames % o.search_every != 0
             if self.state == TrackingState.LOST and rests:
                 return None, self._why
-            detections = self.detector.detect(image, max_results=1)
+            is_thorough = self.state == TrackingState.SEARCHING or self._lost_frames % (3 * o.search_every) == 0
+            detections = self.detector.detect(image, max_results=1, is_thorough=is_thorough)
             if not detections:
                 self._why = self._why_not(image)
                 return None, self._why

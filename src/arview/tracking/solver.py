@@ -158,3 +158,24 @@ def apply_twist(cam_from_body, twist):  # type: ignore[no-untyped-def]
         result[3, i] = 0.0
     result[3, 3] = 1.0
     return result
+
+
+@njit(cache=True, nogil=True)
+def relative_twist(cam_from_before, cam_from_after):  # type: ignore[no-untyped-def]
+    """Twist (6,) with ``apply_twist(cam_from_before, twist) = cam_from_after``, for turns below 180°."""
+    a, b = cam_from_before, cam_from_after
+    turn = np.zeros((3, 3))
+    twist = np.zeros(6)
+    for i in range(3):
+        for k in range(3):
+            twist[3 + i] += a[k, i] * (b[k, 3] - a[k, 3])
+            for j in range(3):
+                turn[i, j] += a[k, i] * b[k, j]
+    x = 0.5 * (turn[2, 1] - turn[1, 2])
+    y = 0.5 * (turn[0, 2] - turn[2, 0])
+    z = 0.5 * (turn[1, 0] - turn[0, 1])
+    sine = np.sqrt(x * x + y * y + z * z)
+    angle = np.arctan2(sine, 0.5 * (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0))
+    factor = angle / sine if sine > 1e-9 else 1.0
+    twist[0], twist[1], twist[2] = factor * x, factor * y, factor * z
+    return twist

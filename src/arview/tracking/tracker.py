@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.geometry import Array, exp_se3, invert, log_se3, rigid
+from arview.geometry import Array, invert, rigid
 from arview.guideviews import GuideViewSet
 from arview.tracking.feature import FeatureModality, Matches
 from arview.tracking.patch import Pyramid
@@ -29,6 +29,7 @@ from arview.tracking.refine import (
     run_stages,
 )
 from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
+from arview.tracking.solver import apply_twist, relative_twist
 
 
 @dataclass(frozen=True)
@@ -226,6 +227,8 @@ class Tracker:
         self._bin_of = value_bins(1.0)
         self._sparse_gray: NDArray[np.float64] | None = None
         self._best_contour_support = 0.0
+        self._gray = np.zeros((0, 0), dtype=np.uint8)
+        self._smooth = np.zeros((0, 0), dtype=np.uint8)
         self._features: FeatureModality | None = None
         if self.options.use_feature and model is not None:
             vertices, faces, _ = model.mesh
@@ -352,12 +355,11 @@ class Tracker:
         """Pose in the next frame, with its evidence."""
         if self._cam_from_body is None:
             raise RuntimeError("Tracker.track was called before Tracker.start")
-        plain_gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        gray = smoothed(plain_gray)
-        self._follow_exposure(gray)
+        self._follow_exposure(image[..., 1])
         o = self.options
         before = self._cam_from_body
-        predicted = before @ exp_se3(self._velocity)
+        predicted = apply_twist(before, self._velocity)
+        plain_gray, gray = self._gray_around(image, before, predicted)
         matches, found_share = None, 0.0
         start = predicted
         if self._features is not None:
@@ -376,7 +378,7 @@ class Tracker:
                 other_evidence = self.evidence(image, gray, other)
                 if other_evidence.worth > evidence.worth:
                     pose, information, evidence, matches = other, other_information, other_evidence, None
-        self._velocity = 0.9 * log_se3(invert(before) @ pose)
+        self._velocity = 0.9 * relative_twist(before, pose)
         self._cam_from_body = pose
         quality = evidence.quality
         if matches is not None and evidence.points_in_picture > 0.05:
@@ -388,6 +390,26 @@ class Tracker:
             if self._features is not None:
                 self._remember_texture(pyramid, pose, matches, evidence)
         return Estimate(pose @ self.part.body_from_model, information, quality, evidence)
+
+    def _gray_around(self, image: NDArray[np.uint8], *poses: Array) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Gray picture and its smoothed copy, filled only around where the part may be, or everywhere for texture."""
+        height, width = image.shape[:2]
+        first, last = np.array([0, 0]), np.array([width, height])
+        if self._features is None:
+            centers = np.array([self.camera.project(pose[:3, 3]) for pose in poses])
+            if np.all(np.isfinite(centers)):
+                reach = 1.15 * max(self.radius_px(pose) for pose in poses) + 50.0
+                first = np.clip(centers.min(axis=0) - reach, 0, last).astype(int)
+                last = np.clip(centers.max(axis=0) + reach, 0, last).astype(int)
+        if np.any(last - first < 16):
+            first, last = np.array([0, 0]), np.array([width, height])
+        window = np.s_[first[1] : last[1], first[0] : last[0]]
+        if self._gray.shape != (height, width):
+            self._gray = np.zeros((height, width), dtype=np.uint8)
+            self._smooth = np.zeros((height, width), dtype=np.uint8)
+        self._gray[window] = cv2.cvtColor(image[window], cv2.COLOR_RGB2GRAY)
+        self._smooth[window] = smoothed(self._gray[window])
+        return self._gray, self._smooth
 
     def _remember_texture(
         self, pyramid: Pyramid, cam_from_body: Array, matches: Matches | None, evidence: Evidence
