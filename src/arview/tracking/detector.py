@@ -83,11 +83,11 @@ class SearchGrid:
     apart_deg: float
 
 
-NEAR_GRID = SearchGrid(_turn_grid(9.0, 4.5), np.array([0.93, 0.965, 1.0, 1.035, 1.07]), 2.0, 2, 14, 4.0)
+NEAR_GRID = SearchGrid(_turn_grid(9.0, 4.5), np.array([0.93, 0.965, 1.0, 1.035, 1.07]), 2.0, 2, 10, 4.0)
 """Between the templates of the first search."""
 WIDE_GRID = SearchGrid(_turn_grid(16.0, 4.0), np.array([0.92, 0.96, 1.0, 1.04, 1.08]), 2.0, 10, 10, 4.0)
 """Around a pose given by hand or a guess."""
-FINE_GRID = SearchGrid(_turn_grid(3.0, 1.5), np.array([0.976, 0.988, 1.0, 1.012, 1.024]), 4.0, 1, 14, 1.5)
+FINE_GRID = SearchGrid(_turn_grid(3.0, 1.5), np.array([0.976, 0.988, 1.0, 1.012, 1.024]), 4.0, 1, 10, 1.5)
 """Between the poses of the grids above."""
 
 
@@ -114,7 +114,7 @@ class DetectorOptions:
     subdivisions: int = 3
     spread_px: int = 2
     grid_px: int = 2
-    refined: int = 18
+    refined: int = 14
     likeliest: int = 6
     finalists: int = 5
     min_quality: float = 0.5
@@ -245,11 +245,12 @@ class Detector:
         o = self.options
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         candidates = self.candidates(image)
+        maps: dict[int, tuple[NDArray[np.uint8], Array] | None] = {}
         settled: list[tuple[float, Array]] = []
         # The likeliest first: when they settle the matter, the others are not looked at.
         for batch in (candidates[: o.likeliest], candidates[o.likeliest :]):
-            near = self._sharpen(image, batch, NEAR_GRID)
-            settled += self._settle(image, gray, self._sharpen(image, near, FINE_GRID))
+            near = self._sharpen(image, batch, NEAR_GRID, maps)
+            settled += self._settle(image, gray, self._sharpen(image, near, FINE_GRID, maps))
             settled.sort(key=lambda item: -self._rank(*item))
             hopeless = not settled or self._quality(*settled[0]) < HOPELESS_QUALITY
             if (hopeless and not is_thorough) or (settled and self._is_sure(settled[0][1], self._quality(*settled[0]))):
@@ -268,8 +269,9 @@ class Detector:
         """
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         start = cam_from_model @ self.tracker.part.model_from_body
-        wide = self._sharpen(image, [Candidate(1.0, start)], WIDE_GRID)
-        settled = self._settle(image, gray, [Candidate(1.0, start), *self._sharpen(image, wide, FINE_GRID)])
+        maps: dict[int, tuple[NDArray[np.uint8], Array] | None] = {}
+        wide = self._sharpen(image, [Candidate(1.0, start)], WIDE_GRID, maps)
+        settled = self._settle(image, gray, [Candidate(1.0, start), *self._sharpen(image, wide, FINE_GRID, maps)])
         worth, pose = settled[0]
         return Detection(pose @ self.tracker.part.body_from_model, self._quality(worth, pose))
 
@@ -278,23 +280,24 @@ class Detector:
         image: NDArray[np.uint8],
         candidates: list[Candidate],
         grid: SearchGrid,
+        maps: dict[int, tuple[NDArray[np.uint8], Array] | None],
     ) -> list[Candidate]:
         """Poses around candidates that fit the picture best at a higher resolution, likeliest first.
 
+        ``maps`` keeps the response maps of this picture by scale, for the next call.
         One score over the whole outline is not misled by print or texture that draws single edge points away.
         """
         o = self.options
         camera = self.camera
         pad = round(0.6 * o.radius_px)
-        by_scale: dict[int, list[Candidate]] = {}
+        by_step: dict[int, list[Candidate]] = {}
         for candidate in candidates:
-            step = round(np.log(float(candidate.cam_from_body[2, 3])) / np.log(o.distance_ratio))
-            by_scale.setdefault(step, []).append(candidate)
+            scale = min(1.0, grid.magnification * o.radius_px / self.tracker.radius_px(candidate.cam_from_body))
+            by_step.setdefault(round(np.log(scale) / np.log(o.distance_ratio)), []).append(candidate)
 
-        def maps_at(group: list[Candidate]) -> tuple[NDArray[np.uint8], Array] | None:
-            radius_px = self.tracker.radius_px(group[0].cam_from_body)
-            scale = min(1.0, grid.magnification * o.radius_px / radius_px)
-            width, height = round(camera.width * scale), round(camera.height * scale)
+        def maps_at(step: int) -> tuple[NDArray[np.uint8], Array] | None:
+            width = round(camera.width * o.distance_ratio**step)
+            height = round(camera.height * o.distance_ratio**step)
             if width < 24 or height < 24:
                 return None
             small = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
@@ -302,10 +305,13 @@ class Detector:
             intrinsics[2:4] += pad
             return response_maps(small, o.spread_px, pad), intrinsics
 
+        missing = [step for step in by_step if step not in maps]
+        maps.update(zip(missing, _pool().map(maps_at, missing), strict=True))
+
         def search(item: tuple[Candidate, NDArray[np.uint8], Array]) -> list[Candidate]:
-            candidate, maps, intrinsics = item
+            candidate, responses, intrinsics = item
             scores, poses = score_around(
-                maps, self.tracker.part.arrays, candidate.cam_from_body, intrinsics,
+                responses, self.tracker.part.arrays, candidate.cam_from_body, intrinsics,
                 0.01 * self.views.diameter_mm, grid.turns, grid.stretches, 4, 2, 64, 32,
             )  # fmt: skip
             best: list[Candidate] = []
@@ -317,7 +323,8 @@ class Detector:
             return best
 
         jobs: list[tuple[Candidate, NDArray[np.uint8], Array]] = []
-        for group, made in zip(by_scale.values(), _pool().map(maps_at, by_scale.values()), strict=True):
+        for step, group in by_step.items():
+            made = maps[step]
             if made is not None:
                 jobs += [(candidate, *made) for candidate in group]
         found = [candidate for best in _pool().map(search, jobs) for candidate in best]
