@@ -167,8 +167,8 @@ def _import_pyrender() -> Any:
                 f"the GL library {library} is missing; run: {GL_INSTALL_COMMAND}  (or choose --renderer zbuffer)"
             ) from error
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-    if not hasattr(np, "infty"):
-        vars(np)["infty"] = np.inf  # pyrender reads it; numpy 2 has dropped it
+    # pyrender reads numpy's old name of infinity, which numpy 2 has dropped.
+    vars(np).setdefault("infty", float("inf"))
     if "pyrender.viewer" not in sys.modules:
         stub = types.ModuleType("pyrender.viewer")
         stub.Viewer = None  # type: ignore[attr-defined]

@@ -248,8 +248,7 @@ class Detector:
         maps: dict[int, tuple[NDArray[np.uint8], Array] | None] = {}
         settled: list[tuple[float, Array]] = []
         # The likeliest first: when they settle the matter, the others are not looked at.
-        first = o.likeliest if is_thorough else o.likeliest // 2
-        for batch in (candidates[:first], candidates[first:]):
+        for batch in (candidates[: o.likeliest], candidates[o.likeliest :]):
             near = self._sharpen(image, batch, NEAR_GRID, maps)
             settled += self._settle(image, gray, self._sharpen(image, near, FINE_GRID, maps))
             settled.sort(key=lambda item: -self._rank(*item))

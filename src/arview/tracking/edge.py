@@ -10,8 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.tracking.solver import add_line, project
 
+SOFT_EDGE_TRUST = 0.2
+"""Weight of folds of a curved surface against outline and design edges: they need not show, and texture is near."""
 HYPOTHESES = 5
 """Steps kept per point, the strongest."""
 
@@ -95,12 +98,13 @@ def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # 
 
 @njit(cache=True, nogil=True)
 def add_edges(  # type: ignore[no-untyped-def]
-    hessian, gradient, points, cam_from_body, intrinsics, pixels, normals, positions, strengths,
+    hessian, gradient, points, kinds, cam_from_body, intrinsics, pixels, normals, positions, strengths,
     strength_half, sigma_px, spread_px, weight
 ):  # fmt: skip
     """Add the chosen hypothesis of each point to the 6×6 system.
 
-    ``spread_px`` is how far the pose may still be off: hypotheses are judged by strength × Gaussian of that width,
+    ``kinds`` are EDGE_* bits. ``spread_px`` is how far the pose may still be off: hypotheses are judged by
+    strength × Gaussian of that width,
     and residuals beyond about twice it fade out (Tukey). Returns the summed weighted squared residual and weight.
     """
     r = cam_from_body
@@ -135,6 +139,8 @@ def add_edges(  # type: ignore[no-untyped-def]
             continue
         fade = 1.0 - (residual / cut) ** 2
         w = weight * fade * fade * strength / (strength + strength_half) / (sigma_px * sigma_px)
+        if (kinds[i] & (EDGE_CONTOUR | EDGE_SHARP)) == 0:
+            w *= SOFT_EDGE_TRUST
         add_line(hessian, gradient, p, r, x, y, z, normals[i, 0], normals[i, 1], intrinsics, residual, w)
         sum_weight += w
         sum_square += w * residual * residual

@@ -45,7 +45,7 @@ def run_stages(  # type: ignore[no-untyped-def]
     Returns:
         cam_from_body (4,4), information (6,6).
     """
-    directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, _ = part
+    directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
     pose = cam_from_body.copy()
     hessian = np.zeros((6, 6))
     gradient = np.zeros(6)
@@ -59,6 +59,7 @@ def run_stages(  # type: ignore[no-untyped-def]
         edges = e_points[e_start[view] : e_start[view + 1] : stride]
         region_gain = region_weight * stages[s, 5] * stride
         edge_gain = edge_weight * stride
+        kinds = e_kinds[e_start[view] : e_start[view + 1] : stride]
         c_px, c_n, c_z = project_lines(
             contour, c_normals[c_start[view] : c_start[view + 1] : stride], False, pose, intrinsics, step_mm
         )
@@ -97,7 +98,7 @@ def run_stages(  # type: ignore[no-untyped-def]
                 )
             if edge_gain > 0:
                 add_edges(
-                    hessian, gradient, edges, pose, intrinsics, e_px, e_n, positions, strengths,
+                    hessian, gradient, edges, kinds, pose, intrinsics, e_px, e_n, positions, strengths,
                     15.0, edge_sigma_px * max(1.0, 0.5 * spread), spread, edge_gain,
                 )  # fmt: skip
             if match_points.shape[0] > 0:

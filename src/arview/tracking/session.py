@@ -50,7 +50,7 @@ class SessionOptions:
     lost_frames: int = 2
     critical_frames: int = 45
     eager_frames: int = 2
-    search_every: int = 5
+    search_every: int = 4
     min_in_picture: float = 0.25
     detector: DetectorOptions | None = None
 
@@ -198,7 +198,7 @@ class TrackingSession:
             rests = self._lost_frames > o.eager_frames and self._lost_frames % o.search_every != 0
             if self.state == TrackingState.LOST and rests:
                 return None, self._why
-            is_thorough = self.state == TrackingState.SEARCHING or self._lost_frames % (3 * o.search_every) == 0
+            is_thorough = self.state == TrackingState.SEARCHING or self._lost_frames % (2 * o.search_every) == 0
             detections = self.detector.detect(image, max_results=1, is_thorough=is_thorough)
             if not detections:
                 self._why = self._why_not(image)

@@ -18,6 +18,7 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, invert, rigid
 from arview.guideviews import GuideViewSet
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.tracking.feature import FeatureModality, Matches
 from arview.tracking.patch import Pyramid
 from arview.tracking.quality import Evidence, quality_of
@@ -215,6 +216,12 @@ class Tracker:
         self._intrinsics = intrinsics_of(camera)
         self._step_mm = 0.01 * self.diameter_mm
         o = self.options
+        # Parts without design edges inside their outline lean on colours the more.
+        kinds = np.asarray(views.arrays["edge_kinds"])
+        outline = np.count_nonzero(kinds & EDGE_CONTOUR)
+        inner = np.count_nonzero(((kinds & EDGE_CONTOUR) == 0) & ((kinds & EDGE_SHARP) > 0))
+        inner_share = inner / max(outline + inner, 1)
+        self._region_weight = o.region_weight * (1.0 + 6.0 * max(0.0, 1.0 - inner_share / 0.3))
         self._damping = np.concatenate(
             [
                 np.full(3, 1.0 / o.rotation_sigma_rad**2),
@@ -300,7 +307,7 @@ class Tracker:
         pose, information = run_stages(
             image, gray, self._bin_of, look.odds, EDGE_FUNCTION, self.part.arrays, cam_from_body,
             self._intrinsics, self._step_mm, _stage_table(stages), self._damping,
-            o.region_weight if o.use_region and look.is_known else 0.0,
+            self._region_weight if o.use_region and look.is_known else 0.0,
             o.edge_weight if o.use_edge else 0.0, o.edge_sigma_px, o.edge_threshold,
             matches.points_in_body, matches.pixels, matches.weights, o.feature_sigma_px,
         )  # fmt: skip
