@@ -218,8 +218,8 @@ class Tracker:
         o = self.options
         # Parts without design edges inside their outline lean on colours the more.
         kinds = np.asarray(views.arrays["edge_kinds"])
-        outline = np.count_nonzero(kinds & EDGE_CONTOUR)
-        inner = np.count_nonzero(((kinds & EDGE_CONTOUR) == 0) & ((kinds & EDGE_SHARP) > 0))
+        outline = int(np.count_nonzero(kinds & EDGE_CONTOUR))
+        inner = int(np.count_nonzero(((kinds & EDGE_CONTOUR) == 0) & ((kinds & EDGE_SHARP) > 0)))
         inner_share = inner / max(outline + inner, 1)
         self._region_weight = o.region_weight * (1.0 + 6.0 * max(0.0, 1.0 - inner_share / 0.3))
         self._damping = np.concatenate(
