@@ -50,7 +50,7 @@ class SessionOptions:
     lost_frames: int = 2
     critical_frames: int = 45
     eager_frames: int = 2
-    search_every: int = 4
+    search_every: int = 3
     min_in_picture: float = 0.25
     detector: DetectorOptions | None = None
 
