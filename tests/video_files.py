@@ -84,7 +84,9 @@ def turn_by_metadata(path: Path, quarter_turns_clockwise: int) -> None:
 def write_hdr_clip(path: Path, levels: Sequence[int], transfer: int) -> Path:
     """10-bit BT.2020 clip of one frame whose vertical bars are grey at the given limited-range luma codes."""
     with av.open(str(path), "w") as container:
-        video = container.add_stream("libx265", rate=30, options={"x265-params": "log-level=none:lossless=1:pools=none:frame-threads=1"})
+        video = container.add_stream(
+            "libx265", rate=30, options={"x265-params": "log-level=none:lossless=1:pools=none:frame-threads=1"}
+        )
         video.width, video.height, video.pix_fmt = 64 * len(levels), 64, "yuv420p10le"
         context = video.codec_context
         context.colorspace, context.color_primaries, context.color_range = 9, 9, 1
