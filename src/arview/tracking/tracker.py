@@ -134,10 +134,6 @@ class Appearance:
     odds: Array = field(default_factory=lambda: np.zeros(BINS**3))
     is_known: bool = False
 
-    def copy(self) -> Appearance:
-        """Independent copy."""
-        return Appearance(self.fore.copy(), self.back.copy(), self.odds.copy(), self.is_known)
-
 
 @dataclass(frozen=True)
 class Estimate:
