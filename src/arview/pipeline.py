@@ -240,7 +240,7 @@ class PoseWriter:
     """Writes poses as JSON lines under a temporary name; `close` gives the file its name.
 
     A line holds ``index``, ``time_s``, ``state``, ``quality``, ``cam_from_model`` (4×4 row-major, mm, or
-    null), ``covariance`` (6×6 or null) and ``ms``.
+    null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty) and ``mismatches`` (list).
 
     Raises:
         OutputError: the file cannot be written.
@@ -295,6 +295,8 @@ def pose_line(pose: Pose) -> str:
             "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.tolist(),
             "covariance": covariance.tolist() if covariance is not None and is_known else None,
             "ms": round(pose.ms, 4),
+            "reason": pose.reason,
+            "mismatches": list(pose.mismatches),
         },
         allow_nan=False,
     )

@@ -31,6 +31,8 @@ class Pose:
         index: index of the frame in its source.
         ms: time spent on detection and tracking of this frame, milliseconds.
         reason: for ``searching``, ``critical`` and ``lost``: why, in words.
+        mismatches: what is not as the CAD says, e.g. ``mismatch: nut_2 not seen where expected``; a part with
+            any is never ``tracked`` but ``critical``: it may be another part of the family.
     """
 
     cam_from_model: Array | None
@@ -41,3 +43,4 @@ class Pose:
     index: int
     ms: float = 0.0
     reason: str = ""
+    mismatches: tuple[str, ...] = ()

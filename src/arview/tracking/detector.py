@@ -151,10 +151,19 @@ def options_for(views: GuideViewSet) -> DetectorOptions:
 
 @dataclass(frozen=True)
 class Detection:
-    """A place where the part was found: ``cam_from_model`` (4,4) mm, quality 0–1."""
+    """A place where the part was found.
+
+    Attributes:
+        cam_from_model: (4,4) mm.
+        quality: 0–1, probability that the pose is right.
+        mismatches: components that are not seen where expected, see `Pose.mismatches`.
+        alternatives: other poses (4,4) that the picture bears out as well; not empty: the view is ambiguous.
+    """
 
     cam_from_model: Array
     quality: float
+    mismatches: tuple[str, ...] = ()
+    alternatives: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True)
