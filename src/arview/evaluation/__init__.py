@@ -1,8 +1,9 @@
 """Evaluation: recorded scenes with reference poses, and how far the tracker is from them."""
 
+from arview.cad.viewpoint import viewpoint
 from arview.evaluation.bop import Scene, SceneFrame, find_scenes, load_scene
 from arview.evaluation.metrics import PoseError, PoseMeter
-from arview.evaluation.ranges import covering_range, viewpoint
+from arview.evaluation.ranges import covering_range
 from arview.evaluation.report import format_result
 from arview.evaluation.run import (
     FrameResult,

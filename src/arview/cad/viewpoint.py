@@ -1,0 +1,91 @@
+"""Viewpoint: where one camera stands around a part, and the pose that belongs to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arview.errors import InputError
+from arview.geometry import Array, exp_so3, rigid
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Where a camera stands around a part, as `ViewRange` counts it."""
+
+    distance_mm: float
+    elevation_deg: float
+    azimuth_deg: float
+    roll_deg: float
+
+
+def viewpoint(cam_from_model: Array, center_in_model: ArrayLike) -> Viewpoint:
+    """Viewpoint of a pose.
+
+    The part need not be in the middle of the picture: the camera is first turned, the shortest way, to look
+    at the centre. What then differs from a camera that has +Z up is a turn about the optical axis: the roll,
+    positive when the part appears turned clockwise in the picture.
+
+    Args:
+        cam_from_model: (4,4), mm.
+        center_in_model: (3,) middle of the model's bounding box, mm.
+
+    Raises:
+        InputError: the camera is at the centre.
+    """
+    center = np.asarray(center_in_model, dtype=np.float64)
+    rotation = cam_from_model[:3, :3]
+    eye = -rotation.T @ cam_from_model[:3, 3]
+    away = eye - center
+    distance_mm = float(np.linalg.norm(away))
+    if distance_mm < 1e-9:
+        raise InputError("view range: a camera stands at the centre of the part")
+    x, y, z = away / distance_mm
+    elevation_rad = float(np.arcsin(np.clip(z, -1.0, 1.0)))
+    azimuth_rad = float(np.arctan2(y, x))
+    center_in_cam = -rotation @ away / distance_mm
+    centred = _shortest_turn(center_in_cam, np.array([0.0, 0.0, 1.0])) @ rotation
+    turn = centred @ _upright(azimuth_rad, elevation_rad).T
+    return Viewpoint(
+        distance_mm=distance_mm,
+        elevation_deg=float(np.rad2deg(elevation_rad)),
+        azimuth_deg=float(np.rad2deg(azimuth_rad)),
+        roll_deg=float(np.rad2deg(np.arctan2(turn[1, 0], turn[0, 0]))),
+    )
+
+
+def pose_at(place: Viewpoint, center_in_model: ArrayLike, ray_in_cam: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """``cam_from_model`` (4,4) of a camera that stands there, the inverse of `viewpoint`.
+
+    Straight above and below the azimuth still counts: it says which side of the part is down in the picture.
+
+    Args:
+        place: of the camera.
+        center_in_model: (3,) middle of the model's bounding box, mm.
+        ray_in_cam: (3,) direction in which the camera sees that middle.
+    """
+    ray = np.asarray(ray_in_cam, dtype=np.float64)
+    ray = ray / np.linalg.norm(ray)
+    roll = exp_so3([0.0, 0.0, np.deg2rad(place.roll_deg)])
+    aside = _shortest_turn(np.array([0.0, 0.0, 1.0]), ray)
+    rotation = aside @ roll @ _upright(np.deg2rad(place.azimuth_deg), np.deg2rad(place.elevation_deg))
+    return rigid(rotation, place.distance_mm * ray - rotation @ np.asarray(center_in_model, dtype=np.float64))
+
+
+def _upright(azimuth_rad: float, elevation_rad: float) -> Array:
+    """(3,3) rotation cam from model of a camera in that direction that looks at the middle with +Z up."""
+    c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
+    forward = -np.array([np.cos(elevation_rad) * c, np.cos(elevation_rad) * s, np.sin(elevation_rad)])
+    right = np.array([-s, c, 0.0])
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def _shortest_turn(start: Array, end: Array) -> Array:
+    """(3,3) rotation by the smallest angle that takes one unit vector to another."""
+    axis = np.cross(start, end)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        return np.eye(3) if start @ end > 0 else np.diag([1.0, -1.0, -1.0])
+    return exp_so3(axis / sine * np.arctan2(sine, float(start @ end)))
