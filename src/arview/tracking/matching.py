@@ -167,6 +167,7 @@ def score_around(  # type: ignore[no-untyped-def]
     scores = np.zeros(total)
     poses = np.zeros((total, 4, 4))
     steps = 2 * (shift_px // shift_step) + 1
+    sums = np.empty((steps, steps), dtype=np.int32)
     columns = np.empty(contour_count + edge_count + 64, dtype=np.int64)
     rows = np.empty(contour_count + edge_count + 64, dtype=np.int64)
     bins = np.empty(contour_count + edge_count + 64, dtype=np.int64)
@@ -213,24 +214,49 @@ def score_around(  # type: ignore[no-untyped-def]
                     count += 1
             if count < 16:
                 continue
-            best = -1
-            best_dx = 0
-            best_dy = 0
-            for sy in range(steps):
-                dy = (sy - steps // 2) * shift_step
-                for sx in range(steps):
-                    dx = (sx - steps // 2) * shift_step
-                    value = 0
-                    for i in range(count):
-                        x = columns[i] + dx
-                        y = rows[i] + dy
-                        if 0 <= x < width and 0 <= y < height:
-                            value += maps[bins[i], y, x]
-                    if value > best:
-                        best = value
-                        best_dx = dx
-                        best_dy = dy
+            best, best_dx, best_dy = _best_shift(maps, columns, rows, bins, count, shift_px, shift_step, sums)
             scores[index] = best / (255.0 * count)
             poses[index, 0, 3] += best_dx * pose[2, 3] / intrinsics[0]
             poses[index, 1, 3] += best_dy * pose[2, 3] / intrinsics[1]
     return scores, poses
+
+
+@njit(cache=True, nogil=True)
+def _best_shift(maps, columns, rows, bins, count, shift_px, shift_step, sums):  # type: ignore[no-untyped-def]
+    """Highest sum of responses under the first ``count`` points over all shifts, and that shift dx, dy in px.
+
+    ``sums`` (S,S) int32 is room to work in. Points that a shift moves outside the maps add nothing.
+    """
+    height, width = maps.shape[1], maps.shape[2]
+    steps = sums.shape[0]
+    reach = shift_px // shift_step * shift_step
+    sums[:] = 0
+    for i in range(count):
+        x0 = columns[i] - reach
+        y0 = rows[i] - reach
+        plane = maps[bins[i]]
+        if x0 >= 0 and y0 >= 0 and x0 + 2 * reach < width and y0 + 2 * reach < height:
+            for sy in range(steps):
+                line = plane[y0 + sy * shift_step]
+                for sx in range(steps):
+                    # An unsigned index spares the test for counting from the end.
+                    sums[sy, sx] += line[np.uint64(x0 + sx * shift_step)]
+        else:
+            for sy in range(steps):
+                y = y0 + sy * shift_step
+                if y < 0 or y >= height:
+                    continue
+                for sx in range(steps):
+                    x = x0 + sx * shift_step
+                    if 0 <= x < width:
+                        sums[sy, sx] += plane[y, x]
+    best = -1
+    best_dx = 0
+    best_dy = 0
+    for sy in range(steps):
+        for sx in range(steps):
+            if sums[sy, sx] > best:
+                best = sums[sy, sx]
+                best_dx = sx * shift_step - reach
+                best_dy = sy * shift_step - reach
+    return best, best_dx, best_dy
