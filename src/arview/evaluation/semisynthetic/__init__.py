@@ -1,0 +1,43 @@
+"""Semi-synthetic sequences: CAD rendered along known trajectories over real photos, as BOP scenes."""
+
+from arview.evaluation.semisynthetic.ambiguity import alike_poses, least_error
+from arview.evaluation.semisynthetic.backgrounds import photos_in
+from arview.evaluation.semisynthetic.look_alikes import LookAlike, look_alikes
+from arview.evaluation.semisynthetic.make import Job, look_alike_job, make_sequence, read_record, shape_job
+from arview.evaluation.semisynthetic.negatives import frames_without_part
+from arview.evaluation.semisynthetic.sequence import (
+    CAMERA,
+    VARIANTS,
+    SequenceFrame,
+    SequenceOptions,
+    Variant,
+    render_sequence,
+    trajectory,
+)
+from arview.evaluation.semisynthetic.shapes import SHAPES, near_symmetries, shape
+from arview.evaluation.semisynthetic.trajectory import TrajectoryOptions
+
+__all__ = [
+    "CAMERA",
+    "SHAPES",
+    "VARIANTS",
+    "Job",
+    "LookAlike",
+    "SequenceFrame",
+    "SequenceOptions",
+    "TrajectoryOptions",
+    "Variant",
+    "alike_poses",
+    "frames_without_part",
+    "least_error",
+    "look_alike_job",
+    "look_alikes",
+    "make_sequence",
+    "near_symmetries",
+    "photos_in",
+    "read_record",
+    "render_sequence",
+    "shape",
+    "shape_job",
+    "trajectory",
+]

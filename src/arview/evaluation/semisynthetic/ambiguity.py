@@ -1,0 +1,47 @@
+"""Poses that a picture cannot tell apart, because what would tell them apart is not in view."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arview.cad.model import Model
+from arview.cad.symmetry import Symmetry
+from arview.camera import Camera
+from arview.evaluation.metrics import PoseError, PoseMeter, symmetry_group
+from arview.geometry import Array
+from arview.render import ZBufferRenderer
+
+LEAST_PIXELS = 24
+"""Fewer pixels than these cannot tell two poses apart: a patch of about 5 × 5 px."""
+_DIFFERENT_DEPTH = 0.004
+"""Of the part's diameter: less depth between two surfaces makes no edge."""
+
+
+def alike_poses(
+    model: Model, camera: Camera, cam_from_model: Array, near_symmetries: tuple[Symmetry, ...]
+) -> tuple[Array, ...]:
+    """``cam_from_model`` (4,4) of all poses that look the same as one, itself first.
+
+    Args:
+        model: the part.
+        camera: ideal, of the picture.
+        cam_from_model: the true pose.
+        near_symmetries: rotations that all but small features of the part keep; a turn counts as long as fewer
+            than `LEAST_PIXELS` of the picture change.
+    """
+    if not near_symmetries:
+        return (cam_from_model,)
+    renderer = ZBufferRenderer(model, camera)
+    truth = renderer.render(cam_from_model).depth_mm
+    limit_mm = _DIFFERENT_DEPTH * model.diameter_mm
+    alike = [cam_from_model]
+    for turn in symmetry_group(near_symmetries)[1:]:
+        turned = renderer.render(cam_from_model @ turn).depth_mm
+        if np.count_nonzero(np.abs(turned - truth) > limit_mm) < LEAST_PIXELS:
+            alike.append(cam_from_model @ turn)
+    return tuple(alike)
+
+
+def least_error(meter: PoseMeter, estimate: Array, truths: tuple[Array, ...]) -> PoseError:
+    """Error of an estimate (4,4) against the one of several true poses that it is least turned against."""
+    return min((meter.measure(estimate, truth) for truth in truths), key=lambda error: error.rotation_deg)

@@ -1,0 +1,94 @@
+"""Real photos behind the part: where they come from, and crops that move over them as a hand would."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.errors import InputError
+from arview.evaluation.bop import PICTURE_SUFFIXES
+from arview.evaluation.semisynthetic.trajectory import smooth_noise
+from arview.video import Image
+
+SMALLEST_SIDE_PX = 200
+"""Smaller pictures make poor backgrounds."""
+_CROP_SHARE = (0.72, 0.92)
+"""Width of the crop as a share of the widest that fits, from moment to moment."""
+_TILT_DEG = 4.0
+
+
+def photos_in(folder: Path) -> list[Path]:
+    """All pictures below a folder, by name.
+
+    Raises:
+        InputError: no such folder, or no picture in it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give --backgrounds a folder of photos")
+    photos = sorted(p for p in folder.rglob("*") if p.suffix.lower() in PICTURE_SUFFIXES and p.is_file())
+    if not photos:
+        raise InputError(f"{folder}: holds no photos ({' '.join(PICTURE_SUFFIXES)}); give --backgrounds another folder")
+    return photos
+
+
+def read_photo(path: Path) -> Image:
+    """Picture (H,W,3) uint8 RGB of a file.
+
+    Raises:
+        InputError: it cannot be read, or is too small for a background.
+    """
+    data = np.fromfile(path, dtype=np.uint8) if path.is_file() else np.zeros(0, np.uint8)
+    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if bgr is None:
+        raise InputError(f"{path}: cannot be read as a picture; take it out of the backgrounds")
+    if min(bgr.shape[:2]) < SMALLEST_SIDE_PX:
+        size = f"{bgr.shape[1]}×{bgr.shape[0]}"
+        raise InputError(
+            f"{path}: {size} px is too small for a background; give photos of {SMALLEST_SIDE_PX} px or more"
+        )
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+
+
+def moving_crops(
+    photo: Image, width: int, height: int, count: int, rng: np.random.Generator, smooth_frames: float = 14.0
+) -> Iterator[Image]:
+    """Crops (height,width,3) of a photo that wander, turn and zoom smoothly, as of a hand-held camera."""
+    photo = _shrunk(photo, width, height)
+    noise = np.tanh(smooth_noise(count, 4, smooth_frames, rng))
+    rows, columns = photo.shape[:2]
+    widest = min(columns, rows * width / height)
+    low, high = _CROP_SHARE
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    for across, down, zoom, tilt in noise:
+        scale = widest * (middle + half * zoom) / width
+        angle = np.deg2rad(_TILT_DEG * tilt)
+        linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        # What the turned crop reaches to on both sides must stay inside the photo.
+        reach = 0.5 * np.abs(linear) @ [width, height]
+        free = np.maximum(0.5 * np.array([columns, rows]) - reach - 1.0, 0.0)
+        center = 0.5 * np.array([columns - 1, rows - 1]) + free * [across, down]
+        shift = center - linear @ [0.5 * (width - 1), 0.5 * (height - 1)]
+        photo_from_crop = np.column_stack([linear, shift])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        crop = cv2.warpAffine(photo, photo_from_crop, (width, height), flags=flags, borderMode=cv2.BORDER_REFLECT_101)
+        yield np.asarray(crop)
+
+
+def surroundings(photo: Image) -> NDArray[np.float32]:
+    """(32,64,3) in 0–1: a photo bent round the scene, blurred: what a shiny part mirrors."""
+    small = cv2.resize(photo, (32, 32), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+    round_about = np.concatenate([small, small[:, ::-1]], axis=1)
+    return np.asarray(cv2.GaussianBlur(round_about, (0, 0), 1.2, borderType=cv2.BORDER_REFLECT_101))
+
+
+def _shrunk(photo: Image, width: int, height: int) -> Image:
+    """The photo made small enough that a crop takes hardly more of its pixels than the picture has."""
+    share = 1.25 * max(width / photo.shape[1], height / photo.shape[0]) / _CROP_SHARE[0]
+    if share >= 1.0:
+        return photo
+    size = (round(photo.shape[1] * share), round(photo.shape[0] * share))
+    return np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA))

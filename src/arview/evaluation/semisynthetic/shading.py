@@ -1,0 +1,237 @@
+"""A textureless part lit like metal or paint: per-pixel normals, two lights, reflections of the surroundings.
+
+Everything is drawn on a grid three times as fine as the picture and averaged, so that edges are right to a fraction
+of a pixel. Colours are linear in the picture's grey levels, as in RBOT: no tone curve is applied.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.cad.model import Model
+from arview.camera import Camera
+from arview.geometry import Array, apply
+from arview.raster import rasterise
+
+SUPERSAMPLING = 3
+SMOOTH_BELOW_DEG = 40.0
+"""Faces that meet at less than this are shaded as one round surface."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """What lights the part.
+
+    Attributes:
+        toward_in_cam: (L,3) unit vectors to the lights.
+        strength: (L,) of each.
+        ambient: from all sides, most from above.
+        surroundings: (H,W,3) float32 in 0–1, latitude by longitude: what shiny surfaces mirror.
+    """
+
+    toward_in_cam: Array
+    strength: Array
+    ambient: float
+    surroundings: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """How a part's surface answers to light: shares of diffuse light, highlights and mirroring, and gloss."""
+
+    diffuse: float = 0.75
+    specular: float = 0.35
+    mirror: float = 0.25
+    gloss: float = 24.0
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A part drawn alone.
+
+    Attributes:
+        left, top: of the window in the picture, px; it may reach outside.
+        color: (h,w,3) float32 in 0–1, multiplied by coverage.
+        coverage: (h,w) float32, share of each pixel that the part covers.
+    """
+
+    left: int
+    top: int
+    color: NDArray[np.float32]
+    coverage: NDArray[np.float32]
+
+
+class ShadedModel:
+    """A model made ready for drawing: normals at the corners of its faces, colours."""
+
+    def __init__(self, model: Model, surface: Surface | None = None) -> None:
+        self.model = model
+        self.surface = surface or Surface()
+        self._vertices, self._faces, owners = model.mesh
+        self._normals = corner_normals(self._vertices, self._faces, SMOOTH_BELOW_DEG)
+        self._colors = np.array([component.color for component in model.components])[owners]
+
+    def draw(self, cam_from_model: Array, camera: Camera, light: Light) -> Layer | None:
+        """The part at a pose (4,4), whole also where it lies outside the picture; None when it cannot be seen.
+
+        The camera is an ideal one.
+        """
+        points = apply(cam_from_model, self._vertices)
+        if points[:, 2].min() < 1.0:
+            return None
+        pixels = camera.project(points)
+        # Two pixels around it for the blur; never more than the picture's size beyond its borders.
+        size = np.array([camera.width, camera.height])
+        left, top = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 2, -size).tolist()
+        right, bottom = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 3, 2 * size).tolist()
+        if right <= left or bottom <= top:
+            return None
+        n = SUPERSAMPLING
+        fine = camera.scaled(n * camera.width, n * camera.height)
+        inverse_depth, face_ids = rasterise(
+            points, self._faces, fine.fx, fine.fy, fine.cx, fine.cy, n * (right - left), n * (bottom - top),
+            origin=(n * left, n * top),
+        )  # fmt: skip
+        s = self.surface
+        color = _shade(
+            inverse_depth, face_ids, points, self._faces, self._normals @ cam_from_model[:3, :3].T, self._colors,
+            np.array([fine.fx, fine.fy, fine.cx - n * left, fine.cy - n * top]),
+            light.toward_in_cam, light.strength, light.ambient, light.surroundings,
+            s.diffuse, s.specular, s.mirror, s.gloss,
+        )  # fmt: skip
+        seen = (face_ids >= 0).astype(np.float32)
+        color *= _openness(inverse_depth, seen, fine, self.model.diameter_mm)[..., None]
+        window = (right - left, bottom - top)
+        return Layer(
+            left,
+            top,
+            np.asarray(cv2.resize(color, window, interpolation=cv2.INTER_AREA)),
+            np.asarray(cv2.resize(seen, window, interpolation=cv2.INTER_AREA)),
+        )
+
+
+def corner_normals(vertices: Array, faces: NDArray[np.int32], smooth_below_deg: float) -> Array:
+    """(F,3,3) unit normals at the faces' corners: the mean of the faces around that meet at less than an angle."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    doubled = np.cross(b - a, c - a)
+    normals = doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-12)
+    order = np.argsort(faces.ravel(), kind="stable")
+    starts = np.searchsorted(faces.ravel()[order], np.arange(len(vertices) + 1))
+    return np.asarray(
+        _corner_normals(faces, normals, doubled, order // 3, starts, float(np.cos(np.deg2rad(smooth_below_deg))))
+    )
+
+
+@njit(cache=True, nogil=True)
+def _corner_normals(faces, normals, doubled, owners, starts, smooth_cosine):  # type: ignore[no-untyped-def]
+    corners = np.empty((faces.shape[0], 3, 3))
+    for face in range(faces.shape[0]):
+        for k in range(3):
+            x = y = z = 0.0
+            vertex = faces[face, k]
+            for i in range(starts[vertex], starts[vertex + 1]):
+                other = owners[i]
+                cosine = (
+                    normals[face, 0] * normals[other, 0]
+                    + normals[face, 1] * normals[other, 1]
+                    + normals[face, 2] * normals[other, 2]
+                )
+                if cosine > smooth_cosine:
+                    x += doubled[other, 0]
+                    y += doubled[other, 1]
+                    z += doubled[other, 2]
+            length = max((x * x + y * y + z * z) ** 0.5, 1e-12)
+            corners[face, k, 0], corners[face, k, 1], corners[face, k, 2] = x / length, y / length, z / length
+    return corners
+
+
+@njit(cache=True, nogil=True)
+def _shade(  # type: ignore[no-untyped-def]
+    inverse_depth, face_ids, points, faces, normals, colors, lens, toward, strength, ambient, surroundings,
+    diffuse, specular, mirror, gloss,
+):  # fmt: skip
+    height, width = face_ids.shape
+    fx, fy, cx, cy = lens
+    map_height, map_width = surroundings.shape[:2]
+    out = np.zeros((height, width, 3), dtype=np.float32)
+    for r in range(height):
+        for col in range(width):
+            face = face_ids[r, col]
+            if face < 0:
+                continue
+            z = 1.0 / inverse_depth[r, col]
+            x, y = (col - cx) / fx * z, (r - cy) / fy * z
+            i, j, k = faces[face, 0], faces[face, 1], faces[face, 2]
+            # Weights of the corners: areas of the three triangles that the point makes, along the face's normal.
+            e1x, e1y, e1z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+            e2x, e2y, e2z = points[k, 0] - points[i, 0], points[k, 1] - points[i, 1], points[k, 2] - points[i, 2]
+            px, py, pz = x - points[i, 0], y - points[i, 1], z - points[i, 2]
+            d11 = e1x * e1x + e1y * e1y + e1z * e1z
+            d12 = e1x * e2x + e1y * e2y + e1z * e2z
+            d22 = e2x * e2x + e2y * e2y + e2z * e2z
+            p1 = px * e1x + py * e1y + pz * e1z
+            p2 = px * e2x + py * e2y + pz * e2z
+            determinant = max(d11 * d22 - d12 * d12, 1e-18)
+            wj = min(max((d22 * p1 - d12 * p2) / determinant, 0.0), 1.0)
+            wk = min(max((d11 * p2 - d12 * p1) / determinant, 0.0), 1.0 - wj)
+            wi = 1.0 - wj - wk
+            nx = wi * normals[face, 0, 0] + wj * normals[face, 1, 0] + wk * normals[face, 2, 0]
+            ny = wi * normals[face, 0, 1] + wj * normals[face, 1, 1] + wk * normals[face, 2, 1]
+            nz = wi * normals[face, 0, 2] + wj * normals[face, 1, 2] + wk * normals[face, 2, 2]
+            length = max((nx * nx + ny * ny + nz * nz) ** 0.5, 1e-12)
+            distance = (x * x + y * y + z * z) ** 0.5
+            vx, vy, vz = -x / distance, -y / distance, -z / distance
+            facing = (nx * vx + ny * vy + nz * vz) / length
+            if facing < 0.0:
+                length, facing = -length, -facing
+            nx, ny, nz = nx / length, ny / length, nz / length
+            rx, ry, rz = 2.0 * facing * nx - vx, 2.0 * facing * ny - vy, 2.0 * facing * nz - vz
+            # The camera's +Y is down: what looks up gets more of the light from all sides.
+            matt = ambient * (0.75 - 0.25 * ny)
+            shine = 0.0
+            for s in range(toward.shape[0]):
+                cosine = nx * toward[s, 0] + ny * toward[s, 1] + nz * toward[s, 2]
+                if cosine > 0.0:
+                    matt += diffuse * strength[s] * cosine
+                    along = rx * toward[s, 0] + ry * toward[s, 1] + rz * toward[s, 2]
+                    if along > 0.0:
+                        shine += specular * strength[s] * along**gloss
+            # Mirrored surroundings, more at grazing angles (Schlick's approximation).
+            share = mirror * (0.4 + 0.6 * (1.0 - facing) ** 3)
+            column = (np.arctan2(rx, rz) / (2.0 * np.pi) + 0.5) * map_width
+            row = min(max((np.arcsin(min(max(ry, -1.0), 1.0)) / np.pi + 0.5) * map_height, 0.0), map_height - 1.001)
+            c0, r0 = int(column) % map_width, int(row)
+            c1, r1 = (c0 + 1) % map_width, min(r0 + 1, map_height - 1)
+            fc, fr = column - int(column), row - r0
+            for c in range(3):
+                upper = (1.0 - fc) * surroundings[r0, c0, c] + fc * surroundings[r0, c1, c]
+                lower = (1.0 - fc) * surroundings[r1, c0, c] + fc * surroundings[r1, c1, c]
+                mirrored = (1.0 - fr) * upper + fr * lower
+                value = colors[face, c] * matt + share * mirrored + shine
+                # Bright tones bend towards white as a camera's do.
+                out[r, col, c] = value if value < 0.8 else 1.0 - 0.2 * np.exp(-(value - 0.8) / 0.2)
+    return out
+
+
+def _openness(inverse_depth: Array, seen: NDArray[np.float32], fine: Camera, diameter_mm: float) -> NDArray[np.float32]:
+    """(H,W) in 0.45–1: less light where the surface lies behind its surroundings in the picture.
+
+    Unsharp masking of the depth buffer (Luft et al. 2006), which darkens inner corners and what stands behind.
+    """
+    if not seen.any():
+        return seen
+    depth = np.where(seen > 0, 1.0 / np.maximum(inverse_depth, 1e-9), 0.0).astype(np.float32)
+    sigma = max(2.0, 0.03 * diameter_mm * fine.fx * float(inverse_depth.max()))
+    # Smoothed on a coarser grid: the window is wide.
+    shrink = max(1, int(sigma / 4.0))
+    small = (max(1, depth.shape[1] // shrink), max(1, depth.shape[0] // shrink))
+    parts = [cv2.resize(x, small, interpolation=cv2.INTER_AREA) for x in (depth, seen)]
+    parts = [cv2.GaussianBlur(x, (0, 0), sigma / shrink) for x in parts]
+    smooth, weight = (cv2.resize(x, depth.shape[::-1], interpolation=cv2.INTER_LINEAR) for x in parts)
+    behind = (depth - smooth / np.maximum(weight, 1e-3)) / (0.06 * diameter_mm)
+    return np.asarray(np.clip(1.0 - 0.35 * np.clip(behind, 0.0, None), 0.45, 1.0), dtype=np.float32)

@@ -1,0 +1,70 @@
+"""Real photos that stand behind rendered parts, or that must not be taken for one."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+
+from arview.evaluation.bop import PICTURE_SUFFIXES
+from arview.evaluation.semisynthetic import photos_in
+from recordings import DATA, SEQUENCES
+
+EACH_RECORDING = 8
+PACKAGES = {
+    "skimage": (
+        "data/astronaut.png",
+        "data/chelsea.png",
+        "data/coffee.png",
+        "data/motorcycle_left.png",
+        "data/rocket.jpg",
+    ),
+    "sklearn": ("datasets/images/china.jpg", "datasets/images/flower.jpg"),
+}
+"""Photos that Python packages bring along."""
+WALLPAPERS = (Path("/usr/share/backgrounds"), Path("/usr/share/wallpapers"))
+"""Where Debian's packages of photos are (mate-backgrounds, gnome-backgrounds)."""
+SHOW_TOO = {"cube": ("castle",)}
+"""Recordings that show a part besides its own: there is a box in the castle's picture."""
+
+
+def background_photos(folder: Path | None, without: str = "") -> tuple[Path, ...]:
+    """Photos for backgrounds: of a folder, or a few of each recording and what the machine has.
+
+    ``without`` names a recorded part that they must not show.
+    """
+    if folder is not None:
+        return tuple(photos_in(folder))
+    spread = [frames[:: max(1, len(frames) // EACH_RECORDING)] for frames in recorded_frames(without)]
+    return tuple(path for frames in spread for path in frames) + machine_photos()
+
+
+def all_photos(folder: Path | None, without: str = "") -> tuple[Path, ...]:
+    """Every photo there is that does not show a recorded part."""
+    if folder is not None:
+        return tuple(photos_in(folder))
+    return tuple(path for frames in recorded_frames(without) for path in frames) + machine_photos()
+
+
+def recorded_frames(without: str = "") -> list[list[Path]]:
+    """Frames of each recording, and the photos of the plate, in order; none of those that show a part."""
+    left_out = (without, *SHOW_TOO.get(without, ()))
+    folders = [DATA / name / "test" / "000001" for name in SEQUENCES if name not in left_out]
+    if "plate" not in left_out:
+        folders.append(DATA.parent / "plate" / "photos")
+    return [photos_in(folder) for folder in folders if folder.is_dir()]
+
+
+def machine_photos() -> tuple[Path, ...]:
+    """Photos in ``$ARVIEW_BACKGROUNDS``, in Python packages and in Debian's folders."""
+    found: list[Path] = []
+    own = os.environ.get("ARVIEW_BACKGROUNDS")
+    if own:
+        found += photos_in(Path(own))
+    for package, names in PACKAGES.items():
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.origin is not None:
+            found += [path for name in names if (path := Path(spec.origin).parent / name).is_file()]
+    for folder in WALLPAPERS:
+        found += sorted(p for p in folder.rglob("*") if p.suffix.lower() in PICTURE_SUFFIXES and p.is_file())
+    return tuple(found)
