@@ -45,6 +45,13 @@ elevation_deg = [20.0, 85.0]
 azimuth_deg = [-180.0, 180.0]
 roll_deg = [-30.0, 30.0]
 
+# Views of your own for --init guide:NAME, next to front, back, left, right, top, bottom, iso and middle.
+[guides.start]
+azimuth_deg = -60.0
+elevation_deg = 40.0
+roll_deg = 0.0                 # default: 0, or the middle of the declared rolls
+distance_mm = 650.0            # default: the part spans 60 % of the picture's smaller side
+
 # For components that do not say otherwise.
 [defaults]
 role = "inspect"
@@ -123,6 +130,17 @@ class Datum:
 
 
 @dataclass(frozen=True)
+class Guide:
+    """A view with a name that the part can be brought into; None leaves the choice to the declared range."""
+
+    name: str
+    azimuth_deg: float
+    elevation_deg: float
+    roll_deg: float | None = None
+    distance_mm: float | None = None
+
+
+@dataclass(frozen=True)
 class Part:
     """A model and the settings of a part file (or the defaults, for a bare CAD file).
 
@@ -135,6 +153,7 @@ class Part:
         view_range: as declared, or None; see default_view_range.
         symmetries: declared rotations of the whole part.
         datums: in order of precedence.
+        guides: views of the part file.
         serial: of the specimen, or None.
         notes: remarks of the loader (renamed or empty components).
     """
@@ -147,6 +166,7 @@ class Part:
     view_range: ViewRange | None = None
     symmetries: tuple[Symmetry, ...] = ()
     datums: tuple[Datum, ...] = ()
+    guides: tuple[Guide, ...] = ()
     serial: str | None = None
     notes: tuple[str, ...] = ()
 
@@ -205,7 +225,7 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
 
 
 def _read_part(root: _Table, path: Path, unit: str | None) -> Part:
-    for key in ("part", "view_range", "defaults", "components", "symmetry", "datums"):
+    for key in ("part", "view_range", "guides", "defaults", "components", "symmetry", "datums"):
         root.known(key)
     root.finish()
     head = root.table("part", required=True)
@@ -220,6 +240,7 @@ def _read_part(root: _Table, path: Path, unit: str | None) -> Part:
     if not cad_path.is_file():
         raise InputError(f"{path}: [part] cad = {str(head.content['cad'])!r}: there is no file {cad_path}")
     view_range = _read_view_range(root.table("view_range")) if "view_range" in root.content else None
+    guides = _read_guides(root.table("guides"))
     cad = load_cad(cad_path, unit or own_unit, cast(float, tol_linear_mm), cast(float, tol_angular_deg))
     names = [component.name for component in cad.model.components]
     defaults = _read_settings(root.table("defaults"), "", cad.model, ComponentSettings(""))
@@ -251,6 +272,7 @@ def _read_part(root: _Table, path: Path, unit: str | None) -> Part:
         view_range=view_range,
         symmetries=symmetries,
         datums=datums,
+        guides=guides,
         serial=serial,
         notes=cad.notes,
     )
@@ -266,6 +288,24 @@ def _read_view_range(table: _Table) -> ViewRange:
         return ViewRange(**intervals)
     except InputError as error:
         raise InputError(f"{table.path}: [view_range] {error}") from error
+
+
+def _read_guides(tables: _Table) -> tuple[Guide, ...]:
+    guides = []
+    for name in tables.content:
+        table = tables.table(name)
+        guides.append(
+            Guide(
+                name,
+                azimuth_deg=table.angle("azimuth_deg"),
+                elevation_deg=table.angle("elevation_deg", 90.0),
+                roll_deg=table.angle("roll_deg") if table.known("roll_deg") else None,
+                distance_mm=table.positive("distance_mm"),
+            )
+        )
+        table.finish()
+    tables.finish()
+    return tuple(guides)
 
 
 def _read_settings(table: _Table, name: str, model: Model, defaults: ComponentSettings) -> ComponentSettings:
@@ -390,6 +430,12 @@ class _Table:
         value = self.take(key)
         if not _is_number(value) or value <= 0:
             self.fail(key, value, "a positive number")
+        return float(value)
+
+    def angle(self, key: str, largest: float = 360.0) -> float:
+        value = self.take(key)
+        if not _is_number(value) or abs(value) > largest:
+            self.fail(key, value, f"a number from -{largest:g} to {largest:g}")
         return float(value)
 
     def interval(self, key: str) -> tuple[float, float]:

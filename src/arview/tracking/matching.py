@@ -162,7 +162,6 @@ def score_around(  # type: ignore[no-untyped-def]
         scores (R·D,) 0–1 and poses (R·D,4,4), the best shift applied.
     """
     directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
-    height, width = maps.shape[1], maps.shape[2]
     total = turns.shape[0] * stretches.shape[0]
     scores = np.zeros(total)
     poses = np.zeros((total, 4, 4))
