@@ -3,7 +3,14 @@
 from arview.evaluation.semisynthetic.ambiguity import alike_poses, least_error
 from arview.evaluation.semisynthetic.backgrounds import photos_in
 from arview.evaluation.semisynthetic.look_alikes import LookAlike, look_alikes
-from arview.evaluation.semisynthetic.make import Job, look_alike_job, make_sequence, read_record, shape_job
+from arview.evaluation.semisynthetic.make import (
+    WALK_ROUND,
+    Job,
+    look_alike_job,
+    make_sequence,
+    read_record,
+    shape_job,
+)
 from arview.evaluation.semisynthetic.negatives import frames_without_part
 from arview.evaluation.semisynthetic.sequence import (
     CAMERA,
@@ -21,6 +28,7 @@ __all__ = [
     "CAMERA",
     "SHAPES",
     "VARIANTS",
+    "WALK_ROUND",
     "Job",
     "LookAlike",
     "SequenceFrame",

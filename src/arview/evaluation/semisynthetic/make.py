@@ -32,8 +32,8 @@ from arview.evaluation.semisynthetic.trajectory import TrajectoryOptions, follow
 from arview.geometry import Array
 
 Progress = Callable[[int, int], None]
-HAND_MOTION = TrajectoryOptions(turn_deg=2.0, step_mm=5.0, distance_mm=(450.0, 800.0))
-"""Motion of a camera that walks round an assembly, for look-alikes."""
+WALK_ROUND = TrajectoryOptions(turn_deg=4.0, step_mm=8.0, distance_mm=(450.0, 800.0))
+"""Motion of a camera that is led round an assembly, for look-alikes."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Job:
     def poses(self) -> Array:
         """``cam_from_model`` (frames,4,4)."""
         if self.follow is None:
-            return trajectory(self.model, self.options)
+            return trajectory(self.model, self.options, name=self.look_alike.name if self.look_alike else "")
         center = self.follow.part.model.center_in_model
         return followed_trajectory(self.follow.poses[: self.options.frames], center, self.model.center_in_model)
 
@@ -94,8 +94,8 @@ def look_alike_job(
     photos: tuple[Path, ...],
     follow: Scene | None = None,
 ) -> Job:
-    """A sequence of a look-alike, in which the model is to be looked for; the camera moves slowly."""
-    options = replace(options, motion=HAND_MOTION)
+    """A sequence of a look-alike, in which the model is to be looked for; the camera moves more slowly."""
+    options = replace(options, motion=WALK_ROUND)
     name = f"{name}_{look_alike.name.replace('/', '-')}_{options.variant}"
     return Job(name, model, options, photos, look_alike, follow)
 

@@ -96,9 +96,9 @@ def generator(seed: int, *words: str) -> np.random.Generator:
     return np.random.default_rng([seed, *(zlib.crc32(word.encode()) for word in words)])
 
 
-def trajectory(model: Model, options: SequenceOptions, camera: Camera = CAMERA) -> Array:
-    """``cam_from_model`` (frames,4,4) of a part in a sequence: the same in every variant."""
-    rng = generator(options.seed, model.name, "trajectory")
+def trajectory(model: Model, options: SequenceOptions, camera: Camera = CAMERA, name: str = "") -> Array:
+    """``cam_from_model`` (frames,4,4) of a part in a sequence: the same in every variant, another for each name."""
+    rng = generator(options.seed, model.name, "trajectory", name)
     return random_trajectory(camera, model.center_in_model, model.diameter_mm, options.frames, rng, options.motion)
 
 

@@ -1,0 +1,130 @@
+"""How trackers and detectors are judged: tracking with resets, as RBOT does, and detection in single frames."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from arview.cad.model import Model
+from arview.cad.symmetry import Symmetry
+from arview.cad.view_range import ViewRange
+from arview.evaluation.bop import Scene, SceneFrame
+from arview.evaluation.metrics import PoseError, PoseMeter
+from arview.evaluation.run import COARSE, IN_VIEW
+from arview.geometry import Array
+from arview.guideviews import GuideViewSet
+from arview.tracking import Detector, Tracker
+
+EQUAL_SIDES = 0.05
+"""Sides of a box that differ by less are taken for equal."""
+_DISTANCE_MARGIN = 0.05
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Frames, and those among them whose pose is within 5 cm and 5°.
+
+    Attributes:
+        frames: how many were looked at.
+        right: how many of them are right.
+        ms: (N,) time of each, the first left out: it may hold the loading of compiled code.
+    """
+
+    frames: int = 0
+    right: int = 0
+    ms: tuple[float, ...] = ()
+
+    @property
+    def share(self) -> float:
+        """Share of right frames, 0 without any frame."""
+        return self.right / self.frames if self.frames else 0.0
+
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(self.frames + other.frames, self.right + other.right, self.ms + other.ms)
+
+
+def full_sphere_range(nearest_mm: float, farthest_mm: float, ratio: float = 4.0) -> ViewRange:
+    """Every direction and roll, over distances that cover the given ones with 5 % to spare.
+
+    The distances are stretched, both ends alike, until the farthest is at least ``ratio`` times the nearest.
+    """
+    low, high = nearest_mm * (1.0 - _DISTANCE_MARGIN), farthest_mm * (1.0 + _DISTANCE_MARGIN)
+    stretch = max(1.0, float(np.sqrt(ratio * low / high)))
+    return ViewRange((low / stretch, high * stretch))
+
+
+def box_symmetries(model: Model) -> tuple[Symmetry, ...]:
+    """Rotations of the model's bounding box: half turns, and quarter turns where two sides are equal within 5 %."""
+    size = model.bounds_in_model[1] - model.bounds_in_model[0]
+    x, y, z = model.center_in_model.tolist()
+    found = []
+    for axis, direction in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
+        a, b = np.delete(size, axis)
+        is_square = abs(a - b) <= EQUAL_SIDES * max(a, b)
+        found.append(Symmetry(direction, (x, y, z), 4 if is_square else 2))
+    return tuple(found)
+
+
+def track_with_resets(scene: Scene, views: GuideViewSet, step: int = 1, most_frames: int | None = None) -> Tally:
+    """Track a scene from truth, and again from truth after every frame that is off by over 5 cm or 5° (RBOT).
+
+    Args:
+        scene: every frame has a pose.
+        views: guide views of its part.
+        step: every how manieth frame is shown to the tracker.
+        most_frames: look at no more of the scene than its first frames.
+    """
+    frames = scene.frames[:most_frames:step]
+    tracker = Tracker(views, scene.camera, model=scene.part.model)
+    meter = PoseMeter(scene.part.model, scene.camera, symmetries=scene.part.symmetries)
+    tracker.start(scene.image(frames[0]), _truth(frames[0]))
+    right, ms = 0, []
+    for frame in frames[1:]:
+        image = scene.image(frame)
+        began = time.perf_counter()
+        estimate = tracker.track(image)
+        ms.append(1e3 * (time.perf_counter() - began))
+        if meter.measure(estimate.cam_from_model, _truth(frame)).within(*COARSE):
+            right += 1
+        else:
+            tracker.start(image, _truth(frame))
+    return Tally(len(frames) - 1, right, tuple(ms[1:]))
+
+
+def detect_in_frames(
+    scene: Scene,
+    frames: Sequence[SceneFrame],
+    detector: Detector,
+    error_of: Callable[[Array, Array], PoseError],
+) -> Tally:
+    """Look for the part in single frames; the best detection counts.
+
+    Args:
+        scene: of the frames.
+        frames: each with a pose.
+        detector: of the scene's part and camera.
+        error_of: error of an estimated against a true ``cam_from_model``.
+    """
+    right, ms = 0, []
+    for frame in frames:
+        image = scene.image(frame)
+        began = time.perf_counter()
+        detections = detector.detect(image, max_results=1)
+        ms.append(1e3 * (time.perf_counter() - began))
+        right += bool(detections) and error_of(detections[0].cam_from_model, _truth(frame)).within(*COARSE)
+    return Tally(len(frames), right, tuple(ms[1:]))
+
+
+def spread_frames(scene: Scene, count: int) -> list[SceneFrame]:
+    """At most so many frames, evenly spread, of those that show at least half of the part and have a pose."""
+    fit = [f for f in scene.frames if f.cam_from_model is not None and (f.visible is None or f.visible >= IN_VIEW)]
+    chosen = np.unique(np.linspace(0, len(fit) - 1, min(count, len(fit))).round().astype(int))
+    return [fit[k] for k in chosen]
+
+
+def _truth(frame: SceneFrame) -> Array:
+    assert frame.cam_from_model is not None
+    return frame.cam_from_model

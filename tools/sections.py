@@ -1,0 +1,290 @@
+"""Sections of the evaluation on detection and on semi-synthetic sequences."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from arview.cad import Model, ViewRange, load_part
+from arview.evaluation import PoseMeter, Scene, load_scene
+from arview.evaluation.protocols import (
+    Tally,
+    box_symmetries,
+    detect_in_frames,
+    full_sphere_range,
+    spread_frames,
+    track_with_resets,
+)
+from arview.evaluation.semisynthetic import (
+    SHAPES,
+    VARIANTS,
+    WALK_ROUND,
+    LookAlike,
+    SequenceOptions,
+    Variant,
+    alike_poses,
+    frames_without_part,
+    least_error,
+    look_alike_job,
+    look_alikes,
+    make_sequence,
+    near_symmetries,
+    shape,
+    shape_job,
+)
+from arview.geometry import Array, apply
+from arview.guideview_cache import cached_guide_views
+from arview.guideviews import GuideViewSet
+from arview.tracking import Detector, TrackingSession
+from lines import Line, timing, watched
+from photos import all_photos, background_photos
+from recordings import SAMPLE
+
+SCENE_FRAMES = 200
+LOOK_ALIKE_FRAMES = 60
+SEED = 1
+DETECT_FRAMES = {"real": 60, "semisynthetic": 25, "look-alike": 6}
+FALSE_ALARM_FRAMES = 1000
+BOXES = ("cube", "teabox")
+TRACK_TARGETS = {1: 0.95, 2: 0.88, 3: 0.75, 4: 0.60}
+DETECT_TARGETS: dict[Variant, float] = {"regular": 0.95, "light": 0.93, "noise": 0.90, "occlusion": 0.85}
+LEAST_DIFFERENT = 0.01
+"""Frames in which the fault changes less of the part's picture do not show it."""
+
+
+@dataclass(frozen=True)
+class Sections:
+    """What the sections work on.
+
+    Attributes:
+        recorded: scenes by name.
+        details: for evaluation.json; each section adds its own.
+        folder: of the semi-synthetic sequences, made when missing.
+        shapes: names of the shapes looked at.
+        frames: look at no more frames of a scene than these; None: each section's own number.
+        backgrounds: folder of photos, or None.
+    """
+
+    recorded: dict[str, Scene]
+    details: dict[str, Any]
+    folder: Path
+    shapes: tuple[str, ...] = SHAPES
+    frames: int | None = None
+    backgrounds: Path | None = None
+
+    # --- Real sequences ---------------------------------------------------------------------------------
+
+    def detect(self) -> list[Line]:
+        """The detector, without any hint, on single frames of the real sequences."""
+        lines = []
+        for name, scene in watched(self.recorded.items(), "detect"):
+            model = scene.part.model
+            symmetries = box_symmetries(model) if name in BOXES else scene.part.symmetries
+            meter = PoseMeter(model, scene.camera, symmetries=symmetries, symmetric_poses=scene.symmetric_poses)
+            detector = Detector(recorded_views(scene), scene.camera)
+            frames = spread_frames(scene, self.frames or DETECT_FRAMES["real"])
+            tally = detect_in_frames(scene, frames, detector, meter.measure)
+            self.details.setdefault("detect", {})[name] = asdict(tally)
+            target = "≥ 95 % within 5 cm/5°, full sphere, no hint"
+            lines.append(Line("detect", name, detection_text(tally), target, tally.share >= 0.95))
+        return lines
+
+    # --- Semi-synthetic sequences -----------------------------------------------------------------------
+
+    @cached_property
+    def photos(self) -> tuple[Path, ...]:
+        """Backgrounds of the sequences."""
+        return background_photos(self.backgrounds)
+
+    def scene(self, name: str, variant: Variant) -> Scene:
+        """A sequence of a shape, made when it is not there."""
+        options = SequenceOptions(variant, SCENE_FRAMES, SEED)
+        made = make_sequence(shape_job(name, options, self.photos), self.folder)
+        return load_scene(made / "test" / "000001")
+
+    def semisynthetic_track(self) -> list[Line]:
+        """RBOT's protocol at four frame steps."""
+        tallies: dict[tuple[int, Variant, str], Tally] = {}
+        for name in watched(self.shapes, "semisynthetic-track"):
+            for variant in VARIANTS:
+                scene = self.scene(name, variant)
+                views = shape_views(scene.part.model)
+                for step in TRACK_TARGETS:
+                    tallies[step, variant, name] = track_with_resets(scene, views, step, self.frames)
+        rows = [{"step": s, "variant": v, "shape": n, **asdict(t)} for (s, v, n), t in tallies.items()]
+        self.details["semisynthetic-track"] = rows
+        lines = []
+        for step, target in TRACK_TARGETS.items():
+            of_step = {key: tally for key, tally in tallies.items() if key[0] == step}
+            total = summed(of_step.values())
+            by_variant = {v: summed(t for key, t in of_step.items() if key[1] == v) for v in VARIANTS}
+            by_shape = {n: summed(t for key, t in of_step.items() if key[2] == n) for n in self.shapes}
+            text = f"{100 * total.share:.1f} % of {total.frames} ({shares(by_variant)}; {shares(by_shape)})"
+            wanted = f"≥ {100 * target:.0f} % within 5 cm/5°"
+            lines.append(Line("semisynthetic track", f"frame step {step}", text, wanted, total.share >= target))
+        return lines
+
+    def semisynthetic_detect(self) -> list[Line]:
+        """The detector, without any hint, on single frames of every variant."""
+        tallies: dict[tuple[Variant, str], Tally] = {}
+        for name in watched(self.shapes, "semisynthetic-detect"):
+            for variant in VARIANTS:
+                scene = self.scene(name, variant)
+                detector = Detector(shape_views(scene.part.model), scene.camera)
+                frames = spread_frames(scene, self.frames or DETECT_FRAMES["semisynthetic"])
+                measure = _AlikeMeter(scene, name)
+                tallies[variant, name] = detect_in_frames(scene, frames, detector, measure)
+        rows = [{"variant": v, "shape": n, **asdict(t)} for (v, n), t in tallies.items()]
+        self.details["semisynthetic-detect"] = rows
+        lines = []
+        for variant, target in DETECT_TARGETS.items():
+            by_shape = {n: tallies[variant, n] for n in self.shapes}
+            total = summed(by_shape.values())
+            text = f"{detection_text(total)} ({shares(by_shape)})"
+            wanted = f"≥ {100 * target:.0f} % within 5 cm/5°, full sphere, no hint"
+            lines.append(Line("semisynthetic detect", variant, text, wanted, total.share >= target))
+        return lines
+
+    # --- Other things -----------------------------------------------------------------------------------
+
+    def false_alarms(self) -> list[Line]:
+        """The detectors of all parts on pictures without them, shared out among the parts."""
+        parts = [*self.shapes, *self.recorded]
+        each = self.frames or -(-FALSE_ALARM_FRAMES // len(parts))
+        false: dict[str, list[str]] = {}
+        looked = 0
+        for number, name in enumerate(watched(parts, "false-alarms")):
+            detector, camera = self._detector_of(name)
+            scenes = [self.scene(other, "regular") for other in self.shapes if other != name]
+            photos = all_photos(self.backgrounds, name)
+            false[name] = []
+            for origin, image in frames_without_part(photos, scenes, camera.width, camera.height, each, number):
+                looked += 1
+                if detector.detect(image, max_results=1):
+                    false[name].append(origin)
+        self.details["false-alarms"] = false
+        count = sum(len(origins) for origins in false.values())
+        named = ", ".join(f"{name} {len(origins)}" for name, origins in false.items() if origins)
+        text = f"{count} of {looked}" + (f" ({named})" if named else "")
+        return [Line("false alarms", f"{len(parts)} parts", text, "none", count == 0)]
+
+    def _detector_of(self, name: str) -> tuple[Detector, Any]:
+        if name in self.recorded:
+            scene = self.recorded[name]
+            return Detector(recorded_views(scene), scene.camera), scene.camera
+        scene = self.scene(name, "regular")
+        return Detector(shape_views(scene.part.model), scene.camera), scene.camera
+
+    def look_alikes(self) -> list[Line]:
+        """Whether a session says what is wrong with an assembly, from a detection in single frames."""
+        models = {"assembly": shape("assembly")} if "assembly" in self.shapes else {}
+        if (SAMPLE / "part.toml").is_file() and self.frames is None:
+            models[SAMPLE.name] = load_part(SAMPLE / "part.toml").model
+        results = []
+        for name, model in models.items():
+            variants = look_alikes(model)
+            every = max(1, len(variants) // self.frames) if self.frames else 1
+            for look_alike in watched(variants[::every], f"lookalike {name}"):
+                results += self._look_alike_results(name, model, look_alike)
+        self.details["lookalike"] = [asdict(result) for result in results]
+        total = len(results)
+        named, clean = sum(r.is_named for r in results), sum(r.is_clean for r in results)
+        silent = sum(not r.is_locked for r in results)
+        on = f"{', '.join(models)}: {total} frames"
+        text = f"{percent(named, total)} named, {percent(silent, total)} not found"
+        return [
+            Line("lookalike named", on, text, "≥ 90 %", total > 0 and named >= 0.9 * total),
+            Line("lookalike clean lock", on, f"{clean} of {total}", "none", total > 0 and clean == 0),
+        ]
+
+    def _look_alike_results(self, name: str, model: Model, look_alike: LookAlike) -> Iterator[LookAlikeResult]:
+        options = SequenceOptions("regular", LOOK_ALIKE_FRAMES, SEED)
+        made = make_sequence(look_alike_job(name, model, look_alike, options, self.photos), self.folder / "look_alikes")
+        scene = load_scene(made / "test" / "000001")
+        infos = json.loads((scene.folder / "scene_gt_info.json").read_text())
+        shown = tuple(f for f in scene.frames if infos[str(f.index)][0]["different_fract"] >= LEAST_DIFFERENT)
+        if not shown:
+            return
+        session = TrackingSession(
+            full_sphere_views(scene.part.model, WALK_ROUND.distance_mm), scene.part.model, scene.camera
+        )
+        scene = Scene(scene.name, scene.folder, scene.part, scene.symmetric_poses, scene.camera, shown)
+        for frame in spread_frames(scene, self.frames or DETECT_FRAMES["look-alike"]):
+            image = scene.image(frame)
+            session.reset()
+            for _ in range(2):  # a detection must hold a second frame before it is believed
+                pose = session.process(image, frame.index, frame.index / 30.0)
+            found = tuple(getattr(pose, "mismatches", ()))
+            is_named = any(part in words(text) for text in found for part in look_alike.components)
+            yield LookAlikeResult(look_alike.name, frame.index, pose.cam_from_model is not None, is_named, found)
+
+
+@dataclass(frozen=True)
+class LookAlikeResult:
+    """What a session made of one picture of a look-alike."""
+
+    look_alike: str
+    frame: int
+    is_locked: bool
+    is_named: bool
+    mismatches: tuple[str, ...]
+
+    @property
+    def is_clean(self) -> bool:
+        """True when it was taken for the right part."""
+        return self.is_locked and not self.mismatches
+
+
+class _AlikeMeter:
+    """Errors against whichever of the poses that look the same in a picture is nearest."""
+
+    def __init__(self, scene: Scene, name: str) -> None:
+        self._scene, self._near = scene, near_symmetries(name)
+        self._meter = PoseMeter(scene.part.model, scene.camera, symmetries=scene.part.symmetries)
+
+    def __call__(self, estimate: Array, truth: Array) -> Any:
+        truths = alike_poses(self._scene.part.model, self._scene.camera, truth, self._near)
+        return least_error(self._meter, estimate, truths)
+
+
+def shape_views(model: Model) -> GuideViewSet:
+    """Guide views of a shape, from everywhere."""
+    return full_sphere_views(model, SequenceOptions().motion.distance_mm)
+
+
+def recorded_views(scene: Scene) -> GuideViewSet:
+    """Guide views of a recorded part, from everywhere, at the distances of the recording."""
+    center = scene.part.model.center_in_model
+    distances = [float((apply(pose, center) ** 2).sum() ** 0.5) for pose in scene.poses]
+    return full_sphere_views(scene.part.model, (min(distances), max(distances)))
+
+
+def full_sphere_views(model: Model, distance_mm: tuple[float, float]) -> GuideViewSet:
+    """Guide views from everywhere, cached between runs."""
+    view_range: ViewRange = full_sphere_range(*distance_mm)
+    return cached_guide_views(model, view_range)
+
+
+def summed(tallies: Iterable[Tally]) -> Tally:
+    return sum(tallies, Tally())
+
+
+def shares(tallies: dict[Any, Tally]) -> str:
+    return ", ".join(f"{name} {100 * tally.share:.0f}" for name, tally in tallies.items())
+
+
+def detection_text(tally: Tally) -> str:
+    return f"{100 * tally.share:.0f} % of {tally.frames}, {timing(tally.ms)}"
+
+
+def percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.0f} %" if whole else "0 %"
+
+
+def words(text: str) -> list[str]:
+    """The words of a message, without the punctuation around them."""
+    return [word.strip(".,:;()'\"") for word in text.split()]
