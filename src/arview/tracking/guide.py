@@ -30,6 +30,7 @@ MIDDLE = "middle"
 """The middle of the declared range: every range has it."""
 FILL = 0.6
 """Without a distance the part's diameter spans this share of the picture's smaller side, if the range allows."""
+ROOM = 1.15
 MARGIN_DEG, MARGIN_SHARE = 1.0, 0.01
 """So far outside the declared range still counts as inside."""
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
@@ -69,7 +70,9 @@ def guide_pose(name: str, part: Part, views: GuideViewSet, camera: Camera) -> Ar
     distance_mm = placed.distance_mm
     if distance_mm is None:
         wanted = views.diameter_mm * camera.fx / (FILL * min(camera.width, camera.height))
-        distance_mm = float(np.clip(wanted, low, high))
+        # Off the ends of the range, so that there is room to bring the part nearer and farther.
+        middle = np.sqrt(low * high)
+        distance_mm = float(np.clip(wanted, min(ROOM * low, middle), max(high / ROOM, middle)))
     elif not low * (1 - MARGIN_SHARE) <= distance_mm <= high * (1 + MARGIN_SHARE):
         raise InputError(
             f"guide view {name!r}: {distance_mm:g} mm is outside the declared distances ({_interval((low, high))} mm)"
