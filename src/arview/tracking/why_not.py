@@ -1,0 +1,237 @@
+"""Why the part is not found, or was lost, in words that a user can act on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.view_range import ViewRange
+from arview.cad.viewpoint import Viewpoint, viewpoint
+from arview.camera import Camera
+from arview.geometry import Array, apply
+from arview.guideviews import GuideViewSet
+from arview.tracking.quality import Evidence
+from arview.tracking.tracker import Estimate
+
+NOTHING = "nothing like the part in view"
+"""How the reason begins when neither picture nor hypothesis says more."""
+WIDTH_PX = 640
+"""Pictures are looked at no wider than this."""
+DARK, BRIGHT = 40, 250
+"""Grey levels: nineteen in twenty pixels darker; half of them brighter."""
+BLURRED_PX = 2.5
+"""Deviation of the blur, in a picture WIDTH_PX wide, from which on detection fails."""
+FEWEST_EDGES = 10
+STEP_LEVELS = 25.0
+"""Edges of fewer grey levels do not say how sharp the picture is."""
+LEAST_QUALITY = 0.06
+"""Hypotheses of less quality are found in any clutter."""
+FITTING_QUALITY = 0.5
+SMALLEST_PX = 36.0
+"""A part that spans less shows too little to be found."""
+LOW_CONTRAST = 14.0
+"""Median difference of colours across the outline, grey levels."""
+ANGLE_MARGIN_DEG, DISTANCE_MARGIN = 5.0, 0.1
+"""So far outside the declared range is not yet the reason."""
+POLE_DEG = 80.0
+"""From this elevation on roll and azimuth say the same."""
+LEFT_SHARE = 0.7
+"""With less of the outline inside the picture when it is lost, the part has left it."""
+FAST = 0.12
+"""A motion of this share of the part's diameter between frames is fast."""
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """The best hypothesis that the detector did not believe: ``cam_from_model`` (4,4), evidence and quality."""
+
+    cam_from_model: Array
+    evidence: Evidence
+    quality: float
+
+
+def why_not(image: NDArray[np.uint8], camera: Camera, views: GuideViewSet, rejected: Rejected | None) -> str:
+    """The likeliest reason why the part is not found.
+
+    Args:
+        image: (H,W,3) uint8 RGB of the camera's size.
+        camera: that took it.
+        views: guide views of the part.
+        rejected: the best hypothesis that was not believed, if there was one.
+    """
+    poor = poor_picture(image)
+    if poor:
+        return poor
+    credible = rejected if rejected is not None and rejected.quality >= LEAST_QUALITY else None
+    reason = _too_small(camera, views, credible)
+    if not reason and credible is not None:
+        place = viewpoint(credible.cam_from_model, views.center_in_model)
+        reason = outside_range(place, views.view_range, credible.quality >= FITTING_QUALITY)
+        reason = reason or _partly_outside(camera, views, credible)
+        reason = reason or _low_contrast(image, camera, views, credible.cam_from_model)
+        reason = reason or f"only {100 * credible.evidence.contour_support:.0f} % of the outline found"
+    low, high = views.view_range.distance_mm
+    return reason or f"{NOTHING}, {low:.0f} to {high:.0f} mm away"
+
+
+def poor_picture(image: NDArray[np.uint8]) -> str:
+    """What is wrong with a picture (H,W,3) uint8 RGB by itself: light, blur, contrast; empty when nothing is."""
+    scale = min(1.0, WIDTH_PX / image.shape[1])
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    if scale < 1.0:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    if float(np.percentile(gray, 95)) < DARK:
+        return "too dark"
+    if float(np.percentile(gray, 50)) >= BRIGHT:
+        return "overexposed"
+    widths_px = edge_widths_px(np.asarray(gray))
+    if np.all(np.isnan(widths_px)):
+        return "low contrast: hardly an edge in the picture"
+    return "blurred" if np.nanmax(widths_px) > BLURRED_PX else ""
+
+
+def edge_widths_px(gray: NDArray[np.uint8]) -> Array:
+    """(2,) deviation of the blur across the strongest upright and lying edges of a picture (H,W); NaN without any.
+
+    A step blurred with σ has a slope in inverse proportion to √(σ² + s²) after smoothing with s, so the ratio of the
+    slopes at two smoothings says σ whatever the step's height: Zhuo & Sim, "Defocus map estimation from a single
+    image" (Pattern Recognition 2011). Edges are judged by their height, so a plain background counts for nothing,
+    and by direction, since motion blurs only the edges across it. Where wide blur leaves too few edges, they are
+    looked for at half the size.
+    """
+    widths = _widths_px(gray)
+    if np.any(np.isnan(widths)):
+        half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        widths = np.where(np.isnan(widths), 2.0 * _widths_px(np.asarray(half)), widths)
+    return widths
+
+
+def _widths_px(gray: NDArray[np.uint8]) -> Array:
+    fine_px, coarse_px = 1.0, 4.0
+    picture = gray.astype(np.float32)
+    slopes = []
+    for sigma_px in (fine_px, coarse_px):
+        smooth = cv2.GaussianBlur(picture, (0, 0), sigma_px)
+        slopes.append([np.abs(cv2.Sobel(smooth, cv2.CV_32F, *axis, ksize=3)) / 8.0 for axis in ((1, 0), (0, 1))])
+    widths = np.full(2, np.nan)
+    for axis in (0, 1):
+        coarse, across = slopes[1][axis], slopes[1][1 - axis]
+        height = coarse * np.sqrt(2.0 * np.pi) * coarse_px
+        is_peak = (coarse >= cv2.dilate(coarse, np.ones((7, 7), np.uint8))) & (coarse > across)
+        rows, columns = np.nonzero(is_peak & (height > STEP_LEVELS))
+        if len(rows) < FEWEST_EDGES:
+            continue
+        fine = cv2.dilate(slopes[0][axis], np.ones((9, 9), np.uint8))
+        strongest = np.argsort(-coarse[rows, columns])[:400]
+        ratio2 = (fine[rows, columns][strongest] / coarse[rows, columns][strongest]) ** 2
+        square = (coarse_px**2 - ratio2 * fine_px**2) / np.maximum(ratio2 - 1.0, 1e-3)
+        widths[axis] = np.percentile(np.sqrt(np.maximum(square, 0.0)), 25)
+    return widths
+
+
+def outside_range(place: Viewpoint, view_range: ViewRange, is_fitting: bool) -> str:
+    """How a viewpoint is outside the declared range, in words; directions and rolls only when the pose fits."""
+    low, high = view_range.distance_mm
+    if place.distance_mm > high * (1.0 + DISTANCE_MARGIN):
+        return f"too far: about {place.distance_mm:.0f} mm, declared up to {high:.0f} mm"
+    if place.distance_mm < low * (1.0 - DISTANCE_MARGIN):
+        return f"too near: about {place.distance_mm:.0f} mm, declared from {low:.0f} mm"
+    if not is_fitting:
+        return ""
+    azimuth, elevation = np.deg2rad([place.azimuth_deg, place.elevation_deg])
+    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    if not view_range.contains_direction(direction, ANGLE_MARGIN_DEG):
+        return (
+            f"seen from outside the declared range: azimuth {place.azimuth_deg:.0f}°, "
+            f"elevation {place.elevation_deg:.0f}°"
+        )
+    first, last = view_range.roll_deg
+    away = abs((place.roll_deg - 0.5 * (first + last) + 180.0) % 360.0 - 180.0)
+    if abs(place.elevation_deg) < POLE_DEG and away > 0.5 * (last - first) + ANGLE_MARGIN_DEG:
+        return f"turned outside the declared range: roll {place.roll_deg:.0f}°, declared {first:.0f} to {last:.0f}°"
+    return ""
+
+
+def why_lost(
+    estimate: Estimate, recent: tuple[Array, Array] | None, camera: Camera, views: GuideViewSet, is_possible: bool
+) -> str:
+    """Why tracking ended.
+
+    Args:
+        estimate: of the last frame, which is not believed.
+        recent: the last two poses (4,4) that were believed, older first, if there are two.
+        camera, views: of the session.
+        is_possible: the estimate is in front of the camera and near the declared distances.
+    """
+    center = apply(estimate.cam_from_model, views.center_in_model)
+    if not is_possible and center[2] > 0:
+        return outside_range(viewpoint(estimate.cam_from_model, views.center_in_model), views.view_range, False)
+    if estimate.evidence.points_in_picture < LEFT_SHARE or center[2] <= 0:
+        edge = _edge_of_picture(camera, center)
+        return f"the part left the picture at the {edge} edge" if edge else "the part left the picture"
+    if recent is not None and _motion(*recent, views) > FAST:
+        return "the part moved too fast"
+    return "the part is hidden or moved too fast"
+
+
+def _motion(before: Array, after: Array, views: GuideViewSet) -> float:
+    """Motion of the part's middle across the line of sight, in diameters."""
+    a, b = (apply(pose, views.center_in_model) for pose in (before, after))
+    across_mm = np.linalg.norm(b[:2] - a[:2] * b[2] / max(a[2], 1.0))
+    return float(across_mm / views.diameter_mm)
+
+
+def _edge_of_picture(camera: Camera, center_in_cam: Array) -> str:
+    """The edge of the picture that a point is nearest to or beyond; empty behind the camera."""
+    if center_in_cam[2] <= 0:
+        return ""
+    u, v = camera.project(center_in_cam)
+    beyond = {"left": -u, "right": u - camera.width, "upper": -v, "lower": v - camera.height}
+    return max(beyond, key=lambda name: beyond[name])
+
+
+def _span_px(camera: Camera, views: GuideViewSet, distance_mm: float) -> float:
+    return views.diameter_mm * camera.fx / distance_mm
+
+
+def _too_small(camera: Camera, views: GuideViewSet, rejected: Rejected | None) -> str:
+    """Whether the part spans too few pixels: where it seems to be, or even at the nearest declared distance."""
+    low = views.view_range.distance_mm[0]
+    distance_mm = low
+    if rejected is not None:
+        distance_mm = max(float(np.linalg.norm(apply(rejected.cam_from_model, views.center_in_model))), low)
+    span_px = _span_px(camera, views, distance_mm)
+    return f"too far: the part spans only {span_px:.0f} px" if span_px < SMALLEST_PX else ""
+
+
+def _partly_outside(camera: Camera, views: GuideViewSet, rejected: Rejected) -> str:
+    center = apply(rejected.cam_from_model, views.center_in_model)
+    if rejected.evidence.points_in_picture > 0.8 or center[2] <= 0:
+        return ""
+    if _span_px(camera, views, float(center[2])) > 1.2 * max(camera.width, camera.height):
+        return "too near: the part does not fit in the picture"
+    edge = _edge_of_picture(camera, center)
+    return f"partly outside the picture at the {edge} edge"
+
+
+def _low_contrast(image: NDArray[np.uint8], camera: Camera, views: GuideViewSet, cam_from_model: Array) -> str:
+    """Whether the colours inside and outside of the outline at a pose are about the same."""
+    features = views.nearest(cam_from_model).features
+    ahead = apply(cam_from_model, features.contour_points)
+    normals = features.contour_normals @ cam_from_model[:3, :3].T
+    pixels = camera.project(ahead)
+    aside = camera.project(ahead + 0.01 * views.diameter_mm * normals) - pixels
+    with np.errstate(invalid="ignore"):
+        aside *= 4.0 / np.linalg.norm(aside, axis=1, keepdims=True)
+        inside, outside = np.round(pixels - aside), np.round(pixels + aside)
+        both = np.concatenate([inside, outside], axis=1)
+        is_seen = np.all((both >= 0) & (both < np.tile([camera.width, camera.height], 2)), axis=1)
+    if is_seen.sum() < 20:
+        return ""
+    (u, v), (x, y) = inside[is_seen].astype(np.intp).T, outside[is_seen].astype(np.intp).T
+    smooth = cv2.blur(image, (3, 3)).astype(np.float64)
+    difference = float(np.median(np.abs(smooth[v, u] - smooth[y, x]).max(axis=1)))
+    return "low contrast of the part against its background" if difference < LOW_CONTRAST else ""
