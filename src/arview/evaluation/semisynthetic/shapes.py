@@ -114,7 +114,7 @@ def bracket() -> Model:
 
 
 def flange() -> Model:
-    """Near-symmetric: a hub on a disc with 6 bolt holes, ⌀170 × 58 mm; a notch and a stud tell the sixths apart."""
+    """Near-symmetric: a hub on a disc with 6 bolt holes, ⌀170 × 58 mm; a notch in the rim tells the sixths apart."""
     angle = np.deg2rad(np.arange(360) - 90.0)
     rim = 85.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     # The notch: 12 mm wide and 9 mm deep at the disc's +X, between two bolt holes.
@@ -127,8 +127,7 @@ def flange() -> Model:
     holes = tuple(circle((64.0 * np.cos(b), 64.0 * np.sin(b)), 6.5, 24) for b in bolts)
     disc = prism(outline, (*holes, circle((0, 0), 17.0, 48)), 0.0, 14.0)
     hub = joined(tube((0, 0), 38.0, 20.0, 14.0, 58.0), tube((0, 0), 44.0, 38.0, 14.0, 22.0))
-    stud = cylinder((50.0, 0.0), 5.0, 14.0, 30.0, 24)
-    return _model("flange", (("flange", joined(disc, hub, stud), STEEL),))
+    return _model("flange", (("flange", joined(disc, hub), STEEL),))
 
 
 def ribbed() -> Model:
