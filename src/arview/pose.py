@@ -33,6 +33,7 @@ class Pose:
         reason: for ``searching``, ``critical`` and ``lost``: why, in words.
         mismatches: what is not as the CAD says, e.g. ``mismatch: nut_2 not seen where expected``; a part with
             any is never ``tracked`` but ``critical``: it may be another part of the family.
+        guide_cam_from_model: (4,4) where the user should bring the part; None unless the session waits for that.
     """
 
     cam_from_model: Array | None
@@ -44,3 +45,4 @@ class Pose:
     ms: float = 0.0
     reason: str = ""
     mismatches: tuple[str, ...] = ()
+    guide_cam_from_model: Array | None = None

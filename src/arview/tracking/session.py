@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +19,12 @@ from arview.geometry import Array, apply, check_rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.tracking.detector import Detector, DetectorOptions
+from arview.tracking.snap import Snap
 from arview.tracking.tracker import Estimate, Tracker, TrackerOptions
+from arview.tracking.why_not import NOTHING, Rejected, poor_picture, why_lost, why_not
+
+ALIGN = "align the part with the outline"
+"""The reason while the session waits for the part at its guide pose."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ class SessionOptions:
         lost_frames: frames in a row.
         critical_frames: so many critical frames in a row end in ``lost`` too.
         eager_frames, search_every: a lost part is looked for in so many frames at once, then in every n-th.
+        align_again_frames: a part that is not found again in so many frames may be aligned with the guide again.
         min_in_picture: less of the outline inside the picture cannot hold a pose.
         detector: None chooses by the declared range.
     """
@@ -51,6 +56,7 @@ class SessionOptions:
     critical_frames: int = 45
     eager_frames: int = 2
     search_every: int = 3
+    align_again_frames: int = 60
     min_in_picture: float = 0.25
     detector: DetectorOptions | None = None
 
@@ -68,10 +74,12 @@ class TrackingSession:
         camera: intrinsics of the frames.
         options: see SessionOptions.
         initial_cam_from_model: (4,4) mm; the first frame snaps to it and does not search.
+        guide_cam_from_model: (4,4) mm; the part is first found by bringing it near this pose, not by a search,
+            and by both when it has been lost for a while.
 
     Raises:
         MismatchError: guide views of another model.
-        InputError: an initial pose that is not a rigid transform.
+        InputError: an initial or guide pose that is not a rigid transform.
     """
 
     def __init__(
@@ -81,6 +89,7 @@ class TrackingSession:
         camera: Camera,
         options: SessionOptions | None = None,
         initial_cam_from_model: Array | None = None,
+        guide_cam_from_model: Array | None = None,
     ) -> None:
         self.options = options or SessionOptions()
         if views.model_hash != model.source_hash:
@@ -102,6 +111,8 @@ class TrackingSession:
         )
         self._detector: Detector | None = None
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
+        self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
+        self._snap: Snap | None = None
         self.reset()
 
     @property
@@ -111,6 +122,19 @@ class TrackingSession:
             self._detector = Detector(self._views, self.camera, self.options.detector)
         return self._detector
 
+    @property
+    def snap(self) -> Snap:
+        """The search around a given pose, made when first needed."""
+        if self._snap is None:
+            self._snap = Snap(self._views, self.camera)
+        return self._snap
+
+    @property
+    def is_aligning(self) -> bool:
+        """Whether the part can be found by bringing it near the guide pose."""
+        has_waited = self.state == TrackingState.LOST and self._lost_frames > self.options.align_again_frames
+        return self._guide is not None and (self.state == TrackingState.SEARCHING or has_waited)
+
     def reset(self) -> None:
         """Forget the part's place: search again."""
         self.state = TrackingState.SEARCHING
@@ -118,7 +142,9 @@ class TrackingSession:
         self._critical = 0
         self._lost_frames = 0
         self._confirmed = False
-        self._why = ""
+        self._was_found = False
+        self._recent: list[Array] = []
+        self._why = self._why_lost = ""
 
     def process(self, image: NDArray[np.uint8], index: int, time_s: float) -> Pose:
         """Pose and state of the next frame.
@@ -142,7 +168,8 @@ class TrackingSession:
             estimate, reason = self._search(image)
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
-            return Pose(None, None, 0.0, self.state, time_s, index, ms, reason)
+            guide = self._guide if self.is_aligning else None
+            return Pose(None, None, 0.0, self.state, time_s, index, ms, reason, guide_cam_from_model=guide)
         return Pose(
             cam_from_model=estimate.cam_from_model,
             covariance=self.tracker.covariance(estimate),
@@ -158,16 +185,20 @@ class TrackingSession:
         o = self.options
         estimate = self.tracker.track(image)
         quality = estimate.quality
-        outside = estimate.evidence.points_in_picture < o.min_in_picture or not self._is_possible(estimate)
+        is_possible = self._is_possible(estimate)
+        outside = estimate.evidence.points_in_picture < o.min_in_picture or not is_possible
         poor = outside or quality < o.lost_quality
         self._poor = self._poor + 1 if poor else 0
         if self._poor >= o.lost_frames or (poor and not self._confirmed):
-            return self._lose("the part left the picture" if outside else "the part is hidden or moved too fast")
+            recent = (self._recent[0], self._recent[1]) if len(self._recent) == 2 else None
+            return self._lose(why_lost(estimate, recent, self.camera, self._views, is_possible))
+        if not poor:
+            self._recent = [*self._recent[-1:], estimate.cam_from_model]
         was_tracked = self.state == TrackingState.TRACKED
         if not poor and quality >= (o.critical_quality if was_tracked else o.tracked_quality):
             self.state = TrackingState.TRACKED
             self._critical = 0
-            self._confirmed = True
+            self._confirmed = self._was_found = True
             return estimate, ""
         self.state = TrackingState.CRITICAL
         self._critical += 1
@@ -176,10 +207,15 @@ class TrackingSession:
         return estimate, "the outline is hardly seen"
 
     def _lose(self, reason: str) -> tuple[None, str]:
+        self._poor = self._critical = 0
+        if self._guide is not None and not self._confirmed:
+            # It was aligned, but did not hold the second frame: go on as before.
+            self.state = TrackingState.LOST if self._was_found else TrackingState.SEARCHING
+            return None, self._why
         self.state = TrackingState.LOST
-        self._poor = self._critical = self._lost_frames = 0
+        self._lost_frames = 0
         self._confirmed = False
-        self._why = reason
+        self._why = self._why_lost = reason
         return None, reason
 
     def _is_possible(self, estimate: Estimate) -> bool:
@@ -190,36 +226,60 @@ class TrackingSession:
 
     def _search(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
         o = self.options
+        self._lost_frames += 1
         if self._initial is not None:
-            detection = self.detector.snap(image, self._initial)
+            snapped = self.snap.find(image, self._initial)
             self._initial = None
+            if snapped is None:
+                return None, "the part is outside the picture at the initial pose"
+            start = snapped.cam_from_model
+        elif self.state == TrackingState.SEARCHING and self._guide is not None:
+            return self._align(image, self._guide)
         else:
-            self._lost_frames += 1
             rests = self._lost_frames > o.eager_frames and self._lost_frames % o.search_every != 0
             if self.state == TrackingState.LOST and rests:
+                if self._guide is not None and self.is_aligning:
+                    return self._align(image, self._guide)
                 return None, self._why
             is_thorough = self.state == TrackingState.SEARCHING or self._lost_frames % (2 * o.search_every) == 0
             detections = self.detector.detect(image, max_results=1, is_thorough=is_thorough)
             if not detections:
-                self._why = self._why_not(image)
-                return None, self._why
-            detection = detections[0]
-        self.tracker.start(image, detection.cam_from_model)
+                return None, self._why_not(image, getattr(self.detector, "best_rejected", None))
+            start = detections[0].cam_from_model
+        self.tracker.start(image, start)
         estimate = self.tracker.track(image)
         if estimate.quality < o.tracked_quality or not self._is_possible(estimate):
-            return None, self._why_not(image)
+            return None, self._why_not(image, Rejected(estimate.cam_from_model, estimate.evidence, estimate.quality))
         self._poor = self._critical = 0
         self._confirmed = estimate.quality >= o.lock_quality
+        self._was_found |= self._confirmed
+        self._recent = []
         self.state = TrackingState.TRACKED if self._confirmed else TrackingState.CRITICAL
         return estimate, "" if self._confirmed else "found, to be confirmed"
 
-    def _why_not(self, image: NDArray[np.uint8]) -> str:
-        """The likeliest reason in words: light and blur first."""
-        small = cv2.cvtColor(image[::2, ::2], cv2.COLOR_RGB2GRAY)
-        if float(np.percentile(small, 95)) < 40:
-            return "too dark"
-        if float(np.percentile(small, 5)) > 225:
-            return "overexposed"
-        if float(np.percentile(np.abs(cv2.Laplacian(small, cv2.CV_32F)), 99)) < 8:
-            return "blurred or nothing in view"
-        return "no view of the part fits"
+    def _align(self, image: NDArray[np.uint8], guide_cam_from_model: Array) -> tuple[Estimate | None, str]:
+        """Look whether the part has been brought near the guide pose; what is found must hold a second frame."""
+        snapped = self.snap.lock(image, guide_cam_from_model, self.options.lock_quality)
+        if snapped is not None:
+            self.tracker.start(image, snapped.cam_from_model)
+            estimate = self.tracker.track(image)
+            is_good = estimate.quality >= self.options.lock_quality and self._is_possible(estimate)
+            if is_good and self.snap.is_near(estimate.cam_from_model, guide_cam_from_model):
+                self._why = ALIGN
+                self._poor = self._critical = 0
+                self._confirmed = False
+                self._recent = []
+                self.state = TrackingState.CRITICAL
+                return estimate, "found, to be confirmed"
+        if self.state == TrackingState.SEARCHING and self._lost_frames % 10 == 1:
+            self._why = poor_picture(image) or ALIGN
+        return None, self._why
+
+    def _why_not(self, image: NDArray[np.uint8], rejected: Rejected | None) -> str:
+        """Why a search found nothing; a lost part's loss says more than that nothing is in view."""
+        reason = why_not(image, self.camera, self._views, rejected)
+        is_told = self.state == TrackingState.LOST and reason.startswith(NOTHING)
+        self._why = self._why_lost if is_told else reason
+        if self.is_aligning and self.state == TrackingState.LOST:
+            self._why += f"; {ALIGN}"
+        return self._why
