@@ -6,7 +6,6 @@ import importlib.util
 import os
 from pathlib import Path
 
-from arview.evaluation.bop import PICTURE_SUFFIXES
 from arview.evaluation.semisynthetic import photos_in
 from recordings import DATA, SEQUENCES
 
@@ -22,8 +21,10 @@ PACKAGES = {
     "sklearn": ("datasets/images/china.jpg", "datasets/images/flower.jpg"),
 }
 """Photos that Python packages bring along."""
-WALLPAPERS = (Path("/usr/share/backgrounds"), Path("/usr/share/wallpapers"))
-"""Where Debian's packages of photos are (mate-backgrounds, gnome-backgrounds)."""
+DEBIAN = Path("/usr/share/backgrounds/mate/nature")
+"""Photos of Debian's package mate-backgrounds."""
+FLAT = ("castle",)
+"""Recordings that look like no photo: flat computer graphics."""
 SHOW_TOO = {"cube": ("castle",)}
 """Recordings that show a part besides its own: there is a box in the castle's picture."""
 
@@ -35,7 +36,8 @@ def background_photos(folder: Path | None, without: str = "") -> tuple[Path, ...
     """
     if folder is not None:
         return tuple(photos_in(folder))
-    spread = [frames[:: max(1, len(frames) // EACH_RECORDING)] for frames in recorded_frames(without)]
+    recorded = recorded_frames(without, *FLAT)
+    spread = [frames[:: max(1, len(frames) // EACH_RECORDING)] for frames in recorded]
     return tuple(path for frames in spread for path in frames) + machine_photos()
 
 
@@ -46,9 +48,9 @@ def all_photos(folder: Path | None, without: str = "") -> tuple[Path, ...]:
     return tuple(path for frames in recorded_frames(without) for path in frames) + machine_photos()
 
 
-def recorded_frames(without: str = "") -> list[list[Path]]:
-    """Frames of each recording, and the photos of the plate, in order; none of those that show a part."""
-    left_out = (without, *SHOW_TOO.get(without, ()))
+def recorded_frames(*without: str) -> list[list[Path]]:
+    """Frames of each recording, and the photos of the plate, in order; none of those that show certain parts."""
+    left_out = {other for name in without for other in (name, *SHOW_TOO.get(name, ()))}
     folders = [DATA / name / "test" / "000001" for name in SEQUENCES if name not in left_out]
     if "plate" not in left_out:
         folders.append(DATA.parent / "plate" / "photos")
@@ -56,7 +58,7 @@ def recorded_frames(without: str = "") -> list[list[Path]]:
 
 
 def machine_photos() -> tuple[Path, ...]:
-    """Photos in ``$ARVIEW_BACKGROUNDS``, in Python packages and in Debian's folders."""
+    """Photos in ``$ARVIEW_BACKGROUNDS``, in Python packages and in Debian's folder."""
     found: list[Path] = []
     own = os.environ.get("ARVIEW_BACKGROUNDS")
     if own:
@@ -65,6 +67,6 @@ def machine_photos() -> tuple[Path, ...]:
         spec = importlib.util.find_spec(package)
         if spec is not None and spec.origin is not None:
             found += [path for name in names if (path := Path(spec.origin).parent / name).is_file()]
-    for folder in WALLPAPERS:
-        found += sorted(p for p in folder.rglob("*") if p.suffix.lower() in PICTURE_SUFFIXES and p.is_file())
+    if DEBIAN.is_dir():
+        found += photos_in(DEBIAN)
     return tuple(found)
