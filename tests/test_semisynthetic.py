@@ -37,7 +37,7 @@ from arview.evaluation.semisynthetic import (
     trajectory,
 )
 from arview.evaluation.semisynthetic.look_alikes import different_share
-from arview.evaluation.semisynthetic.shading import corner_normals
+from arview.evaluation.semisynthetic.shading import corner_normals, muted
 from arview.evaluation.semisynthetic.solids import circle, prism, rectangle, triangulate
 from arview.geometry import Array, apply, exp_so3, look_at, rigid, rotation_angle_rad
 from cad_files import box
@@ -229,6 +229,16 @@ def test_normals_are_smooth_on_round_and_sharp_on_flat_faces() -> None:
     outward = corners[wall][..., :2] / 10.0
     assert np.allclose(np.einsum("fki,fki->fk", normals[wall][..., :2], outward), 1.0, atol=2e-3)
     assert np.all(flat[~wall])
+
+
+def test_colours_of_cad_become_those_of_a_real_part() -> None:
+    vivid, white, black, steel = muted(np.array([(0.9, 0.3, 0.1), (1.0, 1, 1), (0.0, 0, 0), (0.56, 0.57, 0.58)]))
+    assert vivid.max() == pytest.approx(0.65)
+    assert 1 - vivid.min() / vivid.max() == pytest.approx(0.35)
+    assert (vivid[1] - vivid[2]) / (vivid[0] - vivid[2]) == pytest.approx(0.25)
+    assert np.allclose(white, 0.65)
+    assert np.allclose(steel, (0.56, 0.57, 0.58))
+    assert np.allclose(black, 0.3)
 
 
 # --- Trajectory -----------------------------------------------------------------------------------------

@@ -22,6 +22,10 @@ SUPERSAMPLING = 3
 SMOOTH_BELOW_DEG = 40.0
 """Faces that meet at less than this are shaded as one round surface."""
 
+MOST_SATURATION = 0.35
+BRIGHTNESS = (0.3, 0.65)
+"""Colours of CAD are made to look like a real part's: at most so saturated, and so dark or bright."""
+
 
 @dataclass(frozen=True)
 class Light:
@@ -74,7 +78,7 @@ class ShadedModel:
         self.surface = surface or Surface()
         self._vertices, self._faces, owners = model.mesh
         self._normals = corner_normals(self._vertices, self._faces, SMOOTH_BELOW_DEG)
-        self._colors = np.array([component.color for component in model.components])[owners]
+        self._colors = muted(np.array([component.color for component in model.components]))[owners]
 
     def draw(self, cam_from_model: Array, camera: Camera, light: Light) -> Layer | None:
         """The part at a pose (4,4), whole also where it lies outside the picture; None when it cannot be seen.
@@ -113,6 +117,16 @@ class ShadedModel:
             np.asarray(cv2.resize(color, window, interpolation=cv2.INTER_AREA)),
             np.asarray(cv2.resize(seen, window, interpolation=cv2.INTER_AREA)),
         )
+
+
+def muted(colors: Array) -> Array:
+    """Colours (N,3) in 0–1 as metal or paint has them: neither vivid nor very dark or bright; hues stay."""
+    colors = np.maximum(colors, 1e-3)
+    value = colors.max(axis=1, keepdims=True)
+    saturation = 1.0 - colors.min(axis=1, keepdims=True) / value
+    kept = np.minimum(1.0, MOST_SATURATION / np.maximum(saturation, 1e-6))
+    pale = value - kept * (value - colors)
+    return np.asarray(pale * np.clip(value, *BRIGHTNESS) / value)
 
 
 def corner_normals(vertices: Array, faces: NDArray[np.int32], smooth_below_deg: float) -> Array:
