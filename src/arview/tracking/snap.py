@@ -7,7 +7,10 @@ are refined by the tracker and judged by the same evidence as a tracked pose.
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -16,6 +19,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.geometry import Array, apply, exp_so3, rotation_angle_rad
 from arview.guideviews import GuideViewSet
+from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
 from arview.tracking.matching import response_maps, score_around
 from arview.tracking.quality import Evidence
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions, intrinsics_of, smoothed
@@ -30,6 +34,8 @@ class SnapOptions:
             taken for the part; the distance is a share, the offset in diameters of the part. They are wider than
             the search (15°, 15 % and 15 %), because the best pose on its rim may lie just outside.
         min_in_picture: less of the outline inside the picture is not judged.
+        least_coarse, least_fine: edge scores of the two rounds below which the part is not there.
+        least_worth: of a pose less what its view is plain by; right and wrong poses part a little below.
         rival_worth: a nearer pose around the found one that is worth this share of it makes the found one doubtful.
     """
 
@@ -38,6 +44,9 @@ class SnapOptions:
     offset_limit: float = 0.2
     min_in_picture: float = 0.4
     rival_worth: float = 0.8
+    least_coarse: float = 0.34
+    least_fine: float = 0.4
+    least_worth: float = 0.6
 
 
 @dataclass(frozen=True)
@@ -80,9 +89,9 @@ def turn_grid(reach_deg: float, step_deg: float) -> Array:
     return np.stack([exp_so3(np.deg2rad(v)) for v in vectors])
 
 
-COARSE = SearchLevel(26.0, turn_grid(16.0, 9.0), np.geomspace(0.85, 1.15, 7), 8, 2, 6, 6, 4.0)
+COARSE = SearchLevel(26.0, turn_grid(16.0, 9.0), np.geomspace(0.85, 1.15, 7), 8, 2, 8, 8, 4.0)
 """15° all around, 15 % of the distance, 15 % of the diameter aside."""
-FINE = SearchLevel(60.0, turn_grid(3.6, 2.4), np.linspace(0.97, 1.03, 5), 4, 2, 1, 3, 1.5)
+FINE = SearchLevel(80.0, turn_grid(3.6, 2.4), np.linspace(0.97, 1.03, 5), 4, 2, 1, 4, 1.5)
 """Between the poses of the coarse grid."""
 RIVAL = SearchLevel(26.0, turn_grid(22.0, 10.0), np.geomspace(0.69, 1.38, 8), 12, 3, 3, 3, 4.0)
 """Around the found pose at RIVAL_DISTANCE: 0.38 to 0.76 of its distance."""
@@ -90,6 +99,8 @@ RIVAL_DISTANCE = 0.55
 NEARER = 0.85
 """A rival at a larger share of the distance is the same pose."""
 SPREAD_PX = 2
+PLAIN_WORTH = 0.3
+"""What a view without any line of its own takes from a pose's worth."""
 CROP_REACH = 1.35
 """Radii around the part's middle that are looked at: it may be nearer than the given pose says."""
 STAGES = (
@@ -113,6 +124,7 @@ class Snap:
     def __init__(self, views: GuideViewSet, camera: Camera, options: SnapOptions | None = None) -> None:
         self.options = options or SnapOptions()
         self.camera = camera
+        self._views = views
         self._center_in_model = views.center_in_model
         self._tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
 
@@ -137,11 +149,16 @@ class Snap:
     def lock(self, image: NDArray[np.uint8], cam_from_model: Array, min_quality: float) -> Snapped | None:
         """The part's pose when it is near the given one beyond doubt, else None.
 
-        A pose must be good, near enough (see `SnapOptions`), and not a figure inside the part: print on a box may
-        look like a smaller box, and then a nearer pose around it fits as well.
+        A pose must be good, near enough (see `SnapOptions`), borne out the better the plainer the part looks from
+        there, and not a figure inside the part: print on a box may look like a smaller box, and then a nearer pose
+        around it fits as well. Most pictures without the part are done with after the first round.
         """
-        found = self.find(image, cam_from_model)
+        start = cam_from_model @ self._tracker.part.model_from_body
+        near = self._search(image, start, [start], COARSE, self.options.least_coarse)
+        found = self._best(image, self._search(image, start, near, FINE, self.options.least_fine))
         if found is None or found.quality < min_quality or not self.is_near(found.cam_from_model, cam_from_model):
+            return None
+        if found.evidence.worth - PLAIN_WORTH * self._plainness(found.cam_from_model) < self.options.least_worth:
             return None
         return None if self._has_rival(image, found) else found
 
@@ -159,6 +176,11 @@ class Snap:
             and aside_mm <= o.offset_limit * self._tracker.diameter_mm
         )
 
+    def _plainness(self, cam_from_model: Array) -> float:
+        """0–1: how few distinct lines the part shows from there; a box about 0.7."""
+        view = self._views.nearest(cam_from_model)
+        return max(1.0 - view_lines(view, self._views.diameter_mm) / (2.0 * PLAIN_LINES), 0.0)
+
     def _has_rival(self, image: NDArray[np.uint8], found: Snapped) -> bool:
         """Whether a much nearer pose around the found one fits about as well."""
         pose = found.cam_from_model @ self._tracker.part.model_from_body
@@ -171,30 +193,38 @@ class Snap:
         center = apply(rival.cam_from_model, self._center_in_model)
         return bool(np.linalg.norm(center) < NEARER * np.linalg.norm(pose[:3, 3]))
 
-    def _search(self, image: NDArray[np.uint8], around: Array, starts: list[Array], level: SearchLevel) -> list[Array]:
+    def _search(
+        self, image: NDArray[np.uint8], around: Array, starts: list[Array], level: SearchLevel, least: float = 0.0
+    ) -> list[Array]:
         """The best poses (``cam_from_body``) of a level's grid around starts, best first.
 
-        ``around`` says where in the picture and at what scale to look.
+        ``around`` says where in the picture and at what scale to look; poses that score less than ``least`` are
+        left out.
         """
+        if not starts or around[2, 3] <= 0:
+            return []
         maps = self._maps(image, around, level)
         if maps is None:
             return []
-        found: list[tuple[float, Array]] = []
-        for start in starts:
+
+        def search(start: Array) -> list[tuple[float, Array]]:
             scores, poses = score_around(
                 maps[0], self._tracker.part.arrays, start, maps[1], 0.01 * self._tracker.diameter_mm,
                 level.turns, level.stretches, level.shift_px, level.shift_step_px, 64, 32,
             )  # fmt: skip
-            best: list[Array] = []
+            best: list[tuple[float, Array]] = []
             for index in np.argsort(-scores)[:400]:
-                if not any(self._same(poses[index], other, level.apart_deg) for other in best):
-                    best.append(poses[index])
-                    found.append((float(scores[index]), poses[index]))
+                if not any(self._same(poses[index], other, level.apart_deg) for _, other in best):
+                    best.append((float(scores[index]), poses[index]))
                     if len(best) >= level.kept_each:
                         break
-        found.sort(key=lambda item: -item[0])
+            return best
+
+        found = sorted((item for best in _pool().map(search, starts) for item in best), key=lambda item: -item[0])
         apart: list[Array] = []
-        for _, pose in found:
+        for score, pose in found:
+            if score < least:
+                break
             if not any(self._same(pose, other, level.apart_deg) for other in apart):
                 apart.append(pose)
         return apart[: level.kept]
@@ -225,18 +255,27 @@ class Snap:
 
     def _best(self, image: NDArray[np.uint8], starts: list[Array]) -> Snapped | None:
         """The start that is worth most after refinement."""
+        if not starts:
+            return None
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        found: list[Snapped] = []
-        for start in starts:
+
+        def refine(start: Array) -> Snapped:
             pose = self._tracker.refine_fresh(image, gray, start, STAGES)
             look = self._tracker.fresh_appearance(image, pose)
             evidence = self._tracker.evidence(image, gray, pose, appearance=look)
             is_inside = evidence.points_in_picture >= self.options.min_in_picture
             quality = evidence.quality if is_inside else 0.0
-            found.append(Snapped(pose @ self._tracker.part.body_from_model, evidence, quality))
-        return max(found, key=lambda item: (item.quality > 0, item.evidence.worth), default=None)
+            return Snapped(pose @ self._tracker.part.body_from_model, evidence, quality)
+
+        return max(_pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.worth))
 
     def _same(self, a: Array, b: Array, angle_deg: float) -> bool:
         near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.01 * angle_deg * self._tracker.diameter_mm
         cosine = 0.5 * (float(np.sum(a[:3, :3] * b[:3, :3])) - 1.0)
         return bool(near and cosine > np.cos(np.deg2rad(angle_deg)))
+
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    """Threads for starts: the kernels release the interpreter."""
+    return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)), thread_name_prefix="snap")
