@@ -15,6 +15,7 @@ from arview.inspection import ComponentDeviation, Inspection, Verdict
 from arview.overlay import labels, paint
 from arview.overlay.edges import Edges
 from arview.overlay.ghost import CELL_PX, NEAR_MM, Ghost, GhostView, blend, count_cells
+from arview.overlay.guide import GuideOutline
 from arview.overlay.layout import LabelLayout, LabelRequest, PlacedLabel
 from arview.overlay.mesh import anchor_in_model, topology
 from arview.overlay.options import CONTEXT_RGB, NEUTRAL_RGB, VERDICT_RGB, OverlayOptions
@@ -64,6 +65,7 @@ class OverlayRenderer:
             [anchor_in_model(component, shape) for component, shape in zip(model.components, shapes, strict=True)]
         )
         self._line_px = max(1.0, 0.7 + camera.height / 800)
+        self._guide = GuideOutline(self._ghost, self._edges, self._line_px)
 
         size_px = labels.text_size_px(camera.height)
         self._size_px = size_px
@@ -100,7 +102,8 @@ class OverlayRenderer:
 
         Args:
             image: (H,W,3) uint8 RGB, of the camera's size.
-            pose: of this frame; without ``cam_from_model`` only the status line is drawn.
+            pose: of this frame; without ``cam_from_model`` only the status line is drawn, and the outline of its
+                ``guide_cam_from_model`` if it has one.
             fps: frames per second to show, if any.
             now: moment that the age of the inspection refers to; default: this moment.
             in_place: draw on the given image, which must be writable, instead of on a copy of it.
@@ -116,6 +119,8 @@ class OverlayRenderer:
         if pose.cam_from_model is None or view is None:
             self._layout.reset()
             self._was_seen.clear()
+            if pose.guide_cam_from_model is not None:
+                self._guide.draw(canvas, pose.guide_cam_from_model)
         else:
             self._draw_model(canvas, view, pose.cam_from_model, pose.state)
             self._draw_annotations(canvas, view, pose.cam_from_model)
