@@ -47,7 +47,15 @@ POSE = look_at([320.0, 30.0, 250.0], [30.0, 30.0, 5.0], [0.0, 0.0, 1.0])
 class FakeSession:
     """Stands still where it is told to, or at POSE; takes the time of a slow tracker when asked to."""
 
-    def __init__(self, views: Any, model: Any, camera: Any, options: Any, initial_cam_from_model: Any = None) -> None:
+    def __init__(
+        self,
+        views: Any,
+        model: Any,
+        camera: Any,
+        options: Any,
+        initial_cam_from_model: Any = None,
+        guide_cam_from_model: Any = None,
+    ) -> None:
         self.pose = POSE if initial_cam_from_model is None else initial_cam_from_model
         self.seconds = float(os.environ.get("FAKE_SESSION_S", "0"))
 

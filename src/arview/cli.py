@@ -229,11 +229,21 @@ Examples:
   arview annotate clip.mov --part housing.step --camera fov:65 --poses poses.jsonl
   arview annotate "shots/*.jpg" --part part.toml --camera exif --start 10 --end 200
   arview annotate rtsp://camera.local/1 --part part.toml --camera camera.json -o live.mp4
+  arview annotate 0 --part part.toml --camera fov:65 --init guide:iso -o live.mp4
+
+\b
+Without --init the part is searched for. --init POSE.json, {"cam_from_model": 4x4}, begins near that pose.
+--init guide:NAME draws the outline of a guide view over the video, and tracking begins when the part is
+brought within about 15 degrees and 15 % of it. NAME is a view of the part file ([guides.NAME]), or one of
+these as far as the declared range has them: front (camera at -Y), back (+Y), left (-X), right (+X),
+top (+Z), bottom (-Z), iso (front, right and above), middle (of the range); or a direction like
+az45_el30, with _d650 for the distance in mm and _r10 for the roll.
 
 \b
 CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt), fov:DEG
 (field of view along the longer side), or exif. Each line of a poses file is a JSON object: index, time_s,
-state, quality, cam_from_model (4x4 row-major, mm), covariance (6x6), ms.
+state, quality, cam_from_model (4x4 row-major, mm), covariance (6x6), ms, reason (why not tracked),
+mismatches.
 Ctrl-C ends the run and finishes the files.""",
 )
 @click.argument("source")
@@ -243,7 +253,7 @@ Ctrl-C ends the run and finishes the files.""",
 @click.option("--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are drawn.")
 @click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
 @click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
-@click.option("--init", "init_path", metavar="POSE.json", help='{"cam_from_model": 4x4} of the first frame.')
+@click.option("--init", metavar="WHERE", help="Pose of the first frame, or guide:NAME to align with; see below.")
 @click.option("--start", callback=_parse_moment, metavar="S", help="First frame: number, or seconds like 2.5s.")
 @click.option("--end", callback=_parse_moment, metavar="S", help="Where to stop: number, or seconds like 8s.")
 @click.option("--stride", type=click.IntRange(min=1), default=1, help="Take every N-th frame.", metavar="N")
@@ -265,7 +275,7 @@ def annotate(
     inspection_path: str | None,
     output: str | None,
     poses_path: str | None,
-    init_path: str | None,
+    init: str | None,
     start: int | float | None,
     end: int | float | None,
     stride: int,
@@ -290,12 +300,15 @@ def annotate(
     from arview.overlay import OverlayOptions, OverlayRenderer
     from arview.overlay.options import EdgeMode
     from arview.tracking import TrackingSession
+    from arview.tracking.guide import GUIDE_PREFIX, guide_pose
     from arview.video import VideoSink, open_source
 
     if output is None and poses_path is None:
         output = _default_output(source)
         _say(f"no -o or --poses given: writing {output}")
     part = load_part(part_path, unit)
+    guide_name = init.removeprefix(GUIDE_PREFIX) if init and init.startswith(GUIDE_PREFIX) else None
+    init_path = init if guide_name is None else None
     first_pose = _load_pose(init_path) if init_path else None
     inspection = load_inspection(inspection_path, part.model) if inspection_path else None
     inputs = [source, part.path, part.cad_path, views_path, camera_spec, inspection_path, init_path]
@@ -313,7 +326,12 @@ def annotate(
                     part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress
                 )
         session = TrackingSession(
-            views, part.model, camera, _session_options(modalities), initial_cam_from_model=first_pose
+            views,
+            part.model,
+            camera,
+            _session_options(modalities),
+            initial_cam_from_model=first_pose,
+            guide_cam_from_model=None if guide_name is None else guide_pose(guide_name, part, views, camera),
         )
         overlay = sink = None
         if video_path is not None:
@@ -345,6 +363,8 @@ def annotate(
 
 
 def _print_annotated(summary: AnnotateSummary, written: list[Path]) -> None:
+    from arview.pipeline import reasons_text
+
     if summary.ended_reason:
         _say(f"warning: {summary.ended_reason}")
     if summary.frames == 0:
@@ -359,9 +379,17 @@ def _print_annotated(summary: AnnotateSummary, written: list[Path]) -> None:
         f"{summary.frames} frames in {summary.seconds:.1f} s ({summary.fps:.1f} fps end to end, tracking "
         f"{tracking_ms:.1f} ms a frame): {states}{skipped}"
     )
+    for state, reasons in sorted(summary.reasons.items()):
+        click.echo(f"{state} {sum(reasons.values())} frames: {reasons_text(reasons)}")
 
 
 # --- evaluate -------------------------------------------------------------------------------------------
+
+
+def _parse_evaluate_init(ctx: click.Context, parameter: click.Parameter, value: str) -> str:
+    if value not in ("truth", "detect") and not value.startswith("guide:"):
+        raise click.BadParameter(f"{value!r}: expected truth, detect or guide:NAME")
+    return value
 
 
 @main.command(
@@ -376,8 +404,9 @@ Translation errors are those of the middle of the part's bounding box. Without a
 the range is what covers the scene's poses with a margin of 20 %.""",
 )
 @click.argument("scenes", nargs=-1, required=True, metavar="SCENE...")
-@click.option("--init", type=click.Choice(["truth", "detect"]), default="truth", show_default=True,
-              help="Start from the first reference pose, or find the part.")  # fmt: skip
+@click.option("--init", callback=_parse_evaluate_init, default="truth", show_default=True,
+              metavar="[truth|detect|guide:NAME]",
+              help="Start from the first reference pose, find the part, or wait for it at a guide view.")  # fmt: skip
 @click.option("--json", "json_path", metavar="OUT", help="Write the errors of every frame and the summary.")
 @click.option("--per-frame", is_flag=True, help="Print a line for every frame.")
 @click.option("--part", "part_path", metavar="PART", help="Part or CAD file; default: the dataset's model.")
@@ -404,7 +433,6 @@ def evaluate(
     """
     from arview.cad import load_part
     from arview.evaluation import evaluate_scene, find_scenes, format_result, load_scene, scene_guide_views
-    from arview.evaluation.run import Init
     from arview.guideviews import GuideViewOptions
 
     folders = [folder for path in scenes for folder in find_scenes(path)]
@@ -418,7 +446,7 @@ def evaluate(
         with _progress(f"{scene.name} guide views") as progress:
             views = scene_guide_views(scene, GuideViewOptions(renderer=renderer), progress)
         with _progress(scene.name) as progress:
-            result = evaluate_scene(scene, cast(Init, init), _session_options(modalities), views, progress)
+            result = evaluate_scene(scene, init, _session_options(modalities), views, progress)
         click.echo(format_result(result, per_frame))
         results.append(result.to_dict())
     if output is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import re
 import threading
 import time
 from collections import Counter
@@ -24,6 +25,8 @@ from arview.pose import Pose
 from arview.video import Frame, FrameSource, Image
 
 QUEUED_FRAMES = 3  # between tracking and drawing; 19 MB at 1080p
+MOST_REASONS = 4
+_NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 FPS_WINDOW_S = 1.0  # the rate on the picture is that of the last second
 
 
@@ -70,6 +73,7 @@ class AnnotateSummary:
         skipped: broken frames that the source left out.
         seconds: from the first frame asked for to the finished files.
         states: frames by tracking state.
+        reasons: frames by state and reason, of the frames that have one.
         ms: (F,) time of detection and tracking of each frame.
         ended_reason: why the source ended before its time, or empty.
         is_interrupted: stopped by Ctrl-C; the files hold what was done until then.
@@ -79,6 +83,7 @@ class AnnotateSummary:
     skipped: int
     seconds: float
     states: dict[str, int]
+    reasons: dict[str, dict[str, int]]
     ms: tuple[float, ...]
     ended_reason: str
     is_interrupted: bool
@@ -122,6 +127,7 @@ def annotate(
     poses: PoseWriter | None = None
     drawer: _Drawer | None = None
     states: Counter[str] = Counter()
+    reasons: dict[str, Counter[str]] = {}
     ms: list[float] = []
     is_interrupted = False
     began = time.perf_counter()
@@ -140,6 +146,8 @@ def annotate(
                 if poses is not None:
                     poses.write(pose)
                 states[str(pose.state)] += 1
+                if pose.reason:
+                    reasons.setdefault(str(pose.state), Counter())[pose.reason] += 1
                 ms.append(pose.ms)
                 if progress:
                     progress(len(ms), pose)
@@ -169,10 +177,31 @@ def annotate(
         skipped=source.skipped,
         seconds=time.perf_counter() - began,
         states=dict(states),
+        reasons={state: dict(counts) for state, counts in reasons.items()},
         ms=tuple(ms),
         ended_reason=source.ended_reason,
         is_interrupted=is_interrupted,
     )
+
+
+def reasons_text(reasons: dict[str, int]) -> str:
+    """The commonest reasons with their frames, e.g. ``too dark (80), only 8–12 % of the outline found (40)``.
+
+    Reasons that differ only in their numbers are one, with the span of those numbers.
+    """
+    counts: Counter[str] = Counter()
+    numbers: dict[str, list[list[str]]] = {}
+    for reason, count in reasons.items():
+        kind = _NUMBER.sub("{}", reason)
+        counts[kind] += count
+        numbers.setdefault(kind, []).append(_NUMBER.findall(reason))
+    texts = []
+    for kind, count in counts.most_common(MOST_REASONS):
+        spans = [sorted(set(column), key=float) for column in zip(*numbers[kind], strict=True)]
+        words = kind.format(*(s[0] if len(s) == 1 else f"{s[0]}–{s[-1]}" for s in spans))
+        texts.append(f"{words} ({count})")
+    others = counts.total() - sum(count for _, count in counts.most_common(MOST_REASONS))
+    return ", ".join([*texts, f"other ({others})"] if others else texts)
 
 
 class _Drawer:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,9 +19,8 @@ from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.tracking import SessionOptions, TrackingSession
+from arview.tracking.guide import GUIDE_PREFIX, guide_pose
 from arview.video import Image
-
-Init = Literal["truth", "detect"]
 
 COARSE = (50.0, 5.0)
 """5 cm / 5°: beyond it a pose is wrong."""
@@ -136,7 +135,7 @@ class SceneResult:
     """Frames and summary of one scene."""
 
     scene: str
-    init: Init
+    init: str
     reference: str
     frames: tuple[FrameResult, ...]
     summary: Summary
@@ -165,7 +164,7 @@ def scene_guide_views(
 
 def evaluate_scene(
     scene: Scene,
-    init: Init = "truth",
+    init: str = "truth",
     options: SessionOptions | None = None,
     views: GuideViewSet | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -176,14 +175,14 @@ def evaluate_scene(
     Args:
         scene: see `load_scene`.
         init: ``truth`` starts at the first frame with a reference pose, and from that pose; ``detect`` starts
-            at the first frame and finds the part.
+            at the first frame and finds the part; ``guide:NAME`` waits for it near a guide view.
         options: of the session.
         views: guide views of the part; None makes them with `scene_guide_views`.
         progress: called with (frames done, frames in all).
         make_session: makes the session from views, camera and first pose; None makes a TrackingSession.
 
     Raises:
-        InputError: ``truth`` without any reference pose; a picture that cannot be read.
+        InputError: ``truth`` without any reference pose; no such guide view; a picture that cannot be read.
     """
     frames = scene.frames
     first_pose = None
@@ -197,9 +196,12 @@ def evaluate_scene(
         first_pose = frames[0].cam_from_model
     views = views or scene_guide_views(scene)
     model = scene.part.model
+    guide = None
+    if init.startswith(GUIDE_PREFIX):
+        guide = guide_pose(init.removeprefix(GUIDE_PREFIX), scene.part, views, scene.camera)
     if make_session is None:
         session: Session = TrackingSession(
-            views, model, scene.camera, options or SessionOptions(), initial_cam_from_model=first_pose
+            views, model, scene.camera, options or SessionOptions(), first_pose, guide_cam_from_model=guide
         )
     else:
         session = make_session(views, scene.camera, first_pose)

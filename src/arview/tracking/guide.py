@@ -16,6 +16,8 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 
+GUIDE_PREFIX = "guide:"
+"""Before the name of a guide view where a pose could be meant as well."""
 STANDARD_GUIDES = (
     Guide("front", -90.0, 0.0),
     Guide("back", 90.0, 0.0),
