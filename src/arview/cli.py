@@ -318,9 +318,11 @@ def annotate(
     last = end if isinstance(end, int) else None
     with open_source(source, first, last, stride, fps) as frames:
         camera = _camera_for(frames, camera_spec, source)
-        if views_path:
-            views = load_guide_views(Path(views_path), part.model)
-        else:
+        views = load_guide_views(Path(views_path), part.model) if views_path else None
+        guide = None
+        if guide_name is not None:
+            guide = guide_pose(guide_name, part, views.view_range if views else part.effective_view_range, camera)
+        if views is None:
             with _progress("guide views") as progress:
                 views = cached_guide_views(
                     part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress
@@ -331,7 +333,7 @@ def annotate(
             camera,
             _session_options(modalities),
             initial_cam_from_model=first_pose,
-            guide_cam_from_model=None if guide_name is None else guide_pose(guide_name, part, views, camera),
+            guide_cam_from_model=guide,
         )
         overlay = sink = None
         if video_path is not None:

@@ -198,7 +198,7 @@ def evaluate_scene(
     model = scene.part.model
     guide = None
     if init.startswith(GUIDE_PREFIX):
-        guide = guide_pose(init.removeprefix(GUIDE_PREFIX), scene.part, views, scene.camera)
+        guide = guide_pose(init.removeprefix(GUIDE_PREFIX), scene.part, views.view_range, scene.camera)
     if make_session is None:
         session: Session = TrackingSession(
             views, model, scene.camera, options or SessionOptions(), first_pose, guide_cam_from_model=guide

@@ -14,7 +14,6 @@ from arview.cad.viewpoint import Viewpoint, pose_at
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.guideviews import GuideViewSet
 
 GUIDE_PREFIX = "guide:"
 """Before the name of a guide view where a pose could be meant as well."""
@@ -46,20 +45,19 @@ def guide_names(part: Part, view_range: ViewRange) -> list[str]:
     return own + [name for name in [*standard, MIDDLE] if name not in own]
 
 
-def guide_pose(name: str, part: Part, views: GuideViewSet, camera: Camera) -> Array:
+def guide_pose(name: str, part: Part, view_range: ViewRange, camera: Camera) -> Array:
     """``cam_from_model`` (4,4) of a guide view, the part's middle in the middle of the picture.
 
     Args:
         name: of the part file (``[guides.NAME]``), a standard name, ``middle``, or a direction like
             ``az45_el30``, with ``_d650`` for the distance in mm and ``_r10`` for the roll in degrees if wanted.
         part: whose guides are meant.
-        views: of the same part; their declared range counts.
+        view_range: declared for the guide views in use.
         camera: that will look.
 
     Raises:
         InputError: no such guide view, or one outside the declared range.
     """
-    view_range = views.view_range
     guide = _find(name, part, view_range)
     placed = _in_range(guide, view_range)
     if placed is None:
@@ -71,7 +69,7 @@ def guide_pose(name: str, part: Part, views: GuideViewSet, camera: Camera) -> Ar
     low, high = view_range.distance_mm
     distance_mm = placed.distance_mm
     if distance_mm is None:
-        wanted = views.diameter_mm * camera.fx / (FILL * min(camera.width, camera.height))
+        wanted = part.model.diameter_mm * camera.fx / (FILL * min(camera.width, camera.height))
         # Off the ends of the range, so that there is room to bring the part nearer and farther.
         middle = np.sqrt(low * high)
         distance_mm = float(np.clip(wanted, min(ROOM * low, middle), max(high / ROOM, middle)))
@@ -82,7 +80,7 @@ def guide_pose(name: str, part: Part, views: GuideViewSet, camera: Camera) -> Ar
     ray = camera.unproject([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])
     roll_deg = placed.roll_deg if placed.roll_deg is not None else _usual_roll_deg(view_range)
     place = Viewpoint(distance_mm, placed.elevation_deg, placed.azimuth_deg, roll_deg)
-    return pose_at(place, views.center_in_model, ray)
+    return pose_at(place, part.model.center_in_model, ray)
 
 
 def _find(name: str, part: Part, view_range: ViewRange) -> Guide:
