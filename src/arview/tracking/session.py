@@ -191,7 +191,7 @@ class TrackingSession:
         self._poor = self._poor + 1 if poor else 0
         if self._poor >= o.lost_frames or (poor and not self._confirmed):
             recent = (self._recent[0], self._recent[1]) if len(self._recent) == 2 else None
-            return self._lose(why_lost(estimate, recent, self.camera, self._views, is_possible))
+            return self._lose(why_lost(image, estimate, recent, self.camera, self._views, is_possible))
         if not poor:
             self._recent = [*self._recent[-1:], estimate.cam_from_model]
         was_tracked = self.state == TrackingState.TRACKED

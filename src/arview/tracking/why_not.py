@@ -40,8 +40,11 @@ POLE_DEG = 80.0
 """From this elevation on roll and azimuth say the same."""
 LEFT_SHARE = 0.7
 """With less of the outline inside the picture when it is lost, the part has left it."""
-FAST = 0.12
-"""A motion of this share of the part's diameter between frames is fast."""
+LEAVING_SHARE, SOON_FRAMES = 0.95, 5
+"""With less than this share, if the middle will be outside so many frames later, it is leaving it."""
+FAST, SLOW = 0.07, 0.02
+"""Motions from frame to frame in diameters of the part: so fast that it is hard to follow, and hardly any."""
+BLURRED = "blurred"
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ def poor_picture(image: NDArray[np.uint8]) -> str:
     widths_px = edge_widths_px(np.asarray(gray))
     if np.all(np.isnan(widths_px)):
         return "low contrast: hardly an edge in the picture"
-    return "blurred" if np.nanmax(widths_px) > BLURRED_PX else ""
+    return BLURRED if np.nanmax(widths_px) > BLURRED_PX else ""
 
 
 def edge_widths_px(gray: NDArray[np.uint8]) -> Array:
@@ -156,12 +159,18 @@ def outside_range(place: Viewpoint, view_range: ViewRange, is_fitting: bool) -> 
 
 
 def why_lost(
-    estimate: Estimate, recent: tuple[Array, Array] | None, camera: Camera, views: GuideViewSet, is_possible: bool
+    image: NDArray[np.uint8],
+    estimate: Estimate,
+    recent: tuple[Array, Array] | None,
+    camera: Camera,
+    views: GuideViewSet,
+    is_possible: bool,
 ) -> str:
     """Why tracking ended.
 
     Args:
-        estimate: of the last frame, which is not believed.
+        image: (H,W,3) uint8 RGB, the last frame.
+        estimate: of that frame, which is not believed.
         recent: the last two poses (4,4) that were believed, older first, if there are two.
         camera, views: of the session.
         is_possible: the estimate is in front of the camera and near the declared distances.
@@ -169,28 +178,35 @@ def why_lost(
     center = apply(estimate.cam_from_model, views.center_in_model)
     if not is_possible and center[2] > 0:
         return outside_range(viewpoint(estimate.cam_from_model, views.center_in_model), views.view_range, False)
-    if estimate.evidence.points_in_picture < LEFT_SHARE or center[2] <= 0:
-        edge = _edge_of_picture(camera, center)
-        return f"the part left the picture at the {edge} edge" if edge else "the part left the picture"
-    if recent is not None and _motion(*recent, views) > FAST:
+    step_px, share = _motion(camera, views, recent) if recent is not None else (np.zeros(2), None)
+    in_picture = estimate.evidence.points_in_picture
+    if center[2] <= 0 or in_picture < LEFT_SHARE:
+        edge = "" if center[2] <= 0 else f" at the {_edge_of_picture(camera, camera.project(center))[0]} edge"
+        return f"the part left the picture{edge}"
+    edge, beyond_px = _edge_of_picture(camera, camera.project(center) + SOON_FRAMES * step_px)
+    if in_picture < LEAVING_SHARE and beyond_px > 0:
+        return f"the part left the picture at the {edge} edge"
+    poor = poor_picture(image)
+    if poor == BLURRED or (share is not None and share > FAST):
         return "the part moved too fast"
-    return "the part is hidden or moved too fast"
+    if poor:
+        return poor
+    return "the part is hidden" if share is not None and share < SLOW else "the part is hidden or moved too fast"
 
 
-def _motion(before: Array, after: Array, views: GuideViewSet) -> float:
-    """Motion of the part's middle across the line of sight, in diameters."""
-    a, b = (apply(pose, views.center_in_model) for pose in (before, after))
-    across_mm = np.linalg.norm(b[:2] - a[:2] * b[2] / max(a[2], 1.0))
-    return float(across_mm / views.diameter_mm)
+def _motion(camera: Camera, views: GuideViewSet, recent: tuple[Array, Array]) -> tuple[Array, float]:
+    """Motion of the part's middle from one frame to the next: (2,) px, and its size in diameters of the part."""
+    before, after = (apply(pose, views.center_in_model) for pose in recent)
+    step_px = camera.project(after) - camera.project(before)
+    return step_px, float(np.linalg.norm(step_px) / _span_px(camera, views, float(after[2])))
 
 
-def _edge_of_picture(camera: Camera, center_in_cam: Array) -> str:
-    """The edge of the picture that a point is nearest to or beyond; empty behind the camera."""
-    if center_in_cam[2] <= 0:
-        return ""
-    u, v = camera.project(center_in_cam)
-    beyond = {"left": -u, "right": u - camera.width, "upper": -v, "lower": v - camera.height}
-    return max(beyond, key=lambda name: beyond[name])
+def _edge_of_picture(camera: Camera, pixel: Array) -> tuple[str, float]:
+    """The edge of the picture that a pixel (2,) is nearest to, and how far it is beyond, negative when inside."""
+    u, v = pixel
+    beyond_px = {"left": -u, "right": u - camera.width, "upper": -v, "lower": v - camera.height}
+    edge = max(beyond_px, key=lambda name: beyond_px[name])
+    return edge, float(beyond_px[edge])
 
 
 def _span_px(camera: Camera, views: GuideViewSet, distance_mm: float) -> float:
@@ -213,7 +229,7 @@ def _partly_outside(camera: Camera, views: GuideViewSet, rejected: Rejected) -> 
         return ""
     if _span_px(camera, views, float(center[2])) > 1.2 * max(camera.width, camera.height):
         return "too near: the part does not fit in the picture"
-    edge = _edge_of_picture(camera, center)
+    edge, _ = _edge_of_picture(camera, camera.project(center))
     return f"partly outside the picture at the {edge} edge"
 
 
