@@ -23,6 +23,7 @@ import arview.evaluation.run
 import arview.tracking
 from arview import __version__
 from arview.cad import load_part
+from arview.cad.viewpoint import viewpoint
 from arview.cli import main
 from arview.geometry import look_at
 from arview.inspection import Inspection, Provenance, save_inspection
@@ -170,6 +171,33 @@ def test_annotate_takes_a_part_of_the_frames_and_a_first_pose(room: Path) -> Non
     assert [line["index"] for line in lines] == [4, 6, 8]
 
 
+def test_annotate_aligns_with_a_guide_view(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (room / "part.toml").read_text()
+    (room / "part.toml").write_text(text + "[guides.start]\nazimuth_deg = 5.0\nelevation_deg = 40.0\n")
+    guides: list[Any] = []
+
+    class Waiting(FakeSession):
+        """Waits for the part, in the dark now and then."""
+
+        def __init__(self, *arguments: Any, guide_cam_from_model: Any = None, **others: Any) -> None:
+            guides.append(guide_cam_from_model)
+            super().__init__(*arguments, **others)
+
+        def process(self, image: object, index: int, time_s: float) -> Pose:
+            reason = "too dark" if index % 3 == 0 else f"only {index} % of the outline found"
+            return Pose(None, None, 0.0, TrackingState.SEARCHING, time_s, index, 1.0, reason, (), guides[-1])
+
+    monkeypatch.setattr(arview.tracking, "TrackingSession", Waiting)
+    for name, azimuth_deg, elevation_deg in (("start", 5.0, 40.0), ("az-10_el50_d400", -10.0, 50.0)):
+        result = run("annotate", "clip.mp4", *ANNOTATE, "--init", f"guide:{name}", "-o", "out.mp4")
+        assert result.exit_code == 0, result.output
+        found = viewpoint(guides[-1], [30.0, 30.0, 5.0])
+        assert (found.azimuth_deg, found.elevation_deg) == pytest.approx((azimuth_deg, elevation_deg))
+        assert "searching 12 frames: only 1 to 11 % of the outline found (8), too dark (4)" in result.stdout
+    for name, word in (("strat", "did you mean 'start'"), ("front", "outside the declared range")):
+        refused(run("annotate", "clip.mp4", *ANNOTATE, "--init", f"guide:{name}", "--poses", "p.jsonl"), name, word)
+
+
 def test_guideviews_are_written_and_used(room: Path) -> None:
     options = ("--renderer", "zbuffer", "--component", "brick", "--preview", "sheet.png")
     result = run("guideviews", "part.toml", "-o", "set.bin", *options)
@@ -214,6 +242,10 @@ def test_evaluate_prints_errors_and_writes_them(room: Path) -> None:
     (scene,) = json.loads((room / "out.json").read_text())["scenes"]
     assert [frame["error"]["translation_mm"] for frame in scene["frames"]] == pytest.approx([0, 1, 2], abs=1e-9)
     assert scene["summary"]["errors"]["translation_mm"]["max"] == pytest.approx(2.0)
+    result = run("evaluate", "set/brick", "--init", "guide:middle", "--renderer", "zbuffer")
+    assert result.exit_code == 0, result.output
+    assert "from guide:middle" in result.stdout
+    refused(run("evaluate", "set/brick", "--init", "guide:nowhere", "--renderer", "zbuffer"), "nowhere", "middle")
 
 
 # --- Bad input ------------------------------------------------------------------------------------------

@@ -185,21 +185,22 @@ def annotate(
 
 
 def reasons_text(reasons: dict[str, int]) -> str:
-    """The commonest reasons with their frames, e.g. ``too dark (80), only 8–12 % of the outline found (40)``.
+    """The commonest reasons with their frames, e.g. ``too dark (80), only 8 to 12 % of the outline found (40)``.
 
     Reasons that differ only in their numbers are one, with the span of those numbers.
     """
     counts: Counter[str] = Counter()
     numbers: dict[str, list[list[str]]] = {}
     for reason, count in reasons.items():
-        kind = _NUMBER.sub("{}", reason)
+        kind = _NUMBER.sub("\0", reason)
         counts[kind] += count
         numbers.setdefault(kind, []).append(_NUMBER.findall(reason))
     texts = []
     for kind, count in counts.most_common(MOST_REASONS):
-        spans = [sorted(set(column), key=float) for column in zip(*numbers[kind], strict=True)]
-        words = kind.format(*(s[0] if len(s) == 1 else f"{s[0]}–{s[-1]}" for s in spans))
-        texts.append(f"{words} ({count})")
+        for column in zip(*numbers[kind], strict=True):
+            low, high = min(column, key=float), max(column, key=float)
+            kind = kind.replace("\0", low if low == high else f"{low} to {high}", 1)
+        texts.append(f"{kind} ({count})")
     others = counts.total() - sum(count for _, count in counts.most_common(MOST_REASONS))
     return ", ".join([*texts, f"other ({others})"] if others else texts)
 

@@ -25,8 +25,8 @@ DARK, BRIGHT = 40, 250
 BLURRED_PX = 2.5
 """Deviation of the blur, in a picture WIDTH_PX wide, from which on detection fails."""
 FEWEST_EDGES = 10
-STEP_LEVELS = 25.0
-"""Edges of fewer grey levels do not say how sharp the picture is."""
+STEP_SHARE, STEP_LEVELS = 0.12, 10.0
+"""Edges lower than this share of the brightest grey, or so many grey levels, do not say how sharp a picture is."""
 LEAST_QUALITY = 0.06
 """Hypotheses of less quality are found in any clutter."""
 FITTING_QUALITY = 0.5
@@ -42,8 +42,8 @@ LEFT_SHARE = 0.7
 """With less of the outline inside the picture when it is lost, the part has left it."""
 LEAVING_SHARE, SOON_FRAMES = 0.95, 5
 """With less than this share, if the middle will be outside so many frames later, it is leaving it."""
-FAST, SLOW = 0.07, 0.02
-"""Motions from frame to frame in diameters of the part: so fast that it is hard to follow, and hardly any."""
+FAST = 0.07
+"""A motion from frame to frame of so many diameters of the part is hard to follow."""
 BLURRED = "blurred"
 
 
@@ -103,12 +103,14 @@ def edge_widths_px(gray: NDArray[np.uint8]) -> Array:
     slopes at two smoothings says σ whatever the step's height: Zhuo & Sim, "Defocus map estimation from a single
     image" (Pattern Recognition 2011). Edges are judged by their height, so a plain background counts for nothing,
     and by direction, since motion blurs only the edges across it. Where wide blur leaves too few edges, they are
-    looked for at half the size.
+    looked for at half and a quarter of the size.
     """
     widths = _widths_px(gray)
-    if np.any(np.isnan(widths)):
-        half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        widths = np.where(np.isnan(widths), 2.0 * _widths_px(np.asarray(half)), widths)
+    for shrinking in (2, 4):
+        if not np.any(np.isnan(widths)):
+            break
+        small = cv2.resize(gray, None, fx=1 / shrinking, fy=1 / shrinking, interpolation=cv2.INTER_AREA)
+        widths = np.where(np.isnan(widths), shrinking * _widths_px(np.asarray(small)), widths)
     return widths
 
 
@@ -119,12 +121,13 @@ def _widths_px(gray: NDArray[np.uint8]) -> Array:
     for sigma_px in (fine_px, coarse_px):
         smooth = cv2.GaussianBlur(picture, (0, 0), sigma_px)
         slopes.append([np.abs(cv2.Sobel(smooth, cv2.CV_32F, *axis, ksize=3)) / 8.0 for axis in ((1, 0), (0, 1))])
+    lowest = max(STEP_SHARE * float(np.percentile(gray, 95)), STEP_LEVELS)
     widths = np.full(2, np.nan)
     for axis in (0, 1):
         coarse, across = slopes[1][axis], slopes[1][1 - axis]
         height = coarse * np.sqrt(2.0 * np.pi) * coarse_px
-        is_peak = (coarse >= cv2.dilate(coarse, np.ones((7, 7), np.uint8))) & (coarse > across)
-        rows, columns = np.nonzero(is_peak & (height > STEP_LEVELS))
+        is_peak = (coarse >= cv2.dilate(coarse, np.ones((7, 7), np.uint8))) & (coarse > 1.5 * across)
+        rows, columns = np.nonzero(is_peak & (height > lowest))
         if len(rows) < FEWEST_EDGES:
             continue
         fine = cv2.dilate(slopes[0][axis], np.ones((9, 9), np.uint8))
@@ -191,7 +194,7 @@ def why_lost(
         return "the part moved too fast"
     if poor:
         return poor
-    return "the part is hidden" if share is not None and share < SLOW else "the part is hidden or moved too fast"
+    return "the part is hidden or moved too fast"
 
 
 def _motion(camera: Camera, views: GuideViewSet, recent: tuple[Array, Array]) -> tuple[Array, float]:
