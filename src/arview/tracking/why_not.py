@@ -24,7 +24,7 @@ DARK, BRIGHT = 40, 250
 """Grey levels: nineteen in twenty pixels darker; half of them brighter."""
 BLURRED_PX = 2.5
 """Deviation of the blur, in a picture WIDTH_PX wide, from which on detection fails."""
-FEWEST_EDGES = 10
+FEWEST_EDGES = 6
 STEP_SHARE, STEP_LEVELS = 0.12, 10.0
 """Edges lower than this share of the brightest grey, or so many grey levels, do not say how sharp a picture is."""
 LEAST_QUALITY = 0.06
