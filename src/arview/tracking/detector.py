@@ -1,13 +1,14 @@
 """Detector: finds the part in a single frame from its guide views, with no pose to start from.
 
-Candidates come from template matching over directions, rolls and distances of the declared range; the picture is
-resized for every distance so that the part always spans the same few pixels and one bank of templates serves all.
-The best candidates are refined by the tracker's edge modality and judged by the same evidence as a tracked pose.
+Coarse to fine: templates over all directions, rolls, distances and places (`templates`); pattern search around the
+best of them on response maps of growing resolution (`climb`); the tracker's edges and colours from the best of
+those; and the same evidence as for a tracked pose. At each level fewer hypotheses are left and each costs more.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,13 +21,13 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.guideviews import GuideViewSet
-from arview.guideviews.mesh_edges import EDGE_CONTOUR
-from arview.guideviews.sphere import icosphere_directions
 from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
-from arview.tracking.matching import decimate, match_templates, orientation_bins, response_maps, score_around
-from arview.tracking.quality import RIGHT_WORTH, quality_of
-from arview.tracking.solver import project_lines
+from arview.tracking.climb import climb
+from arview.tracking.matching import response_maps
+from arview.tracking.quality import RIGHT_WORTH, Evidence, quality_of
+from arview.tracking.templates import choose_apart, decimate, make_bank, match_templates
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions, intrinsics_of, smoothed
+from arview.tracking.why_not import Rejected
 
 
 def _coarse_stages(region_gain: float) -> tuple[Stage, ...]:
@@ -40,7 +41,7 @@ def _coarse_stages(region_gain: float) -> tuple[Stage, ...]:
 
 COARSE_STAGES: tuple[tuple[Stage, ...], ...] = ((), _coarse_stages(1.0), _coarse_stages(20.0))
 """Tries from every start: it is near enough already; edges lead; colours lead, on plain and glossy parts."""
-LOWEST_SCORE = 0.25
+LOWEST_SCORE = 0.3
 """Template matches below this are noise."""
 HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
@@ -59,36 +60,39 @@ FINE_STAGES = (
 )
 
 
-def _turn_grid(reach_deg: float, step_deg: float) -> Array:
-    """(R,3,3) rotations on a grid of rotation vectors inside a ball."""
-    axis = np.arange(-reach_deg, reach_deg + 0.5 * step_deg, step_deg)
-    vectors = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    vectors = vectors[np.linalg.norm(vectors, axis=1) <= 1.3 * reach_deg]
-    return np.stack([exp_so3(np.deg2rad(v)) for v in vectors])
+STEPS_PER_OCTAVE = 4
+"""Scales at which response maps are made: the distances of the templates, shared by all levels of the search."""
+LARGEST_SCALE = 1.5
+"""The picture is not enlarged more than this."""
 
 
 @dataclass(frozen=True)
-class SearchGrid:
-    """Poses tried around a pose: turns (R,3,3), factors of the distance (D,), and how sharply they are looked at.
+class Level:
+    """One level of the pattern search.
 
-    ``magnification`` is the part's size against that of the templates, ``kept_each`` and ``kept`` how many of the
-    best are kept around one pose and in all, apart from each other by ``apart_deg``.
+    Attributes:
+        magnification: the part's size against that of the templates.
+        turn_step_deg, stretch_step: first steps of rotations and of the distance as a share.
+        rounds, halvings: see `climb`.
+        kept: hypotheses left afterwards; apart_deg: no two nearer than this.
+        points: of outline and, as many, of design edges that are looked at.
     """
 
-    turns: Array
-    stretches: Array
     magnification: float
-    kept_each: int
+    turn_step_deg: float
+    stretch_step: float
+    rounds: int
+    halvings: int
     kept: int
     apart_deg: float
+    points: int
 
 
-NEAR_GRID = SearchGrid(_turn_grid(9.0, 4.5), np.array([0.93, 0.965, 1.0, 1.035, 1.07]), 2.0, 2, 10, 4.0)
-"""Between the templates of the first search."""
-WIDE_GRID = SearchGrid(_turn_grid(16.0, 4.0), np.array([0.92, 0.96, 1.0, 1.04, 1.08]), 2.0, 10, 10, 4.0)
-"""Around a pose given by hand or a guess."""
-FINE_GRID = SearchGrid(_turn_grid(3.0, 1.5), np.array([0.976, 0.988, 1.0, 1.012, 1.024]), 4.0, 1, 10, 1.5)
-"""Between the poses of the grids above."""
+LEVELS = (
+    Level(1.0, 7.0, 0.07, 2, 0, 90, 6.0, 48),
+    Level(2.0, 4.0, 0.035, 2, 0, 24, 4.0, 64),
+    Level(4.0, 2.0, 0.017, 2, 1, 8, 2.5, 96),
+)
 
 
 @dataclass(frozen=True)
@@ -96,26 +100,29 @@ class DetectorOptions:
     """Options of the detector.
 
     Attributes:
-        radius_px: half the part's diameter in the resized picture.
-        points: per template.
-        roll_step_deg, distance_ratio: spacing of the templates; the spread of the responses covers half of it.
-        subdivisions: icosahedron level of the template directions (3: 642, about 9° apart).
-        refined: template matches that are searched around.
-        likeliest: of those, how many are tried first, and alone if they settle the matter.
-        finalists: how many of either are refined to the end.
+        radius_px: half the part's diameter in the templates.
+        points: per template, a multiple of 4.
+        roll_step_deg: spacing of the templates.
+        subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
+        spread_px: how far edges may lie from where the template has them.
+        grid_px: places looked at are so far apart.
+        matches: template matches kept at each distance.
+        starts: of those, how many places apart from each other are searched around.
+        levels: of that search.
+        finalists: how many of its results are refined to the end.
         min_in_picture: less of the outline inside the picture is no detection.
         min_quality: a weaker result is no detection.
     """
 
     radius_px: float = 26.0
     points: int = 64
-    roll_step_deg: float = 12.0
-    distance_ratio: float = 1.16
-    subdivisions: int = 3
+    roll_step_deg: float = 18.0
+    subdivisions: int = 2
     spread_px: int = 2
     grid_px: int = 2
-    refined: int = 14
-    likeliest: int = 6
+    matches: int = 600
+    starts: int = 300
+    levels: tuple[Level, ...] = LEVELS
     finalists: int = 5
     min_quality: float = 0.5
     min_in_picture: float = 0.4
@@ -123,30 +130,8 @@ class DetectorOptions:
     def __post_init__(self) -> None:
         if not 10 <= self.radius_px <= 60:
             raise InputError(f"detector: radius_px = {self.radius_px}, expected 10 to 60")
-
-
-BROAD_OPTIONS = DetectorOptions(
-    radius_px=16.0,
-    points=48,
-    roll_step_deg=18.0,
-    distance_ratio=1.22,
-    subdivisions=2,
-    refined=40,
-    likeliest=8,
-)
-"""For ranges up to the full sphere at all rolls: fewer and coarser templates, more of them searched around."""
-MOST_MATCHES = 6000
-"""More templates times distances than this make a range broad."""
-
-
-def options_for(views: GuideViewSet) -> DetectorOptions:
-    """The options that suit the declared range."""
-    usual = DetectorOptions()
-    view_range = views.view_range
-    directions = np.count_nonzero(view_range.contains_direction(icosphere_directions(usual.subdivisions), 3.0))
-    rolls = len(view_range.rolls_deg(usual.roll_step_deg))
-    matches = directions * rolls * len(view_range.distances_mm(usual.distance_ratio))
-    return usual if matches <= MOST_MATCHES else BROAD_OPTIONS
+        if self.points < 20 or self.points % 4:
+            raise InputError(f"detector: points = {self.points}, expected a multiple of 4 from 20 on")
 
 
 @dataclass(frozen=True)
@@ -168,80 +153,74 @@ class Detection:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A template match: score 0–1 and the pose it stands for, about the model's centre."""
+    """A hypothesis: score for comparing, and the pose it stands for, about the model's centre."""
 
     score: float
     cam_from_body: Array
 
 
+class _Picture:
+    """A frame with what was made from it: response maps by scale, kept until the frame is done with."""
+
+    def __init__(self, image: NDArray[np.uint8], camera: Camera, spread_px: int, pad_px: int) -> None:
+        self.image = image
+        self.gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        self.pad_px = pad_px
+        self._camera, self._spread_px = camera, spread_px
+        self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
+
+    def make(self, steps: Sequence[int]) -> None:
+        """Make the maps of several scales at once."""
+        missing = [step for step in dict.fromkeys(steps) if step not in self._maps]
+        self._maps.update(zip(missing, _pool().map(self._make, sorted(missing, reverse=True)), strict=True))
+
+    def maps(self, step: int) -> tuple[NDArray[np.uint8], Array]:
+        """Response maps (8,H,W) at a scale, padded, and the intrinsics (10,) that belong to them."""
+        if step not in self._maps:
+            self._maps[step] = self._make(step)
+        return self._maps[step]
+
+    def _make(self, step: int) -> tuple[NDArray[np.uint8], Array]:
+        camera = self._camera
+        scale = 2.0 ** (step / STEPS_PER_OCTAVE)
+        width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
+        way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        image = self.image if scale == 1.0 else np.asarray(cv2.resize(self.image, (width, height), interpolation=way))
+        intrinsics = intrinsics_of(camera.scaled(width, height))
+        intrinsics[2:4] += self.pad_px
+        return response_maps(image, self._spread_px, self.pad_px), intrinsics
+
+
 class Detector:
-    """Detection of one part with one camera over the declared range of its guide views."""
+    """Detection of one part with one camera over the declared range of its guide views.
+
+    ``best_rejected`` is the best hypothesis of the last frame when nothing was found, for `why_not`.
+    """
 
     def __init__(self, views: GuideViewSet, camera: Camera, options: DetectorOptions | None = None) -> None:
-        self.options = options or options_for(views)
+        self.options = o = options or DetectorOptions()
         self.views = views
         self.camera = camera
+        self.best_rejected: Rejected | None = None
         self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
-        self._make_templates()
+        self.bank = make_bank(
+            views, self.tracker.part.model_from_body, o.radius_px, o.points, o.roll_step_deg, o.subdivisions
+        )
+        self._focal = 0.5 * (camera.fx + camera.fy)
+        # Scale steps of the templates, large distances (large pictures) first.
+        low, high = views.view_range.distance_mm
+        near, far = self._step_at(low), self._step_at(high)
+        top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
+        self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
         self._lines: dict[int, float] = {}
         looked_at = range(0, len(views), max(1, len(views) // 50))
         lines = [view_lines(views.view(i), views.diameter_mm) for i in looked_at]
         self._telling_lines = 0.7 * float(np.percentile(lines, 75))
 
-    def _make_templates(self) -> None:
-        o = self.options
-        wanted = icosphere_directions(o.subdivisions)
-        inside = self.views.view_range.contains_direction(wanted, 3.0)
-        if not inside.any():
-            chosen = np.arange(len(self.views))
-        else:
-            chosen = np.unique(np.argmax(wanted[inside] @ self.views.directions.T, axis=1))
-        rolls = np.deg2rad(self.views.view_range.rolls_deg(o.roll_step_deg))
-        focal = 1000.0
-        # Normalised camera: the bounding sphere has radius_px.
-        template_scale = o.radius_px / (0.5 * self.views.diameter_mm)
-        offsets = np.zeros((len(chosen) * len(rolls), o.points, 2), dtype=np.int32)
-        bins = np.zeros((len(chosen) * len(rolls), o.points), dtype=np.uint8)
-        counts = np.zeros(len(chosen) * len(rolls), dtype=np.int32)
-        origins = np.zeros((len(counts), 2))
-        rotations = np.zeros((len(counts), 3, 3))
-        intrinsics = np.array([focal, focal, 0.0, 0.0, 0, 0, 0, 0, 0, 0])
-        row = 0
-        for index in chosen:
-            view = self.views.view(int(index))
-            features = view.features
-            cam_from_body = view.cam_from_model @ self.tracker.part.model_from_body
-            center = self.views.center_in_model
-            contour, normals = features.contour_points - center, features.contour_normals
-            edges, tangents = features.edge_points - center, features.edge_tangents
-            distance = cam_from_body[2, 3]
-            c_px, c_n, c_z = project_lines(contour, normals, False, cam_from_body, intrinsics, 0.5)
-            inner = (features.edge_kinds & EDGE_CONTOUR) == 0
-            e_px, e_n, e_z = project_lines(edges[inner], tangents[inner], True, cam_from_body, intrinsics, 0.5)
-            c_px, c_n = c_px[c_z > 0], c_n[c_z > 0]
-            e_px, e_n = e_px[e_z > 0], e_n[e_z > 0]
-            inner_count = min(len(e_px), int(0.35 * o.points))
-            outer_count = min(len(c_px), o.points - inner_count)
-            if outer_count < 8:
-                continue
-            px = np.concatenate([c_px[_spread(len(c_px), outer_count)], e_px[_spread(len(e_px), inner_count)]])
-            n = np.concatenate([c_n[_spread(len(c_n), outer_count)], e_n[_spread(len(e_n), inner_count)]])
-            px *= distance / focal * template_scale
-            for roll in rolls:
-                c, s = np.cos(roll), np.sin(roll)
-                turn = np.array([[c, -s], [s, c]])
-                p, q = px @ turn.T, n @ turn.T
-                low = np.floor(p.min(axis=0))
-                origins[row] = -low
-                offsets[row, : len(p)] = np.round(p - low)
-                bins[row, : len(p)] = orientation_bins(q)
-                counts[row] = len(p)
-                rotations[row] = rigid(exp_so3([0, 0, roll]), np.zeros(3))[:3, :3] @ cam_from_body[:3, :3]
-                row += 1
-        if row == 0:
-            raise InputError("guide views: no view shows an outline; check the model and the declared distances")
-        self._offsets, self._bins, self._counts = offsets[:row], bins[:row], counts[:row]
-        self._origins, self._rotations = origins[:row], rotations[:row]
+    def _step_at(self, distance_mm: float, magnification: float = 1.0) -> float:
+        """Scale step at which the part at a distance has the size of the templates, times the magnification."""
+        radius_px = self._focal * 0.5 * self.views.diameter_mm / distance_mm
+        return STEPS_PER_OCTAVE * float(np.log2(magnification * self.options.radius_px / radius_px))
 
     def detect(self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True) -> list[Detection]:
         """Poses of the part in a frame, best first; an empty list when it is not found.
@@ -249,21 +228,12 @@ class Detector:
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             max_results: at most so many, all above the quality threshold and apart from each other.
-            is_thorough: look at the less likely template matches too when the likeliest come to nothing at all.
+            is_thorough: look at the less likely hypotheses too when the likeliest come to nothing at all.
         """
         o = self.options
-        gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        candidates = self.candidates(image)
-        maps: dict[int, tuple[NDArray[np.uint8], Array] | None] = {}
-        settled: list[tuple[float, Array]] = []
-        # The likeliest first: when they settle the matter, the others are not looked at.
-        for batch in (candidates[: o.likeliest], candidates[o.likeliest :]):
-            near = self._sharpen(image, batch, NEAR_GRID, maps)
-            settled += self._settle(image, gray, self._sharpen(image, near, FINE_GRID, maps))
-            settled.sort(key=lambda item: -self._rank(*item))
-            hopeless = not settled or self._quality(*settled[0]) < HOPELESS_QUALITY
-            if (hopeless and not is_thorough) or (settled and self._is_sure(settled[0][1], self._quality(*settled[0]))):
-                break
+        picture = self._picture(image)
+        likely = self.candidates(picture)
+        settled = self._settle(picture.image, picture.gray, likely)
         found = [
             Detection(pose @ self.tracker.part.body_from_model, quality)
             for quality, pose in ((self._quality(worth, pose), pose) for worth, pose in settled)
@@ -271,78 +241,87 @@ class Detector:
         ]
         return found[:max_results]
 
-    def snap(self, image: NDArray[np.uint8], cam_from_model: Array) -> Detection:
-        """The best pose near a given one, up to about 15° and 5 % of distance away.
-
-        Its quality says whether it is right; it is returned even when that is low.
-        """
-        gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        start = cam_from_model @ self.tracker.part.model_from_body
-        maps: dict[int, tuple[NDArray[np.uint8], Array] | None] = {}
-        wide = self._sharpen(image, [Candidate(1.0, start)], WIDE_GRID, maps)
-        settled = self._settle(image, gray, [Candidate(1.0, start), *self._sharpen(image, wide, FINE_GRID, maps)])
-        worth, pose = settled[0]
-        return Detection(pose @ self.tracker.part.body_from_model, self._quality(worth, pose))
-
-    def _sharpen(
-        self,
-        image: NDArray[np.uint8],
-        candidates: list[Candidate],
-        grid: SearchGrid,
-        maps: dict[int, tuple[NDArray[np.uint8], Array] | None],
-    ) -> list[Candidate]:
-        """Poses around candidates that fit the picture best at a higher resolution, likeliest first.
-
-        ``maps`` keeps the response maps of this picture by scale, for the next call.
-        One score over the whole outline is not misled by print or texture that draws single edge points away.
-        """
+    def _picture(self, image: NDArray[np.uint8]) -> _Picture:
         o = self.options
+        return _Picture(image, self.camera, o.spread_px, round(0.6 * o.radius_px))
+
+    def candidates(self, picture: _Picture) -> list[Candidate]:
+        """The likeliest hypotheses after all levels of the search, best first."""
+        found = self.starts(picture)
+        for level in self.options.levels:
+            found = self._climb(picture, found, level)
+        return found
+
+    def starts(self, picture: _Picture) -> list[Candidate]:
+        """The best template matches over the whole range, apart from each other, best first."""
+        o = self.options
+        bank = self.bank
+        picture.make(self._steps)
+        halves = [0, len(bank.bins) // 2, len(bank.bins)]
+        jobs = [(step, first, last) for step in self._steps for first, last in zip(halves, halves[1:], strict=False)]
+        matches = [m for m in _pool().map(lambda job: self._match(picture, *job), jobs) if m is not None]
+        if not matches:
+            return []
+        keys, rotations, positions = (np.concatenate([m[k] for m in matches]) for k in range(3))
+        order = np.argsort(-keys, kind="stable")
+        keys, rotations, positions = keys[order], rotations[order], positions[order]
+        # Within six pixels of the templates' scale: as many times further off as the part is larger than there.
+        reach = np.full(len(keys), 6.0 / o.radius_px) * 0.5 * self.views.diameter_mm / positions[:, 2]
+        chosen = choose_apart(rotations, positions, reach, np.cos(0.28), 1.22, o.starts)
+        return [Candidate(float(keys[i]), rigid(rotations[i], positions[i])) for i in chosen]
+
+    def _match(self, picture: _Picture, step: int, first: int, last: int) -> tuple[Array, Array, Array] | None:
+        """Keys (M,), rotations (M,3,3) and positions (M,3) mm of the matches of some templates at one scale."""
+        o = self.options
+        bank = self.bank
+        maps, intrinsics = picture.maps(step)
+        if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
+            return None
+        keys, templates, places = match_templates(
+            decimate(maps, o.grid_px), bank.offsets, bank.bins, bank.gains, first, last, o.matches // 2, LOWEST_SCORE
+        )
         camera = self.camera
-        pad = round(0.6 * o.radius_px)
-        by_step: dict[int, list[Candidate]] = {}
+        size = np.array(maps.shape[:0:-1]) - 2 * picture.pad_px
+        centers = places + bank.origins[templates] - picture.pad_px
+        rays = camera.unproject((centers + 0.5) * [camera.width, camera.height] / size - 0.5)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        distance_mm = self._focal * 0.5 * self.views.diameter_mm * 2.0 ** (step / STEPS_PER_OCTAVE) / o.radius_px
+        return keys, _turned_with_rays(bank.rotations[templates], rays), rays * distance_mm
+
+    def _climb(self, picture: _Picture, candidates: list[Candidate], level: Level) -> list[Candidate]:
+        """The hypotheses after a pattern search around each, apart from each other, best first."""
+        by_step: dict[int, list[Array]] = {}
         for candidate in candidates:
-            scale = min(1.0, grid.magnification * o.radius_px / self.tracker.radius_px(candidate.cam_from_body))
-            by_step.setdefault(round(np.log(scale) / np.log(o.distance_ratio)), []).append(candidate)
+            distance_mm = float(np.linalg.norm(candidate.cam_from_body[:3, 3]))
+            step = min(0, round(self._step_at(distance_mm, level.magnification)))
+            by_step.setdefault(step, []).append(candidate.cam_from_body)
+        picture.make(list(by_step))
+        jobs = []
+        for step, poses in by_step.items():
+            size = max(2, -(-len(poses) // 4))
+            jobs += [(step, np.stack(poses[i : i + size])) for i in range(0, len(poses), size)]
 
-        def maps_at(step: int) -> tuple[NDArray[np.uint8], Array] | None:
-            width = round(camera.width * o.distance_ratio**step)
-            height = round(camera.height * o.distance_ratio**step)
-            if width < 24 or height < 24:
-                return None
-            small = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
-            intrinsics = intrinsics_of(camera.scaled(width, height))
-            intrinsics[2:4] += pad
-            return response_maps(small, o.spread_px, pad), intrinsics
-
-        missing = [step for step in by_step if step not in maps]
-        maps.update(zip(missing, _pool().map(maps_at, missing), strict=True))
-
-        def search(item: tuple[Candidate, NDArray[np.uint8], Array]) -> list[Candidate]:
-            candidate, responses, intrinsics = item
-            scores, poses = score_around(
-                responses, self.tracker.part.arrays, candidate.cam_from_body, intrinsics,
-                0.01 * self.views.diameter_mm, grid.turns, grid.stretches, 4, 2, 64, 32,
+        def search(job: tuple[int, Array]) -> tuple[Array, Array]:
+            maps, intrinsics = picture.maps(job[0])
+            return climb(  # type: ignore[no-any-return]
+                maps, self.tracker.part.arrays, job[1], intrinsics, 0.01 * self.views.diameter_mm,
+                np.deg2rad(level.turn_step_deg), level.stretch_step, level.rounds, level.halvings, 2, 2,
+                level.points, level.points,
             )  # fmt: skip
-            best: list[Candidate] = []
-            for index in np.argsort(-scores)[:200]:
-                if not any(self._same(poses[index], other.cam_from_body, grid.apart_deg) for other in best):
-                    best.append(Candidate(float(scores[index]), poses[index]))
-                    if len(best) >= grid.kept_each:
-                        break
-            return best
 
-        jobs: list[tuple[Candidate, NDArray[np.uint8], Array]] = []
-        for step, group in by_step.items():
-            made = maps[step]
-            if made is not None:
-                jobs += [(candidate, *made) for candidate in group]
-        found = [candidate for best in _pool().map(search, jobs) for candidate in best]
-        found.sort(key=lambda item: -item.score)
-        apart: list[Candidate] = []
-        for candidate in found:
-            if not any(self._same(candidate.cam_from_body, other.cam_from_body, grid.apart_deg) for other in apart):
-                apart.append(candidate)
-        return apart[: grid.kept]
+        results = list(_pool().map(search, jobs))
+        if not results:
+            return []
+        scores, poses = np.concatenate([r[0] for r in results]), np.concatenate([r[1] for r in results])
+        scores = scores * np.array([self._view_lines(pose) for pose in poses]) ** 0.25
+        order = np.argsort(-scores, kind="stable")
+        scores, poses = scores[order], poses[order]
+        reach = np.full(len(poses), 0.01 * level.apart_deg * self.views.diameter_mm) / poses[:, 2, 3]
+        chosen = choose_apart(
+            np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), reach,
+            np.cos(np.deg2rad(level.apart_deg)), 1.0 + 0.01 * level.apart_deg, level.kept,
+        )  # fmt: skip
+        return [Candidate(float(scores[i]), poses[i]) for i in chosen]
 
     def _settle(
         self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Candidate]
@@ -424,57 +403,6 @@ class Detector:
         distance = float(np.linalg.norm(cam_from_body[:3, 3]))
         return bool(0.85 * low <= distance <= 1.18 * high and cam_from_body[2, 3] > 0)
 
-    def candidates(self, image: NDArray[np.uint8]) -> list[Candidate]:
-        """The best template matches over the whole range, apart from each other, best first."""
-        o = self.options
-        distances = self.views.view_range.distances_mm(o.distance_ratio)
-        matches = [m for m in _pool().map(lambda d: self._match_at(image, float(d)), distances) if m is not None]
-        if not matches:
-            return []
-        scores = np.concatenate([m[0] for m in matches])
-        order = np.argsort(-scores, kind="stable")[:1000]
-        scores = scores[order]
-        templates = np.concatenate([m[1] for m in matches])[order]
-        centers_px = np.concatenate([m[2] for m in matches])[order]
-        distance_mm = np.concatenate([np.full(len(m[0]), m[3]) for m in matches])[order]
-        reach_px = np.concatenate([np.full(len(m[0]), 6.0 / m[4]) for m in matches])[order]
-        rays = self.camera.unproject(centers_px)
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        rotations = _turned_with_rays(self._rotations[templates], rays)
-        kept: list[int] = []
-        free = np.ones(len(scores), dtype=bool)
-        for i in range(len(scores)):
-            if not free[i]:
-                continue
-            kept.append(i)
-            if len(kept) >= o.refined:
-                break
-            near = np.all(np.abs(centers_px - centers_px[i]) < reach_px[i], axis=1)
-            near &= np.abs(np.log(distance_mm / distance_mm[i])) < 0.2
-            near &= np.einsum("jk,njk->n", rotations[i], rotations) > 1.0 + 2.0 * np.cos(0.3)
-            free &= ~near
-        return [Candidate(float(scores[i]), rigid(rotations[i], rays[i] * distance_mm[i])) for i in kept]
-
-    def _match_at(
-        self, image: NDArray[np.uint8], distance_mm: float
-    ) -> tuple[Array, NDArray[np.intp], Array, float, float] | None:
-        """Scores, templates and centres (px) of the matches at one distance, with the distance and the scale."""
-        o = self.options
-        camera = self.camera
-        focal = 0.5 * (camera.fx + camera.fy)
-        scale = o.radius_px / (focal * 0.5 * self.views.diameter_mm / distance_mm)
-        width, height = round(camera.width * scale), round(camera.height * scale)
-        if width < 24 or height < 24 or scale > 1.5:
-            return None
-        resized = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
-        pad = round(0.6 * o.radius_px)
-        phases = decimate(response_maps(resized, o.spread_px, pad), o.grid_px)
-        scores, places = match_templates(phases, self._offsets, self._bins, self._counts, 3, LOWEST_SCORE)
-        templates, ranks = np.nonzero(scores)
-        centers = places[templates, ranks] + self._origins[templates] - pad
-        centers_px = (centers + 0.5) * [camera.width / width, camera.height / height] - 0.5
-        return scores[templates, ranks], templates, centers_px, distance_mm, scale
-
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
@@ -504,7 +432,3 @@ def _around(cam_from_body: Array, angle_rad: float) -> list[Array]:
             turn = exp_so3(axis / np.linalg.norm(axis) * sign * angle_rad)
             turned.append(rigid(turn @ cam_from_body[:3, :3], cam_from_body[:3, 3]))
     return turned
-
-
-def _spread(available: int, wanted: int) -> NDArray[np.intp]:
-    return np.floor((np.arange(wanted) + 0.5) * available / max(wanted, 1)).astype(np.intp)

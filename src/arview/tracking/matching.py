@@ -1,10 +1,9 @@
-"""Oriented-gradient template matching: the kernels behind the detector.
+"""Response maps of a picture by edge orientation, and the scores of poses on them.
 
-The picture becomes a response map for each of eight edge orientations, spread so that small errors of the template
-do not matter; a template is a short list of (dx, dy, orientation) and its score at a place is the mean response
-under its points: Hinterstoisser et al., "Gradient Response Maps for Real-Time Detection of Textureless Objects"
-(PAMI 2012). Own here: responses are normalised by the local contrast and cleared of what all orientations share, so
-that texture and clutter, which answer to everything, do not win.
+After Hinterstoisser et al., "Gradient Response Maps for Real-Time Detection of Textureless Objects" (PAMI 2012): a map
+for each of eight orientations, spread so that small errors of a pose do not matter. Own here: responses are
+normalised by the local contrast and cleared of what all orientations share, so that texture and clutter, which answer
+to everything, do not win.
 """
 
 from __future__ import annotations
@@ -26,113 +25,80 @@ ORIENTATIONS = 8
 def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int) -> NDArray[np.uint8]:
     """(8, H + 2 pad, W + 2 pad) uint8 responses of an RGB or gray picture, 255 = a clear edge of that orientation."""
     smooth = cv2.GaussianBlur(image, (3, 3), 0)
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3)
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)
-    if image.ndim == 3:
-        # Per pixel the channel with the strongest gradient (Dalal & Triggs 2005).
-        strongest = np.argmax(gx * gx + gy * gy, axis=2)[..., None]
-        gx = np.take_along_axis(gx, strongest, axis=2)[..., 0]
-        gy = np.take_along_axis(gy, strongest, axis=2)[..., 0]
-    magnitude = cv2.magnitude(gx, gy) * 0.25
+    gx, gy, magnitude = _gradients(smooth if smooth.ndim == 3 else smooth[..., None])
     around = cv2.boxFilter(magnitude, -1, (21, 21), borderType=cv2.BORDER_REFLECT)
-    strength = magnitude / (magnitude + around + 3.0)
-    # Thin: only pixels that are a maximum of their neighbourhood in some direction say where the edge is.
-    strength[magnitude < 0.6 * cv2.dilate(magnitude, np.ones((3, 3), np.uint8))] = 0.0
-    position = np.arctan2(gy, gx) / np.pi * ORIENTATIONS
-    low = np.floor(position)
-    share = position - low
-    low_bin = low.astype(np.intp) % ORIENTATIONS
-    high_bin = (low_bin + 1) % ORIENTATIONS
-    size = (2 * spread_px + 1, 2 * spread_px + 1)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size)
-    spread = np.empty((ORIENTATIONS, *magnitude.shape), dtype=np.float32)
-    for o in range(ORIENTATIONS):
-        own = np.where(low_bin == o, strength * np.minimum(1.0, 2.0 * (1.0 - share)), 0.0)
-        own += np.where(high_bin == o, strength * np.minimum(1.0, 2.0 * share), 0.0)
-        spread[o] = cv2.dilate(own.astype(np.float32), kernel)
-    common = spread.mean(axis=0)
-    spread = np.clip((spread - common) * 1.6, 0.0, 1.0)
-    padding = ((0, 0), (pad_px, pad_px), (pad_px, pad_px))
-    return np.pad((spread * 255.0).astype(np.uint8), padding)
-
-
-def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-    """(8, step, step, ceil(H/step), ceil(W/step)): phases of the maps apart, a coarse grid is contiguous."""
-    count, height, width = maps.shape
-    rows, columns = -(-height // step), -(-width // step)
-    padded = np.zeros((count, rows * step, columns * step), dtype=np.uint8)
-    padded[:, :height, :width] = maps
-    return np.ascontiguousarray(padded.reshape(count, rows, step, columns, step).transpose(0, 2, 4, 1, 3))
+    own = _oriented(gx, gy, magnitude, around, cv2.dilate(magnitude, np.ones((3, 3), np.uint8)))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * spread_px + 1, 2 * spread_px + 1))
+    for plane in own:
+        cv2.dilate(plane, kernel, dst=plane)
+    return np.asarray(_without_common(own, pad_px))
 
 
 @njit(cache=True, nogil=True)
-def match_templates(phases, offsets, bins, counts, top, lowest):  # type: ignore[no-untyped-def]
-    """Best places of each template on a grid of ``step`` px.
-
-    Args:
-        phases: from `decimate`.
-        offsets: (T,N,2) int dx, dy of the points, shifted to be ≥ 0; bins: (T,N) orientation; counts: (T,).
-        lowest: templates that nowhere score this much are skipped.
-        top: places kept per template, at least about a template's core apart.
-
-    Returns:
-        scores (T,top) 0–1 and places (T,top,2) of the shifted template's origin, in full pixels.
-    """
-    step = phases.shape[1]
-    rows, columns = phases.shape[3], phases.shape[4]
-    templates = offsets.shape[0]
-    scores = np.zeros((templates, top))
-    places = np.zeros((templates, top, 2), dtype=np.int32)
-    total = np.empty(rows * columns, dtype=np.uint16)
-    flat = phases.reshape((phases.shape[0], step, step, rows * columns))
-    for t in range(templates):
-        reach_x = 0
-        reach_y = 0
-        for i in range(counts[t]):
-            reach_x = max(reach_x, offsets[t, i, 0])
-            reach_y = max(reach_y, offsets[t, i, 1])
-        last_row = rows - reach_y // step - 1
-        last_column = columns - reach_x // step - 1
-        if last_row < 1 or last_column < 1:
-            continue
-        span = (last_row - 1) * columns + last_column
-        total[:] = 0
-        for i in range(counts[t]):
-            dx, dy = offsets[t, i, 0], offsets[t, i, 1]
-            source = flat[bins[t, i], dy % step, dx % step]
-            shift = (dy // step) * columns + dx // step
-            moved = source[shift : shift + span]
-            for k in range(span):
-                total[k] += moved[k]
-        highest = 0
-        for k in range(span):
-            highest = max(highest, total[k])
-        if highest < lowest * 255.0 * counts[t]:
-            continue
-        for n in range(top):
+def _gradients(image):  # type: ignore[no-untyped-def]
+    """Sobel gx, gy (H,W) int16 of the channel with the strongest gradient (Dalal & Triggs 2005), and magnitudes."""
+    height, width, channels = image.shape
+    gx = np.zeros((height, width), dtype=np.int16)
+    gy = np.zeros((height, width), dtype=np.int16)
+    magnitude = np.zeros((height, width), dtype=np.float32)
+    for y in range(height):
+        above, below = max(y - 1, 0), min(y + 1, height - 1)
+        for x in range(width):
+            left, right = max(x - 1, 0), min(x + 1, width - 1)
             best = 0
-            where = -1
-            for row in range(last_row):
-                line = total[row * columns : row * columns + last_column]
-                peak = 0
-                for k in range(last_column):
-                    peak = max(peak, line[k])
-                if peak > best:
-                    best = peak
-                    for k in range(last_column):
-                        if line[k] == peak:
-                            where = row * columns + k
-                            break
-            if where < 0:
-                break
-            row, column = where // columns, where % columns
-            scores[t, n] = best / (255.0 * counts[t])
-            places[t, n, 0] = column * step
-            places[t, n, 1] = row * step
-            for y in range(max(0, row - 4), min(last_row, row + 5)):
-                for x in range(max(0, column - 4), min(last_column, column + 5)):
-                    total[y * columns + x] = 0
-    return scores, places
+            for c in range(channels):
+                nw, ne = np.int32(image[above, left, c]), np.int32(image[above, right, c])
+                sw, se = np.int32(image[below, left, c]), np.int32(image[below, right, c])
+                dx = ne + se - nw - sw + 2 * (np.int32(image[y, right, c]) - np.int32(image[y, left, c]))
+                dy = sw + se - nw - ne + 2 * (np.int32(image[below, x, c]) - np.int32(image[above, x, c]))
+                square = dx * dx + dy * dy
+                if square > best:
+                    best = square
+                    gx[y, x] = dx
+                    gy[y, x] = dy
+            magnitude[y, x] = np.sqrt(np.float32(best)) * np.float32(0.25)
+    return gx, gy, magnitude
+
+
+@njit(cache=True, nogil=True)
+def _oriented(gx, gy, magnitude, around, peak):  # type: ignore[no-untyped-def]
+    """(8,H,W) uint8 strength of thin edges by orientation, relative to the contrast around, shared by two bins."""
+    height, width = magnitude.shape
+    own = np.zeros((ORIENTATIONS, height, width), dtype=np.uint8)
+    for y in range(height):
+        for x in range(width):
+            m = magnitude[y, x]
+            # Thin: only a maximum of the neighbourhood in some direction says where the edge is.
+            if m < 0.6 * peak[y, x] or m == 0.0:
+                continue
+            strength = 255.0 * m / (m + around[y, x] + 3.0)
+            position = np.arctan2(np.float32(gy[y, x]), np.float32(gx[y, x])) / np.float32(np.pi) * ORIENTATIONS
+            low = np.floor(position)
+            share = position - low
+            bin_low = int(low) % ORIENTATIONS
+            own[bin_low, y, x] = np.uint8(strength * min(1.0, 2.0 * (1.0 - share)))
+            own[(bin_low + 1) % ORIENTATIONS, y, x] = np.uint8(strength * min(1.0, 2.0 * share))
+    return own
+
+
+@njit(cache=True, nogil=True)
+def _without_common(spread, pad):  # type: ignore[no-untyped-def]
+    """What an orientation has beyond the mean of all, stretched and padded by zeros."""
+    count, height, width = spread.shape
+    maps = np.zeros((count, height + 2 * pad, width + 2 * pad), dtype=np.uint8)
+    common = np.empty(width, dtype=np.int32)
+    for y in range(height):
+        common[:] = 0
+        for o in range(count):
+            for x in range(width):
+                common[x] += spread[o, y, x]
+        for o in range(count):
+            line = maps[o, y + pad]
+            for x in range(width):
+                # 1.6 (s - mean), in integers: 205 / 128.
+                value = ((count * np.int32(spread[o, y, x]) - common[x]) * 205) // (128 * count)
+                line[x + pad] = np.uint8(min(max(value, 0), 255))
+    return maps
 
 
 def orientation_bins(normals_px: Array) -> NDArray[np.uint8]:
@@ -213,7 +179,7 @@ def score_around(  # type: ignore[no-untyped-def]
                     count += 1
             if count < 16:
                 continue
-            best, best_dx, best_dy = _best_shift(maps, columns, rows, bins, count, shift_px, shift_step, sums)
+            best, best_dx, best_dy = best_shift(maps, columns, rows, bins, count, shift_px, shift_step, sums)
             scores[index] = best / (255.0 * count)
             poses[index, 0, 3] += best_dx * pose[2, 3] / intrinsics[0]
             poses[index, 1, 3] += best_dy * pose[2, 3] / intrinsics[1]
@@ -221,7 +187,7 @@ def score_around(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _best_shift(maps, columns, rows, bins, count, shift_px, shift_step, sums):  # type: ignore[no-untyped-def]
+def best_shift(maps, columns, rows, bins, count, shift_px, shift_step, sums):  # type: ignore[no-untyped-def]
     """Highest sum of responses under the first ``count`` points over all shifts, and that shift dx, dy in px.
 
     ``sums`` (S,S) int32 is room to work in. Points that a shift moves outside the maps add nothing.

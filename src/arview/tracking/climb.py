@@ -1,0 +1,136 @@
+"""Pattern search of poses on response maps: tilt, roll and distance step by step, the place by trying shifts.
+
+Coordinate search with shrinking steps (Hooke & Jeeves 1961). The score is the mean response under the projected
+outline and design edges: over the whole part at once it is not misled by print or clutter that draws single edge
+points away, which gradient methods follow.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.tracking.matching import ORIENTATIONS, best_shift
+from arview.tracking.refine import nearest_view
+from arview.tracking.solver import project_lines
+
+
+@njit(cache=True, nogil=True)
+def pose_score(maps, part, pose, intrinsics, step_mm, contour_count, edge_count, shift_px, shift_step, room, sums):  # type: ignore[no-untyped-def]
+    """Mean response 0–1 at a pose and the best shift dx, dy of the picture in px; 0 with too few points.
+
+    Args:
+        maps: (8,H,W) from `response_maps`, padded.
+        part: arrays of all guide views, see `PartView.arrays`.
+        intrinsics: (10,) of the picture that the maps were made from, padding included.
+        step_mm: length over which directions are projected.
+        contour_count, edge_count: about so many points are looked at.
+        shift_px, shift_step: shifts of ± shift_px are tried; ``sums`` (S,S) int32 is room for them.
+        room: (3, contour_count + edge_count + 96) int64 to work in.
+    """
+    directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
+    view = nearest_view(directions, pose)
+    count = 0
+    for group in range(2):
+        if group == 0:
+            first, last = c_start[view], c_start[view + 1]
+            stride = max(1, (last - first) // contour_count)
+            px, normals, depths = project_lines(
+                c_points[first:last:stride], c_normals[first:last:stride], False, pose, intrinsics, step_mm
+            )
+            limit = contour_count + 32
+        else:
+            first, last = e_start[view], e_start[view + 1]
+            stride = max(1, (last - first) // (2 * edge_count))
+            px, normals, depths = project_lines(
+                e_points[first:last:stride], e_tangents[first:last:stride], True, pose, intrinsics, step_mm
+            )
+            limit = contour_count + edge_count + 96
+        for i in range(px.shape[0]):
+            if group == 1:
+                kind = e_kinds[first + i * stride]
+                if (kind & EDGE_CONTOUR) > 0 or (kind & EDGE_SHARP) == 0:
+                    continue
+            if depths[i] <= 0 or count >= limit:
+                continue
+            room[0, count] = int(np.round(px[i, 0]))
+            room[1, count] = int(np.round(px[i, 1]))
+            turn = np.arctan2(normals[i, 1], normals[i, 0]) / np.pi * ORIENTATIONS
+            room[2, count] = int(np.round(turn)) % ORIENTATIONS
+            count += 1
+    if count < 16:
+        return 0.0, 0, 0
+    best, dx, dy = best_shift(maps, room[0], room[1], room[2], count, shift_px, shift_step, sums)
+    return best / (255.0 * count), dx, dy
+
+
+@njit(cache=True, nogil=True)
+def _stepped(pose, axis, amount):  # type: ignore[no-untyped-def]
+    """A pose turned about axis 0–2 of the camera through the part's centre, or moved in distance (axis 3)."""
+    moved = pose.copy()
+    if axis == 3:
+        for i in range(3):
+            moved[i, 3] = pose[i, 3] * (1.0 + amount)
+        return moved
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    c, s = np.cos(amount), np.sin(amount)
+    for j in range(3):
+        moved[a, j] = c * pose[a, j] - s * pose[b, j]
+        moved[b, j] = s * pose[a, j] + c * pose[b, j]
+    return moved
+
+
+@njit(cache=True, nogil=True)
+def climb(  # type: ignore[no-untyped-def]
+    maps, part, poses, intrinsics, step_mm, turn_step_rad, stretch_step, rounds, halvings, shift_px, shift_step,
+    contour_count, edge_count
+):  # fmt: skip
+    """Improve poses, each by itself.
+
+    Args:
+        maps, part, intrinsics, step_mm, contour_count, edge_count, shift_px, shift_step: see `pose_score`.
+        poses: (N,4,4) ``cam_from_body``.
+        turn_step_rad, stretch_step: first steps of tilt, roll and of the distance as a share.
+        rounds: over the four axes before the steps are halved; halvings: how often they are.
+
+    Returns:
+        scores (N,) 0–1 and poses (N,4,4).
+    """
+    steps = 2 * (shift_px // shift_step) + 1
+    sums = np.empty((steps, steps), dtype=np.int32)
+    room = np.empty((3, contour_count + edge_count + 128), dtype=np.int64)
+    scores = np.zeros(poses.shape[0])
+    found = poses.copy()
+    for n in range(poses.shape[0]):
+        pose = poses[n].copy()
+        best, dx, dy = pose_score(
+            maps, part, pose, intrinsics, step_mm, contour_count, edge_count, shift_px, shift_step, room, sums
+        )
+        pose[0, 3] += dx * pose[2, 3] / intrinsics[0]
+        pose[1, 3] += dy * pose[2, 3] / intrinsics[1]
+        turn, stretch = turn_step_rad, stretch_step
+        for _ in range(halvings + 1):
+            for _ in range(rounds):
+                has_moved = False
+                for axis in range(4):
+                    for sign in range(-1, 2, 2):
+                        trial = _stepped(pose, axis, sign * (stretch if axis == 3 else turn))
+                        score, dx, dy = pose_score(
+                            maps, part, trial, intrinsics, step_mm, contour_count, edge_count, shift_px, shift_step,
+                            room, sums
+                        )  # fmt: skip
+                        if score > best:
+                            best = score
+                            trial[0, 3] += dx * trial[2, 3] / intrinsics[0]
+                            trial[1, 3] += dy * trial[2, 3] / intrinsics[1]
+                            pose = trial
+                            has_moved = True
+                            break
+                if not has_moved:
+                    break
+            turn *= 0.5
+            stretch *= 0.5
+        scores[n] = best
+        found[n] = pose
+    return scores, found

@@ -1,0 +1,311 @@
+"""The first search: every guide view at every roll, place and distance, by oriented-gradient templates.
+
+The picture becomes a response map for each of eight edge orientations, spread so that small errors of the template
+do not matter; a template is a short list of (dx, dy, orientation) and its score at a place is the mean response
+under its points: Hinterstoisser et al., "Gradient Response Maps for Real-Time Detection of Textureless Objects"
+(PAMI 2012). Own here: matches are compared by how far they stand out from what the same template scores elsewhere
+in this picture, and by how many distinct lines they explain, so that plain views do not win in clutter; and the
+bar that a match must clear rises as better ones are found, so that most of the work is cut short.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.errors import InputError
+from arview.geometry import Array, exp_so3
+from arview.guideviews import GuideViewSet
+from arview.guideviews.mesh_edges import EDGE_CONTOUR
+from arview.guideviews.sphere import icosphere_directions
+from arview.guideviews.uniqueness import view_lines
+from arview.tracking.matching import orientation_bins
+from arview.tracking.solver import project_lines
+
+FIRST_POINTS = 16
+"""So many points of a template are looked at everywhere, the others only where these bode well."""
+FIRST_MARGIN = 0.1
+"""The mean of the first points may be so much lower than the score asked for."""
+TILE = 2048
+"""Places looked at together: their sums stay in the nearest cache."""
+
+
+@dataclass(frozen=True)
+class TemplateBank:
+    """Templates of one part.
+
+    Attributes:
+        offsets: (T,N,2) int32 dx, dy ≥ 0 of the points; bins: (T,N) orientations, see `orientation_bins`.
+        origins: (T,2) place of the part's centre in the frame of the offsets.
+        rotations: (T,3,3) of ``cam_from_body``, seen along the optical axis.
+        gains: (T,) by which a match counts: the square root of the distinct lines that the view shows.
+        radius_px: half the part's diameter.
+    """
+
+    offsets: NDArray[np.int32]
+    bins: NDArray[np.uint8]
+    origins: Array
+    rotations: Array
+    gains: Array
+    radius_px: float
+
+
+def make_bank(
+    views: GuideViewSet, model_from_body: Array, radius_px: float, points: int, roll_step_deg: float, subdivisions: int
+) -> TemplateBank:
+    """Templates over the directions and rolls of the declared range.
+
+    Args:
+        views: of the part; the nearest to each direction of an icosphere is taken.
+        model_from_body: (4,4) to the model's centre.
+        radius_px: half the part's diameter in the templates.
+        points: per template, a multiple of 4; views with few points repeat some.
+        roll_step_deg: between templates.
+        subdivisions: of the icosphere; 2 gives 162 directions, about 17° apart.
+
+    Raises:
+        InputError: no view shows an outline.
+    """
+    wanted = icosphere_directions(subdivisions)
+    inside = views.view_range.contains_direction(wanted, 3.0)
+    if not inside.any():
+        chosen = np.arange(len(views))
+    else:
+        chosen = np.unique(np.argmax(wanted[inside] @ views.directions.T, axis=1))
+    rolls = np.deg2rad(views.view_range.rolls_deg(roll_step_deg))
+    turns = np.array([[[np.cos(r), -np.sin(r)], [np.sin(r), np.cos(r)]] for r in rolls])
+    focal = 1000.0
+    intrinsics = np.array([focal, focal, 0.0, 0.0, 0, 0, 0, 0, 0, 0])
+    scale = radius_px / (0.5 * views.diameter_mm)
+    # One order for all templates in which every beginning is spread over the whole.
+    order = np.random.default_rng(0).permutation(points)
+    rows: list[tuple[Array, NDArray[np.uint8], Array, Array, float]] = []
+    for index in chosen:
+        view = views.view(int(index))
+        found = _view_points(view.features, views.center_in_model, view.cam_from_model @ model_from_body, points)
+        if found is None:
+            continue
+        body, directions, across = found
+        cam_from_body = view.cam_from_model @ model_from_body
+        px, normals, depths = project_lines(body, directions, False, cam_from_body, intrinsics, 0.5)
+        _, edge_normals, _ = project_lines(body, directions, True, cam_from_body, intrinsics, 0.5)
+        normals = np.where(across, edge_normals, normals)
+        # A direction along the line of sight has none in the picture: another point stands in.
+        px[depths <= 0], normals[depths <= 0] = px[depths > 0][0], normals[depths > 0][0]
+        px *= cam_from_body[2, 3] / focal * scale
+        px, normals = px[order], normals[order]
+        gain = float(np.sqrt(max(view_lines(view, views.diameter_mm), 1.0)))
+        for roll, turn in zip(rolls, turns, strict=True):
+            turned = px @ turn.T
+            low = np.floor(turned.min(axis=0))
+            rotation = exp_so3([0.0, 0.0, roll]) @ cam_from_body[:3, :3]
+            rows.append((np.round(turned - low), orientation_bins(normals @ turn.T), -low, rotation, gain))
+    if not rows:
+        raise InputError("guide views: no view shows an outline; check the model and the declared distances")
+    # Mixed, so that the bar rises early.
+    mixed = np.random.default_rng(1).permutation(len(rows))
+    offsets, bins, origins, rotations, gains = ([row[k] for row in rows] for k in range(5))
+    return TemplateBank(
+        offsets=np.stack(offsets)[mixed].astype(np.int32),
+        bins=np.stack(bins)[mixed],
+        origins=np.stack(origins)[mixed],
+        rotations=np.stack(rotations)[mixed],
+        gains=np.array(gains)[mixed],
+        radius_px=radius_px,
+    )
+
+
+def _view_points(features, center, cam_from_body, points):  # type: ignore[no-untyped-def]
+    """Outline and design-edge points (N,3) in the body, directions (N,3), and (N,1) whether these run along an edge."""
+    contour = features.contour_points - center
+    inner = (features.edge_kinds & EDGE_CONTOUR) == 0
+    edges = features.edge_points[inner] - center
+    is_ahead = (contour @ cam_from_body[2, :3] + cam_from_body[2, 3]) > 1.0
+    contour, normals = contour[is_ahead], features.contour_normals[is_ahead]
+    inner_count = min(len(edges), int(0.35 * points))
+    outer_count = points - inner_count
+    if len(contour) < 8:
+        return None
+    outer, inside = _spread(len(contour), outer_count), _spread(len(edges), inner_count)
+    body = np.concatenate([contour[outer], edges[inside]])
+    directions = np.concatenate([normals[outer], features.edge_tangents[inner][inside]])
+    across = np.arange(len(body))[:, None] >= outer_count
+    return np.ascontiguousarray(body), np.ascontiguousarray(directions), across
+
+
+def _spread(available: int, wanted: int) -> NDArray[np.intp]:
+    return np.floor((np.arange(wanted) + 0.5) * available / max(wanted, 1)).astype(np.intp)
+
+
+def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
+    """(8, step, step, ceil(H/step), ceil(W/step)): phases of the maps apart, each contiguous, in 0–63."""
+    count, height, width = maps.shape
+    rows, columns = -(-height // step), -(-width // step)
+    padded = np.zeros((count, rows * step, columns * step), dtype=np.uint8)
+    np.right_shift(maps, 2, out=padded[:, :height, :width])
+    return np.ascontiguousarray(padded.reshape(count, rows, step, columns, step).transpose(0, 2, 4, 1, 3))
+
+
+@njit(cache=True, nogil=True)
+def _add_points(total, flat, source, shift, start, size, first, last):  # type: ignore[no-untyped-def]
+    """Add the responses under points first to last to the sums of a tile, four points at a time in 8 bits."""
+    for i in range(first, last, 4):
+        a = flat[source[i], shift[i] + start : shift[i] + start + size]
+        b = flat[source[i + 1], shift[i + 1] + start : shift[i + 1] + start + size]
+        c = flat[source[i + 2], shift[i + 2] + start : shift[i + 2] + start + size]
+        d = flat[source[i + 3], shift[i + 3] + start : shift[i + 3] + start + size]
+        for k in range(size):
+            total[k] += np.uint8(a[k] + b[k] + c[k] + d[k])
+
+
+@njit(cache=True, nogil=True)
+def match_templates(phases, offsets, bins, gains, first_template, last_template, kept, lowest):  # type: ignore[no-untyped-def]
+    """The matches that stand out most.
+
+    Args:
+        phases: from `decimate`.
+        offsets, bins, gains: see `TemplateBank`; the templates from first to last are matched.
+        kept: about so many matches are returned.
+        lowest: mean response below which a match is noise.
+
+    Returns:
+        keys (M,) by which matches compare, templates (M,), places (M,2) of the offsets' origin in full pixels.
+    """
+    step = phases.shape[1]
+    rows, columns = phases.shape[3], phases.shape[4]
+    flat = phases.reshape((phases.shape[0] * step * step, rows * columns))
+    points = bins.shape[1]
+    total = np.empty(TILE, dtype=np.uint16)
+    source = np.empty(points, dtype=np.int64)
+    shift = np.empty(points, dtype=np.int64)
+    room = 4 * kept
+    keys = np.empty(room)
+    templates = np.empty(room, dtype=np.int32)
+    cells = np.empty(room, dtype=np.int32)
+    found = 0
+    bar = 0.0
+    full = 63.0 * points
+    first_full = 63.0 * FIRST_POINTS
+    for t in range(first_template, last_template):
+        reach_x = 0
+        reach_y = 0
+        for i in range(points):
+            dx, dy = offsets[t, i, 0], offsets[t, i, 1]
+            reach_x = max(reach_x, dx)
+            reach_y = max(reach_y, dy)
+            source[i] = (bins[t, i] * step + dy % step) * step + dx % step
+            shift[i] = (dy // step) * columns + dx // step
+        last_row = rows - reach_y // step - 1
+        last_column = columns - reach_x // step - 1
+        if last_row < 1 or last_column < 1:
+            continue
+        span = (last_row - 1) * columns + last_column
+        # What this template scores anywhere in this picture, from the first points in every other tile.
+        count = 0
+        mean = 0.0
+        square = 0.0
+        for start in range(0, span, 2 * TILE):
+            size = min(TILE, span - start)
+            total[:size] = 0
+            _add_points(total, flat, source, shift, start, size, 0, FIRST_POINTS)
+            sums = np.uint64(0)
+            squares = np.uint64(0)
+            for k in range(size):
+                value = np.uint64(total[k])
+                sums += value
+                squares += value * value
+            count += size
+            mean += sums
+            square += squares
+        mean /= count
+        deviation = np.sqrt(max(square / count - mean * mean, 1.0)) / first_full
+        mean /= first_full
+        gain = gains[t] / np.sqrt(deviation)
+        asked = max(lowest, mean + bar / gain)
+        if asked > 1.0:
+            continue
+        for start in range(0, span, TILE):
+            size = min(TILE, span - start)
+            total[:size] = 0
+            _add_points(total, flat, source, shift, start, size, 0, FIRST_POINTS)
+            highest = np.uint16(0)
+            for k in range(size):
+                highest = max(highest, total[k])
+            if highest < (asked - FIRST_MARGIN) * first_full:
+                continue
+            _add_points(total, flat, source, shift, start, size, FIRST_POINTS, points)
+            highest = np.uint16(0)
+            for k in range(size):
+                highest = max(highest, total[k])
+            if highest < asked * full:
+                continue
+            limit = np.uint16(np.ceil(asked * full))
+            for k in range(size):
+                value = total[k]
+                if value < limit or (start + k) % columns >= last_column:
+                    continue
+                if (k > 0 and total[k - 1] > value) or (k + 1 < size and total[k + 1] >= value):
+                    continue
+                if (k >= columns and total[k - columns] > value) or (
+                    k + columns < size and total[k + columns] >= value
+                ):
+                    continue
+                keys[found] = (value / full - mean) * gain
+                templates[found] = t
+                cells[found] = start + k
+                found += 1
+                if found == room:
+                    best = np.argsort(-keys)[:kept]
+                    bar = max(bar, keys[best[kept - 1]])
+                    keys[:kept] = keys[best]
+                    templates[:kept] = templates[best]
+                    cells[:kept] = cells[best]
+                    found = kept
+                    asked = max(asked, mean + bar / gain)
+                    limit = np.uint16(np.ceil(min(asked, 1.0) * full))
+    best = np.argsort(-keys[:found])[:kept]
+    places = np.empty((len(best), 2), dtype=np.int32)
+    for n in range(len(best)):
+        places[n, 0] = cells[best[n]] % columns * step
+        places[n, 1] = cells[best[n]] // columns * step
+    return keys[best], templates[best], places
+
+
+@njit(cache=True, nogil=True)
+def choose_apart(rotations, positions, reach, cosine, distance_ratio, most):  # type: ignore[no-untyped-def]
+    """Indices of at most ``most`` poses, best first as given, none near a better one.
+
+    Args:
+        rotations: (N,3,3); positions: (N,3) mm, best first.
+        reach: of the position across the line of sight, as a share of the distance (N,).
+        cosine: of the angle within which two are near; distance_ratio: the same for the distance.
+    """
+    chosen = np.empty(most, dtype=np.int64)
+    count = 0
+    for i in range(rotations.shape[0]):
+        is_near = False
+        for c in range(count):
+            j = chosen[c]
+            trace = 0.0
+            for a in range(3):
+                for b in range(3):
+                    trace += rotations[i, a, b] * rotations[j, a, b]
+            if 0.5 * (trace - 1.0) < cosine:
+                continue
+            ratio = positions[i, 2] / positions[j, 2]
+            if ratio > distance_ratio or ratio * distance_ratio < 1.0:
+                continue
+            dx = positions[i, 0] / positions[i, 2] - positions[j, 0] / positions[j, 2]
+            dy = positions[i, 1] / positions[i, 2] - positions[j, 1] / positions[j, 2]
+            if abs(dx) < reach[j] and abs(dy) < reach[j]:
+                is_near = True
+                break
+        if not is_near:
+            chosen[count] = i
+            count += 1
+            if count == most:
+                break
+    return chosen[:count]
