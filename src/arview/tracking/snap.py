@@ -149,18 +149,21 @@ class Snap:
     def lock(self, image: NDArray[np.uint8], cam_from_model: Array, min_quality: float) -> Snapped | None:
         """The part's pose when it is near the given one beyond doubt, else None.
 
-        A pose must be good, near enough (see `SnapOptions`), borne out the better the plainer the part looks from
-        there, and not a figure inside the part: print on a box may look like a smaller box, and then a nearer pose
-        around it fits as well. Most pictures without the part are done with after the first round.
+        A pose must be good, near enough (see `SnapOptions`) and borne out the better the plainer the part looks
+        from there. A plain part must not be a figure inside itself either: print on a box may look like a smaller
+        box, and then a nearer pose around it fits as well. Most pictures without the part are done with after the
+        first round.
         """
         start = cam_from_model @ self._tracker.part.model_from_body
         near = self._search(image, start, [start], COARSE, self.options.least_coarse)
         found = self._best(image, self._search(image, start, near, FINE, self.options.least_fine))
         if found is None or found.quality < min_quality or not self.is_near(found.cam_from_model, cam_from_model):
             return None
-        if found.evidence.worth - PLAIN_WORTH * self._plainness(found.cam_from_model) < self.options.least_worth:
+        lines = view_lines(self._views.nearest(found.cam_from_model), self._views.diameter_mm)
+        plainness = max(1.0 - lines / (2.0 * PLAIN_LINES), 0.0)
+        if found.evidence.worth - PLAIN_WORTH * plainness < self.options.least_worth:
             return None
-        return None if self._has_rival(image, found) else found
+        return None if lines < PLAIN_LINES and self._has_rival(image, found) else found
 
     def is_near(self, cam_from_model: Array, guide_cam_from_model: Array) -> bool:
         """Whether a pose is within the limits of `SnapOptions` around a given one."""
@@ -175,11 +178,6 @@ class Snap:
             and abs(np.linalg.norm(center) / np.linalg.norm(wanted) - 1.0) <= o.distance_limit
             and aside_mm <= o.offset_limit * self._tracker.diameter_mm
         )
-
-    def _plainness(self, cam_from_model: Array) -> float:
-        """0–1: how few distinct lines the part shows from there; a box about 0.7."""
-        view = self._views.nearest(cam_from_model)
-        return max(1.0 - view_lines(view, self._views.diameter_mm) / (2.0 * PLAIN_LINES), 0.0)
 
     def _has_rival(self, image: NDArray[np.uint8], found: Snapped) -> bool:
         """Whether a much nearer pose around the found one fits about as well."""
