@@ -244,7 +244,7 @@ class TrackingSession:
             is_thorough = self.state == TrackingState.SEARCHING or self._lost_frames % (2 * o.search_every) == 0
             detections = self.detector.detect(image, max_results=1, is_thorough=is_thorough)
             if not detections:
-                return None, self._why_not(image, getattr(self.detector, "best_rejected", None))
+                return None, self._why_not(image, self.detector.best_rejected)
             start = detections[0].cam_from_model
         self.tracker.start(image, start)
         estimate = self.tracker.track(image)
