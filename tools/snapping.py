@@ -66,8 +66,8 @@ class _Snapping:
             verdict = self.try_at(image, self.moved(truth, 15.0, 0.15, 0.15), truth)
             right, wrong = right + (verdict is True), wrong + (verdict is False)
         text = f"{right} of {NEAR_COUNT} snap, {wrong} wrong, {timing(self.ms[1:])}"
-        target = "≥ 80 % within 15°, 15 %, 15 % aside; 0 wrong; ≤ 100 ms"
-        reached = right >= 0.8 * NEAR_COUNT and wrong == 0 and float(np.median(self.ms)) <= 100
+        target = "≥ 80 % within 15°, 15 %, 15 % aside; 0 wrong"
+        reached = right >= 0.8 * NEAR_COUNT and wrong == 0
         lines = [Line("snap", f"{self.name}, near", text, target, reached)]
         self.ms.clear()
         wrong = 0
