@@ -1,0 +1,690 @@
+"""Is every component where the CAD has it? A part of the same family may hold the pose with one component wrong.
+
+The base and all other components hold the pose, so a component that is missing, elsewhere or another one leaves its
+own edges empty. For each component that a direction shows, a look measures how many points of its outline and design
+edges lie on an edge of the picture, how many would if it stood somewhere else within reach, and how the colours change
+across its outline; whether the edges around it are seen says if anything could be seen there at all. A logistic model
+of these makes the log-likelihood ratio of "not there" to "there"; ratios add up over looks from new directions.
+
+Score maps over shifts of an edge template are Borgefors' (PAMI 1988) and those of `matching`; adding up log-likelihood
+ratios until a threshold is Wald's sequential test (1945). The measures and the model are our own; its constants were
+fitted by logistic regression to 9,000 looks at components that were right, missing, moved by 20 mm or swapped, in
+half of semi-synthetic pictures of two assemblies and half of recordings of two steel plates whose CAD was changed
+instead. One set of constants serves all parts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.cad.model import Model
+from arview.camera import Camera
+from arview.geometry import Array, rigid
+from arview.guideviews import GuideViewSet
+from arview.guideviews.mesh_edges import mesh_edges
+from arview.render import ZBufferRenderer
+from arview.tracking.solver import project_lines
+from arview.tracking.tracker import intrinsics_of
+
+LARGEST_PX = 400.0
+"""Larger pictures of the part are shrunk to about this: more says no more of where a component is."""
+POINTS, LEAST_POINTS = 48, 14
+"""Points looked at per component; with fewer nothing is said of it."""
+WEAKEST_STEP = 1.5
+"""Weakest edge, grey levels per px of the strongest channel."""
+DISPLACED_MM, DISPLACED_SHARE, POSE_PX = 2.5, 0.02, 1.0
+"""A component may stand this far from nominal (no more than the share of the part's diameter), its pose this far."""
+SEARCHED_MM, SEARCHED_SHARE, SEARCHED_PX = 24.0, 0.15, 44.0
+"""Other places of a component are looked for as far as this."""
+SHIFT_COST = 0.2
+"""Share of points that a shift to the rim of what is allowed must gain."""
+SEEN_WELL = 0.8
+"""A component with so many points borne out is not looked for elsewhere; `USUAL_ELSEWHERE` stands for it."""
+USUAL_ELSEWHERE = 0.45
+SHARED_PX, SHARED_COS = 3.0, 0.87
+"""Points this near a parallel edge of another component are no evidence for either."""
+OCCLUDER_PX = 4
+"""Points this near something in front of them may be hidden at a direction between two sheets."""
+SIDE_PX = 4.0
+"""How far beside an edge it is asked which component is there."""
+COLOUR_PX = 3.0
+"""How far beside an edge colours are compared."""
+HALF_LAMBDA = 15.0
+"""A component is half reliable when its points, weighed by the direction they say least about, are so many."""
+SURROUNDINGS, LEAST_SURROUNDINGS = 16, 8
+"""Points of other components around one, that say whether it is hidden by something that is not in the CAD."""
+HIDDEN_SHARE, CLEAR_SHARE = 0.45, 0.70
+"""Shares of the surroundings, and of the whole part, that are borne out where it is hidden and where it is not."""
+MODEL = (14.5, -12.5, -13.1, -1.25)
+"""Log-likelihood ratio: constant; share borne out; that less the best elsewhere; colour contrast up to 6."""
+MOST_CONTRAST = 6.0
+LARGEST_RATIO = 4.0
+"""A single look says no more than this."""
+NAMED, CLEARED, DOUBTFUL = 2.5, 0.5, 1.0
+"""Evidence above which a component is named, below which it no longer is, and above which it is to be looked at."""
+BOUND = 6.0
+"""Evidence is kept within ± this."""
+SINGLE = 2.0
+"""A single picture's ratio above which a component is named."""
+FORGETTING = 0.01
+"""Share of the evidence that is lost with every look."""
+NEW_DIRECTION_DEG = 6.0
+LEAST_NEWS = 0.05
+"""Looks from about the same direction say the same: the n-th counts 1/n, but no less than this."""
+EAGER_LOOKS, LOOK_EVERY = 3, 4
+"""So many frames after a lock are looked at, then every n-th."""
+KEPT_SHEETS = 64
+
+
+@dataclass(frozen=True)
+class ComponentSheet:
+    """Edges of all components as one direction shows them, sorted by component.
+
+    Attributes:
+        points_in_body, tangents: (N,3) float32 mm about the model's centre, and unit.
+        component: (N,) int16.
+        sides: (N,2) int16 component seen beside the edge, against and along its normal; -1: none.
+        is_own: (N,) not on an edge of another component nor beside something in front.
+        starts: (C+1,) first point of each component.
+    """
+
+    points_in_body: NDArray[np.float32]
+    tangents: NDArray[np.float32]
+    component: NDArray[np.int16]
+    sides: NDArray[np.int16]
+    is_own: NDArray[np.bool_]
+    starts: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Look:
+    """What one picture says of the components.
+
+    Attributes:
+        against: (C,) log-likelihood ratio of "not where expected" to "as expected"; 0 where nothing is said.
+        is_shown: (C,) enough of it shows to say something.
+        borne_out, elsewhere: (C,) share of its points on edges of the picture, at its place and at the best other.
+        contrast: (C,) mean change of colour across its outline in deviations, -1 where there is none.
+        surroundings: (C,) share of the points around it that is borne out.
+    """
+
+    against: Array
+    is_shown: NDArray[np.bool_]
+    borne_out: Array
+    elsewhere: Array
+    contrast: Array
+    surroundings: Array
+
+
+@njit(cache=True, nogil=True)
+def _sample_edges(  # type: ignore[no-untyped-def]
+    vertices, ends, faces, is_sharp, normals, component, cam_from_model, focal, middle, ids, depth, tolerance_mm
+):  # fmt: skip
+    """Samples every pixel along visible design edges and silhouettes of a view.
+
+    As `mesh_edges.sample_visible_edges`, but a silhouette is also seen where the surface beside it curves towards the
+    camera by more than the tolerance: thin cylinders.
+
+    Returns:
+        points (N,3) mm, tangents (N,3), pixels (N,2), image normals (N,2), depths (N,), component (N,).
+    """
+    height, width = ids.shape
+    rotation = np.ascontiguousarray(cam_from_model[:3, :3])
+    translation = np.ascontiguousarray(cam_from_model[:3, 3])
+    eye = -np.ascontiguousarray(rotation.T) @ translation
+    capacity = 4096
+    points = np.empty((capacity, 3))
+    tangents = np.empty((capacity, 3))
+    pixels = np.empty((capacity, 2))
+    normals_px = np.empty((capacity, 2))
+    depths = np.empty(capacity)
+    owners = np.empty(capacity, dtype=np.int16)
+    found = 0
+    carry = 0.5
+    for e in range(ends.shape[0]):
+        a = vertices[ends[e, 0]]
+        b = vertices[ends[e, 1]]
+        f0, f1 = faces[e, 0], faces[e, 1]
+        front0 = 0.0
+        front1 = 0.0
+        for k in range(3):
+            front0 += normals[f0, k] * (eye[k] - a[k])
+            if f1 >= 0:
+                front1 += normals[f1, k] * (eye[k] - a[k])
+        silhouette = f1 < 0 or (front0 > 0) != (front1 > 0)
+        if not (silhouette or (is_sharp[e] and front0 > 0)):
+            continue
+        a_cam = rotation @ a + translation
+        b_cam = rotation @ b + translation
+        if a_cam[2] < 1.0 or b_cam[2] < 1.0:
+            continue
+        du = focal * (b_cam[0] / b_cam[2] - a_cam[0] / a_cam[2])
+        dv = focal * (b_cam[1] / b_cam[2] - a_cam[1] / a_cam[2])
+        length = np.sqrt(du * du + dv * dv)
+        size = np.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2)
+        # Edges along the line of sight have no direction in the picture.
+        if length < 0.05 * focal * size / a_cam[2]:
+            continue
+        wanted = length + carry
+        count = int(wanted)
+        carry = wanted - count
+        c = component[e]
+        for i in range(count):
+            t = (i + 0.5) / count
+            z = a_cam[2] + t * (b_cam[2] - a_cam[2])
+            u = focal * (a_cam[0] + t * (b_cam[0] - a_cam[0])) / z + middle
+            v = focal * (a_cam[1] + t * (b_cam[1] - a_cam[1])) / z + middle
+            iu, iv = int(np.round(u)), int(np.round(v))
+            if iu < 1 or iv < 1 or iu >= width - 1 or iv >= height - 1:
+                continue
+            on_surface = False
+            beside = False
+            open_side = False
+            for y in range(iv - 1, iv + 2):
+                for x in range(iu - 1, iu + 2):
+                    d = depth[y, x]
+                    if ids[y, x] == c:
+                        if abs(z - d) < tolerance_mm:
+                            on_surface = True
+                        elif d < z:
+                            beside = True
+                    elif ids[y, x] < 0 or d > z - tolerance_mm:
+                        open_side = True
+            if not (on_surface or (silhouette and beside and open_side)):
+                continue
+            if found == capacity:
+                capacity *= 2
+                points = np.concatenate((points, np.empty_like(points)))
+                tangents = np.concatenate((tangents, np.empty_like(tangents)))
+                pixels = np.concatenate((pixels, np.empty_like(pixels)))
+                normals_px = np.concatenate((normals_px, np.empty_like(normals_px)))
+                depths = np.concatenate((depths, np.empty_like(depths)))
+                owners = np.concatenate((owners, np.empty_like(owners)))
+            for k in range(3):
+                points[found, k] = a[k] + t * (b[k] - a[k])
+                tangents[found, k] = (b[k] - a[k]) / size
+            pixels[found, 0] = u
+            pixels[found, 1] = v
+            normals_px[found, 0] = -dv / length
+            normals_px[found, 1] = du / length
+            depths[found] = z
+            owners[found] = c
+            found += 1
+    return points[:found], tangents[:found], pixels[:found], normals_px[:found], depths[:found], owners[:found]
+
+
+@njit(cache=True, nogil=True)
+def _own_samples(  # type: ignore[no-untyped-def]
+    pixels, normals_px, depths, owners, ids, depth, tolerance_mm, shared_px, shared_cos, occluder_px
+):  # fmt: skip
+    """(N,) False for samples beside a parallel one of another component, or beside something in front of them."""
+    height, width = ids.shape
+    grid = np.full((height, width), -1, dtype=np.int32)
+    following = np.full(pixels.shape[0], -1, dtype=np.int32)
+    for i in range(pixels.shape[0]):
+        x, y = int(np.round(pixels[i, 0])), int(np.round(pixels[i, 1]))
+        following[i] = grid[y, x]
+        grid[y, x] = i
+    own = np.ones(pixels.shape[0], dtype=np.bool_)
+    reach = max(int(np.ceil(shared_px)), occluder_px)
+    for i in range(pixels.shape[0]):
+        x0, y0 = int(np.round(pixels[i, 0])), int(np.round(pixels[i, 1]))
+        for y in range(max(0, y0 - reach), min(height, y0 + reach + 1)):
+            for x in range(max(0, x0 - reach), min(width, x0 + reach + 1)):
+                in_front = ids[y, x] >= 0 and ids[y, x] != owners[i] and depth[y, x] < depths[i] - tolerance_mm
+                if in_front and max(abs(x - x0), abs(y - y0)) <= occluder_px:
+                    own[i] = False
+                j = grid[y, x]
+                while j >= 0:
+                    if owners[j] != owners[i]:
+                        apart = (pixels[j, 0] - pixels[i, 0]) ** 2 + (pixels[j, 1] - pixels[i, 1]) ** 2
+                        along = normals_px[i, 0] * normals_px[j, 0] + normals_px[i, 1] * normals_px[j, 1]
+                        if apart < shared_px * shared_px and abs(along) > shared_cos:
+                            own[i] = False
+                    j = following[j]
+    return own
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _thin_edges(image, weakest):  # type: ignore[no-untyped-def]
+    """Thin edges of an (H,W,3) uint8 picture by the gradient of the strongest channel (Canny, PAMI 1986).
+
+    Returns:
+        strength (H,W) uint8, half grey levels per px, 0 = no edge; angle (H,W) uint8 of the gradient, 256 = 180°.
+    """
+    height, width = image.shape[:2]
+    gx = np.zeros((3, width), dtype=np.float32)
+    gy = np.zeros((3, width), dtype=np.float32)
+    magnitude = np.zeros((3, width), dtype=np.float32)
+    strength = np.zeros((height, width), dtype=np.uint8)
+    angle = np.zeros((height, width), dtype=np.uint8)
+    for row in range(1, height - 1):
+        k = row % 3
+        for x in range(1, width - 1):
+            best = -1
+            for q in range(3):
+                a, b, c = int(image[row - 1, x - 1, q]), int(image[row - 1, x, q]), int(image[row - 1, x + 1, q])
+                d, e = int(image[row, x - 1, q]), int(image[row, x + 1, q])
+                f, g, h = int(image[row + 1, x - 1, q]), int(image[row + 1, x, q]), int(image[row + 1, x + 1, q])
+                dx = c + 2 * e + h - a - 2 * d - f
+                dy = f + 2 * g + h - a - 2 * b - c
+                size = dx * dx + dy * dy
+                if size > best:
+                    best = size
+                    gx[k, x] = 0.125 * dx
+                    gy[k, x] = 0.125 * dy
+            magnitude[k, x] = 0.125 * np.sqrt(best)
+        y = row - 1
+        if y < 2:
+            continue
+        here, up, down = y % 3, (y - 1) % 3, (y + 1) % 3
+        for x in range(2, width - 2):
+            m = magnitude[here, x]
+            if m < weakest:
+                continue
+            dx, dy = gx[here, x], gy[here, x]
+            # The neighbours across the edge, between two pixels each.
+            if abs(dx) > abs(dy):
+                s = abs(dy / dx)
+                after, before = (down, up) if dx * dy > 0 else (up, down)
+                ahead = magnitude[after, x + 1] * s + magnitude[here, x + 1] * (1 - s)
+                behind = magnitude[before, x - 1] * s + magnitude[here, x - 1] * (1 - s)
+            else:
+                s = abs(dx / dy)
+                side = 1 if dx * dy > 0 else -1
+                ahead = magnitude[down, x + side] * s + magnitude[down, x] * (1 - s)
+                behind = magnitude[up, x - side] * s + magnitude[up, x] * (1 - s)
+            if m >= ahead and m > behind:
+                strength[y, x] = min(255, int(2.0 * m))
+                angle[y, x] = int(np.arctan2(dy, dx) / np.pi * 256.0 + 512.0) % 256
+    return strength, angle
+
+
+@njit(cache=True, nogil=True)
+def _owners(pixels, depths, component, height, width):  # type: ignore[no-untyped-def]
+    """(H,W) int16 component whose edges pass within two pixels; -1 none, -2 several."""
+    owners = np.full((height, width), -1, dtype=np.int16)
+    for i in range(pixels.shape[0]):
+        if depths[i] <= 0:
+            continue
+        x0, y0 = int(np.round(pixels[i, 0])), int(np.round(pixels[i, 1]))
+        for y in range(max(0, y0 - 2), min(height, y0 + 3)):
+            for x in range(max(0, x0 - 2), min(width, x0 + 3)):
+                if owners[y, x] == -1:
+                    owners[y, x] = component[i]
+                elif owners[y, x] != component[i]:
+                    owners[y, x] = -2
+    return owners
+
+
+@njit(cache=True, nogil=True)
+def _strength_at(strength, angle, owners, c, places, wanted, dx, dy):  # type: ignore[no-untyped-def]
+    """Strongest edge of a direction at three places (3,2) across an edge, shifted; others' edges do not count."""
+    height, width = strength.shape
+    best = 0
+    for t in range(3):
+        x, y = places[t, 0] + dx, places[t, 1] + dy
+        if x < 0 or y < 0 or x >= width or y >= height:
+            continue
+        s = strength[y, x]
+        if s <= best or (owners[y, x] >= 0 and owners[y, x] != c):
+            continue
+        apart = (np.int64(angle[y, x]) - wanted) & 255
+        if min(apart, 256 - apart) <= 36:
+            best = s
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _best_shift(strength, angle, owners, c, places, wanted, count, shifts, costs, hit):  # type: ignore[no-untyped-def]
+    """Share of ``count`` points on edges at the shift with the strongest edges; sets which points in ``hit``."""
+    best = -1e9
+    best_shift = 0
+    share = 0.0
+    for s in range(shifts.shape[0]):
+        total = -costs[s] * count
+        hits = 0
+        for k in range(count):
+            e = _strength_at(strength, angle, owners, c, places[k], wanted[k], shifts[s, 0], shifts[s, 1])
+            if e > 0:
+                hits += 1
+                total += e / (e + 20.0)
+            elif total + (count - k) < best:
+                break
+        if total > best:
+            best, best_shift, share = total, s, hits / count
+    dx, dy = shifts[best_shift, 0], shifts[best_shift, 1]
+    for k in range(count):
+        hit[k] = _strength_at(strength, angle, owners, c, places[k], wanted[k], dx, dy) > 0
+    return share
+
+
+@njit(cache=True, nogil=True)
+def _contrast(image, pixels, normals, depths, sides, is_own, first, last, reach_px):  # type: ignore[no-untyped-def]
+    """Mean over runs of 10 outline points of how many deviations the colours change across; -1 without runs."""
+    height, width = image.shape[:2]
+    total = 0.0
+    runs = 0
+    i = first
+    while i < last:
+        j = i
+        n = 0
+        change = np.zeros(3)
+        square = np.zeros(3)
+        while (
+            j < last
+            and j - i < 10
+            and sides[j, 0] == sides[i, 0]
+            and sides[j, 1] == sides[i, 1]
+            and depths[j] > 0
+            and (pixels[j, 0] - pixels[i, 0]) ** 2 + (pixels[j, 1] - pixels[i, 1]) ** 2 < 144.0
+        ):
+            u, v, nu, nv = pixels[j, 0] + 0.5, pixels[j, 1] + 0.5, normals[j, 0] * reach_px, normals[j, 1] * reach_px
+            xa, ya, xb, yb = int(u - nu), int(v - nv), int(u + nu), int(v + nv)
+            if is_own[j] and min(xa, xb) >= 0 and min(ya, yb) >= 0 and max(xa, xb) < width and max(ya, yb) < height:
+                n += 1
+                for q in range(3):
+                    d = float(image[yb, xb, q]) - float(image[ya, xa, q])
+                    change[q] += d
+                    square[q] += d * d
+            j += 1
+        if n >= 5 and sides[i, 0] != sides[i, 1]:
+            runs += 1
+            largest = 0.0
+            for q in range(3):
+                mean = change[q] / n
+                deviation = np.sqrt(max(square[q] / n - mean * mean, 1.0) / n)
+                largest = max(largest, abs(mean) / (deviation + 0.5))
+            total += min(largest, 10.0)
+        i = max(j, i + 1)
+    return total / runs if runs > 0 else -1.0
+
+
+@njit(cache=True, nogil=True)
+def _surroundings(pixels, chosen, sizes, hit, c, wanted, least):  # type: ignore[no-untyped-def]
+    """Share of the points of other components nearest to those of one that is borne out; 1 where there are few."""
+    low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
+    for k in range(sizes[c]):
+        i = chosen[c, k]
+        low_u, high_u = min(low_u, pixels[i, 0]), max(high_u, pixels[i, 0])
+        low_v, high_v = min(low_v, pixels[i, 1]), max(high_v, pixels[i, 1])
+    reach = 16.0
+    hits = 0
+    tried = 0
+    while reach < 130.0:
+        hits = 0
+        tried = 0
+        for o in range(sizes.shape[0]):
+            if o == c:
+                continue
+            for k in range(sizes[o]):
+                u, v = pixels[chosen[o, k], 0], pixels[chosen[o, k], 1]
+                if u < low_u - reach or u > high_u + reach or v < low_v - reach or v > high_v + reach:
+                    continue
+                for q in range(sizes[c]):
+                    j = chosen[c, q]
+                    if (pixels[j, 0] - u) ** 2 + (pixels[j, 1] - v) ** 2 < reach * reach:
+                        tried += 1
+                        hits += hit[o, k]
+                        break
+        if tried >= wanted:
+            break
+        reach *= 1.5
+    return hits / tried if tried >= least else 1.0
+
+
+@njit(cache=True, nogil=True)
+def measure_components(  # type: ignore[no-untyped-def]
+    image, points, tangents, component, sides, is_own, starts, cam_from_body, intrinsics, step_mm, near, near_costs,
+    far, weakest, most_points, least_points, seen_well, usual_elsewhere, colour_px, around, least_around
+):  # fmt: skip
+    """What a picture shows of each component.
+
+    Args:
+        image: (H,W,3) uint8, smoothed.
+        points, tangents, component, sides, is_own, starts: of a `ComponentSheet`.
+        cam_from_body, intrinsics: (4,4) and (10,) of the picture.
+        step_mm: length over which directions are projected.
+        near, near_costs: (S,2) int shifts in px that leave a component where it is, and what each must gain.
+        far: (T,2) int shifts in px to other places.
+
+    Returns:
+        (C,6): share of its points borne out, -1 where it does not show; the best share elsewhere; contrast; share of
+        the surroundings borne out; share of all other components borne out; points by their weakest direction.
+    """
+    height, width = image.shape[:2]
+    count = starts.shape[0] - 1
+    pixels, normals, depths = project_lines(points, tangents, True, cam_from_body, intrinsics, step_mm)
+    strength, angle = _thin_edges(image, weakest)
+    owners = _owners(pixels, depths, component, height, width)
+    found = np.full((count, 6), -1.0)
+    chosen = np.empty((count, most_points), dtype=np.int64)
+    sizes = np.zeros(count, dtype=np.int64)
+    hit = np.zeros((count, most_points), dtype=np.bool_)
+    elsewhere = np.zeros(most_points, dtype=np.bool_)
+    usable = np.empty(pixels.shape[0], dtype=np.int64)
+    places = np.empty((most_points, 3, 2), dtype=np.int64)
+    wanted = np.empty(most_points, dtype=np.int64)
+    no_costs = np.zeros(far.shape[0])
+    all_hits = 0.0
+    all_points = 0
+    for c in range(count):
+        own = 0
+        inside = 0
+        xx = 0.0
+        yy = 0.0
+        xy = 0.0
+        for i in range(starts[c], starts[c + 1]):
+            if not is_own[i]:
+                continue
+            own += 1
+            if depths[i] > 0 and 3 < pixels[i, 0] < width - 4 and 3 < pixels[i, 1] < height - 4:
+                usable[inside] = i
+                inside += 1
+                xx += normals[i, 0] ** 2
+                yy += normals[i, 1] ** 2
+                xy += normals[i, 0] * normals[i, 1]
+        if inside < least_points or inside < 0.8 * own:
+            continue
+        kept = min(inside, most_points)
+        for k in range(kept):
+            i = usable[int((k + 0.5) * inside / kept)]
+            chosen[c, k] = i
+            wanted[k] = int(np.arctan2(normals[i, 1], normals[i, 0]) / np.pi * 256.0 + 512.0) & 255
+            for t in range(3):
+                places[k, t, 0] = int(pixels[i, 0] + (t - 1) * normals[i, 0] + 0.5)
+                places[k, t, 1] = int(pixels[i, 1] + (t - 1) * normals[i, 1] + 0.5)
+        sizes[c] = kept
+        here = _best_shift(strength, angle, owners, c, places, wanted, kept, near, near_costs, hit[c])
+        found[c, 0] = here
+        found[c, 1] = usual_elsewhere
+        if here < seen_well:
+            found[c, 1] = _best_shift(strength, angle, owners, c, places, wanted, kept, far, no_costs, elsewhere)
+        first, last = starts[c], starts[c + 1]
+        found[c, 2] = _contrast(image, pixels, normals, depths, sides, is_own, first, last, colour_px)
+        found[c, 5] = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+        all_points += kept
+        all_hits += here * kept
+    for c in range(count):
+        if sizes[c] == 0:
+            continue
+        found[c, 3] = _surroundings(pixels, chosen, sizes, hit, c, around, least_around)
+        others = all_points - sizes[c]
+        found[c, 4] = (all_hits - found[c, 0] * sizes[c]) / others if others > 0 else 1.0
+    return found
+
+
+class ComponentCheck:
+    """Watches whether the components of one part are where the CAD has them, for one camera.
+
+    Args:
+        views: guide views; their directions and camera are used.
+        model: the same model.
+        camera: of the pictures.
+    """
+
+    def __init__(self, views: GuideViewSet, model: Model, camera: Camera) -> None:
+        self.views, self.model, self.camera = views, model, camera
+        self._renderer = ZBufferRenderer(model, views.camera)
+        self._edges = mesh_edges(model, views.options.crease_angle_deg)
+        self._model_from_body = rigid(np.eye(3), views.center_in_model)
+        self._sheets: dict[int, ComponentSheet] = {}
+        self.reset()
+
+    @property
+    def mismatches(self) -> tuple[str, ...]:
+        """What is not as the CAD says, one message a component."""
+        return self._messages(self._is_named)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether a component that is not named must be looked at again before the part can be called right."""
+        return bool(self._looks < EAGER_LOOKS and np.any(self._evidence > DOUBTFUL))
+
+    def reset(self) -> None:
+        """Forget what was seen: another part may be in view."""
+        count = len(self.views.component_names)
+        self._evidence = np.zeros(count)
+        self._is_named = np.zeros(count, dtype=bool)
+        self._looks = 0
+        self._frames = 0
+        self._directions = np.zeros((0, 3))
+        self._visits = np.zeros((0, count))
+
+    def update(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
+        """Take in a frame with a good pose; only the first ones and then every few are looked at."""
+        self._frames += 1
+        if len(self.model.components) < 2 or (self._looks >= EAGER_LOOKS and self._frames % LOOK_EVERY != 0):
+            return
+        look = self.look(image, cam_from_model)
+        self._looks += 1
+        news = self._news(cam_from_model, look.against != 0.0)
+        self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + news * look.against, -BOUND, BOUND)
+        self._is_named = self._evidence > np.where(self._is_named, CLEARED, NAMED)
+
+    def single_look(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[str, ...]:
+        """Mismatches that one picture alone bears out; what was seen before does not count, nor is it changed."""
+        if len(self.model.components) < 2:
+            return ()
+        return self._messages(self.look(image, cam_from_model).against > SINGLE)
+
+    def look(self, image: NDArray[np.uint8], cam_from_model: Array) -> Look:
+        """What a picture says of the components at a pose.
+
+        Args:
+            image: (H,W,3) uint8 RGB of the camera's size.
+            cam_from_model: (4,4) mm, right to a pixel or two.
+        """
+        found = self._measure(image, cam_from_model)
+        borne_out, elsewhere, contrast, around, others, spread = found.T
+        is_shown = borne_out >= 0.0
+        constant, per_share, per_lead, per_contrast = MODEL
+        ratio = constant + per_share * borne_out + per_lead * (borne_out - elsewhere)
+        ratio += per_contrast * np.clip(contrast, 0.0, MOST_CONTRAST)
+        ratio *= np.maximum(spread, 0.0) / (np.maximum(spread, 0.0) + HALF_LAMBDA)
+        # Where the surroundings are not seen either, something hides it, or the picture is blurred.
+        is_open = np.clip((np.minimum(around, others) - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
+        ratio = np.where(ratio > 0.0, ratio * is_open, ratio)
+        against = np.where(is_shown, np.clip(ratio, -LARGEST_RATIO, LARGEST_RATIO), 0.0)
+        return Look(against, is_shown, borne_out, elsewhere, contrast, around)
+
+    def _measure(self, image: NDArray[np.uint8], cam_from_model: Array) -> Array:
+        """(C,6), see `measure_components`."""
+        camera, diameter_mm = self.camera, self.views.diameter_mm
+        cam_from_body = cam_from_model @ self._model_from_body
+        scale = camera.fx / max(float(cam_from_body[2, 3]), 1.0)
+        shrink = max(1, round(diameter_mm * scale / LARGEST_PX))
+        size = np.array([camera.width, camera.height])
+        reach = 0.55 * diameter_mm * scale + SEARCHED_PX * shrink
+        center = np.nan_to_num(camera.project(cam_from_body[:3, 3]))
+        low = np.clip(np.floor(center - reach), 0, size - 8 * shrink).astype(int)
+        small = (np.clip(np.ceil(center + reach), low + 8 * shrink, size).astype(int) - low) // shrink
+        high = low + small * shrink
+        window = image[low[1] : high[1], low[0] : high[0]]
+        if shrink > 1:
+            window = np.asarray(cv2.resize(window, (int(small[0]), int(small[1])), interpolation=cv2.INTER_AREA))
+        intrinsics = intrinsics_of(camera)
+        intrinsics[:2] /= shrink
+        intrinsics[2:4] = (intrinsics[2:4] - low + 0.5) / shrink - 0.5
+        scale /= shrink
+        allowed = min(DISPLACED_MM, DISPLACED_SHARE * diameter_mm) * scale + POSE_PX
+        searched = min(SEARCHED_MM * scale, SEARCHED_SHARE * diameter_mm * scale, SEARCHED_PX)
+        near, far = _disc(0.0, allowed, 1), _disc(allowed + 2.0, max(searched, allowed + 6.0), 3)
+        sheet = self._sheet(cam_from_model)
+        return np.asarray(
+            measure_components(
+                cv2.GaussianBlur(window, (3, 3), 0), sheet.points_in_body, sheet.tangents, sheet.component,
+                sheet.sides, sheet.is_own, sheet.starts, cam_from_body, intrinsics, 0.01 * diameter_mm, near,
+                SHIFT_COST * np.sum(near**2, axis=1) / allowed**2, far, WEAKEST_STEP, POINTS, LEAST_POINTS, SEEN_WELL,
+                USUAL_ELSEWHERE, COLOUR_PX, SURROUNDINGS, LEAST_SURROUNDINGS,
+            )
+        )  # fmt: skip
+
+    def _sheet(self, cam_from_model: Array) -> ComponentSheet:
+        """The edges of the guide view whose direction is nearest, made when first needed."""
+        index = int(np.argmax(self.views.directions @ self._direction(cam_from_model)))
+        if index not in self._sheets:
+            if len(self._sheets) >= KEPT_SHEETS:
+                del self._sheets[next(iter(self._sheets))]
+            self._sheets[index] = self._make_sheet(self.views.poses[index])
+        return self._sheets[index]
+
+    def _make_sheet(self, cam_from_model: Array) -> ComponentSheet:
+        camera, edges = self.views.camera, self._edges
+        rendering = self._renderer.render(cam_from_model)
+        ids, depth = rendering.component_ids, rendering.depth_mm
+        tolerance_mm = 3.0 * float(np.median(depth[depth > 0])) / camera.fx if np.any(depth > 0) else 1.0
+        points, tangents, pixels, normals_px, depths, owners = _sample_edges(
+            edges.vertices_in_model, edges.ends, edges.faces, edges.is_sharp, edges.face_normals, edges.component,
+            cam_from_model, camera.fx, camera.cx, ids, depth, tolerance_mm,
+        )  # fmt: skip
+        order = np.argsort(owners, kind="stable")
+        own = _own_samples(
+            pixels, normals_px, depths, owners, ids, depth, tolerance_mm, SHARED_PX, SHARED_COS, OCCLUDER_PX
+        )
+        beside = [np.round(pixels + sign * SIDE_PX * normals_px).astype(np.intp) for sign in (-1, 1)]
+        beside = [np.clip(place, 0, [camera.width - 1, camera.height - 1]) for place in beside]
+        return ComponentSheet(
+            points_in_body=(points - self.views.center_in_model)[order].astype(np.float32),
+            tangents=tangents[order].astype(np.float32),
+            component=owners[order],
+            sides=np.stack([ids[place[:, 1], place[:, 0]] for place in beside], axis=1)[order],
+            is_own=own[order],
+            starts=np.searchsorted(owners[order], np.arange(len(self.model.components) + 1)).astype(np.int64),
+        )
+
+    def _direction(self, cam_from_model: Array) -> Array:
+        """(3,) unit vector from the part's centre to the camera."""
+        offset = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - self.views.center_in_model
+        return np.asarray(offset / np.linalg.norm(offset), dtype=np.float64)
+
+    def _news(self, cam_from_model: Array, is_told: NDArray[np.bool_]) -> Array:
+        """(C,) how much a look counts for each component: less the oftener it was seen from this direction."""
+        direction = self._direction(cam_from_model)
+        cosines = self._directions @ direction
+        if len(cosines) == 0 or cosines.max() < np.cos(np.deg2rad(NEW_DIRECTION_DEG)):
+            self._directions = np.concatenate([self._directions[-63:], direction[None]])
+            self._visits = np.concatenate([self._visits[-63:], np.zeros((1, len(is_told)))])
+            nearest = len(self._directions) - 1
+        else:
+            nearest = int(np.argmax(cosines))
+        self._visits[nearest] += is_told
+        return np.asarray(np.maximum(1.0 / np.maximum(self._visits[nearest], 1.0), LEAST_NEWS))
+
+    def _messages(self, is_wrong: NDArray[np.bool_]) -> tuple[str, ...]:
+        names = self.views.component_names
+        return tuple(f"mismatch: {names[index]} not seen where expected" for index in np.flatnonzero(is_wrong))
+
+
+def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:
+    """(S,2) points of a grid between two radii."""
+    reach = step * int(outer_px // step)
+    axis = np.arange(-reach, reach + 1, step)
+    points = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    radius = np.linalg.norm(points, axis=1)
+    return np.ascontiguousarray(points[(radius >= inner_px) & (radius <= outer_px)], dtype=np.int64)
