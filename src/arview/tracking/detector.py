@@ -62,6 +62,8 @@ FINE_STAGES = (
 
 STEPS_PER_OCTAVE = 4
 """Scales at which response maps are made: the distances of the templates, shared by all levels of the search."""
+SPREAD_PX = 1
+"""How far edges may lie from where a pose has them, in pixels of the maps."""
 LARGEST_SCALE = 1.5
 """The picture is not enlarged more than this."""
 
@@ -89,9 +91,9 @@ class Level:
 
 
 LEVELS = (
-    Level(1.0, 7.0, 0.07, 2, 0, 90, 6.0, 48),
-    Level(2.0, 4.0, 0.035, 2, 0, 24, 4.0, 64),
-    Level(4.0, 2.0, 0.017, 2, 1, 8, 2.5, 96),
+    Level(1.3, 7.0, 0.07, 2, 0, 90, 6.0, 48),
+    Level(2.6, 4.0, 0.035, 2, 0, 24, 4.0, 64),
+    Level(5.2, 2.0, 0.017, 2, 1, 8, 2.5, 96),
 )
 
 
@@ -104,24 +106,24 @@ class DetectorOptions:
         points: per template, a multiple of 4.
         roll_step_deg: spacing of the templates.
         subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
-        spread_px: how far edges may lie from where the template has them.
         grid_px: places looked at are so far apart.
-        matches: template matches kept at each distance.
+        matches: the best template matches of all distances.
         starts: of those, how many places apart from each other are searched around.
+        likeliest: of these, how many are tried first, and alone if they settle the matter.
         levels: of that search.
         finalists: how many of its results are refined to the end.
         min_in_picture: less of the outline inside the picture is no detection.
         min_quality: a weaker result is no detection.
     """
 
-    radius_px: float = 26.0
+    radius_px: float = 20.0
     points: int = 64
     roll_step_deg: float = 18.0
     subdivisions: int = 2
-    spread_px: int = 2
     grid_px: int = 2
-    matches: int = 600
+    matches: int = 1500
     starts: int = 300
+    likeliest: int = 40
     levels: tuple[Level, ...] = LEVELS
     finalists: int = 5
     min_quality: float = 0.5
@@ -162,11 +164,11 @@ class Candidate:
 class _Picture:
     """A frame with what was made from it: response maps by scale, kept until the frame is done with."""
 
-    def __init__(self, image: NDArray[np.uint8], camera: Camera, spread_px: int, pad_px: int) -> None:
+    def __init__(self, image: NDArray[np.uint8], camera: Camera, pad_px: int) -> None:
         self.image = image
         self.gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         self.pad_px = pad_px
-        self._camera, self._spread_px = camera, spread_px
+        self._camera = camera
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
 
     def make(self, steps: Sequence[int]) -> None:
@@ -184,11 +186,14 @@ class _Picture:
         camera = self._camera
         scale = 2.0 ** (step / STEPS_PER_OCTAVE)
         width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
+        # Edges are found at twice the resolution as long as the picture has it.
+        pool = 2 if scale <= 0.5 else 1
         way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        image = self.image if scale == 1.0 else np.asarray(cv2.resize(self.image, (width, height), interpolation=way))
+        size = (pool * width, pool * height)
+        image = self.image if size == (camera.width, camera.height) else cv2.resize(self.image, size, interpolation=way)
         intrinsics = intrinsics_of(camera.scaled(width, height))
         intrinsics[2:4] += self.pad_px
-        return response_maps(image, self._spread_px, self.pad_px), intrinsics
+        return response_maps(np.asarray(image), SPREAD_PX, self.pad_px, pool), intrinsics
 
 
 class Detector:
@@ -232,8 +237,15 @@ class Detector:
         """
         o = self.options
         picture = self._picture(image)
-        likely = self.candidates(picture)
-        settled = self._settle(picture.image, picture.gray, likely)
+        starts = self.starts(picture)
+        settled: list[tuple[float, Array]] = []
+        # The likeliest first: when they settle the matter, the others are not looked at.
+        for batch in (starts[: o.likeliest], starts[o.likeliest :]):
+            settled += self._settle(picture.image, picture.gray, self.climbed(picture, batch))
+            settled.sort(key=lambda item: -self._rank(*item))
+            best = self._quality(*settled[0]) if settled else 0.0
+            if (best < HOPELESS_QUALITY and not is_thorough) or (settled and self._is_sure(settled[0][1], best)):
+                break
         found = [
             Detection(pose @ self.tracker.part.body_from_model, quality)
             for quality, pose in ((self._quality(worth, pose), pose) for worth, pose in settled)
@@ -243,14 +255,13 @@ class Detector:
 
     def _picture(self, image: NDArray[np.uint8]) -> _Picture:
         o = self.options
-        return _Picture(image, self.camera, o.spread_px, round(0.6 * o.radius_px))
+        return _Picture(image, self.camera, round(0.6 * o.radius_px))
 
-    def candidates(self, picture: _Picture) -> list[Candidate]:
-        """The likeliest hypotheses after all levels of the search, best first."""
-        found = self.starts(picture)
+    def climbed(self, picture: _Picture, starts: list[Candidate]) -> list[Candidate]:
+        """The likeliest hypotheses after all levels of the search from some starts, best first."""
         for level in self.options.levels:
-            found = self._climb(picture, found, level)
-        return found
+            starts = self._climb(picture, starts, level)
+        return starts
 
     def starts(self, picture: _Picture) -> list[Candidate]:
         """The best template matches over the whole range, apart from each other, best first."""
@@ -258,8 +269,10 @@ class Detector:
         bank = self.bank
         picture.make(self._steps)
         halves = [0, len(bank.bins) // 2, len(bank.bins)]
-        jobs = [(step, first, last) for step in self._steps for first, last in zip(halves, halves[1:], strict=False)]
-        matches = [m for m in _pool().map(lambda job: self._match(picture, *job), jobs) if m is not None]
+        # Small pictures first: what is found there raises the bar for the large ones.
+        bar = np.zeros(1)
+        jobs = [(step, first, last) for step in reversed(self._steps) for first, last in zip(halves, halves[1:], strict=False)]
+        matches = [m for m in _pool().map(lambda job: self._match(picture, bar, *job), jobs) if m is not None]
         if not matches:
             return []
         keys, rotations, positions = (np.concatenate([m[k] for m in matches]) for k in range(3))
@@ -270,15 +283,17 @@ class Detector:
         chosen = choose_apart(rotations, positions, reach, np.cos(0.28), 1.22, o.starts)
         return [Candidate(float(keys[i]), rigid(rotations[i], positions[i])) for i in chosen]
 
-    def _match(self, picture: _Picture, step: int, first: int, last: int) -> tuple[Array, Array, Array] | None:
+    def _match(
+        self, picture: _Picture, bar: Array, step: int, first: int, last: int
+    ) -> tuple[Array, Array, Array] | None:
         """Keys (M,), rotations (M,3,3) and positions (M,3) mm of the matches of some templates at one scale."""
         o = self.options
         bank = self.bank
-        maps, intrinsics = picture.maps(step)
+        maps, _ = picture.maps(step)
         if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
             return None
         keys, templates, places = match_templates(
-            decimate(maps, o.grid_px), bank.offsets, bank.bins, bank.gains, first, last, o.matches // 2, LOWEST_SCORE
+            decimate(maps, o.grid_px), bank.offsets, bank.bins, bank.gains, first, last, o.matches, LOWEST_SCORE, bar
         )
         camera = self.camera
         size = np.array(maps.shape[:0:-1]) - 2 * picture.pad_px

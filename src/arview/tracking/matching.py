@@ -22,82 +22,101 @@ ORIENTATIONS = 8
 """Bins over 180°."""
 
 
-def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int) -> NDArray[np.uint8]:
-    """(8, H + 2 pad, W + 2 pad) uint8 responses of an RGB or gray picture, 255 = a clear edge of that orientation."""
+COMMON = 0.5
+"""Share of the mean of all orientations that is taken from each: clutter answers to all of them."""
+
+
+def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int, pool: int = 1) -> NDArray[np.uint8]:
+    """(8, H + 2 pad, W + 2 pad) uint8 responses of an RGB or gray picture, 255 = a clear edge of that orientation.
+
+    With ``pool`` the maps are so many times smaller than the picture; each of their pixels has the strongest edge of
+    those it stands for: fine lines that lie close keep their directions. ``spread_px`` is in pixels of the maps.
+    """
     smooth = cv2.GaussianBlur(image, (3, 3), 0)
-    gx, gy, magnitude = _gradients(smooth if smooth.ndim == 3 else smooth[..., None])
-    around = cv2.boxFilter(magnitude, -1, (21, 21), borderType=cv2.BORDER_REFLECT)
-    own = _oriented(gx, gy, magnitude, around, cv2.dilate(magnitude, np.ones((3, 3), np.uint8)))
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * spread_px + 1, 2 * spread_px + 1))
+    gx, gy = cv2.Sobel(smooth, cv2.CV_16S, 1, 0, ksize=3), cv2.Sobel(smooth, cv2.CV_16S, 0, 1, ksize=3)
+    if image.ndim == 2:
+        gx, gy = gx[..., None], gy[..., None]
+    x, y, magnitude = _strongest(gx, gy)
+    size = 20 * pool + 1
+    around = cv2.boxFilter(magnitude, -1, (size, size), borderType=cv2.BORDER_REFLECT)
+    own = _oriented(x, y, magnitude, around, cv2.dilate(magnitude, np.ones((3, 3), np.uint8)), pool)
+    shape = cv2.MORPH_RECT if spread_px == 1 else cv2.MORPH_ELLIPSE
+    kernel = cv2.getStructuringElement(shape, (2 * spread_px + 1, 2 * spread_px + 1))
     for plane in own:
         cv2.dilate(plane, kernel, dst=plane)
     return np.asarray(_without_common(own, pad_px))
 
 
 @njit(cache=True, nogil=True)
-def _gradients(image):  # type: ignore[no-untyped-def]
-    """Sobel gx, gy (H,W) int16 of the channel with the strongest gradient (Dalal & Triggs 2005), and magnitudes."""
-    height, width, channels = image.shape
-    gx = np.zeros((height, width), dtype=np.int16)
-    gy = np.zeros((height, width), dtype=np.int16)
-    magnitude = np.zeros((height, width), dtype=np.float32)
-    for y in range(height):
-        above, below = max(y - 1, 0), min(y + 1, height - 1)
-        for x in range(width):
-            left, right = max(x - 1, 0), min(x + 1, width - 1)
-            best = 0
+def _strongest(gx, gy):  # type: ignore[no-untyped-def]
+    """Gradient (H,W) of the channel with the strongest one (Dalal & Triggs 2005), and its magnitude in grey levels."""
+    height, width, channels = gx.shape
+    x = np.empty((height, width), dtype=np.float32)
+    y = np.empty((height, width), dtype=np.float32)
+    magnitude = np.empty((height, width), dtype=np.float32)
+    for row in range(height):
+        for column in range(width):
+            best = np.float32(-1.0)
             for c in range(channels):
-                nw, ne = np.int32(image[above, left, c]), np.int32(image[above, right, c])
-                sw, se = np.int32(image[below, left, c]), np.int32(image[below, right, c])
-                dx = ne + se - nw - sw + 2 * (np.int32(image[y, right, c]) - np.int32(image[y, left, c]))
-                dy = sw + se - nw - ne + 2 * (np.int32(image[below, x, c]) - np.int32(image[above, x, c]))
+                dx, dy = np.float32(gx[row, column, c]), np.float32(gy[row, column, c])
                 square = dx * dx + dy * dy
                 if square > best:
                     best = square
-                    gx[y, x] = dx
-                    gy[y, x] = dy
-            magnitude[y, x] = np.sqrt(np.float32(best)) * np.float32(0.25)
-    return gx, gy, magnitude
+                    x[row, column] = dx
+                    y[row, column] = dy
+            magnitude[row, column] = np.float32(0.25) * np.sqrt(best)
+    return x, y, magnitude
 
 
 @njit(cache=True, nogil=True)
-def _oriented(gx, gy, magnitude, around, peak):  # type: ignore[no-untyped-def]
-    """(8,H,W) uint8 strength of thin edges by orientation, relative to the contrast around, shared by two bins."""
-    height, width = magnitude.shape
-    own = np.zeros((ORIENTATIONS, height, width), dtype=np.uint8)
-    for y in range(height):
-        for x in range(width):
+def _oriented(gx, gy, magnitude, around, peak, pool):  # type: ignore[no-untyped-def]
+    """(8, H / pool, W / pool) strength of thin edges by orientation, relative to the contrast around.
+
+    An edge between two orientations counts for both.
+    """
+    rows, columns = magnitude.shape[0] // pool, magnitude.shape[1] // pool
+    own = np.zeros((ORIENTATIONS, rows, columns), dtype=np.uint8)
+    per_rad = np.float32(ORIENTATIONS / np.pi)
+    for y in range(rows * pool):
+        for x in range(columns * pool):
             m = magnitude[y, x]
             # Thin: only a maximum of the neighbourhood in some direction says where the edge is.
-            if m < 0.6 * peak[y, x] or m == 0.0:
+            if m < np.float32(0.6) * peak[y, x] or m < np.float32(0.5):
                 continue
-            strength = 255.0 * m / (m + around[y, x] + 3.0)
-            position = np.arctan2(np.float32(gy[y, x]), np.float32(gx[y, x])) / np.float32(np.pi) * ORIENTATIONS
-            low = np.floor(position)
-            share = position - low
-            bin_low = int(low) % ORIENTATIONS
-            own[bin_low, y, x] = np.uint8(strength * min(1.0, 2.0 * (1.0 - share)))
-            own[(bin_low + 1) % ORIENTATIONS, y, x] = np.uint8(strength * min(1.0, 2.0 * share))
+            strength = np.float32(255.0) * m / (m + around[y, x] + np.float32(3.0))
+            position = np.arctan2(gy[y, x], gx[y, x]) * per_rad + np.float32(ORIENTATIONS)
+            low = int(position)
+            share = position - np.float32(low)
+            a, b = low % ORIENTATIONS, (low + 1) % ORIENTATIONS
+            row, column = y // pool, x // pool
+            value = np.uint8(strength * min(np.float32(1.0), np.float32(2.0) * (np.float32(1.0) - share)))
+            own[a, row, column] = max(own[a, row, column], value)
+            value = np.uint8(strength * min(np.float32(1.0), np.float32(2.0) * share))
+            own[b, row, column] = max(own[b, row, column], value)
     return own
 
 
 @njit(cache=True, nogil=True)
 def _without_common(spread, pad):  # type: ignore[no-untyped-def]
-    """What an orientation has beyond the mean of all, stretched and padded by zeros."""
+    """What an orientation has beyond a share of the mean of all, stretched and padded by zeros."""
     count, height, width = spread.shape
     maps = np.zeros((count, height + 2 * pad, width + 2 * pad), dtype=np.uint8)
     common = np.empty(width, dtype=np.int32)
+    # In integers: COMMON · mean is sum · COMMON / count; the stretch makes up for what is taken.
+    part = np.int32(COMMON * 256 / count)
+    stretch = np.int32(256 * (1.0 + 0.6 * COMMON))
     for y in range(height):
         common[:] = 0
         for o in range(count):
             for x in range(width):
-                common[x] += spread[o, y, x]
+                common[x] += np.int32(spread[o, y, x])
+        for x in range(width):
+            common[x] = (common[x] * part) >> 8
         for o in range(count):
             line = maps[o, y + pad]
             for x in range(width):
-                # 1.6 (s - mean), in integers: 205 / 128.
-                value = ((count * np.int32(spread[o, y, x]) - common[x]) * 205) // (128 * count)
-                line[x + pad] = np.uint8(min(max(value, 0), 255))
+                value = ((np.int32(spread[o, y, x]) - common[x]) * stretch) >> 8
+                line[x + pad] = np.uint8(min(max(value, np.int32(0)), np.int32(255)))
     return maps
 
 

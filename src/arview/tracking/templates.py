@@ -29,8 +29,10 @@ FIRST_POINTS = 16
 """So many points of a template are looked at everywhere, the others only where these bode well."""
 FIRST_MARGIN = 0.1
 """The mean of the first points may be so much lower than the score asked for."""
-TILE = 2048
+TILE = 1024
 """Places looked at together: their sums stay in the nearest cache."""
+SAMPLE, SAMPLE_EVERY = 128, 384
+"""Runs of places from which a template's usual score is taken."""
 
 
 @dataclass(frozen=True)
@@ -162,14 +164,16 @@ def _add_points(total, flat, source, shift, start, size, first, last):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def match_templates(phases, offsets, bins, gains, first_template, last_template, kept, lowest):  # type: ignore[no-untyped-def]
+def match_templates(phases, offsets, bins, gains, first_template, last_template, kept, lowest, bar):  # type: ignore[no-untyped-def]
     """The matches that stand out most.
 
     Args:
         phases: from `decimate`.
         offsets, bins, gains: see `TemplateBank`; the templates from first to last are matched.
-        kept: about so many matches are returned.
+        kept: at most so many matches are returned.
         lowest: mean response below which a match is noise.
+        bar: (1,) key that a match must reach to be among the best ``kept`` of all calls that share this array;
+            they raise it.
 
     Returns:
         keys (M,) by which matches compare, templates (M,), places (M,2) of the offsets' origin in full pixels.
@@ -186,7 +190,6 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
     templates = np.empty(room, dtype=np.int32)
     cells = np.empty(room, dtype=np.int32)
     found = 0
-    bar = 0.0
     full = 63.0 * points
     first_full = 63.0 * FIRST_POINTS
     for t in range(first_template, last_template):
@@ -203,12 +206,12 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
         if last_row < 1 or last_column < 1:
             continue
         span = (last_row - 1) * columns + last_column
-        # What this template scores anywhere in this picture, from the first points in every other tile.
+        # What this template scores anywhere in this picture, from the first points in samples all over it.
         count = 0
         mean = 0.0
         square = 0.0
-        for start in range(0, span, 2 * TILE):
-            size = min(TILE, span - start)
+        for start in range(0, span, SAMPLE_EVERY):
+            size = min(SAMPLE, span - start)
             total[:size] = 0
             _add_points(total, flat, source, shift, start, size, 0, FIRST_POINTS)
             sums = np.uint64(0)
@@ -224,7 +227,7 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
         deviation = np.sqrt(max(square / count - mean * mean, 1.0)) / first_full
         mean /= first_full
         gain = gains[t] / np.sqrt(deviation)
-        asked = max(lowest, mean + bar / gain)
+        asked = max(lowest, mean + bar[0] / gain)
         if asked > 1.0:
             continue
         for start in range(0, span, TILE):
@@ -259,14 +262,16 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
                 found += 1
                 if found == room:
                     best = np.argsort(-keys)[:kept]
-                    bar = max(bar, keys[best[kept - 1]])
+                    bar[0] = max(bar[0], keys[best[kept - 1]])
                     keys[:kept] = keys[best]
                     templates[:kept] = templates[best]
                     cells[:kept] = cells[best]
                     found = kept
-                    asked = max(asked, mean + bar / gain)
+                    asked = max(asked, mean + bar[0] / gain)
                     limit = np.uint16(np.ceil(min(asked, 1.0) * full))
     best = np.argsort(-keys[:found])[:kept]
+    if found >= kept:
+        bar[0] = max(bar[0], keys[best[kept - 1]])
     places = np.empty((len(best), 2), dtype=np.int32)
     for n in range(len(best)):
         places[n, 0] = cells[best[n]] % columns * step
