@@ -542,9 +542,12 @@ class ComponentCheck:
         return self._messages(self._is_named)
 
     @property
-    def is_doubtful(self) -> bool:
-        """Whether a component that is not named must be looked at again before the part can be called right."""
-        return bool(self._looks < EAGER_LOOKS and np.any(self._evidence > DOUBTFUL))
+    def doubtful(self) -> tuple[str, ...]:
+        """Names of components that are to be looked at again before the part can be called right."""
+        if self._looks >= EAGER_LOOKS:
+            return ()
+        names = self.views.component_names
+        return tuple(names[index] for index in np.flatnonzero((self._evidence > DOUBTFUL) & ~self._is_named))
 
     def reset(self) -> None:
         """Forget what was seen: another part may be in view."""

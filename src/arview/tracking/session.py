@@ -18,6 +18,7 @@ from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, check_rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
+from arview.tracking.components import ComponentCheck
 from arview.tracking.detector import Detector, DetectorOptions
 from arview.tracking.snap import Snap
 from arview.tracking.tracker import Estimate, Tracker, TrackerOptions
@@ -113,6 +114,7 @@ class TrackingSession:
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
         self._snap: Snap | None = None
+        self.components = ComponentCheck(views, model, camera)
         self.reset()
 
     @property
@@ -142,6 +144,7 @@ class TrackingSession:
         self._critical = 0
         self._lost_frames = 0
         self._confirmed = False
+        self._borne_out = False
         self._was_found = False
         self._recent: list[Array] = []
         self._why = self._why_lost = ""
@@ -166,6 +169,8 @@ class TrackingSession:
             estimate, reason = self._follow(image)
         else:
             estimate, reason = self._search(image)
+        if estimate is not None:
+            reason = self._compare(image, estimate, reason)
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
             guide = self._guide if self.is_aligning else None
@@ -179,7 +184,21 @@ class TrackingSession:
             index=index,
             ms=ms,
             reason=reason,
+            mismatches=self.components.mismatches,
         )
+
+    def _compare(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:
+        """Look whether the components are where the CAD has them; a part with one wrong is never `tracked`."""
+        self._borne_out = self.state == TrackingState.TRACKED
+        if self._borne_out:
+            self.components.update(image, estimate.cam_from_model)
+        reasons = [reason, *self.components.mismatches] if reason else [*self.components.mismatches]
+        doubtful = self.components.doubtful
+        if doubtful and not reasons:
+            reasons = [f"not yet seen: {', '.join(doubtful)}"]
+        if reasons:
+            self.state = TrackingState.CRITICAL
+        return "; ".join(reasons)
 
     def _follow(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
         o = self.options
@@ -194,8 +213,7 @@ class TrackingSession:
             return self._lose(why_lost(image, estimate, recent, self.camera, self._views, is_possible))
         if not poor:
             self._recent = [*self._recent[-1:], estimate.cam_from_model]
-        was_tracked = self.state == TrackingState.TRACKED
-        if not poor and quality >= (o.critical_quality if was_tracked else o.tracked_quality):
+        if not poor and quality >= (o.critical_quality if self._borne_out else o.tracked_quality):
             self.state = TrackingState.TRACKED
             self._critical = 0
             self._confirmed = self._was_found = True
@@ -247,6 +265,7 @@ class TrackingSession:
                 return None, self._why_not(image, self.detector.best_rejected)
             start = detections[0].cam_from_model
         self.tracker.start(image, start)
+        self.components.reset()
         estimate = self.tracker.track(image)
         if estimate.quality < o.tracked_quality or not self._is_possible(estimate):
             return None, self._why_not(image, Rejected(estimate.cam_from_model, estimate.evidence, estimate.quality))
@@ -262,6 +281,7 @@ class TrackingSession:
         snapped = self.snap.lock(image, guide_cam_from_model, self.options.lock_quality)
         if snapped is not None:
             self.tracker.start(image, snapped.cam_from_model)
+            self.components.reset()
             estimate = self.tracker.track(image)
             is_good = estimate.quality >= self.options.lock_quality and self._is_possible(estimate)
             if is_good and self.snap.is_near(estimate.cam_from_model, guide_cam_from_model):
