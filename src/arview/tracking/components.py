@@ -16,6 +16,7 @@ instead. One set of constants serves all parts.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
-from arview.geometry import Array, rigid
+from arview.geometry import Array, apply, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import mesh_edges
 from arview.render import ZBufferRenderer
@@ -76,8 +77,10 @@ FORGETTING = 0.01
 NEW_DIRECTION_DEG = 6.0
 LEAST_NEWS = 0.05
 """Looks from about the same direction say the same: the n-th counts 1/n, but no less than this."""
-EAGER_LOOKS, LOOK_EVERY = 3, 4
-"""So many frames after a lock are looked at, then every n-th."""
+EAGER_LOOKS = 3
+"""So many frames after a lock are looked at."""
+LOOK_EVERY, REST_FRAMES = 4, 40
+"""Frames between looks while something is doubtful or the direction is new, and else."""
 KEPT_SHEETS = 64
 
 
@@ -134,9 +137,12 @@ def _sample_edges(  # type: ignore[no-untyped-def]
         points (N,3) mm, tangents (N,3), pixels (N,2), image normals (N,2), depths (N,), component (N,).
     """
     height, width = ids.shape
-    rotation = np.ascontiguousarray(cam_from_model[:3, :3])
-    translation = np.ascontiguousarray(cam_from_model[:3, 3])
-    eye = -np.ascontiguousarray(rotation.T) @ translation
+    r = cam_from_model
+    eye = np.empty(3)
+    for k in range(3):
+        eye[k] = -(r[0, k] * r[0, 3] + r[1, k] * r[1, 3] + r[2, k] * r[2, 3])
+    a_cam = np.empty(3)
+    b_cam = np.empty(3)
     capacity = 4096
     points = np.empty((capacity, 3))
     tangents = np.empty((capacity, 3))
@@ -159,8 +165,9 @@ def _sample_edges(  # type: ignore[no-untyped-def]
         silhouette = f1 < 0 or (front0 > 0) != (front1 > 0)
         if not (silhouette or (is_sharp[e] and front0 > 0)):
             continue
-        a_cam = rotation @ a + translation
-        b_cam = rotation @ b + translation
+        for k in range(3):
+            a_cam[k] = r[k, 0] * a[0] + r[k, 1] * a[1] + r[k, 2] * a[2] + r[k, 3]
+            b_cam[k] = r[k, 0] * b[0] + r[k, 1] * b[1] + r[k, 2] * b[2] + r[k, 3]
         if a_cam[2] < 1.0 or b_cam[2] < 1.0:
             continue
         du = focal * (b_cam[0] / b_cam[2] - a_cam[0] / a_cam[2])
@@ -251,64 +258,60 @@ def _own_samples(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _thin_edges(image, weakest):  # type: ignore[no-untyped-def]
-    """Thin edges of an (H,W,3) uint8 picture by the gradient of the strongest channel (Canny, PAMI 1986).
+def _thin_edges(slopes, weakest, edges, strength):  # type: ignore[no-untyped-def]
+    """Thin edges by the slope of the strongest channel (Canny, PAMI 1986).
 
-    Returns:
-        strength (H,W) uint8, half grey levels per px, 0 = no edge; angle (H,W) uint8 of the gradient, 256 = 180°.
+    Args:
+        slopes: (6,H,W) int16 Sobel's slopes to the right and down of each channel, eighths of a grey level per px.
+        weakest: edge, grey levels per px.
+        edges: (3,H,W) float32, becomes the slope, its part to the right and its part down.
+        strength: (H,W) uint8, becomes the slope of edges in half grey levels per px, 0 = no edge.
     """
-    height, width = image.shape[:2]
-    gx = np.zeros((3, width), dtype=np.float32)
-    gy = np.zeros((3, width), dtype=np.float32)
-    magnitude = np.zeros((3, width), dtype=np.float32)
-    strength = np.zeros((height, width), dtype=np.uint8)
-    angle = np.zeros((height, width), dtype=np.uint8)
-    for row in range(1, height - 1):
-        k = row % 3
-        for x in range(1, width - 1):
-            best = -1
-            for q in range(3):
-                a, b, c = int(image[row - 1, x - 1, q]), int(image[row - 1, x, q]), int(image[row - 1, x + 1, q])
-                d, e = int(image[row, x - 1, q]), int(image[row, x + 1, q])
-                f, g, h = int(image[row + 1, x - 1, q]), int(image[row + 1, x, q]), int(image[row + 1, x + 1, q])
-                dx = c + 2 * e + h - a - 2 * d - f
-                dy = f + 2 * g + h - a - 2 * b - c
-                size = dx * dx + dy * dy
-                if size > best:
-                    best = size
-                    gx[k, x] = 0.125 * dx
-                    gy[k, x] = 0.125 * dy
-            magnitude[k, x] = 0.125 * np.sqrt(best)
-        y = row - 1
-        if y < 2:
-            continue
-        here, up, down = y % 3, (y - 1) % 3, (y + 1) % 3
+    height, width = strength.shape
+    for y in range(height):
+        for x in range(width):
+            du = np.float32(slopes[0, y, x])
+            dv = np.float32(slopes[1, y, x])
+            best = du * du + dv * dv
+            for q in range(2, 6, 2):
+                qu = np.float32(slopes[q, y, x])
+                qv = np.float32(slopes[q + 1, y, x])
+                square = qu * qu + qv * qv
+                is_more = square > best
+                best = square if is_more else best
+                du = qu if is_more else du
+                dv = qv if is_more else dv
+            edges[0, y, x] = np.sqrt(best)
+            edges[1, y, x] = du
+            edges[2, y, x] = dv
+    size = edges[0]
+    strength[:] = 0
+    least = np.float32(8.0 * weakest)
+    for y in range(2, height - 2):
         for x in range(2, width - 2):
-            m = magnitude[here, x]
-            if m < weakest:
+            m = size[y, x]
+            if m < least:
                 continue
-            dx, dy = gx[here, x], gy[here, x]
+            du, dv = edges[1, y, x], edges[2, y, x]
             # The neighbours across the edge, between two pixels each.
-            if abs(dx) > abs(dy):
-                s = abs(dy / dx)
-                after, before = (down, up) if dx * dy > 0 else (up, down)
-                ahead = magnitude[after, x + 1] * s + magnitude[here, x + 1] * (1 - s)
-                behind = magnitude[before, x - 1] * s + magnitude[here, x - 1] * (1 - s)
+            side = 1 if du * dv > 0 else -1
+            if abs(du) > abs(dv):
+                s = abs(dv / du)
+                ahead = size[y + side, x + 1] * s + size[y, x + 1] * (1 - s)
+                behind = size[y - side, x - 1] * s + size[y, x - 1] * (1 - s)
             else:
-                s = abs(dx / dy)
-                side = 1 if dx * dy > 0 else -1
-                ahead = magnitude[down, x + side] * s + magnitude[down, x] * (1 - s)
-                behind = magnitude[up, x - side] * s + magnitude[up, x] * (1 - s)
+                s = abs(du / dv)
+                ahead = size[y + 1, x + side] * s + size[y + 1, x] * (1 - s)
+                behind = size[y - 1, x - side] * s + size[y - 1, x] * (1 - s)
             if m >= ahead and m > behind:
-                strength[y, x] = min(255, int(2.0 * m))
-                angle[y, x] = int(np.arctan2(dy, dx) / np.pi * 256.0 + 512.0) % 256
-    return strength, angle
+                strength[y, x] = min(255, int(0.25 * m))
 
 
 @njit(cache=True, nogil=True)
-def _owners(pixels, depths, component, height, width):  # type: ignore[no-untyped-def]
-    """(H,W) int16 component whose edges pass within two pixels; -1 none, -2 several."""
-    owners = np.full((height, width), -1, dtype=np.int16)
+def _mark_owners(pixels, depths, component, owners):  # type: ignore[no-untyped-def]
+    """Set ``owners`` (H,W) int16 to the component whose edges pass within two pixels; -1 none, -2 several."""
+    height, width = owners.shape
+    owners[:] = -1
     for i in range(pixels.shape[0]):
         if depths[i] <= 0:
             continue
@@ -319,12 +322,11 @@ def _owners(pixels, depths, component, height, width):  # type: ignore[no-untype
                     owners[y, x] = component[i]
                 elif owners[y, x] != component[i]:
                     owners[y, x] = -2
-    return owners
 
 
 @njit(cache=True, nogil=True)
-def _strength_at(strength, angle, owners, c, places, wanted, dx, dy):  # type: ignore[no-untyped-def]
-    """Strongest edge of a direction at three places (3,2) across an edge, shifted; others' edges do not count."""
+def _strength_at(edges, strength, owners, c, places, normal, dx, dy):  # type: ignore[no-untyped-def]
+    """Strongest edge within 25° of a direction at three places (3,2), shifted; others' edges do not count."""
     height, width = strength.shape
     best = 0
     for t in range(3):
@@ -334,14 +336,13 @@ def _strength_at(strength, angle, owners, c, places, wanted, dx, dy):  # type: i
         s = strength[y, x]
         if s <= best or (owners[y, x] >= 0 and owners[y, x] != c):
             continue
-        apart = (np.int64(angle[y, x]) - wanted) & 255
-        if min(apart, 256 - apart) <= 36:
+        if abs(edges[1, y, x] * normal[0] + edges[2, y, x] * normal[1]) > 0.906 * edges[0, y, x]:
             best = s
     return best
 
 
 @njit(cache=True, nogil=True)
-def _best_shift(strength, angle, owners, c, places, wanted, count, shifts, costs, hit):  # type: ignore[no-untyped-def]
+def _best_shift(edges, strength, owners, c, places, along, count, shifts, costs, hit):  # type: ignore[no-untyped-def]
     """Share of ``count`` points on edges at the shift with the strongest edges; sets which points in ``hit``."""
     best = -1e9
     best_shift = 0
@@ -350,7 +351,7 @@ def _best_shift(strength, angle, owners, c, places, wanted, count, shifts, costs
         total = -costs[s] * count
         hits = 0
         for k in range(count):
-            e = _strength_at(strength, angle, owners, c, places[k], wanted[k], shifts[s, 0], shifts[s, 1])
+            e = _strength_at(edges, strength, owners, c, places[k], along[k], shifts[s, 0], shifts[s, 1])
             if e > 0:
                 hits += 1
                 total += e / (e + 20.0)
@@ -360,7 +361,7 @@ def _best_shift(strength, angle, owners, c, places, wanted, count, shifts, costs
             best, best_shift, share = total, s, hits / count
     dx, dy = shifts[best_shift, 0], shifts[best_shift, 1]
     for k in range(count):
-        hit[k] = _strength_at(strength, angle, owners, c, places[k], wanted[k], dx, dy) > 0
+        hit[k] = _strength_at(edges, strength, owners, c, places[k], along[k], dx, dy) > 0
     return share
 
 
@@ -440,13 +441,15 @@ def _surroundings(pixels, chosen, sizes, hit, c, wanted, least):  # type: ignore
 
 @njit(cache=True, nogil=True)
 def measure_components(  # type: ignore[no-untyped-def]
-    image, points, tangents, component, sides, is_own, starts, cam_from_body, intrinsics, step_mm, near, near_costs,
-    far, weakest, most_points, least_points, seen_well, usual_elsewhere, colour_px, around, least_around
+    image, slopes, edges, strength, owners, points, tangents, component, sides, is_own, starts, cam_from_body,
+    intrinsics, step_mm, near, near_costs, far, weakest, most_points, least_points, seen_well, usual_elsewhere,
+    colour_px, around, least_around
 ):  # fmt: skip
     """What a picture shows of each component.
 
     Args:
-        image: (H,W,3) uint8, smoothed.
+        image: (H,W,3) uint8, smoothed; slopes: (6,H,W) int16 of it, see `_thin_edges`.
+        edges, strength, owners: (3,H,W) float32, (H,W) uint8 and (H,W) int16 to work in.
         points, tangents, component, sides, is_own, starts: of a `ComponentSheet`.
         cam_from_body, intrinsics: (4,4) and (10,) of the picture.
         step_mm: length over which directions are projected.
@@ -460,8 +463,8 @@ def measure_components(  # type: ignore[no-untyped-def]
     height, width = image.shape[:2]
     count = starts.shape[0] - 1
     pixels, normals, depths = project_lines(points, tangents, True, cam_from_body, intrinsics, step_mm)
-    strength, angle = _thin_edges(image, weakest)
-    owners = _owners(pixels, depths, component, height, width)
+    _thin_edges(slopes, weakest, edges, strength)
+    _mark_owners(pixels, depths, component, owners)
     found = np.full((count, 6), -1.0)
     chosen = np.empty((count, most_points), dtype=np.int64)
     sizes = np.zeros(count, dtype=np.int64)
@@ -469,7 +472,7 @@ def measure_components(  # type: ignore[no-untyped-def]
     elsewhere = np.zeros(most_points, dtype=np.bool_)
     usable = np.empty(pixels.shape[0], dtype=np.int64)
     places = np.empty((most_points, 3, 2), dtype=np.int64)
-    wanted = np.empty(most_points, dtype=np.int64)
+    along = np.empty((most_points, 2))
     no_costs = np.zeros(far.shape[0])
     all_hits = 0.0
     all_points = 0
@@ -495,16 +498,16 @@ def measure_components(  # type: ignore[no-untyped-def]
         for k in range(kept):
             i = usable[int((k + 0.5) * inside / kept)]
             chosen[c, k] = i
-            wanted[k] = int(np.arctan2(normals[i, 1], normals[i, 0]) / np.pi * 256.0 + 512.0) & 255
+            along[k] = normals[i]
             for t in range(3):
                 places[k, t, 0] = int(pixels[i, 0] + (t - 1) * normals[i, 0] + 0.5)
                 places[k, t, 1] = int(pixels[i, 1] + (t - 1) * normals[i, 1] + 0.5)
         sizes[c] = kept
-        here = _best_shift(strength, angle, owners, c, places, wanted, kept, near, near_costs, hit[c])
+        here = _best_shift(edges, strength, owners, c, places, along, kept, near, near_costs, hit[c])
         found[c, 0] = here
         found[c, 1] = usual_elsewhere
         if here < seen_well:
-            found[c, 1] = _best_shift(strength, angle, owners, c, places, wanted, kept, far, no_costs, elsewhere)
+            found[c, 1] = _best_shift(edges, strength, owners, c, places, along, kept, far, no_costs, elsewhere)
         first, last = starts[c], starts[c + 1]
         found[c, 2] = _contrast(image, pixels, normals, depths, sides, is_own, first, last, colour_px)
         found[c, 5] = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
@@ -533,7 +536,10 @@ class ComponentCheck:
         self._renderer = ZBufferRenderer(model, views.camera)
         self._edges = mesh_edges(model, views.options.crease_angle_deg)
         self._model_from_body = rigid(np.eye(3), views.center_in_model)
+        low, high = model.bounds_in_model
+        self._corners_in_model = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
         self._sheets: dict[int, ComponentSheet] = {}
+        self._buffers: dict[str, NDArray[Any]] = {}
         self.reset()
 
     @property
@@ -555,20 +561,31 @@ class ComponentCheck:
         self._evidence = np.zeros(count)
         self._is_named = np.zeros(count, dtype=bool)
         self._looks = 0
-        self._frames = 0
+        self._rested = 0
         self._directions = np.zeros((0, 3))
         self._visits = np.zeros((0, count))
 
     def update(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
-        """Take in a frame with a good pose; only the first ones and then every few are looked at."""
-        self._frames += 1
-        if len(self.model.components) < 2 or (self._looks >= EAGER_LOOKS and self._frames % LOOK_EVERY != 0):
+        """Take in a frame with a good pose; only frames that may tell something new are looked at."""
+        self._rested += 1
+        if len(self.model.components) < 2 or not self._is_due(cam_from_model):
+            return
+        if self._looks >= EAGER_LOOKS and self._sheet_index(cam_from_model) not in self._sheets:
+            # One frame for the sheet, the next for the look.
+            self._sheet(cam_from_model)
             return
         look = self.look(image, cam_from_model)
         self._looks += 1
+        self._rested = 0
         news = self._news(cam_from_model, look.against != 0.0)
         self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + news * look.against, -BOUND, BOUND)
         self._is_named = self._evidence > np.where(self._is_named, CLEARED, NAMED)
+
+    def _is_due(self, cam_from_model: Array) -> bool:
+        if self._looks < EAGER_LOOKS or self._rested >= REST_FRAMES:
+            return True
+        is_doubtful = np.any(self._evidence > CLEARED)
+        return bool(self._rested >= LOOK_EVERY and (is_doubtful or self._nearest_seen(cam_from_model) < 0))
 
     def single_look(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[str, ...]:
         """Mismatches that one picture alone bears out; what was seen before does not count, nor is it changed."""
@@ -603,10 +620,10 @@ class ComponentCheck:
         scale = camera.fx / max(float(cam_from_body[2, 3]), 1.0)
         shrink = max(1, round(diameter_mm * scale / LARGEST_PX))
         size = np.array([camera.width, camera.height])
-        reach = 0.55 * diameter_mm * scale + SEARCHED_PX * shrink
-        center = np.nan_to_num(camera.project(cam_from_body[:3, 3]))
-        low = np.clip(np.floor(center - reach), 0, size - 8 * shrink).astype(int)
-        small = (np.clip(np.ceil(center + reach), low + 8 * shrink, size).astype(int) - low) // shrink
+        corners = np.nan_to_num(camera.project(apply(cam_from_model, self._corners_in_model)))
+        margin = SEARCHED_PX * shrink
+        low = np.clip(np.floor(corners.min(axis=0) - margin), 0, size - 8 * shrink).astype(int)
+        small = (np.clip(np.ceil(corners.max(axis=0) + margin), low + 8 * shrink, size).astype(int) - low) // shrink
         high = low + small * shrink
         window = image[low[1] : high[1], low[0] : high[0]]
         if shrink > 1:
@@ -619,29 +636,48 @@ class ComponentCheck:
         searched = min(SEARCHED_MM * scale, SEARCHED_SHARE * diameter_mm * scale, SEARCHED_PX)
         near, far = _disc(0.0, allowed, 1), _disc(allowed + 2.0, max(searched, allowed + 6.0), 3)
         sheet = self._sheet(cam_from_model)
+        shape = window.shape[:2]
+        smooth = cv2.GaussianBlur(window, (3, 3), 0, dst=self._buffer("smooth", window.shape, np.uint8))
+        slopes = self._buffer("slopes", (6, *shape), np.int16)
+        for index, plane in enumerate(cv2.split(smooth)):
+            cv2.Sobel(plane, cv2.CV_16S, 1, 0, dst=slopes[2 * index])
+            cv2.Sobel(plane, cv2.CV_16S, 0, 1, dst=slopes[2 * index + 1])
+        edges = self._buffer("edges", (3, *shape), np.float32)
+        strength, owners = self._buffer("strength", shape, np.uint8), self._buffer("owners", shape, np.int16)
         return np.asarray(
             measure_components(
-                cv2.GaussianBlur(window, (3, 3), 0), sheet.points_in_body, sheet.tangents, sheet.component,
+                smooth, slopes, edges, strength, owners, sheet.points_in_body, sheet.tangents, sheet.component,
                 sheet.sides, sheet.is_own, sheet.starts, cam_from_body, intrinsics, 0.01 * diameter_mm, near,
                 SHIFT_COST * np.sum(near**2, axis=1) / allowed**2, far, WEAKEST_STEP, POINTS, LEAST_POINTS, SEEN_WELL,
                 USUAL_ELSEWHERE, COLOUR_PX, SURROUNDINGS, LEAST_SURROUNDINGS,
             )
         )  # fmt: skip
 
+    def _buffer(self, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
+        """An array kept from look to look: fresh memory costs more than what is done in it."""
+        size = int(np.prod(shape))
+        if name not in self._buffers or self._buffers[name].size < size:
+            self._buffers[name] = np.empty(size, dtype=dtype)
+        return self._buffers[name][:size].reshape(shape)
+
     def _sheet(self, cam_from_model: Array) -> ComponentSheet:
         """The edges of the guide view whose direction is nearest, made when first needed."""
-        index = int(np.argmax(self.views.directions @ self._direction(cam_from_model)))
+        index = self._sheet_index(cam_from_model)
         if index not in self._sheets:
             if len(self._sheets) >= KEPT_SHEETS:
                 del self._sheets[next(iter(self._sheets))]
             self._sheets[index] = self._make_sheet(self.views.poses[index])
         return self._sheets[index]
 
+    def _sheet_index(self, cam_from_model: Array) -> int:
+        return int(np.argmax(self.views.directions @ self._direction(cam_from_model)))
+
     def _make_sheet(self, cam_from_model: Array) -> ComponentSheet:
         camera, edges = self.views.camera, self._edges
         rendering = self._renderer.render(cam_from_model)
         ids, depth = rendering.component_ids, rendering.depth_mm
-        tolerance_mm = 3.0 * float(np.median(depth[depth > 0])) / camera.fx if np.any(depth > 0) else 1.0
+        # Two pixels' worth of a surface seen at 45 degrees.
+        tolerance_mm = 3.0 * float(apply(cam_from_model, self.views.center_in_model)[2]) / camera.fx
         points, tangents, pixels, normals_px, depths, owners = _sample_edges(
             edges.vertices_in_model, edges.ends, edges.faces, edges.is_sharp, edges.face_normals, edges.component,
             cam_from_model, camera.fx, camera.cx, ids, depth, tolerance_mm,
@@ -666,16 +702,19 @@ class ComponentCheck:
         offset = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - self.views.center_in_model
         return np.asarray(offset / np.linalg.norm(offset), dtype=np.float64)
 
+    def _nearest_seen(self, cam_from_model: Array) -> int:
+        """Index of the direction that was looked from before, or -1 when none is near."""
+        cosines = self._directions @ self._direction(cam_from_model)
+        if len(cosines) == 0 or cosines.max() < np.cos(np.deg2rad(NEW_DIRECTION_DEG)):
+            return -1
+        return int(np.argmax(cosines))
+
     def _news(self, cam_from_model: Array, is_told: NDArray[np.bool_]) -> Array:
         """(C,) how much a look counts for each component: less the oftener it was seen from this direction."""
-        direction = self._direction(cam_from_model)
-        cosines = self._directions @ direction
-        if len(cosines) == 0 or cosines.max() < np.cos(np.deg2rad(NEW_DIRECTION_DEG)):
-            self._directions = np.concatenate([self._directions[-63:], direction[None]])
+        nearest = self._nearest_seen(cam_from_model)
+        if nearest < 0:
+            self._directions = np.concatenate([self._directions[-63:], self._direction(cam_from_model)[None]])
             self._visits = np.concatenate([self._visits[-63:], np.zeros((1, len(is_told)))])
-            nearest = len(self._directions) - 1
-        else:
-            nearest = int(np.argmax(cosines))
         self._visits[nearest] += is_told
         return np.asarray(np.maximum(1.0 / np.maximum(self._visits[nearest], 1.0), LEAST_NEWS))
 
