@@ -7,11 +7,13 @@ those; and the same evidence as for a tracked pose. At each level fewer hypothes
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -21,10 +23,11 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.guideviews import GuideViewSet
-from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
+from arview.guideviews.uniqueness import view_lines
+from arview.tracking.ambiguity import LEAD, find_symmetries
 from arview.tracking.climb import climb
 from arview.tracking.matching import response_maps
-from arview.tracking.quality import RIGHT_WORTH, Evidence, quality_of
+from arview.tracking.quality import RIGHT_WORTH, Evidence, found_logit, found_probability
 from arview.tracking.templates import choose_apart, decimate, make_bank, match_templates
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions, intrinsics_of, smoothed
 from arview.tracking.why_not import Rejected
@@ -45,12 +48,12 @@ LOWEST_SCORE = 0.3
 """Template matches below this are noise."""
 HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
-SURE_QUALITY = 0.985
+SURE_QUALITY = 0.8
 """A pose of this quality ends the search."""
 HOPELESS_QUALITY = 0.1
 """When the likeliest matches end below this the part is hardly there."""
-COARSE_TOLERANCE_PX = 3.5
-"""After the coarse stages edges are looked for this near."""
+COARSE_TOLERANCE_PX, FINE_TOLERANCE_PX = 3.5, 1.5
+"""After the coarse and the fine stages edges are looked for this near."""
 FINE_STAGES = (
     Stage(2, 12, 1.5, 5.0, 2),
     Stage(2, 10, 1.0, 4.0, 2),
@@ -161,6 +164,20 @@ class Candidate:
     cam_from_body: Array
 
 
+@dataclass(frozen=True)
+class Hypothesis:
+    """A refined pose about the model's centre, its evidence, and the distinct lines that its view shows."""
+
+    cam_from_body: Array
+    evidence: Evidence
+    lines: float
+
+    @property
+    def logit(self) -> float:
+        """For comparing poses found in one picture: that of the probability that this one is right."""
+        return found_logit(self.evidence, self.lines)
+
+
 class _Picture:
     """A frame with what was made from it: response maps by scale, kept until the frame is done with."""
 
@@ -211,6 +228,7 @@ class Detector:
         self.bank = make_bank(
             views, self.tracker.part.model_from_body, o.radius_px, o.points, o.roll_step_deg, o.subdivisions
         )
+        self.symmetries = find_symmetries(views)
         self._focal = 0.5 * (camera.fx + camera.fy)
         # Scale steps of the templates, large distances (large pictures) first.
         low, high = views.view_range.distance_mm
@@ -218,9 +236,6 @@ class Detector:
         top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
         self._lines: dict[int, float] = {}
-        looked_at = range(0, len(views), max(1, len(views) // 50))
-        lines = [view_lines(views.view(i), views.diameter_mm) for i in looked_at]
-        self._telling_lines = 0.7 * float(np.percentile(lines, 75))
 
     def _step_at(self, distance_mm: float, magnification: float = 1.0) -> float:
         """Scale step at which the part at a distance has the size of the templates, times the magnification."""
@@ -235,23 +250,74 @@ class Detector:
             max_results: at most so many, all above the quality threshold and apart from each other.
             is_thorough: look at the less likely hypotheses too when the likeliest come to nothing at all.
         """
-        o = self.options
         picture = self._picture(image)
-        starts = self.starts(picture)
-        settled: list[tuple[float, Array]] = []
-        # The likeliest first: when they settle the matter, the others are not looked at.
-        for batch in (starts[: o.likeliest], starts[o.likeliest :]):
-            settled += self._settle(picture.image, picture.gray, self.climbed(picture, batch))
-            settled.sort(key=lambda item: -self._rank(*item))
-            best = self._quality(*settled[0]) if settled else 0.0
-            if (best < HOPELESS_QUALITY and not is_thorough) or (settled and self._is_sure(settled[0][1], best)):
-                break
-        found = [
-            Detection(pose @ self.tracker.part.body_from_model, quality)
-            for quality, pose in ((self._quality(worth, pose), pose) for worth, pose in settled)
-            if quality >= o.min_quality and self._is_plausible(pose)
-        ]
+        settled = self.hypotheses(picture, is_thorough)
+        qualities = self.qualities(settled)
+        self.best_rejected = None
+        if not settled or qualities[0] < self.options.min_quality:
+            if settled:
+                best = settled[0]
+                self.best_rejected = Rejected(self._in_model(best), best.evidence, qualities[0])
+            return []
+        best, twins = self._told_apart(picture, settled[0], settled[1:])
+        found = [Detection(self._in_model(best), qualities[0], alternatives=tuple(map(self._in_model, twins)))]
+        for hypothesis, quality in zip(settled[1:], qualities[1:], strict=True):
+            is_apart = all(not self._is_equal(hypothesis, h, 0.25) for h in (best, *twins))
+            if quality >= self.options.min_quality and is_apart:
+                found.append(Detection(self._in_model(hypothesis), quality))
         return found[:max_results]
+
+    def hypotheses(self, picture: _Picture, is_thorough: bool = True) -> list[Hypothesis]:
+        """All that came out of the search, right or wrong, apart from each other, best first."""
+        starts = self.starts(picture)
+        settled: list[Hypothesis] = []
+        likeliest = self.options.likeliest
+        # The likeliest first: when they settle the matter, the others are not looked at.
+        for batch in (starts[:likeliest], starts[likeliest:]):
+            settled = self._ordered([*settled, *self._settle(picture, self.climbed(picture, batch))], 5.0)
+            best = self.qualities(settled)[0] if settled else 0.0
+            if best >= SURE_QUALITY or (best < HOPELESS_QUALITY and not is_thorough):
+                break
+        return settled
+
+    def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
+        """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
+        result = []
+        for k, hypothesis in enumerate(hypotheses):
+            rivals = (h.logit for h in hypotheses[k + 1 :] if not self._is_equal(hypothesis, h))
+            result.append(found_probability(hypothesis.logit, hypothesis.logit - max(rivals, default=-math.inf)))
+        return result
+
+    def _in_model(self, hypothesis: Hypothesis) -> Array:
+        return np.asarray(hypothesis.cam_from_body @ self.tracker.part.body_from_model)
+
+    def _told_apart(
+        self, picture: _Picture, best: Hypothesis, others: list[Hypothesis]
+    ) -> tuple[Hypothesis, list[Hypothesis]]:
+        """The pose that is borne out best among the near symmetries of one found, and those that do as well.
+
+        Hypotheses at the same place whose evidence is as good are alternatives too, unless an exact symmetry makes
+        them the same pose.
+        """
+        pose = best.cam_from_body
+        starts = [rigid(pose[:3, :3] @ turn, pose[:3, 3]) for turn in self.symmetries.near]
+        reach_mm = 0.25 * self.views.diameter_mm
+        rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
+        rivals = self._ordered([best, *self._finished(picture, starts), *rivals], 5.0)
+        rivals.sort(key=lambda h: -h.evidence.worth)
+        if best.evidence.worth < rivals[0].evidence.worth - LEAD:
+            best = rivals[0]
+        twins = [h for h in rivals if h is not best and h.evidence.worth > best.evidence.worth - LEAD]
+        return best, [h for h in twins if not self._is_equal(h, best)]
+
+    def _is_equal(self, a: Hypothesis, b: Hypothesis, reach: float = 0.08) -> bool:
+        """Whether two are the same pose, if need be by an exact symmetry of the part; ``reach`` is in diameters."""
+        if np.linalg.norm(a.cam_from_body[:3, 3] - b.cam_from_body[:3, 3]) > reach * self.views.diameter_mm:
+            return False
+        turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
+        turned = b.cam_from_body[:3, :3] @ turns
+        cosine = 0.5 * (np.einsum("ij,nij->n", a.cam_from_body[:3, :3], turned) - 1.0)
+        return bool(cosine.max() > np.cos(np.deg2rad(8.0)))
 
     def _picture(self, image: NDArray[np.uint8]) -> _Picture:
         o = self.options
@@ -271,7 +337,7 @@ class Detector:
         halves = [0, len(bank.bins) // 2, len(bank.bins)]
         # Small pictures first: what is found there raises the bar for the large ones.
         bar = np.zeros(1)
-        jobs = [(step, first, last) for step in reversed(self._steps) for first, last in zip(halves, halves[1:], strict=False)]
+        jobs = [(step, first, last) for step in reversed(self._steps) for first, last in pairwise(halves)]
         matches = [m for m in _pool().map(lambda job: self._match(picture, bar, *job), jobs) if m is not None]
         if not matches:
             return []
@@ -312,17 +378,18 @@ class Detector:
             by_step.setdefault(step, []).append(candidate.cam_from_body)
         picture.make(list(by_step))
         jobs = []
-        for step, poses in by_step.items():
-            size = max(2, -(-len(poses) // 4))
-            jobs += [(step, np.stack(poses[i : i + size])) for i in range(0, len(poses), size)]
+        for step, group in by_step.items():
+            size = max(2, -(-len(group) // 4))
+            jobs += [(step, np.stack(group[i : i + size])) for i in range(0, len(group), size)]
 
         def search(job: tuple[int, Array]) -> tuple[Array, Array]:
             maps, intrinsics = picture.maps(job[0])
-            return climb(  # type: ignore[no-any-return]
+            scores, poses = climb(
                 maps, self.tracker.part.arrays, job[1], intrinsics, 0.01 * self.views.diameter_mm,
                 np.deg2rad(level.turn_step_deg), level.stretch_step, level.rounds, level.halvings, 2, 2,
                 level.points, level.points,
             )  # fmt: skip
+            return scores, poses
 
         results = list(_pool().map(search, jobs))
         if not results:
@@ -338,30 +405,37 @@ class Detector:
         )  # fmt: skip
         return [Candidate(float(scores[i]), poses[i]) for i in chosen]
 
-    def _settle(
-        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Candidate]
-    ) -> list[tuple[float, Array]]:
-        """Refine starts, keep the best, search around them; (worth, cam_from_body) best first."""
+    def _settle(self, picture: _Picture, starts: list[Candidate]) -> list[Hypothesis]:
+        """Refine starts, keep the best, search around them; apart from each other, best first."""
         o = self.options
         tries = [(start.cam_from_body, stages) for start in starts for stages in COARSE_STAGES]
-        coarse = sorted(
-            _pool().map(lambda item: self._approach(image, gray, *item), tries), key=lambda item: -self._rank(*item)
-        )
-        finalists: list[Array] = []
-        for _, start in coarse:
-            if len(finalists) >= o.finalists:
+        refined = _pool().map(lambda item: self._refined(picture, item[0], item[1], COARSE_TOLERANCE_PX), tries)
+        coarse = self._ordered(refined, 3.0, o.finalists)
+        finished = self._finished(picture, [found.cam_from_body for found in coarse])
+        if finished and HOPELESS_WORTH <= finished[0].evidence.worth < RIGHT_WORTH:
+            finished += self._finished(picture, _around(finished[0].cam_from_body, 0.05))
+        return self._ordered(finished, 5.0)
+
+    def _finished(self, picture: _Picture, starts: Sequence[Array]) -> list[Hypothesis]:
+        """Poses refined to the end, best first; those of which too little is in the picture are left out."""
+        found = _pool().map(lambda start: self._refined(picture, start, FINE_STAGES, FINE_TOLERANCE_PX), starts)
+        low = self.options.min_in_picture
+        return self._ordered((h for h in found if h.evidence.points_in_picture >= low and self._is_plausible(h)), 0.0)
+
+    def _refined(self, picture: _Picture, start: Array, stages: tuple[Stage, ...], tolerance_px: float) -> Hypothesis:
+        pose = self.tracker.refine_fresh(picture.image, picture.gray, start, stages)
+        look = self.tracker.fresh_appearance(picture.image, pose)
+        evidence = self.tracker.evidence(picture.image, picture.gray, pose, tolerance_px, look)
+        return Hypothesis(pose, evidence, self._view_lines(pose))
+
+    def _ordered(self, found: Iterable[Hypothesis], apart_deg: float, most: int = 1000) -> list[Hypothesis]:
+        """Best first, without those near a better one."""
+        result: list[Hypothesis] = []
+        for hypothesis in sorted(found, key=lambda h: -h.logit):
+            if len(result) >= most:
                 break
-            if not any(self._same(start, other, 3.0) for other in finalists):
-                finalists.append(start)
-        finished = self._finish_all(image, gray, finalists)
-        if finished and HOPELESS_WORTH <= finished[0][0] < RIGHT_WORTH:
-            finished += self._finish_all(image, gray, _around(finished[0][1], 0.05))
-            finished.sort(key=lambda item: -item[0])
-        result: list[tuple[float, Array]] = []
-        # Of two poses that both fit, the one that explains more of the picture is right: a plain back fits any outline.
-        for worth, pose in sorted(finished, key=lambda item: -self._rank(*item)):
-            if not any(self._same(pose, other) for _, other in result):
-                result.append((worth, pose))
+            if not any(self._same(hypothesis.cam_from_body, other.cam_from_body, apart_deg) for other in result):
+                result.append(hypothesis)
         return result
 
     def _view_lines(self, cam_from_body: Array) -> float:
@@ -371,52 +445,17 @@ class Detector:
             self._lines[index] = max(view_lines(self.views.view(index), self.views.diameter_mm), 1.0)
         return self._lines[index]
 
-    def _is_sure(self, cam_from_body: Array, quality: float) -> bool:
-        """So good that nothing else need be looked at: plausible, and not a plain side of a part that has others."""
-        is_telling = self._view_lines(cam_from_body) >= self._telling_lines
-        return quality >= SURE_QUALITY and is_telling and self._is_plausible(cam_from_body)
-
-    def _rank(self, worth: float, cam_from_body: Array) -> float:
-        """For comparing poses of one picture, see `_settle`."""
-        return worth * float(np.sqrt(self._view_lines(cam_from_body)))
-
-    def _approach(
-        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], start: Array, stages: tuple[Stage, ...]
-    ) -> tuple[float, Array]:
-        pose = self.tracker.refine_fresh(image, gray, start, stages)
-        look = self.tracker.fresh_appearance(image, pose)
-        return self.tracker.evidence(image, gray, pose, COARSE_TOLERANCE_PX, look).worth, pose
-
-    def _finish_all(
-        self, image: NDArray[np.uint8], gray: NDArray[np.uint8], starts: list[Array]
-    ) -> list[tuple[float, Array]]:
-        """Refine to the end; (worth, cam_from_body) best first, worth 0 where too little is in the picture."""
-
-        def finish(start: Array) -> tuple[float, Array]:
-            pose = self.tracker.refine_fresh(image, gray, start, FINE_STAGES)
-            look = self.tracker.fresh_appearance(image, pose)
-            evidence = self.tracker.evidence(image, gray, pose, appearance=look)
-            return (evidence.worth if evidence.points_in_picture >= self.options.min_in_picture else 0.0), pose
-
-        return sorted(_pool().map(finish, starts), key=lambda item: -item[0])
-
-    def _quality(self, worth: float, cam_from_body: Array) -> float:
-        """Quality of a pose found without history: a view of few lines must be borne out the better."""
-        lines = self._view_lines(cam_from_body)
-        plainness = max(1.0 - lines / (2.0 * PLAIN_LINES), 0.0)
-        return quality_of(worth - 0.3 * plainness)
-
     def _same(self, a: Array, b: Array, angle_deg: float = 5.0) -> bool:
         near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.01 * angle_deg * self.views.diameter_mm
         # cos of the angle between them from the trace: cheap, it is asked often.
         cosine = 0.5 * (float(np.sum(a[:3, :3] * b[:3, :3])) - 1.0)
         return bool(near and cosine > np.cos(np.deg2rad(angle_deg)))
 
-    def _is_plausible(self, cam_from_body: Array) -> bool:
+    def _is_plausible(self, hypothesis: Hypothesis) -> bool:
         """Within a margin of the declared distances and in front of the camera."""
         low, high = self.views.view_range.distance_mm
-        distance = float(np.linalg.norm(cam_from_body[:3, 3]))
-        return bool(0.85 * low <= distance <= 1.18 * high and cam_from_body[2, 3] > 0)
+        distance = float(np.linalg.norm(hypothesis.cam_from_body[:3, 3]))
+        return bool(0.85 * low <= distance <= 1.18 * high and hypothesis.cam_from_body[2, 3] > 0)
 
 
 @lru_cache(maxsize=1)

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError, MismatchError
-from arview.geometry import Array, apply, check_rigid
+from arview.geometry import Array, apply, check_rigid, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
+from arview.tracking.ambiguity import Rivals
 from arview.tracking.components import ComponentCheck
 from arview.tracking.detector import Detector, DetectorOptions
 from arview.tracking.snap import Snap
@@ -147,6 +148,7 @@ class TrackingSession:
         self._borne_out = False
         self._was_found = False
         self._recent: list[Array] = []
+        self._rivals = Rivals([])
         self._why = self._why_lost = ""
 
     def process(self, image: NDArray[np.uint8], index: int, time_s: float) -> Pose:
@@ -170,6 +172,7 @@ class TrackingSession:
         else:
             estimate, reason = self._search(image)
         if estimate is not None:
+            estimate, reason = self._tell_apart(image, estimate, reason)
             reason = self._compare(image, estimate, reason)
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
@@ -186,6 +189,24 @@ class TrackingSession:
             reason=reason,
             mismatches=self.components.mismatches,
         )
+
+    def _tell_apart(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> tuple[Estimate, str]:
+        """Watch the twins of an ambiguous pose until the frames say which is right."""
+        if not self._rivals:
+            return estimate, reason
+        twins = [estimate.cam_from_model @ turn for turn in self._rivals.model_from_twins]
+        better = self._rivals.update(estimate.evidence.worth, self.tracker.worths_near(image, twins))
+        if better is not None:
+            self._rivals = Rivals([])
+            self.tracker.start(image, estimate.cam_from_model @ better)
+            self.components.reset()
+            return self.tracker.track(image), reason
+        count = len(self._rivals.model_from_twins)
+        if count == 0 or reason:
+            return estimate, reason
+        self.state = TrackingState.CRITICAL
+        poses = "another pose fits" if count == 1 else f"{count} other poses fit"
+        return estimate, f"ambiguous: {poses} as well; show another side"
 
     def _compare(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:
         """Look whether the components are where the CAD has them; a part with one wrong is never `tracked`."""
@@ -225,6 +246,7 @@ class TrackingSession:
         return estimate, "the outline is hardly seen"
 
     def _lose(self, reason: str) -> tuple[None, str]:
+        self._rivals = Rivals([])
         self._poor = self._critical = 0
         if self._guide is not None and not self._confirmed:
             # It was aligned, but did not hold the second frame: go on as before.
@@ -264,6 +286,7 @@ class TrackingSession:
             if not detections:
                 return None, self._why_not(image, self.detector.best_rejected)
             start = detections[0].cam_from_model
+            self._rivals = Rivals([invert(start) @ twin for twin in detections[0].alternatives])
         self.tracker.start(image, start)
         self.components.reset()
         estimate = self.tracker.track(image)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3
 from arview.guideviews import GuideViewSet
+from arview.guideviews.extract import ViewFeatures
 from arview.guideviews.mesh_edges import EDGE_CONTOUR
 from arview.guideviews.sphere import icosphere_directions
 from arview.guideviews.uniqueness import view_lines
@@ -120,7 +121,9 @@ def make_bank(
     )
 
 
-def _view_points(features, center, cam_from_body, points):  # type: ignore[no-untyped-def]
+def _view_points(
+    features: ViewFeatures, center: Array, cam_from_body: Array, points: int
+) -> tuple[Array, Array, NDArray[np.bool_]] | None:
     """Outline and design-edge points (N,3) in the body, directions (N,3), and (N,1) whether these run along an edge."""
     contour = features.contour_points - center
     inner = (features.edge_kinds & EDGE_CONTOUR) == 0

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.geometry import Array, invert, rigid
+from arview.geometry import Array, invert, rigid, rotation_angle_rad
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.tracking.feature import FeatureModality, Matches
+from arview.tracking.nonlocal_search import NonlocalSearch
 from arview.tracking.patch import Pyramid
 from arview.tracking.quality import Evidence, quality_of
 from arview.tracking.refine import (
@@ -32,6 +33,8 @@ from arview.tracking.refine import (
 from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
 from arview.tracking.solver import apply_twist, relative_twist
 
+import os
+K=float(os.environ.get('K','0.05')); S2=float(os.environ.get('S2','0.95')); T2=float(os.environ.get('T2','0.02'))
 
 @dataclass(frozen=True)
 class Stage:
@@ -118,6 +121,7 @@ class TrackerOptions:
     translation_sigma: float = 0.3
     stages: tuple[Stage, ...] = TRACK_STAGES
     doubtful_quality: float = 0.4
+    usual_share: float = 0.8
     correlated_points: float = 8.0
 
     def __post_init__(self) -> None:
@@ -224,6 +228,8 @@ class Tracker:
                 np.full(3, 1.0 / (o.translation_sigma * self.diameter_mm) ** 2),
             ]
         )
+        self._search = NonlocalSearch(self.part.arrays, camera, self._intrinsics, self.diameter_mm)
+        self._usual_worth = 0.0
         self._cam_from_body: Array | None = None
         self._velocity = np.zeros(6)
         self._gain = 1.0
@@ -252,6 +258,8 @@ class Tracker:
             # Nothing else could bear the pose out before texture is remembered.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             self._features.add_keyframe(self._features.pyramid(gray), self._cam_from_body)
+        _, gray = self._gray_around(image, self._cam_from_body)
+        self._usual_worth = self.evidence(image, gray, self._cam_from_body).worth
 
     def colours_at(self, image: NDArray[np.uint8], cam_from_body: Array) -> tuple[Array, Array] | None:
         """Normalised histograms (part, background) along the contour at a pose; None where it is too short."""
@@ -341,6 +349,13 @@ class Tracker:
             )
         )  # fmt: skip
 
+    def worths_near(self, image: NDArray[np.uint8], cams_from_model: list[Array]) -> list[float]:
+        """Worths (see `Evidence.worth`) of other poses (4,4) in this frame, each after a fine refinement."""
+        gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        fine = self.options.stages[-2:]
+        poses = [self.refine(image, gray, pose @ self.part.model_from_body, fine)[0] for pose in cams_from_model]
+        return [self.evidence(image, gray, pose).worth for pose in poses]
+
     def _follow_exposure(self, gray: NDArray[np.uint8]) -> None:
         """Take a change of exposure against the last frame out of the colours.
 
@@ -375,12 +390,20 @@ class Tracker:
                 matches = None
         pose, information = self.refine(image, gray, start, o.stages, matches=matches or _NO_MATCHES)
         evidence = self.evidence(image, gray, pose)
-        if evidence.quality < o.doubtful_quality:
-            for start in (predicted, before):
-                other, other_information = self.refine(image, gray, start, WIDE_STAGES)
+        if self._is_suspicious(evidence, self._strangeness(pose, predicted)):
+            self.searched = True
+            _, gray = self._gray_around(image)
+            best = evidence.worth - self._strangeness(pose, predicted)
+            for start in self._search.find(image, (self._bin_of, self.appearance.odds), (predicted,)):
+                other, other_information = self.refine(image, gray, start, o.stages)
                 other_evidence = self.evidence(image, gray, other)
-                if other_evidence.worth > evidence.worth:
+                worth = other_evidence.worth - self._strangeness(other, predicted)
+                if worth > best + 0.02:
                     pose, information, evidence, matches = other, other_information, other_evidence, None
+                    best = worth
+            self._usual_worth = evidence.worth
+        self._usual_worth += 0.1 * (evidence.worth - self._usual_worth)
+        self._has_velocity = True
         self._velocity = 0.9 * relative_twist(before, pose)
         self._cam_from_body = pose
         quality = evidence.quality
@@ -393,6 +416,22 @@ class Tracker:
             if self._features is not None:
                 self._remember_texture(pyramid, pose, matches, evidence)
         return Estimate(pose @ self.part.body_from_model, information, quality, evidence)
+
+    def _strangeness(self, cam_from_body: Array, predicted: Array) -> float:
+        """What a pose's worth is lessened by for its way from the predicted one."""
+        turn = float(rotation_angle_rad(cam_from_body, predicted)) / np.deg2rad(45.0)
+        way = cam_from_body[:3, 3] - predicted[:3, 3]
+        size = 0.35 * self.diameter_mm
+        aside = float(np.hypot(way[0], way[1])) / size
+        along = float(way[2]) / size / 2.0
+        self.inno = (turn, aside, along)
+        return float(K * (turn**2 + aside**2 + along**2))
+
+    def _is_suspicious(self, evidence: Evidence, strangeness: float) -> bool:
+        """Whether the part may be elsewhere: the pose is worth little, or less than usual for its way."""
+        share = evidence.worth / max(self._usual_worth, 1e-6)
+        return evidence.quality < self.options.doubtful_quality or share < self.options.usual_share or (
+            share < S2 and strangeness > K * T2)
 
     def _gray_around(self, image: NDArray[np.uint8], *poses: Array) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Gray picture and its smoothed copy, filled only around where the part may be, or everywhere for texture."""

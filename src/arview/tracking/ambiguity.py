@@ -1,0 +1,109 @@
+"""Poses that look alike: the turns of a part onto itself, exact or nearly so, and which of several poses is right.
+
+Turns about the middle of the bounding box are tried: multiples of 30° and 45° about the model's axes, half turns
+about the diagonals between them and thirds about those of the cube. A turn that takes the CAD's edges onto
+themselves changes nothing (it is an exact symmetry); one that takes most of them there makes a twin, which only the
+rest of the edges can tell from the right pose. Shapes whose axis misses the middle of the box are not discovered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from arview.geometry import Array, exp_so3
+from arview.guideviews import GuideViewSet
+from arview.guideviews.mesh_edges import EDGE_SHARP
+
+NEAR_MM, EXACT_MM = 0.025, 0.012
+"""Edges this near to others, in diameters, look alike in a picture; this near they are the same."""
+NEAR_SHARE, EXACT_SHARE = 0.9, 0.997
+"""Shares of the edges that a near and an exact symmetry take onto others."""
+LOOKED_AT_VIEWS, LOOKED_AT_POINTS = 60, 6000
+LEAD = 0.03
+"""A pose whose worth is so much higher than a twin's is the right one."""
+DECIDED = 0.25
+"""The same for the sum of the differences over frames."""
+
+
+@dataclass(frozen=True)
+class Symmetries:
+    """Turns (N,3,3) of the part about its middle: ``exact`` ones change nothing, ``near`` ones hardly anything."""
+
+    exact: Array
+    near: Array
+
+
+def find_symmetries(views: GuideViewSet) -> Symmetries:
+    """Turns of a part onto itself, found on the edges of its guide views; the identity is not among them."""
+    points = _edge_points(views)
+    tree = cKDTree(points)
+    exact, near = [], []
+    for turn in _turns():
+        distance, _ = tree.query(points[::4] @ turn.T, distance_upper_bound=NEAR_MM * views.diameter_mm)
+        if np.mean(distance < EXACT_MM * views.diameter_mm) >= EXACT_SHARE:
+            exact.append(turn)
+        elif np.mean(np.isfinite(distance)) >= NEAR_SHARE:
+            near.append(turn)
+    return Symmetries(np.array(exact).reshape(-1, 3, 3), np.array(near).reshape(-1, 3, 3))
+
+
+def _edge_points(views: GuideViewSet) -> Array:
+    """Points (N,3) of the edges seen from all around, about the middle of the part."""
+    step = max(1, len(views) // LOOKED_AT_VIEWS)
+    looked_at = [views.view(i).features for i in range(0, len(views), step)]
+    points = np.concatenate([features.edge_points for features in looked_at])
+    sharp = np.concatenate([features.edge_kinds for features in looked_at]) & EDGE_SHARP > 0
+    # Design edges say it best; an organic shape has none, and its silhouettes stand in.
+    points = (points[sharp] if np.mean(sharp) > 0.2 else points) - views.center_in_model
+    # One of many that lie in the same cell: edges seen in many views count once.
+    cells = np.round(points / (0.006 * views.diameter_mm)).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    chosen: NDArray[np.intp] = np.sort(first)[:: max(1, len(first) // LOOKED_AT_POINTS)]
+    return np.asarray(points[chosen])
+
+
+def _turns() -> Array:
+    """(N,3,3) the turns that are tried."""
+    vectors = []
+    for axis in np.eye(3):
+        vectors += [axis * np.deg2rad(angle) for angle in sorted({*range(30, 360, 30), *range(45, 360, 45)})]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        for sign in (-1.0, 1.0):
+            axis = np.zeros(3)
+            axis[a], axis[b] = 1.0, sign
+            vectors.append(axis / np.linalg.norm(axis) * np.pi)
+    for x in (-1.0, 1.0):
+        for y in (-1.0, 1.0):
+            axis = np.array([x, y, 1.0]) / np.sqrt(3.0)
+            vectors += [axis * np.deg2rad(120.0), axis * np.deg2rad(240.0)]
+    return np.stack([exp_so3(vector) for vector in vectors])
+
+
+class Rivals:
+    """Twins of a tracked pose, told from it by what the frames bear out.
+
+    Args:
+        model_from_twins: (4,4) transforms on the model's side that lead from the tracked pose to each twin.
+    """
+
+    def __init__(self, model_from_twins: list[Array]) -> None:
+        self.model_from_twins = model_from_twins
+        self._leads = [0.0] * len(model_from_twins)
+
+    def __bool__(self) -> bool:
+        return bool(self.model_from_twins)
+
+    def update(self, worth: float, twin_worths: list[float]) -> Array | None:
+        """Count a frame: twins that are clearly worse are dropped; the transform to one that is clearly better."""
+        self._leads = [lead + worth - other for lead, other in zip(self._leads, twin_worths, strict=True)]
+        worst = int(np.argmin(self._leads))
+        if self._leads[worst] <= -DECIDED:
+            return self.model_from_twins[worst]
+        kept = [k for k, lead in enumerate(self._leads) if lead < DECIDED]
+        self.model_from_twins = [self.model_from_twins[k] for k in kept]
+        self._leads = [self._leads[k] for k in kept]
+        return None
