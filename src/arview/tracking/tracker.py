@@ -33,8 +33,6 @@ from arview.tracking.refine import (
 from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
 from arview.tracking.solver import apply_twist, relative_twist
 
-import os
-K=float(os.environ.get('K','0.05')); S2=float(os.environ.get('S2','0.95')); T2=float(os.environ.get('T2','0.02'))
 
 @dataclass(frozen=True)
 class Stage:
@@ -80,13 +78,13 @@ TRACK_STAGES = (
 )
 """Coarse to fine for the usual frame. Colours help to find the outline, the edges say where it is."""
 
-WIDE_STAGES = (
-    Stage(8, 12, 2.5, 12.0, 2, 4.0),
-    Stage(6, 12, 2.0, 8.0, 2, 2.0),
-    Stage(4, 12, 1.5, 5.0, 2, 1.0),
-    *TRACK_STAGES[1:],
-)
-"""Tried when the usual stages end in a poor pose: fast motion, up to about 30 px between frames."""
+STRANGE_TURN_RAD = 0.785
+"""A turn away from the prediction that is as strange as a way of STRANGE_WAY diameters aside."""
+STRANGE_WAY = 0.35
+STRANGE_WORTH = 0.15
+"""What a pose must be worth more for each such way from the prediction: turned parts often look alike."""
+CLEARLY_MORE = 0.02
+"""A pose found by the search is worth so much more than that of the usual stages, or is not taken."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,9 @@ class TrackerOptions:
         feature_min_count, feature_min_share: fewer matches, or a smaller share of those tried, are not believed.
         learning_rate: how quickly colour histograms follow the picture.
         correlated_points: how many neighbouring edge points err together.
-        doubtful_quality: below it the wide stages are tried and colours are not learned.
+        doubtful_quality: below it the part is searched for around the prediction and colours are not learned.
+        usual_share: it is searched for, too, where a pose is worth less than this share of the usual.
+        surprise_share, surprise: the same for poses off the prediction, from such a `_strangeness` on (about 6°).
         rotation_sigma_rad, translation_sigma: expected error of the prediction, the latter in diameters.
     """
 
@@ -122,6 +122,8 @@ class TrackerOptions:
     stages: tuple[Stage, ...] = TRACK_STAGES
     doubtful_quality: float = 0.4
     usual_share: float = 0.8
+    surprise_share: float = 0.95
+    surprise: float = 0.02
     correlated_points: float = 8.0
 
     def __post_init__(self) -> None:
@@ -390,20 +392,20 @@ class Tracker:
                 matches = None
         pose, information = self.refine(image, gray, start, o.stages, matches=matches or _NO_MATCHES)
         evidence = self.evidence(image, gray, pose)
-        if self._is_suspicious(evidence, self._strangeness(pose, predicted)):
-            self.searched = True
+        strangeness = self._strangeness(pose, predicted)
+        if self._is_suspicious(evidence, strangeness):
             _, gray = self._gray_around(image)
-            best = evidence.worth - self._strangeness(pose, predicted)
-            for start in self._search.find(image, (self._bin_of, self.appearance.odds), (predicted,)):
+            best = evidence.worth - STRANGE_WORTH * strangeness
+            for start in self._search.find(image, (self._bin_of, self.appearance.odds), predicted):
                 other, other_information = self.refine(image, gray, start, o.stages)
                 other_evidence = self.evidence(image, gray, other)
-                worth = other_evidence.worth - self._strangeness(other, predicted)
-                if worth > best + 0.02:
+                worth = other_evidence.worth - STRANGE_WORTH * self._strangeness(other, predicted)
+                if worth > best + CLEARLY_MORE:
                     pose, information, evidence, matches = other, other_information, other_evidence, None
                     best = worth
+            # What was looked for everywhere and found no better is usual from now on.
             self._usual_worth = evidence.worth
         self._usual_worth += 0.1 * (evidence.worth - self._usual_worth)
-        self._has_velocity = True
         self._velocity = 0.9 * relative_twist(before, pose)
         self._cam_from_body = pose
         quality = evidence.quality
@@ -418,26 +420,26 @@ class Tracker:
         return Estimate(pose @ self.part.body_from_model, information, quality, evidence)
 
     def _strangeness(self, cam_from_body: Array, predicted: Array) -> float:
-        """What a pose's worth is lessened by for its way from the predicted one."""
-        turn = float(rotation_angle_rad(cam_from_body, predicted)) / np.deg2rad(45.0)
-        way = cam_from_body[:3, 3] - predicted[:3, 3]
-        size = 0.35 * self.diameter_mm
-        aside = float(np.hypot(way[0], way[1])) / size
-        along = float(way[2]) / size / 2.0
-        self.inno = (turn, aside, along)
-        return float(K * (turn**2 + aside**2 + along**2))
+        """How far a pose is from the predicted one: 1 at 45°, at a third of the diameter aside or two along."""
+        turn = float(rotation_angle_rad(cam_from_body, predicted)) / STRANGE_TURN_RAD
+        way = (cam_from_body[:3, 3] - predicted[:3, 3]) / (STRANGE_WAY * self.diameter_mm)
+        return float(turn**2 + way[0] ** 2 + way[1] ** 2 + 0.25 * way[2] ** 2)
 
     def _is_suspicious(self, evidence: Evidence, strangeness: float) -> bool:
-        """Whether the part may be elsewhere: the pose is worth little, or less than usual for its way."""
+        """Whether the part may be elsewhere: the pose is worth little, less than usual, or off the prediction."""
+        o = self.options
         share = evidence.worth / max(self._usual_worth, 1e-6)
-        return evidence.quality < self.options.doubtful_quality or share < self.options.usual_share or (
-            share < S2 and strangeness > K * T2)
+        is_less = share < o.usual_share or (share < o.surprise_share and strangeness > o.surprise)
+        return is_less or evidence.quality < o.doubtful_quality
 
     def _gray_around(self, image: NDArray[np.uint8], *poses: Array) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Gray picture and its smoothed copy, filled only around where the part may be, or everywhere for texture."""
+        """Gray picture and its smoothed copy, filled only around where the part may be.
+
+        Everywhere without poses, and for texture.
+        """
         height, width = image.shape[:2]
         first, last = np.array([0, 0]), np.array([width, height])
-        if self._features is None:
+        if self._features is None and poses:
             centers = np.array([self.camera.project(pose[:3, 3]) for pose in poses])
             if np.all(np.isfinite(centers)):
                 reach = 1.15 * max(self.radius_px(pose) for pose in poses) + 50.0
