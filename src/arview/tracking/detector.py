@@ -125,7 +125,7 @@ class DetectorOptions:
     subdivisions: int = 2
     grid_px: int = 2
     matches: int = 1500
-    starts: int = 300
+    starts: int = 200
     likeliest: int = 40
     levels: tuple[Level, ...] = LEVELS
     finalists: int = 5
@@ -174,7 +174,7 @@ class Hypothesis:
 
     @property
     def logit(self) -> float:
-        """For comparing poses found in one picture: that of the probability that this one is right."""
+        """For comparing the hypotheses of one picture, see `found_logit`."""
         return found_logit(self.evidence, self.lines)
 
 
@@ -229,6 +229,7 @@ class Detector:
             views, self.tracker.part.model_from_body, o.radius_px, o.points, o.roll_step_deg, o.subdivisions
         )
         self.symmetries = find_symmetries(views)
+        self._turns = np.concatenate([self.symmetries.exact, self.symmetries.near])
         self._focal = 0.5 * (camera.fx + camera.fy)
         # Scale steps of the templates, large distances (large pictures) first.
         low, high = views.view_range.distance_mm
@@ -262,7 +263,7 @@ class Detector:
         best, twins = self._told_apart(picture, settled[0], settled[1:])
         found = [Detection(self._in_model(best), qualities[0], alternatives=tuple(map(self._in_model, twins)))]
         for hypothesis, quality in zip(settled[1:], qualities[1:], strict=True):
-            is_apart = all(not self._is_equal(hypothesis, h, 0.25) for h in (best, *twins))
+            is_apart = all(not self._is_equal(hypothesis, h, self._turns, 0.25) for h in (best, *twins))
             if quality >= self.options.min_quality and is_apart:
                 found.append(Detection(self._in_model(hypothesis), quality))
         return found[:max_results]
@@ -284,8 +285,9 @@ class Detector:
         """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
         result = []
         for k, hypothesis in enumerate(hypotheses):
-            rivals = (h.logit for h in hypotheses[k + 1 :] if not self._is_equal(hypothesis, h))
-            result.append(found_probability(hypothesis.logit, hypothesis.logit - max(rivals, default=-math.inf)))
+            rivals = (h.logit for h in hypotheses[k + 1 :] if not self._is_equal(hypothesis, h, self._turns))
+            margin = hypothesis.logit - max(rivals, default=-math.inf)
+            result.append(found_probability(hypothesis.evidence, hypothesis.lines, margin))
         return result
 
     def _in_model(self, hypothesis: Hypothesis) -> Array:
@@ -308,14 +310,13 @@ class Detector:
         if best.evidence.worth < rivals[0].evidence.worth - LEAD:
             best = rivals[0]
         twins = [h for h in rivals if h is not best and h.evidence.worth > best.evidence.worth - LEAD]
-        return best, [h for h in twins if not self._is_equal(h, best)]
+        return best, [h for h in twins if not self._is_equal(h, best, self.symmetries.exact)]
 
-    def _is_equal(self, a: Hypothesis, b: Hypothesis, reach: float = 0.08) -> bool:
-        """Whether two are the same pose, if need be by an exact symmetry of the part; ``reach`` is in diameters."""
+    def _is_equal(self, a: Hypothesis, b: Hypothesis, turns: Array, reach: float = 0.08) -> bool:
+        """Whether two are the same pose, if need be by one of some turns (N,3,3); ``reach`` is in diameters."""
         if np.linalg.norm(a.cam_from_body[:3, 3] - b.cam_from_body[:3, 3]) > reach * self.views.diameter_mm:
             return False
-        turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
-        turned = b.cam_from_body[:3, :3] @ turns
+        turned = b.cam_from_body[:3, :3] @ np.concatenate([np.eye(3)[None], turns])
         cosine = 0.5 * (np.einsum("ij,nij->n", a.cam_from_body[:3, :3], turned) - 1.0)
         return bool(cosine.max() > np.cos(np.deg2rad(8.0)))
 
