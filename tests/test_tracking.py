@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from arview.geometry import Array, invert, log_se3, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.pose import Pose, TrackingState
 from arview.tracking import Estimate, SessionOptions, Tracker, TrackerOptions, TrackingSession
+from arview.tracking.tracker import TRACK_STAGES, smoothed
 from synthetic import CAMERA, assembly, assembly_views, bracket, error, part_box, path, picture, pose_from, wrong
 
 MODALITIES = {
@@ -111,6 +113,23 @@ def test_a_start_that_is_off_is_pulled_in() -> None:
     assert np.mean([mm < 2.0 and deg < 0.5 for mm, _, deg in ends]) >= 0.9
 
 
+def test_a_part_that_moved_far_between_frames_is_found() -> None:
+    """20° to 35° and up to a quarter of the diameter aside in one frame; the next ones need no search."""
+    rng = np.random.default_rng(3)
+    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_feature=False))
+    right = 0
+    for k in range(12):
+        first = pose_from(rng.uniform(-60, 60), rng.uniform(25, 60), 520)
+        then = wrong(first, rng, rng.uniform(20, 35), rng.uniform(0.0, 0.25) * tracker.diameter_mm)
+        tracker.start(picture(first, seed=k), first)
+        tracker.track(picture(then, seed=k + 50))
+        estimate = tracker.track(picture(then, seed=k + 50))
+        mm, _, deg = error(estimate.cam_from_model, then)
+        right += mm < 3.0 and deg < 1.0
+        assert estimate.quality < 0.5 or (mm < 10.0 and deg < 5.0)
+    assert right >= 11
+
+
 def test_tracking_before_a_start_is_a_mistake() -> None:
     with pytest.raises(RuntimeError, match=r"before Tracker\.start"):
         Tracker(assembly_views(), CAMERA).track(clip()[0])
@@ -154,10 +173,10 @@ def test_covariance_is_never_too_small_on_ideal_pictures_and_grows_with_hiding()
 
 
 def test_quality_parts_right_from_wrong_poses() -> None:
-    """Wrong starts are refined like any pose; those that end elsewhere must not be believed."""
+    """Wrong starts that the stages alone leave elsewhere must not be believed; the search finds the part from them."""
     rng = np.random.default_rng(5)
     tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_feature=False))
-    right, mistaken = [], []
+    right, mistaken, found = [], [], 0
     for k in range(40):
         truth = pose_from(
             rng.uniform(-75, 75), rng.uniform(20, 70), rng.uniform(440, 620), roll_deg=rng.uniform(-18, 18)
@@ -169,13 +188,18 @@ def test_quality_parts_right_from_wrong_poses() -> None:
         mm, _, deg = error(estimate.cam_from_model, truth)
         if mm < 5.0 and deg < 1.0:
             right.append(estimate.quality)
+        gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         for angle_deg, shift_mm in ((rng.uniform(15, 40), 0.0), (0.0, 0.3 * tracker.diameter_mm)):
-            tracker.start(image, wrong(truth, rng, angle_deg, shift_mm))
-            estimate = tracker.track(image)
-            mm, _, deg = error(estimate.cam_from_model, truth)
+            start = wrong(truth, rng, angle_deg, shift_mm)
+            tracker.start(image, start)
+            pose, _ = tracker.refine(image, gray, start @ tracker.part.model_from_body, TRACK_STAGES)
+            mm, _, deg = error(pose @ tracker.part.body_from_model, truth)
             if mm > 10.0 or deg > 5.0:
-                mistaken.append(estimate.quality)
+                mistaken.append(tracker.evidence(image, gray, pose).quality)
+                mm, _, deg = error(tracker.track(image).cam_from_model, truth)
+                found += mm < 5.0 and deg < 1.0
     assert len(right) >= 38
+    assert found >= 0.9 * len(mistaken)
     assert len(mistaken) >= 50
     assert np.mean(np.array(right) > 0.5) >= 0.97
     assert np.mean(np.array(mistaken) < 0.5) >= 0.95
