@@ -143,6 +143,7 @@ class NonlocalSearch:
         return np.concatenate([r[0] for r in results]), np.concatenate([r[1] for r in results])
 
     def _apart(self, scores: Array, poses: Array, apart_deg: float, most: int) -> tuple[Array, Array]:
+        """The best poses, best first, none nearer to a better one than an angle (and as many % of the part)."""
         order = np.argsort(-scores, kind="stable")[:400]
         scores, poses = scores[order], poses[order]
         reach = np.full(len(poses), 0.01 * apart_deg * self._diameter_mm) / poses[:, 2, 3]
