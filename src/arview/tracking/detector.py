@@ -95,8 +95,8 @@ class Level:
 
 LEVELS = (
     Level(1.3, 7.0, 0.07, 2, 0, 90, 6.0, 48),
-    Level(2.6, 4.0, 0.035, 2, 0, 24, 4.0, 64),
-    Level(5.2, 2.0, 0.017, 2, 1, 8, 2.5, 96),
+    Level(2.6, 4.0, 0.035, 2, 0, 14, 4.0, 64),
+    Level(5.2, 2.0, 0.017, 2, 1, 6, 2.5, 96),
 )
 
 
@@ -124,9 +124,9 @@ class DetectorOptions:
     roll_step_deg: float = 18.0
     subdivisions: int = 2
     grid_px: int = 2
-    matches: int = 1500
+    matches: int = 800
     starts: int = 200
-    likeliest: int = 40
+    likeliest: int = 30
     levels: tuple[Level, ...] = LEVELS
     finalists: int = 5
     min_quality: float = 0.5

@@ -26,9 +26,9 @@ from arview.guideviews.uniqueness import view_lines
 from arview.tracking.matching import orientation_bins
 from arview.tracking.solver import project_lines
 
-FIRST_POINTS = 16
+FIRST_POINTS = 12
 """So many points of a template are looked at everywhere, the others only where these bode well."""
-FIRST_MARGIN = 0.1
+FIRST_MARGIN = 0.12
 """The mean of the first points may be so much lower than the score asked for."""
 TILE = 1024
 """Places looked at together: their sums stay in the nearest cache."""
