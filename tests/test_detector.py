@@ -64,7 +64,9 @@ def test_the_part_is_found_over_the_full_sphere_and_all_rolls() -> None:
     rng = np.random.default_rng(3)
     found, wrong_ones = 0, 0
     for k in range(12):
-        truth = pose_from(rng.uniform(-180, 180), rng.uniform(0, 80), rng.uniform(400, 650), None, rng.uniform(-180, 180))
+        truth = pose_from(
+            rng.uniform(-180, 180), rng.uniform(0, 80), rng.uniform(400, 650), None, rng.uniform(-180, 180)
+        )
         detections = everywhere.detect(picture(truth, seed=k, scene=k % 9, noise=3.0), max_results=1)
         if detections:
             mm, _, deg = error(detections[0].cam_from_model, truth)

@@ -105,7 +105,7 @@ class NonlocalSearch:
         shift_px = round(o.shift * o.radii_px[0])
 
         def score(turns: Array) -> tuple[Array, Array]:
-            return score_around(  # type: ignore[no-any-return]
+            return score_around(
                 maps, self._part, start, intrinsics, step_mm, turns, self._stretches, shift_px,
                 o.shift_step_px, o.points, o.points,
             )  # fmt: skip
@@ -133,7 +133,7 @@ class NonlocalSearch:
         points = self.options.points
 
         def search(starts: Array) -> tuple[Array, Array]:
-            return climb(  # type: ignore[no-any-return]
+            return climb(
                 maps, self._part, starts, intrinsics, 0.01 * self._diameter_mm, np.deg2rad(turn_deg), stretch,
                 2, 1, 2, 1, points, points,
             )  # fmt: skip
