@@ -59,14 +59,17 @@ HALF_LAMBDA = 15.0
 """A component is half reliable when its points, weighed by the direction they say least about, are so many."""
 SURROUNDINGS, LEAST_SURROUNDINGS = 16, 8
 """Points of other components around one, that say whether it is hidden by something that is not in the CAD."""
-HIDDEN_SHARE, CLEAR_SHARE = 0.45, 0.70
+HIDDEN_SHARE, CLEAR_SHARE = 0.42, 0.67
 """Shares of the surroundings, and of the whole part, that are borne out where it is hidden and where it is not."""
-MODEL = (14.5, -12.5, -13.1, -1.25)
+MODEL = (14.95, -12.3, -13.0, -1.38)
 """Log-likelihood ratio: constant; share borne out; that less the best elsewhere; colour contrast up to 6."""
-MOST_CONTRAST = 6.0
+MOST_CONTRAST, USUAL_CONTRAST = 6.0, 5.0
+"""The latter stands for components without an outline of their own."""
+SUSPECTS = 2
+"""One thing wrong is likelier than many: each suspect beyond these halves what is said against all of them."""
 LARGEST_RATIO = 4.0
 """A single look says no more than this."""
-NAMED, CLEARED, DOUBTFUL = 2.5, 0.5, 1.0
+NAMED, CLEARED, DOUBTFUL = 2.3, 0.5, 1.0
 """Evidence above which a component is named, below which it no longer is, and above which it is to be looked at."""
 BOUND = 6.0
 """Evidence is kept within ± this."""
@@ -75,8 +78,8 @@ SINGLE = 2.0
 FORGETTING = 0.01
 """Share of the evidence that is lost with every look."""
 NEW_DIRECTION_DEG = 6.0
-LEAST_NEWS = 0.05
-"""Looks from about the same direction say the same: the n-th counts 1/n, but no less than this."""
+REPEATED_NEWS, LEAST_NEWS = 0.35, 0.03
+"""Looks from about the same direction say the same: the n-th that says so counts 0.35ⁿ⁻¹, but no less than 3 %."""
 EAGER_LOOKS = 3
 """So many frames after a lock are looked at."""
 LOOK_EVERY, REST_FRAMES = 4, 40
@@ -408,12 +411,13 @@ def _contrast(image, pixels, normals, depths, sides, is_own, first, last, reach_
 
 @njit(cache=True, nogil=True)
 def _surroundings(pixels, chosen, sizes, hit, c, wanted, least):  # type: ignore[no-untyped-def]
-    """Share of the points of other components nearest to those of one that is borne out; 1 where there are few."""
+    """Share of other components' points that is borne out, of those nearest to its points that are not; 1 if few."""
     low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
     for k in range(sizes[c]):
-        i = chosen[c, k]
-        low_u, high_u = min(low_u, pixels[i, 0]), max(high_u, pixels[i, 0])
-        low_v, high_v = min(low_v, pixels[i, 1]), max(high_v, pixels[i, 1])
+        if not hit[c, k]:
+            i = chosen[c, k]
+            low_u, high_u = min(low_u, pixels[i, 0]), max(high_u, pixels[i, 0])
+            low_v, high_v = min(low_v, pixels[i, 1]), max(high_v, pixels[i, 1])
     reach = 16.0
     hits = 0
     tried = 0
@@ -429,7 +433,7 @@ def _surroundings(pixels, chosen, sizes, hit, c, wanted, least):  # type: ignore
                     continue
                 for q in range(sizes[c]):
                     j = chosen[c, q]
-                    if (pixels[j, 0] - u) ** 2 + (pixels[j, 1] - v) ** 2 < reach * reach:
+                    if not hit[c, q] and (pixels[j, 0] - u) ** 2 + (pixels[j, 1] - v) ** 2 < reach * reach:
                         tried += 1
                         hits += hit[o, k]
                         break
@@ -563,7 +567,7 @@ class ComponentCheck:
         self._looks = 0
         self._rested = 0
         self._directions = np.zeros((0, 3))
-        self._visits = np.zeros((0, count))
+        self._visits = np.zeros((0, 2, count))
 
     def update(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
         """Take in a frame with a good pose; only frames that may tell something new are looked at."""
@@ -577,7 +581,7 @@ class ComponentCheck:
         look = self.look(image, cam_from_model)
         self._looks += 1
         self._rested = 0
-        news = self._news(cam_from_model, look.against != 0.0)
+        news = self._news(cam_from_model, look.against)
         self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + news * look.against, -BOUND, BOUND)
         self._is_named = self._evidence > np.where(self._is_named, CLEARED, NAMED)
 
@@ -605,11 +609,12 @@ class ComponentCheck:
         is_shown = borne_out >= 0.0
         constant, per_share, per_lead, per_contrast = MODEL
         ratio = constant + per_share * borne_out + per_lead * (borne_out - elsewhere)
-        ratio += per_contrast * np.clip(contrast, 0.0, MOST_CONTRAST)
+        ratio += per_contrast * np.where(contrast < 0.0, USUAL_CONTRAST, np.minimum(contrast, MOST_CONTRAST))
         ratio *= np.maximum(spread, 0.0) / (np.maximum(spread, 0.0) + HALF_LAMBDA)
+        more_suspects = max(0, int(np.count_nonzero(is_shown & (ratio > DOUBTFUL))) - SUSPECTS)
         # Where the surroundings are not seen either, something hides it, or the picture is blurred.
         is_open = np.clip((np.minimum(around, others) - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
-        ratio = np.where(ratio > 0.0, ratio * is_open, ratio)
+        ratio = np.where(ratio > 0.0, ratio * is_open * 0.5**more_suspects, ratio)
         against = np.where(is_shown, np.clip(ratio, -LARGEST_RATIO, LARGEST_RATIO), 0.0)
         return Look(against, is_shown, borne_out, elsewhere, contrast, around)
 
@@ -709,14 +714,16 @@ class ComponentCheck:
             return -1
         return int(np.argmax(cosines))
 
-    def _news(self, cam_from_model: Array, is_told: NDArray[np.bool_]) -> Array:
-        """(C,) how much a look counts for each component: less the oftener it was seen from this direction."""
+    def _news(self, cam_from_model: Array, against: Array) -> Array:
+        """(C,) how much a look counts for each component: less the oftener this direction has said so before."""
         nearest = self._nearest_seen(cam_from_model)
         if nearest < 0:
             self._directions = np.concatenate([self._directions[-63:], self._direction(cam_from_model)[None]])
-            self._visits = np.concatenate([self._visits[-63:], np.zeros((1, len(is_told)))])
-        self._visits[nearest] += is_told
-        return np.asarray(np.maximum(1.0 / np.maximum(self._visits[nearest], 1.0), LEAST_NEWS))
+            self._visits = np.concatenate([self._visits[-63:], np.zeros((1, 2, len(against)))])
+        said = np.stack([against < 0.0, against > 0.0])
+        news = np.where(said, np.maximum(REPEATED_NEWS ** self._visits[nearest], LEAST_NEWS), 0.0).sum(axis=0)
+        self._visits[nearest] += said
+        return np.asarray(news)
 
     def _messages(self, is_wrong: NDArray[np.bool_]) -> tuple[str, ...]:
         names = self.views.component_names
