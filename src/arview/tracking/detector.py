@@ -115,6 +115,7 @@ class DetectorOptions:
         likeliest: of these, how many are tried first, and alone if they settle the matter.
         levels: of that search.
         finalists: how many of its results are refined to the end.
+        rivals: how many more, for quite other poses.
         min_in_picture: less of the outline inside the picture is no detection.
         min_quality: a weaker result is no detection.
     """
@@ -129,6 +130,7 @@ class DetectorOptions:
     likeliest: int = 30
     levels: tuple[Level, ...] = LEVELS
     finalists: int = 5
+    rivals: int = 3
     min_quality: float = 0.5
     min_in_picture: float = 0.4
 
@@ -410,8 +412,11 @@ class Detector:
         """Refine starts, keep the best, search around them; apart from each other, best first."""
         o = self.options
         tries = [(start.cam_from_body, stages) for start in starts for stages in COARSE_STAGES]
-        refined = _pool().map(lambda item: self._refined(picture, item[0], item[1], COARSE_TOLERANCE_PX), tries)
-        coarse = self._ordered(refined, 3.0, o.finalists)
+        tried = _pool().map(lambda item: self._refined(picture, item[0], item[1], COARSE_TOLERANCE_PX), tries)
+        refined = self._ordered(tried, 3.0)
+        # Besides the best, some for quite other poses: the lead over these says whether the best stands out.
+        others = [h for h in refined[o.finalists :] if not self._same(h.cam_from_body, refined[0].cam_from_body, 25.0)]
+        coarse = refined[: o.finalists] + self._ordered(others, 15.0, o.rivals)
         finished = self._finished(picture, [found.cam_from_body for found in coarse])
         if finished and HOPELESS_WORTH <= finished[0].evidence.worth < RIGHT_WORTH:
             finished += self._finished(picture, _around(finished[0].cam_from_body, 0.05))
