@@ -49,7 +49,7 @@ SEEN_WELL = 0.8
 USUAL_ELSEWHERE = 0.45
 SHARED_PX, SHARED_COS = 3.0, 0.87
 """Points this near a parallel edge of another component are no evidence for either."""
-OCCLUDER_PX = 4
+OCCLUDER_PX = 2
 """Points this near something in front of them may be hidden at a direction between two sheets."""
 SIDE_PX = 4.0
 """How far beside an edge it is asked which component is there."""
@@ -61,7 +61,7 @@ SURROUNDINGS, LEAST_SURROUNDINGS = 16, 8
 """Points of other components around one, that say whether it is hidden by something that is not in the CAD."""
 HIDDEN_SHARE, CLEAR_SHARE = 0.42, 0.67
 """Shares of the surroundings, and of the whole part, that are borne out where it is hidden and where it is not."""
-MODEL = (14.95, -12.3, -13.0, -1.38)
+MODEL = (14.3, -11.5, -13.9, -1.29)
 """Log-likelihood ratio: constant; share borne out; that less the best elsewhere; colour contrast up to 6."""
 MOST_CONTRAST, USUAL_CONTRAST = 6.0, 5.0
 """The latter stands for components without an outline of their own."""
