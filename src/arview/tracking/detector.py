@@ -23,6 +23,7 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.guideviews import GuideViewSet
+from arview.guideviews.sphere import icosphere_directions
 from arview.guideviews.uniqueness import view_lines
 from arview.tracking.ambiguity import LEAD, find_symmetries
 from arview.tracking.climb import climb
@@ -141,6 +142,19 @@ class DetectorOptions:
             raise InputError(f"detector: points = {self.points}, expected a multiple of 4 from 20 on")
 
 
+NARROW_DETAIL = DetectorOptions(radius_px=26.0, roll_step_deg=12.0, subdivisions=3)
+"""Finer templates, for ranges in which they are few."""
+FEW_TEMPLATES = 1500
+
+
+def options_for(views: GuideViewSet) -> DetectorOptions:
+    """The options that suit the declared range."""
+    fine = NARROW_DETAIL
+    directions = views.view_range.contains_direction(icosphere_directions(fine.subdivisions), 3.0)
+    count = np.count_nonzero(directions) * len(views.view_range.rolls_deg(fine.roll_step_deg))
+    return fine if count <= FEW_TEMPLATES else DetectorOptions()
+
+
 @dataclass(frozen=True)
 class Detection:
     """A place where the part was found.
@@ -222,7 +236,7 @@ class Detector:
     """
 
     def __init__(self, views: GuideViewSet, camera: Camera, options: DetectorOptions | None = None) -> None:
-        self.options = o = options or DetectorOptions()
+        self.options = o = options or options_for(views)
         self.views = views
         self.camera = camera
         self.best_rejected: Rejected | None = None
