@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from itertools import pairwise
 
@@ -26,10 +26,10 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
 from arview.guideviews.uniqueness import view_lines
 from arview.tracking.ambiguity import LEAD, find_symmetries
-from arview.tracking.climb import climb
+from arview.tracking.climb import climb, climb_outlines
 from arview.tracking.matching import response_maps
 from arview.tracking.quality import RIGHT_WORTH, Evidence, found_logit, found_probability
-from arview.tracking.templates import choose_apart, decimate, make_bank, match_templates
+from arview.tracking.templates import choose_apart, decimate, make_bank, make_outlines, match_templates
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions, intrinsics_of, smoothed
 from arview.tracking.why_not import Rejected
 
@@ -66,6 +66,8 @@ FINE_STAGES = (
 
 STEPS_PER_OCTAVE = 4
 """Scales at which response maps are made: the distances of the templates, shared by all levels of the search."""
+IMPROVED_STEPS, IMPROVED_ROLL, IMPROVED_STRETCH, IMPROVED_SHIFT = 2, 0.12, 0.07, 2
+CELL_PX, CELL_ROLL = 4.0, 0.33
 SPREAD_PX = 1
 """How far edges may lie from where a pose has them, in pixels of the maps."""
 LARGEST_SCALE = 1.5
@@ -126,6 +128,7 @@ class DetectorOptions:
     roll_step_deg: float = 18.0
     subdivisions: int = 2
     grid_px: int = 2
+    kept: int = 2000
     matches: int = 800
     starts: int = 200
     likeliest: int = 30
@@ -194,6 +197,29 @@ class Hypothesis:
         return found_logit(self.evidence, self.lines)
 
 
+@dataclass(frozen=True)
+class Matches:
+    """Matches of outlines in the picture: keys (M,) by which they compare, scale steps (M,), views (M,) of the
+    outlines, rolls (M,) rad, half diameters (M,) px and places (M,2) px of the part's centre, both at that scale."""
+
+    keys: Array
+    steps: NDArray[np.int64]
+    views: NDArray[np.int32]
+    rolls: Array
+    radii_px: Array
+    places: Array
+
+    def best(self, most: int) -> Matches:
+        return self.of(np.argsort(-self.keys, kind="stable")[:most])
+
+    def of(self, index: NDArray[np.intp]) -> Matches:
+        return Matches(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+def _joined(parts: list[Matches]) -> Matches:
+    return Matches(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Matches)))
+
+
 class _Picture:
     """A frame with what was made from it: response maps by scale, kept until the frame is done with."""
 
@@ -241,9 +267,9 @@ class Detector:
         self.camera = camera
         self.best_rejected: Rejected | None = None
         self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
-        self.bank = make_bank(
-            views, self.tracker.part.model_from_body, o.radius_px, o.points, o.roll_step_deg, o.subdivisions
-        )
+        self.outlines = make_outlines(views, self.tracker.part.model_from_body, o.points, max(3, o.subdivisions))
+        self.bank = make_bank(views, self.outlines, o.radius_px, o.roll_step_deg, o.subdivisions)
+        self._clusters = np.argmax(self.outlines.rotations[:, 2] @ icosphere_directions(1).T, axis=1)
         self.symmetries = find_symmetries(views)
         self._turns = np.concatenate([self.symmetries.exact, self.symmetries.near])
         self._focal = 0.5 * (camera.fx + camera.fy)
@@ -259,16 +285,23 @@ class Detector:
         radius_px = self._focal * 0.5 * self.views.diameter_mm / distance_mm
         return STEPS_PER_OCTAVE * float(np.log2(magnification * self.options.radius_px / radius_px))
 
-    def detect(self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True) -> list[Detection]:
+    def detect(
+        self,
+        image: NDArray[np.uint8],
+        max_results: int = 3,
+        is_thorough: bool = True,
+        guesses: Sequence[Array] = (),
+    ) -> list[Detection]:
         """Poses of the part in a frame, best first; an empty list when it is not found.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             max_results: at most so many, all above the quality threshold and apart from each other.
             is_thorough: look at the less likely hypotheses too when the likeliest come to nothing at all.
+            guesses: rough poses (4,4) ``cam_from_model`` that are tried first, and alone if one settles the matter.
         """
         picture = self._picture(image)
-        settled = self.hypotheses(picture, is_thorough)
+        settled = self.hypotheses(picture, is_thorough, guesses)
         qualities = self.qualities(settled)
         self.best_rejected = None
         if not settled or qualities[0] < self.options.min_quality:
@@ -284,10 +317,17 @@ class Detector:
                 found.append(Detection(self._in_model(hypothesis), quality))
         return found[:max_results]
 
-    def hypotheses(self, picture: _Picture, is_thorough: bool = True) -> list[Hypothesis]:
+    def hypotheses(
+        self, picture: _Picture, is_thorough: bool = True, guesses: Sequence[Array] = ()
+    ) -> list[Hypothesis]:
         """All that came out of the search, right or wrong, apart from each other, best first."""
-        starts = self.starts(picture)
         settled: list[Hypothesis] = []
+        if guesses:
+            known = [Candidate(1.0, guess @ self.tracker.part.model_from_body) for guess in guesses]
+            settled = self._settle(picture, self.climbed(picture, known))
+            if settled and self.qualities(settled)[0] >= SURE_QUALITY:
+                return settled
+        starts = self.starts(picture)
         likeliest = self.options.likeliest
         # The likeliest first: when they settle the matter, the others are not looked at.
         for batch in (starts[:likeliest], starts[likeliest:]):
@@ -347,7 +387,7 @@ class Detector:
         return starts
 
     def starts(self, picture: _Picture) -> list[Candidate]:
-        """The best template matches over the whole range, apart from each other, best first."""
+        """The best template matches over the whole range, apart from each other, improved, best first."""
         o = self.options
         bank = self.bank
         picture.make(self._steps)
@@ -358,33 +398,81 @@ class Detector:
         matches = [m for m in _pool().map(lambda job: self._match(picture, bar, *job), jobs) if m is not None]
         if not matches:
             return []
-        keys, rotations, positions = (np.concatenate([m[k] for m in matches]) for k in range(3))
-        order = np.argsort(-keys, kind="stable")
-        keys, rotations, positions = keys[order], rotations[order], positions[order]
-        # Within six pixels of the templates' scale: as many times further off as the part is larger than there.
-        reach = np.full(len(keys), 6.0 / o.radius_px) * 0.5 * self.views.diameter_mm / positions[:, 2]
-        chosen = choose_apart(rotations, positions, reach, np.cos(0.28), 1.22, o.starts)
-        return [Candidate(float(keys[i]), rigid(rotations[i], positions[i])) for i in chosen]
+        matches = self._distinct(_joined(matches), o.matches)
+        matches = self._improved(picture, self._improved(picture, matches, 1).best(o.matches // 4), 2)
+        matches = self._best_apart(matches, 6.0, 0.15, 1.06, o.starts)
+        return [Candidate(float(k), rigid(r, p)) for k, r, p in zip(matches.keys, *self._posed(matches), strict=True)]
 
-    def _match(
-        self, picture: _Picture, bar: Array, step: int, first: int, last: int
-    ) -> tuple[Array, Array, Array] | None:
-        """Keys (M,), rotations (M,3,3) and positions (M,3) mm of the matches of some templates at one scale."""
+    def _match(self, picture: _Picture, bar: Array, step: int, first: int, last: int) -> Matches | None:
+        """The matches of some templates at one scale."""
         o = self.options
         bank = self.bank
         maps, _ = picture.maps(step)
         if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
             return None
         keys, templates, places = match_templates(
-            decimate(maps, o.grid_px), bank.offsets, bank.bins, bank.gains, first, last, o.matches, LOWEST_SCORE, bar
+            decimate(maps, o.grid_px), bank.offsets, bank.bins, bank.gains, first, last, o.kept, LOWEST_SCORE, bar
         )
-        camera = self.camera
-        size = np.array(maps.shape[:0:-1]) - 2 * picture.pad_px
-        centers = places + bank.origins[templates] - picture.pad_px
-        rays = camera.unproject((centers + 0.5) * [camera.width, camera.height] / size - 0.5)
+        return Matches(
+            keys, np.full(len(keys), step), bank.views[templates], bank.rolls[templates],
+            np.full(len(keys), o.radius_px), places + bank.origins[templates] - picture.pad_px,
+        )  # fmt: skip
+
+    def _posed(self, matches: Matches) -> tuple[Array, Array]:
+        """Rotations (M,3,3) and positions (M,3) mm of the part's centre."""
+        scales = 2.0 ** (matches.steps / STEPS_PER_OCTAVE)
+        rays = self.camera.unproject((matches.places + 0.5) / scales[:, None] - 0.5)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        distance_mm = self._focal * 0.5 * self.views.diameter_mm * 2.0 ** (step / STEPS_PER_OCTAVE) / o.radius_px
-        return keys, _turned_with_rays(bank.rotations[templates], rays), rays * distance_mm
+        distances_mm = self._focal * 0.5 * self.views.diameter_mm * scales / matches.radii_px
+        c, s, zero = np.cos(matches.rolls), np.sin(matches.rolls), np.zeros(len(matches.rolls))
+        turns = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], axis=1).reshape(-1, 3, 3)
+        rotations = turns @ self.outlines.rotations[matches.views]
+        return _turned_with_rays(rotations, rays), rays * distances_mm[:, None]
+
+    def _best_apart(self, matches: Matches, reach_px: float, angle_rad: float, ratio: float, most: int) -> Matches:
+        """The best, none near a better one."""
+        matches = matches.of(np.argsort(-matches.keys, kind="stable"))
+        rotations, positions = self._posed(matches)
+        # Pixels of the templates' scale: as many times further off as the part is larger than there.
+        reach = np.full(len(positions), reach_px / self.options.radius_px) * 0.5 * self.views.diameter_mm
+        return matches.of(
+            choose_apart(rotations, positions, reach / positions[:, 2], np.cos(angle_rad), ratio, most)
+        )
+
+    def _distinct(self, matches: Matches, most: int) -> Matches:
+        """The best, one for each cell of places, scales and rotations."""
+        matches = matches.best(len(matches.keys))
+        cells = np.floor(matches.places / CELL_PX).astype(np.int64) + 4096
+        rolls = np.floor(matches.rolls / CELL_ROLL).astype(np.int64) + 64
+        code = ((cells[:, 0] * 8192 + cells[:, 1]) * 128 + rolls) * 1024 + self._clusters[matches.views]
+        code = code * 128 + matches.steps + 64
+        _, first = np.unique(code, return_index=True)
+        return matches.of(np.sort(first)[:most])
+
+    def _improved(self, picture: _Picture, matches: Matches, rounds: int) -> Matches:
+        shapes = self.outlines
+        jobs = []
+        for step in np.unique(matches.steps):
+            group = np.flatnonzero(matches.steps == step)
+            # Those that have been improved once lie on their maps.
+            up = 0 if rounds > 1 else IMPROVED_STEPS
+            jobs += [(min(0, step + up), part) for part in np.array_split(group, 2)]
+        picture.make([step for step, _ in jobs])
+
+        def improve(job: tuple[int, NDArray[np.intp]]) -> Matches:
+            step, index = job
+            some = matches.of(index)
+            scale = 2.0 ** ((step - some.steps) / STEPS_PER_OCTAVE)
+            maps, _ = picture.maps(step)
+            places = (some.places + 0.5) * scale[:, None] - 0.5 + picture.pad_px
+            scores, views, rolls, radii, places = climb_outlines(
+                maps, shapes.points, shapes.angles, shapes.neighbours, shapes.turns, some.views, some.rolls,
+                some.radii_px * scale, places, IMPROVED_ROLL, IMPROVED_STRETCH, rounds, 2, IMPROVED_SHIFT,
+            )  # fmt: skip
+            keys = scores * shapes.lines[views] ** 0.25
+            return Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
+
+        return _joined(list(_pool().map(improve, jobs)))
 
     def _climb(self, picture: _Picture, candidates: list[Candidate], level: Level) -> list[Candidate]:
         """The hypotheses after a pattern search around each, apart from each other, best first."""

@@ -37,13 +37,33 @@ SAMPLE, SAMPLE_EVERY = 128, 384
 
 
 @dataclass(frozen=True)
+class Outlines:
+    """What the part shows from directions spread over the declared range, seen along the optical axis.
+
+    Attributes:
+        points: (V,N,2) float32 of outline and design edges, in halves of the part's diameter about its centre.
+        angles: (V,N) uint8 of their normals, 256 to the half turn.
+        rotations: (V,3,3) of ``cam_from_body``.
+        lines: (V,) distinct lines shown.
+        neighbours: (V,6) nearest other directions; turns: (V,6) rad, the roll that brings each closest.
+    """
+
+    points: NDArray[np.float32]
+    angles: NDArray[np.uint8]
+    rotations: Array
+    lines: Array
+    neighbours: NDArray[np.int32]
+    turns: Array
+
+
+@dataclass(frozen=True)
 class TemplateBank:
     """Templates of one part.
 
     Attributes:
         offsets: (T,N,2) int32 dx, dy ≥ 0 of the points; bins: (T,N) orientations, see `orientation_bins`.
         origins: (T,2) place of the part's centre in the frame of the offsets.
-        rotations: (T,3,3) of ``cam_from_body``, seen along the optical axis.
+        views: (T,) of the outlines; rolls: (T,) rad.
         gains: (T,) by which a match counts: the square root of the distinct lines that the view shows.
         radius_px: half the part's diameter.
     """
@@ -51,72 +71,107 @@ class TemplateBank:
     offsets: NDArray[np.int32]
     bins: NDArray[np.uint8]
     origins: Array
-    rotations: Array
+    views: NDArray[np.int32]
+    rolls: Array
     gains: Array
     radius_px: float
 
 
-def make_bank(
-    views: GuideViewSet, model_from_body: Array, radius_px: float, points: int, roll_step_deg: float, subdivisions: int
-) -> TemplateBank:
-    """Templates over the directions and rolls of the declared range.
+def make_outlines(views: GuideViewSet, model_from_body: Array, points: int, subdivisions: int) -> Outlines:
+    """Outlines over the directions of the declared range.
 
     Args:
         views: of the part; the nearest to each direction of an icosphere is taken.
         model_from_body: (4,4) to the model's centre.
-        radius_px: half the part's diameter in the templates.
-        points: per template, a multiple of 4; views with few points repeat some.
-        roll_step_deg: between templates.
-        subdivisions: of the icosphere; 2 gives 162 directions, about 17° apart.
+        points: per view; views with few points repeat some.
+        subdivisions: of the icosphere; 3 gives 642 directions, about 9° apart.
 
     Raises:
         InputError: no view shows an outline.
     """
-    wanted = icosphere_directions(subdivisions)
-    inside = views.view_range.contains_direction(wanted, 3.0)
-    if not inside.any():
-        chosen = np.arange(len(views))
-    else:
-        chosen = np.unique(np.argmax(wanted[inside] @ views.directions.T, axis=1))
-    rolls = np.deg2rad(views.view_range.rolls_deg(roll_step_deg))
-    turns = np.array([[[np.cos(r), -np.sin(r)], [np.sin(r), np.cos(r)]] for r in rolls])
     focal = 1000.0
     intrinsics = np.array([focal, focal, 0.0, 0.0, 0, 0, 0, 0, 0, 0])
-    scale = radius_px / (0.5 * views.diameter_mm)
-    # One order for all templates in which every beginning is spread over the whole.
+    # One order for all in which every beginning is spread over the whole.
     order = np.random.default_rng(0).permutation(points)
-    rows: list[tuple[Array, NDArray[np.uint8], Array, Array, float]] = []
-    for index in chosen:
+    rows: list[tuple[Array, Array, Array, float, Array]] = []
+    for index in _nearest_views(views, subdivisions):
         view = views.view(int(index))
-        found = _view_points(view.features, views.center_in_model, view.cam_from_model @ model_from_body, points)
+        cam_from_body = view.cam_from_model @ model_from_body
+        found = _view_points(view.features, views.center_in_model, cam_from_body, points)
         if found is None:
             continue
         body, directions, across = found
-        cam_from_body = view.cam_from_model @ model_from_body
         px, normals, depths = project_lines(body, directions, False, cam_from_body, intrinsics, 0.5)
         _, edge_normals, _ = project_lines(body, directions, True, cam_from_body, intrinsics, 0.5)
         normals = np.where(across, edge_normals, normals)
         # A direction along the line of sight has none in the picture: another point stands in.
         px[depths <= 0], normals[depths <= 0] = px[depths > 0][0], normals[depths > 0][0]
-        px *= cam_from_body[2, 3] / focal * scale
-        px, normals = px[order], normals[order]
-        gain = float(np.sqrt(max(view_lines(view, views.diameter_mm), 1.0)))
-        for roll, turn in zip(rolls, turns, strict=True):
-            turned = px @ turn.T
-            low = np.floor(turned.min(axis=0))
-            rotation = exp_so3([0.0, 0.0, roll]) @ cam_from_body[:3, :3]
-            rows.append((np.round(turned - low), orientation_bins(normals @ turn.T), -low, rotation, gain))
+        px *= cam_from_body[2, 3] / focal / (0.5 * views.diameter_mm)
+        angles = np.arctan2(normals[:, 1], normals[:, 0]) / np.pi
+        lines = max(view_lines(view, views.diameter_mm), 1.0)
+        rows.append((px[order], angles[order], cam_from_body[:3, :3], lines, views.directions[index]))
     if not rows:
         raise InputError("guide views: no view shows an outline; check the model and the declared distances")
+    px, angles, rotations, lines_shown, seen_from = (np.stack([row[k] for row in rows]) for k in range(5))
+    cosines = seen_from @ seen_from.T
+    np.fill_diagonal(cosines, -2.0)
+    count = min(6, len(rows) - 1)
+    nearest = np.argsort(-cosines, axis=1, kind="stable")[:, :count]
+    # The roll ψ for which Rz(ψ) R' is closest to R: the largest trace of Rz(ψ) R' Rᵀ.
+    between = np.einsum("vnij,vkj->vnik", rotations[nearest], rotations)
+    turns = np.arctan2(between[..., 0, 1] - between[..., 1, 0], between[..., 0, 0] + between[..., 1, 1])
+    return Outlines(
+        points=px.astype(np.float32),
+        angles=(np.round(angles * 256.0).astype(np.int64) % 256).astype(np.uint8),
+        rotations=rotations,
+        lines=lines_shown,
+        neighbours=nearest.astype(np.int32),
+        turns=turns,
+    )
+
+
+def _nearest_views(views: GuideViewSet, subdivisions: int) -> NDArray[np.intp]:
+    """Indices of the views nearest to the directions of an icosphere within the declared range."""
+    wanted = icosphere_directions(subdivisions)
+    inside = views.view_range.contains_direction(wanted, 3.0)
+    if not inside.any():
+        return np.arange(len(views))
+    return np.unique(np.argmax(wanted[inside] @ views.directions.T, axis=1))
+
+
+def make_bank(
+    views: GuideViewSet, outlines: Outlines, radius_px: float, roll_step_deg: float, subdivisions: int
+) -> TemplateBank:
+    """Templates of the outlines nearest to the directions of an icosphere, at all rolls of the declared range.
+
+    Args:
+        views: of the part.
+        outlines: of at least these directions, see `make_outlines`.
+        radius_px: half the part's diameter in the templates.
+        roll_step_deg: between templates.
+        subdivisions: of the icosphere; 2 gives 162 directions, about 17° apart.
+    """
+    wanted = np.stack([views.view(int(i)).cam_from_model[2, :3] for i in _nearest_views(views, subdivisions)])
+    chosen = np.unique(np.argmax(wanted @ outlines.rotations[:, 2].T, axis=1))
+    rows = []
+    for view in chosen:
+        for roll in np.deg2rad(views.view_range.rolls_deg(roll_step_deg)):
+            turn = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])
+            turned = radius_px * outlines.points[view] @ turn.T
+            low = np.floor(turned.min(axis=0))
+            angles = outlines.angles[view] / 256.0 * np.pi + roll
+            normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+            rows.append((np.round(turned - low), orientation_bins(normals), -low, view, roll))
     # Mixed, so that the bar rises early.
     mixed = np.random.default_rng(1).permutation(len(rows))
-    offsets, bins, origins, rotations, gains = ([row[k] for row in rows] for k in range(5))
+    offsets, bins, origins, views_shown, rolls = (np.stack([row[k] for row in rows])[mixed] for k in range(5))
     return TemplateBank(
-        offsets=np.stack(offsets)[mixed].astype(np.int32),
-        bins=np.stack(bins)[mixed],
-        origins=np.stack(origins)[mixed],
-        rotations=np.stack(rotations)[mixed],
-        gains=np.array(gains)[mixed],
+        offsets=offsets.astype(np.int32),
+        bins=bins,
+        origins=origins,
+        views=views_shown.astype(np.int32),
+        rolls=rolls,
+        gains=np.sqrt(outlines.lines[views_shown]),
         radius_px=radius_px,
     )
 
@@ -293,25 +348,38 @@ def choose_apart(rotations, positions, reach, cosine, distance_ratio, most):  # 
     """
     chosen = np.empty(most, dtype=np.int64)
     count = 0
-    for i in range(rotations.shape[0]):
+    total = rotations.shape[0]
+    if total == 0:
+        return chosen[:0]
+    # Chosen ones in chains by the cell that they lie in: only those of cells nearby are compared.
+    x, y = positions[:, 0] / positions[:, 2], positions[:, 1] / positions[:, 2]
+    low_x, low_y = x.min(), y.min()
+    cell = max(reach.max(), (x.max() - low_x) / 100.0, (y.max() - low_y) / 100.0, 1e-9)
+    columns, rows = int((x.max() - low_x) / cell) + 3, int((y.max() - low_y) / cell) + 3
+    head = np.full((rows, columns), -1, dtype=np.int64)
+    following = np.empty(total, dtype=np.int64)
+    for i in range(total):
+        column, row = int((x[i] - low_x) / cell) + 1, int((y[i] - low_y) / cell) + 1
         is_near = False
-        for c in range(count):
-            j = chosen[c]
-            trace = 0.0
-            for a in range(3):
-                for b in range(3):
-                    trace += rotations[i, a, b] * rotations[j, a, b]
-            if 0.5 * (trace - 1.0) < cosine:
-                continue
-            ratio = positions[i, 2] / positions[j, 2]
-            if ratio > distance_ratio or ratio * distance_ratio < 1.0:
-                continue
-            dx = positions[i, 0] / positions[i, 2] - positions[j, 0] / positions[j, 2]
-            dy = positions[i, 1] / positions[i, 2] - positions[j, 1] / positions[j, 2]
-            if abs(dx) < reach[j] and abs(dy) < reach[j]:
-                is_near = True
+        for around in range(9):
+            j = head[row + around // 3 - 1, column + around % 3 - 1]
+            while j >= 0:
+                if abs(x[i] - x[j]) < reach[j] and abs(y[i] - y[j]) < reach[j]:
+                    ratio = positions[i, 2] / positions[j, 2]
+                    if ratio <= distance_ratio and ratio * distance_ratio >= 1.0:
+                        trace = 0.0
+                        for a in range(3):
+                            for b in range(3):
+                                trace += rotations[i, a, b] * rotations[j, a, b]
+                        if 0.5 * (trace - 1.0) >= cosine:
+                            is_near = True
+                            break
+                j = following[j]
+            if is_near:
                 break
         if not is_near:
+            following[i] = head[row, column]
+            head[row, column] = i
             chosen[count] = i
             count += 1
             if count == most:
