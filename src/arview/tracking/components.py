@@ -69,8 +69,10 @@ SUSPECTS = 2
 """One thing wrong is likelier than many: each suspect beyond these halves what is said against all of them."""
 LARGEST_RATIO = 4.0
 """A single look says no more than this."""
-NAMED, CLEARED, DOUBTFUL = 2.3, 0.5, 1.0
-"""Evidence above which a component is named, below which it no longer is, and above which it is to be looked at."""
+NAMED, CLEARED = 2.3, 0.5
+"""Evidence above which a component is named, and below which it no longer is nor is in doubt."""
+SUSPECT = 1.0
+"""A look's ratio above which a component is a suspect, be it hidden or not."""
 BOUND = 6.0
 """Evidence is kept within ± this."""
 SINGLE = 2.0
@@ -85,7 +87,10 @@ EAGER_LOOKS = 2
 SURE = -1.0
 """Evidence below which a component has been seen."""
 SUSPICIOUS_FRAMES, OPEN_FRAMES, REST_FRAMES = 6, 15, 45
-"""Frames between looks from new directions: while a component seems wrong, has not been seen; and between any looks."""
+"""Frames between looks while a component may be wrong, has not been seen, and while all are as expected.
+
+The first two hold for new directions; from one that was looked from before it takes one step longer.
+"""
 KEPT_SHEETS = 64
 
 
@@ -115,6 +120,7 @@ class Look:
 
     Attributes:
         against: (C,) log-likelihood ratio of "not where expected" to "as expected"; 0 where nothing is said.
+        is_suspect: (C,) its edges are not seen; it may be hidden.
         is_shown: (C,) enough of it shows to say something.
         borne_out, elsewhere: (C,) share of its points on edges of the picture, at its place and at the best other.
         contrast: (C,) mean change of colour across its outline in deviations, -1 where there is none.
@@ -122,6 +128,7 @@ class Look:
     """
 
     against: Array
+    is_suspect: NDArray[np.bool_]
     is_shown: NDArray[np.bool_]
     borne_out: Array
     elsewhere: Array
@@ -567,7 +574,7 @@ class ComponentCheck:
     def doubtful(self) -> tuple[str, ...]:
         """Names of components that are to be looked at again before the part can be called right."""
         names = self.views.component_names
-        return tuple(names[index] for index in np.flatnonzero((self._evidence > DOUBTFUL) & ~self._is_named))
+        return tuple(names[index] for index in np.flatnonzero((self._evidence > CLEARED) & ~self._is_named))
 
     def reset(self) -> None:
         """Forget what was seen: another part may be in view."""
@@ -576,6 +583,7 @@ class ComponentCheck:
         self._is_named = np.zeros(count, dtype=bool)
         self._looks = 0
         self._rested = 0
+        self._has_suspects = False
         self._directions = np.zeros((0, 3))
         self._visits = np.zeros((0, 2, count))
 
@@ -587,6 +595,7 @@ class ComponentCheck:
         look = self.look(image, cam_from_model)
         self._looks += 1
         self._rested = 0
+        self._has_suspects = bool(look.is_suspect.any())
         news = self._news(cam_from_model, look.against)
         self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + news * look.against, -BOUND, BOUND)
         self._is_named = self._evidence > np.where(self._is_named, CLEARED, NAMED)
@@ -598,8 +607,11 @@ class ComponentCheck:
         if self._rested < SUSPICIOUS_FRAMES:
             return False
         highest = float(self._evidence.max())
-        wait = REST_FRAMES if highest < SURE else OPEN_FRAMES if highest < CLEARED else SUSPICIOUS_FRAMES
-        return self._rested >= REST_FRAMES or (self._rested >= wait and self._nearest_seen(cam_from_model) < 0)
+        waits = (SUSPICIOUS_FRAMES, OPEN_FRAMES, REST_FRAMES, REST_FRAMES)
+        step = 0 if self._has_suspects or highest > CLEARED else 1 if highest > SURE else 2
+        if self._rested < waits[step]:
+            return False
+        return self._rested >= waits[step + 1] or self._nearest_seen(cam_from_model) < 0
 
     def single_look(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[str, ...]:
         """Mismatches that one picture alone bears out; what was seen before does not count, nor is it changed."""
@@ -621,12 +633,13 @@ class ComponentCheck:
         ratio = constant + per_share * borne_out + per_lead * (borne_out - elsewhere)
         ratio += per_contrast * np.where(contrast < 0.0, USUAL_CONTRAST, np.minimum(contrast, MOST_CONTRAST))
         ratio *= np.maximum(spread, 0.0) / (np.maximum(spread, 0.0) + HALF_LAMBDA)
-        more_suspects = max(0, int(np.count_nonzero(is_shown & (ratio > DOUBTFUL))) - SUSPECTS)
+        is_suspect = is_shown & (ratio > SUSPECT)
+        more_suspects = max(0, int(np.count_nonzero(is_suspect)) - SUSPECTS)
         # Where the surroundings are not seen either, something hides it, or the picture is blurred.
         is_open = np.clip((np.minimum(around, others) - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
         ratio = np.where(ratio > 0.0, ratio * is_open * 0.5**more_suspects, ratio)
         against = np.where(is_shown, np.clip(ratio, -LARGEST_RATIO, LARGEST_RATIO), 0.0)
-        return Look(against, is_shown, borne_out, elsewhere, contrast, around)
+        return Look(against, is_suspect, is_shown, borne_out, elsewhere, contrast, around)
 
     def _measure(self, image: NDArray[np.uint8], cam_from_model: Array) -> Array:
         """(C,6), see `measure_components`."""

@@ -1,0 +1,187 @@
+"""Whether every component is where the CAD has it: look-alikes are named, right parts are not, hidden ones neither."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from arview.cad.model import Model, make_model
+from arview.geometry import Array, apply
+from arview.tracking import TrackingSession
+from arview.tracking.components import ComponentCheck
+from synthetic import CAMERA, assembly, assembly_views, block, path, picture, pose_from, wrong
+
+MOVED_MM = 20.0
+
+
+@cache
+def check() -> ComponentCheck:
+    return ComponentCheck(assembly_views(), assembly(), CAMERA)
+
+
+def changed(**shifts: tuple[float, float] | None) -> Model:
+    """The assembly with components moved along the plate by (x, y) mm, or left out."""
+    kept = [part for part in assembly().components if shifts.get(part.name, ()) is not None]
+    ways = [np.array([*(shifts.get(part.name) or (0.0, 0.0)), 0.0]) for part in kept]
+    moved = [
+        replace(part, vertices_in_model=part.vertices_in_model + way) for part, way in zip(kept, ways, strict=True)
+    ]
+    return make_model("look-alike", tuple(moved))
+
+
+LOOK_ALIKES: dict[tuple[str, ...], Model] = {
+    ("post_1",): changed(post_1=None),
+    ("post_2",): changed(post_2=None),
+    ("post_3",): changed(post_3=None),
+    ("block_1",): changed(block_1=None),
+    ("block_2",): changed(block_2=None),
+    ("rail",): changed(rail=None),
+    ("post_1", "moved"): changed(post_1=(0.0, MOVED_MM)),
+    ("post_2", "moved"): changed(post_2=(0.0, MOVED_MM)),
+    ("post_3", "moved"): changed(post_3=(-MOVED_MM, 0.0)),
+    ("block_1", "moved"): changed(block_1=(0.0, -MOVED_MM)),
+    ("block_2", "moved"): changed(block_2=(0.0, MOVED_MM)),
+    ("post_1", "post_3"): changed(post_1=(94.0, 66.0), post_3=(-94.0, -66.0)),
+    ("post_2", "block_2"): changed(post_2=(-43.0, 28.0), block_2=(43.0, -28.0)),
+}
+
+
+def views_of(count: int, seed: int) -> list[Array]:
+    """Poses over the declared range."""
+    rng = np.random.default_rng(seed)
+    return [
+        pose_from(rng.uniform(-80, 80), rng.uniform(20, 60), rng.uniform(430, 620), roll_deg=rng.uniform(-20, 20))
+        for _ in range(count)
+    ]
+
+
+def about(pose: Array, seed: int) -> Array:
+    """The pose as a tracker has it: half a degree and a millimetre off."""
+    return wrong(pose, np.random.default_rng(seed), 0.3, 0.5)
+
+
+def named(messages: tuple[str, ...]) -> set[str]:
+    names = {message.split()[1] for message in messages}
+    assert set(messages) == {f"mismatch: {name} not seen where expected" for name in names}
+    return names
+
+
+def card_over(name: str, pose: Array, margin_px: int = 30) -> tuple[int, int, int, int]:
+    part = next(part for part in assembly().components if part.name == name)
+    pixels = CAMERA.project(apply(pose, part.vertices_in_model))
+    left, top = np.floor(pixels.min(axis=0)).astype(int) - margin_px
+    right, bottom = np.ceil(pixels.max(axis=0)).astype(int) + margin_px
+    return max(left, 0), max(top, 0), min(right, CAMERA.width), min(bottom, CAMERA.height)
+
+
+def watch(frames: list[tuple[NDArray[np.uint8], Array]]) -> ComponentCheck:
+    """The check after frames with their poses."""
+    check().reset()
+    for image, pose in frames:
+        check().update(image, pose)
+    return check()
+
+
+def walk(model: Model | None, count: int, seed: int = 0, noise: float = 4.0) -> list[tuple[NDArray[np.uint8], Array]]:
+    poses = path(count, seed)
+    return [
+        (picture(pose, model, seed=100 * seed + k, scene=seed % 9, noise=noise), about(pose, k))
+        for k, pose in enumerate(poses)
+    ]
+
+
+def test_one_picture_names_what_is_missing_moved_or_swapped() -> None:
+    hits, pictures, others = 0, 0, 0
+    for number, (parts, model) in enumerate(LOOK_ALIKES.items()):
+        for k, pose in enumerate(views_of(2, seed=number)):
+            image = picture(pose, model, seed=k, scene=(number + k) % 9, noise=4.0)
+            found = named(check().single_look(image, about(pose, k)))
+            pictures += 1
+            hits += bool(found & set(parts))
+            others += bool(found - set(parts))
+    assert hits >= 0.9 * pictures
+    assert others <= 0.04 * pictures
+
+
+@pytest.mark.parametrize(("noise", "gain"), [(2.0, 1.0), (8.0, 1.0), (4.0, 0.55)])
+def test_a_right_part_is_not_named(noise: float, gain: float) -> None:
+    for k, pose in enumerate(views_of(8, seed=50)):
+        image = picture(pose, seed=k, scene=k % 9, noise=noise, gain=gain)
+        assert check().single_look(image, about(pose, k)) == (), f"view {k}"
+
+
+def test_a_component_a_little_off_nominal_is_not_named() -> None:
+    near = changed(post_1=(1.0, -0.7), block_1=(-0.8, 0.8))
+    for k, pose in enumerate(views_of(6, seed=60)):
+        assert check().single_look(picture(pose, near, seed=k, scene=k % 9), about(pose, k)) == (), f"view {k}"
+
+
+def test_frames_add_up_and_reset_forgets() -> None:
+    seen = watch(walk(changed(post_3=None), 4))
+    assert named(seen.mismatches) == {"post_3"}
+    assert seen.doubtful == ()
+    seen.reset()
+    assert seen.mismatches == () and seen.doubtful == ()
+    for image, pose in walk(None, 4):
+        seen.update(image, pose)
+    assert seen.mismatches == () and seen.doubtful == ()
+
+
+def test_a_component_set_right_is_cleared() -> None:
+    seen = watch(walk(changed(block_2=None), 4))
+    assert named(seen.mismatches) == {"block_2"}
+    for azimuth_deg in range(-60, 20, 10):
+        pose = pose_from(azimuth_deg, 45, 520)
+        image = picture(pose, seed=azimuth_deg + 60)
+        for _ in range(7):  # it does not look at every frame
+            seen.update(image, pose)
+    assert seen.mismatches == ()
+
+
+def test_what_a_card_hides_is_no_mismatch() -> None:
+    for name in ("post_1", "post_3", "block_1", "block_2"):
+        for k, pose in enumerate(views_of(2, seed=70)):
+            image = picture(pose, seed=k, scene=k, noise=3.0, card=card_over(name, pose))
+            assert name not in named(check().single_look(image, about(pose, k))), f"{name}, view {k}"
+
+
+def test_what_is_hidden_at_first_is_named_later_even_at_a_fast_turn() -> None:
+    model = changed(block_2=None)
+    poses = [pose_from(-70 + 7 * k, 40, 520) for k in range(20)]
+    cards = [card_over("block_2", pose, 50) if k < 3 else None for k, pose in enumerate(poses)]
+    frames = [(picture(p, model, seed=k, card=card), p) for k, (p, card) in enumerate(zip(poses, cards, strict=True))]
+    assert watch(frames[:3]).mismatches == ()
+    assert named(watch(frames).mismatches) == {"block_2"}
+
+
+def test_a_sure_part_is_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = []
+    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    look = seen.look
+    monkeypatch.setattr(seen, "look", lambda image, pose: looks.append(1) or look(image, pose))
+    image = picture(pose_from(30, 45, 520))
+    for _ in range(200):
+        seen.update(image, pose_from(30, 45, 520))
+    assert 3 <= len(looks) <= 10
+
+
+def test_a_part_of_one_component_has_nothing_to_mismatch() -> None:
+    alone = ComponentCheck(assembly_views(), block(), CAMERA)
+    pose = pose_from(30, 40, 520)
+    alone.update(picture(pose), pose)
+    assert alone.single_look(picture(None), pose) == ()
+    assert alone.mismatches == () and alone.doubtful == ()
+
+
+def test_a_session_never_calls_a_look_alike_tracked() -> None:
+    session = TrackingSession(assembly_views(), assembly(), CAMERA, initial_cam_from_model=path(1, 4)[0])
+    for k, pose in enumerate(path(5, 4)):
+        result = session.process(picture(pose, changed(post_1=None), seed=k, scene=4, noise=4.0), k, k / 30)
+        if k >= 1:
+            assert named(result.mismatches) == {"post_1"}
+            assert result.state.value == "critical"
+            assert "post_1 not seen where expected" in result.reason
