@@ -137,13 +137,14 @@ def climb(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def outline_score(maps, points, angles, roll, radius_px, x0, y0, shift_px, shift_step, room, sums):  # type: ignore[no-untyped-def]
-    """Mean response 0–1 of an outline (N,2), (N,) at a roll, size and place, and the best shift dx, dy in px."""
+def outline_score(maps, points, angles, roll, radius_px, nearness, x0, y0, shift_px, shift_step, room, sums):  # type: ignore[no-untyped-def]
+    """Mean response 0–1 of an outline (N,3), (N,) at a roll, size and place, and the best shift dx, dy in px."""
     a, b = np.float32(radius_px * np.cos(roll)), np.float32(radius_px * np.sin(roll))
     turn = int(np.round(roll * (256.0 / np.pi))) + 16
     left, top = np.float32(x0 + 0.5), np.float32(y0 + 0.5)
     for i in range(points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
+        scale = np.float32(1.0) / (np.float32(1.0) + np.float32(nearness) * points[i, 2])
+        x, y = points[i, 0] * scale, points[i, 1] * scale
         room[0, i] = int(np.floor(a * x - b * y + left))
         room[1, i] = int(np.floor(b * x + a * y + top))
         room[2, i] = ((angles[i] + turn) >> 5) & 7
@@ -153,8 +154,8 @@ def outline_score(maps, points, angles, roll, radius_px, x0, y0, shift_px, shift
 
 @njit(cache=True, nogil=True)
 def climb_outlines(  # type: ignore[no-untyped-def]
-    maps, points, angles, neighbours, turns, views, rolls, radii_px, places, roll_step_rad, stretch_step, rounds,
-    shift_px, shift_step
+    maps, points, angles, neighbours, turns, views, rolls, radii_px, places, focal_px, roll_step_rad, stretch_step,
+    rounds, shift_px, shift_step
 ):  # fmt: skip
     """Improve matches of outlines, each by itself, in the picture: view, roll, size and place.
 
@@ -164,6 +165,7 @@ def climb_outlines(  # type: ignore[no-untyped-def]
         maps: (8,H,W) from `response_maps`, padded.
         points, angles, neighbours, turns: see `Outlines`.
         views (M,), rolls (M,) rad, radii_px (M,), places (M,2) px of the maps: the matches.
+        focal_px: of the maps.
         roll_step_rad, stretch_step: steps of the roll and, as a share, of the size.
         rounds: over all steps.
         shift_px, shift_step: shifts of ± shift_px are tried.
@@ -180,8 +182,9 @@ def climb_outlines(  # type: ignore[no-untyped-def]
     for n in range(len(views)):
         view, roll, radius = views[n], rolls[n], radii_px[n]
         best, dx, dy = outline_score(
-            maps, points[view], angles[view], roll, radius, places[n, 0], places[n, 1], shift_px, shift_step, room, sums
-        )
+            maps, points[view], angles[view], roll, radius, radius / focal_px, places[n, 0], places[n, 1],
+            shift_px, shift_step, room, sums,
+        )  # fmt: skip
         x, y = places[n, 0] + dx, places[n, 1] + dy
         for _ in range(rounds):
             before = best
@@ -195,7 +198,7 @@ def climb_outlines(  # type: ignore[no-untyped-def]
                     v = neighbours[view, step - 4]
                     r += turns[view, step - 4]
                 score, dx, dy = outline_score(
-                    maps, points[v], angles[v], r, s, x, y, shift_px, shift_step, room, sums
+                    maps, points[v], angles[v], r, s, s / focal_px, x, y, shift_px, shift_step, room, sums
                 )
                 if score > best:
                     best = score

@@ -51,8 +51,6 @@ HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
 SURE_QUALITY = 0.8
 """A pose of this quality ends the search."""
-HOPELESS_QUALITY = 0.1
-"""When the likeliest matches end below this the part is hardly there."""
 COARSE_TOLERANCE_PX, FINE_TOLERANCE_PX = 3.5, 1.5
 """After the coarse and the fine stages edges are looked for this near."""
 FINE_STAGES = (
@@ -66,7 +64,7 @@ FINE_STAGES = (
 
 STEPS_PER_OCTAVE = 4
 """Scales at which response maps are made: the distances of the templates, shared by all levels of the search."""
-IMPROVED_STEPS, IMPROVED_ROLL, IMPROVED_STRETCH, IMPROVED_SHIFT = 2, 0.12, 0.07, 2
+IMPROVED_STEPS, IMPROVED_ROLL, IMPROVED_STRETCH, IMPROVED_SHIFT = 2, 0.16, 0.07, 2
 CELL_PX, CELL_ROLL = 4.0, 0.33
 SPREAD_PX = 1
 """How far edges may lie from where a pose has them, in pixels of the maps."""
@@ -97,10 +95,30 @@ class Level:
 
 
 LEVELS = (
-    Level(1.3, 7.0, 0.07, 2, 0, 90, 6.0, 48),
-    Level(2.6, 4.0, 0.035, 2, 0, 14, 4.0, 64),
+    Level(2.6, 4.0, 0.04, 2, 0, 14, 4.0, 64),
     Level(5.2, 2.0, 0.017, 2, 1, 6, 2.5, 96),
 )
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How far a search goes.
+
+    Attributes:
+        matches: of templates that are improved once as outlines; skipped: the best of them, which were tried before.
+        improved: of these, how many are improved further.
+        starts: of these, how many poses are searched around.
+    """
+
+    matches: int
+    skipped: int
+    improved: int
+    starts: int
+
+
+QUICK = Effort(2500, 0, 800, 40)
+WIDE = Effort(30000, 2500, 6000, 100)
+"""For clutter, in which thousands of wrong matches come before the right one."""
 
 
 @dataclass(frozen=True)
@@ -113,10 +131,8 @@ class DetectorOptions:
         roll_step_deg: spacing of the templates.
         subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
         grid_px: places looked at are so far apart.
-        matches: the best template matches of all distances.
-        starts: of those, how many places apart from each other are searched around.
-        likeliest: of these, how many are tried first, and alone if they settle the matter.
-        levels: of that search.
+        efforts: of the searches, each made if those before it did not settle the matter.
+        levels: of the pattern search.
         finalists: how many of its results are refined to the end.
         rivals: how many more, for quite other poses.
         min_in_picture: less of the outline inside the picture is no detection.
@@ -127,11 +143,8 @@ class DetectorOptions:
     points: int = 64
     roll_step_deg: float = 18.0
     subdivisions: int = 2
-    grid_px: int = 2
-    kept: int = 2000
-    matches: int = 800
-    starts: int = 200
-    likeliest: int = 30
+    grid_px: int = 4
+    efforts: tuple[Effort, ...] = (QUICK, WIDE)
     levels: tuple[Level, ...] = LEVELS
     finalists: int = 5
     rivals: int = 3
@@ -247,7 +260,7 @@ class _Picture:
         width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
         # Edges are found at twice the resolution as long as the picture has it.
         pool = 2 if scale <= 0.5 else 1
-        way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        way = cv2.INTER_AREA if pool * scale < 0.6 else cv2.INTER_LINEAR
         size = (pool * width, pool * height)
         image = self.image if size == (camera.width, camera.height) else cv2.resize(self.image, size, interpolation=way)
         intrinsics = intrinsics_of(camera.scaled(width, height))
@@ -268,7 +281,6 @@ class Detector:
         self.best_rejected: Rejected | None = None
         self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
         self.outlines = make_outlines(views, self.tracker.part.model_from_body, o.points, max(3, o.subdivisions))
-        self.bank = make_bank(views, self.outlines, o.radius_px, o.roll_step_deg, o.subdivisions)
         self._clusters = np.argmax(self.outlines.rotations[:, 2] @ icosphere_directions(1).T, axis=1)
         self.symmetries = find_symmetries(views)
         self._turns = np.concatenate([self.symmetries.exact, self.symmetries.near])
@@ -278,6 +290,13 @@ class Detector:
         near, far = self._step_at(low), self._step_at(high)
         top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
+        self.banks = {
+            step: make_bank(
+                views, self.outlines, o.radius_px, o.radius_px / (self._focal * 2.0 ** (step / STEPS_PER_OCTAVE)),
+                o.roll_step_deg, o.subdivisions,
+            )
+            for step in self._steps
+        }  # fmt: skip
         self._lines: dict[int, float] = {}
 
     def _step_at(self, distance_mm: float, magnification: float = 1.0) -> float:
@@ -297,7 +316,7 @@ class Detector:
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             max_results: at most so many, all above the quality threshold and apart from each other.
-            is_thorough: look at the less likely hypotheses too when the likeliest come to nothing at all.
+            is_thorough: search on among less likely matches when the likeliest come to nothing.
             guesses: rough poses (4,4) ``cam_from_model`` that are tried first, and alone if one settles the matter.
         """
         picture = self._picture(image)
@@ -327,13 +346,10 @@ class Detector:
             settled = self._settle(picture, self.climbed(picture, known))
             if settled and self.qualities(settled)[0] >= SURE_QUALITY:
                 return settled
-        starts = self.starts(picture)
-        likeliest = self.options.likeliest
-        # The likeliest first: when they settle the matter, the others are not looked at.
-        for batch in (starts[:likeliest], starts[likeliest:]):
-            settled = self._ordered([*settled, *self._settle(picture, self.climbed(picture, batch))], 5.0)
-            best = self.qualities(settled)[0] if settled else 0.0
-            if best >= SURE_QUALITY or (best < HOPELESS_QUALITY and not is_thorough):
+        for effort in self.options.efforts if is_thorough else self.options.efforts[:1]:
+            starts = self.climbed(picture, self.starts(picture, effort))
+            settled = self._ordered([*settled, *self._settle(picture, starts)], 5.0)
+            if settled and self.qualities(settled)[0] >= SURE_QUALITY:
                 break
         return settled
 
@@ -386,32 +402,32 @@ class Detector:
             starts = self._climb(picture, starts, level)
         return starts
 
-    def starts(self, picture: _Picture) -> list[Candidate]:
+    def starts(self, picture: _Picture, effort: Effort = QUICK) -> list[Candidate]:
         """The best template matches over the whole range, apart from each other, improved, best first."""
-        o = self.options
-        bank = self.bank
         picture.make(self._steps)
-        halves = [0, len(bank.bins) // 2, len(bank.bins)]
+        count = len(next(iter(self.banks.values())).bins)
+        halves = [0, count // 2, count]
         # Small pictures first: what is found there raises the bar for the large ones.
-        bar = np.zeros(1)
+        votes = np.zeros(1024, dtype=np.int64)
         jobs = [(step, first, last) for step in reversed(self._steps) for first, last in pairwise(halves)]
-        matches = [m for m in _pool().map(lambda job: self._match(picture, bar, *job), jobs) if m is not None]
-        if not matches:
+        found = _pool().map(lambda job: self._match(picture, votes, effort.matches, *job), jobs)
+        raw = [m for m in found if m is not None]
+        if not raw:
             return []
-        matches = self._distinct(_joined(matches), o.matches)
-        matches = self._improved(picture, self._improved(picture, matches, 1).best(o.matches // 4), 2)
-        matches = self._best_apart(matches, 6.0, 0.15, 1.06, o.starts)
+        matches = self._distinct(_joined(raw), effort.matches, effort.skipped)
+        matches = self._improved(picture, self._improved(picture, matches, 1).best(effort.improved), 2)
+        matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.starts)
         return [Candidate(float(k), rigid(r, p)) for k, r, p in zip(matches.keys, *self._posed(matches), strict=True)]
 
-    def _match(self, picture: _Picture, bar: Array, step: int, first: int, last: int) -> Matches | None:
+    def _match(self, picture: _Picture, votes: NDArray[np.int64], kept: int, step: int, first: int, last: int) -> Matches | None:
         """The matches of some templates at one scale."""
         o = self.options
-        bank = self.bank
+        bank = self.banks[step]
         maps, _ = picture.maps(step)
         if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
             return None
         keys, templates, places = match_templates(
-            decimate(maps, o.grid_px), bank.offsets, bank.bins, bank.gains, first, last, o.kept, LOWEST_SCORE, bar
+            decimate(maps, o.grid_px), bank.offsets, bank.bins, bank.gains, first, last, kept, LOWEST_SCORE, votes
         )
         return Matches(
             keys, np.full(len(keys), step), bank.views[templates], bank.rolls[templates],
@@ -439,15 +455,15 @@ class Detector:
             choose_apart(rotations, positions, reach / positions[:, 2], np.cos(angle_rad), ratio, most)
         )
 
-    def _distinct(self, matches: Matches, most: int) -> Matches:
-        """The best, one for each cell of places, scales and rotations."""
+    def _distinct(self, matches: Matches, most: int, skipped: int) -> Matches:
+        """The best, one for each cell of places, scales and rotations, but the first."""
         matches = matches.best(len(matches.keys))
         cells = np.floor(matches.places / CELL_PX).astype(np.int64) + 4096
         rolls = np.floor(matches.rolls / CELL_ROLL).astype(np.int64) + 64
         code = ((cells[:, 0] * 8192 + cells[:, 1]) * 128 + rolls) * 1024 + self._clusters[matches.views]
         code = code * 128 + matches.steps + 64
         _, first = np.unique(code, return_index=True)
-        return matches.of(np.sort(first)[:most])
+        return matches.of(np.sort(first)[skipped:most])
 
     def _improved(self, picture: _Picture, matches: Matches, rounds: int) -> Matches:
         shapes = self.outlines
@@ -467,7 +483,7 @@ class Detector:
             places = (some.places + 0.5) * scale[:, None] - 0.5 + picture.pad_px
             scores, views, rolls, radii, places = climb_outlines(
                 maps, shapes.points, shapes.angles, shapes.neighbours, shapes.turns, some.views, some.rolls,
-                some.radii_px * scale, places, IMPROVED_ROLL, IMPROVED_STRETCH, rounds, 2, IMPROVED_SHIFT,
+                some.radii_px * scale, places, self._focal * 2.0 ** (step / STEPS_PER_OCTAVE), IMPROVED_ROLL, IMPROVED_STRETCH, rounds, 2, IMPROVED_SHIFT,
             )  # fmt: skip
             keys = scores * shapes.lines[views] ** 0.25
             return Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)

@@ -32,14 +32,14 @@ def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int, pool: i
     With ``pool`` the maps are so many times smaller than the picture; each of their pixels has the strongest edge of
     those it stands for: fine lines that lie close keep their directions. ``spread_px`` is in pixels of the maps.
     """
-    smooth = cv2.GaussianBlur(image, (3, 3), 0)
-    gx, gy = cv2.Sobel(smooth, cv2.CV_16S, 1, 0, ksize=3), cv2.Sobel(smooth, cv2.CV_16S, 0, 1, ksize=3)
-    if image.ndim == 2:
-        gx, gy = gx[..., None], gy[..., None]
+    planes = cv2.split(cv2.GaussianBlur(image, (3, 3), 0))
+    gx = np.stack([cv2.Sobel(plane, cv2.CV_16S, 1, 0, ksize=3) for plane in planes])
+    gy = np.stack([cv2.Sobel(plane, cv2.CV_16S, 0, 1, ksize=3) for plane in planes])
     x, y, magnitude = _strongest(gx, gy)
+    phase = cv2.phase(x, y, angleInDegrees=False)
     size = 20 * pool + 1
     around = cv2.boxFilter(magnitude, -1, (size, size), borderType=cv2.BORDER_REFLECT)
-    own = _oriented(x, y, magnitude, around, cv2.dilate(magnitude, np.ones((3, 3), np.uint8)), pool)
+    own = _oriented(phase, magnitude, around, cv2.dilate(magnitude, np.ones((3, 3), np.uint8)), pool)
     shape = cv2.MORPH_RECT if spread_px == 1 else cv2.MORPH_ELLIPSE
     kernel = cv2.getStructuringElement(shape, (2 * spread_px + 1, 2 * spread_px + 1))
     for plane in own:
@@ -50,45 +50,55 @@ def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int, pool: i
 @njit(cache=True, nogil=True)
 def _strongest(gx, gy):  # type: ignore[no-untyped-def]
     """Gradient (H,W) of the channel with the strongest one (Dalal & Triggs 2005), and its magnitude in grey levels."""
-    height, width, channels = gx.shape
+    channels, height, width = gx.shape
     x = np.empty((height, width), dtype=np.float32)
     y = np.empty((height, width), dtype=np.float32)
     magnitude = np.empty((height, width), dtype=np.float32)
     for row in range(height):
+        a, b, m = x[row], y[row], magnitude[row]
         for column in range(width):
-            best = np.float32(-1.0)
-            for c in range(channels):
-                dx, dy = np.float32(gx[row, column, c]), np.float32(gy[row, column, c])
+            dx, dy = np.float32(gx[0, row, column]), np.float32(gy[0, row, column])
+            a[column], b[column], m[column] = dx, dy, dx * dx + dy * dy
+        for c in range(1, channels):
+            for column in range(width):
+                dx, dy = np.float32(gx[c, row, column]), np.float32(gy[c, row, column])
                 square = dx * dx + dy * dy
-                if square > best:
-                    best = square
-                    x[row, column] = dx
-                    y[row, column] = dy
-            magnitude[row, column] = np.float32(0.25) * np.sqrt(best)
+                is_stronger = square > m[column]
+                a[column] = dx if is_stronger else a[column]
+                b[column] = dy if is_stronger else b[column]
+                m[column] = square if is_stronger else m[column]
+        for column in range(width):
+            m[column] = np.float32(0.25) * np.sqrt(m[column])
     return x, y, magnitude
 
 
 @njit(cache=True, nogil=True)
-def _oriented(gx, gy, magnitude, around, peak, pool):  # type: ignore[no-untyped-def]
+def _oriented(phase, magnitude, around, peak, pool):  # type: ignore[no-untyped-def]
     """(8, H / pool, W / pool) strength of thin edges by orientation, relative to the contrast around.
 
-    An edge between two orientations counts for both.
+    An edge between two orientations counts for both. ``phase`` (H,W) rad, 0 to 2π.
     """
     rows, columns = magnitude.shape[0] // pool, magnitude.shape[1] // pool
     own = np.zeros((ORIENTATIONS, rows, columns), dtype=np.uint8)
     per_rad = np.float32(ORIENTATIONS / np.pi)
+    places = np.empty(columns * pool, dtype=np.int32)
     for y in range(rows * pool):
+        row = y // pool
+        # Thin: only a maximum of the neighbourhood in some direction says where the edge is.
+        count = 0
         for x in range(columns * pool):
             m = magnitude[y, x]
-            # Thin: only a maximum of the neighbourhood in some direction says where the edge is.
-            if m < np.float32(0.6) * peak[y, x] or m < np.float32(0.5):
-                continue
+            places[count] = x
+            count += int((m >= np.float32(0.6) * peak[y, x]) & (m >= np.float32(0.5)))
+        for k in range(count):
+            x = places[k]
+            m = magnitude[y, x]
             strength = np.float32(255.0) * m / (m + around[y, x] + np.float32(3.0))
-            position = np.arctan2(gy[y, x], gx[y, x]) * per_rad + np.float32(ORIENTATIONS)
+            position = phase[y, x] * per_rad
             low = int(position)
             share = position - np.float32(low)
             a, b = low % ORIENTATIONS, (low + 1) % ORIENTATIONS
-            row, column = y // pool, x // pool
+            column = x // pool
             value = np.uint8(strength * min(np.float32(1.0), np.float32(2.0) * (np.float32(1.0) - share)))
             own[a, row, column] = max(own[a, row, column], value)
             value = np.uint8(strength * min(np.float32(1.0), np.float32(2.0) * share))

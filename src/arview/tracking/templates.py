@@ -26,14 +26,18 @@ from arview.guideviews.uniqueness import view_lines
 from arview.tracking.matching import orientation_bins
 from arview.tracking.solver import project_lines
 
-FIRST_POINTS = 12
+FIRST_POINTS = 32
 """So many points of a template are looked at everywhere, the others only where these bode well."""
-FIRST_MARGIN = 0.12
+FIRST_MARGIN = 0.035
 """The mean of the first points may be so much lower than the score asked for."""
 TILE = 1024
 """Places looked at together: their sums stay in the nearest cache."""
-SAMPLE, SAMPLE_EVERY = 128, 384
+SAMPLE, SAMPLE_EVERY = 64, 192
 """Runs of places from which a template's usual score is taken."""
+BLOCK = 64
+"""Places passed over together where none of them bodes well."""
+KEY_STEP = 0.02
+"""Keys are counted in steps of this."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,8 @@ class Outlines:
     """What the part shows from directions spread over the declared range, seen along the optical axis.
 
     Attributes:
-        points: (V,N,2) float32 of outline and design edges, in halves of the part's diameter about its centre.
+        points: (V,N,3) float32 of outline and design edges, in halves of the part's diameter about its centre, in
+            the axes of the camera.
         angles: (V,N) uint8 of their normals, 256 to the half turn.
         rotations: (V,3,3) of ``cam_from_body``.
         lines: (V,) distinct lines shown.
@@ -101,18 +106,18 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int, subd
         if found is None:
             continue
         body, directions, across = found
-        px, normals, depths = project_lines(body, directions, False, cam_from_body, intrinsics, 0.5)
+        _, normals, depths = project_lines(body, directions, False, cam_from_body, intrinsics, 0.5)
         _, edge_normals, _ = project_lines(body, directions, True, cam_from_body, intrinsics, 0.5)
         normals = np.where(across, edge_normals, normals)
         # A direction along the line of sight has none in the picture: another point stands in.
-        px[depths <= 0], normals[depths <= 0] = px[depths > 0][0], normals[depths > 0][0]
-        px *= cam_from_body[2, 3] / focal / (0.5 * views.diameter_mm)
+        body[depths <= 0], normals[depths <= 0] = body[depths > 0][0], normals[depths > 0][0]
+        shown = body @ cam_from_body[:3, :3].T / (0.5 * views.diameter_mm)
         angles = np.arctan2(normals[:, 1], normals[:, 0]) / np.pi
         lines = max(view_lines(view, views.diameter_mm), 1.0)
-        rows.append((px[order], angles[order], cam_from_body[:3, :3], lines, views.directions[index]))
+        rows.append((shown[order], angles[order], cam_from_body[:3, :3], lines, views.directions[index]))
     if not rows:
         raise InputError("guide views: no view shows an outline; check the model and the declared distances")
-    px, angles, rotations, lines_shown, seen_from = (np.stack([row[k] for row in rows]) for k in range(5))
+    shown, angles, rotations, lines_shown, seen_from = (np.stack([row[k] for row in rows]) for k in range(5))
     cosines = seen_from @ seen_from.T
     np.fill_diagonal(cosines, -2.0)
     count = min(6, len(rows) - 1)
@@ -121,7 +126,7 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int, subd
     between = np.einsum("vnij,vkj->vnik", rotations[nearest], rotations)
     turns = np.arctan2(between[..., 0, 1] - between[..., 1, 0], between[..., 0, 0] + between[..., 1, 1])
     return Outlines(
-        points=px.astype(np.float32),
+        points=shown.astype(np.float32),
         angles=(np.round(angles * 256.0).astype(np.int64) % 256).astype(np.uint8),
         rotations=rotations,
         lines=lines_shown,
@@ -140,7 +145,7 @@ def _nearest_views(views: GuideViewSet, subdivisions: int) -> NDArray[np.intp]:
 
 
 def make_bank(
-    views: GuideViewSet, outlines: Outlines, radius_px: float, roll_step_deg: float, subdivisions: int
+    views: GuideViewSet, outlines: Outlines, radius_px: float, nearness: float, roll_step_deg: float, subdivisions: int
 ) -> TemplateBank:
     """Templates of the outlines nearest to the directions of an icosphere, at all rolls of the declared range.
 
@@ -148,30 +153,30 @@ def make_bank(
         views: of the part.
         outlines: of at least these directions, see `make_outlines`.
         radius_px: half the part's diameter in the templates.
+        nearness: half the part's diameter over its distance.
         roll_step_deg: between templates.
         subdivisions: of the icosphere; 2 gives 162 directions, about 17° apart.
     """
     wanted = np.stack([views.view(int(i)).cam_from_model[2, :3] for i in _nearest_views(views, subdivisions)])
     chosen = np.unique(np.argmax(wanted @ outlines.rotations[:, 2].T, axis=1))
-    rows = []
-    for view in chosen:
-        for roll in np.deg2rad(views.view_range.rolls_deg(roll_step_deg)):
-            turn = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])
-            turned = radius_px * outlines.points[view] @ turn.T
-            low = np.floor(turned.min(axis=0))
-            angles = outlines.angles[view] / 256.0 * np.pi + roll
-            normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-            rows.append((np.round(turned - low), orientation_bins(normals), -low, view, roll))
+    rolls = np.deg2rad(views.view_range.rolls_deg(roll_step_deg))
     # Mixed, so that the bar rises early.
-    mixed = np.random.default_rng(1).permutation(len(rows))
-    offsets, bins, origins, views_shown, rolls = (np.stack([row[k] for row in rows])[mixed] for k in range(5))
+    mixed = np.random.default_rng(1).permutation(len(chosen) * len(rolls))
+    shown, rolls = np.repeat(chosen, len(rolls))[mixed], np.tile(rolls, len(chosen))[mixed]
+    points = outlines.points[shown].astype(np.float64)
+    px = points[..., :2] * radius_px / (1.0 + nearness * points[..., 2:])
+    c, s = np.cos(rolls)[:, None], np.sin(rolls)[:, None]
+    turned = np.stack([c * px[..., 0] - s * px[..., 1], s * px[..., 0] + c * px[..., 1]], axis=-1)
+    low = np.floor(turned.min(axis=1))
+    angles = outlines.angles[shown] / 256.0 * np.pi + rolls[:, None]
+    normals = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     return TemplateBank(
-        offsets=offsets.astype(np.int32),
-        bins=bins,
-        origins=origins,
-        views=views_shown.astype(np.int32),
+        offsets=np.round(turned - low[:, None]).astype(np.int32),
+        bins=orientation_bins(normals.reshape(-1, 2)).reshape(angles.shape),
+        origins=-low,
+        views=shown.astype(np.int32),
         rolls=rolls,
-        gains=np.sqrt(outlines.lines[views_shown]),
+        gains=np.sqrt(outlines.lines[shown]),
         radius_px=radius_px,
     )
 
@@ -222,16 +227,15 @@ def _add_points(total, flat, source, shift, start, size, first, last):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def match_templates(phases, offsets, bins, gains, first_template, last_template, kept, lowest, bar):  # type: ignore[no-untyped-def]
+def match_templates(phases, offsets, bins, gains, first_template, last_template, kept, lowest, votes):  # type: ignore[no-untyped-def]
     """The matches that stand out most.
 
     Args:
         phases: from `decimate`.
         offsets, bins, gains: see `TemplateBank`; the templates from first to last are matched.
-        kept: at most so many matches are returned.
+        kept: about so many matches of all calls that share ``votes`` are returned, and some that later ones outdo.
         lowest: mean response below which a match is noise.
-        bar: (1,) key that a match must reach to be among the best ``kept`` of all calls that share this array;
-            they raise it.
+        votes: (1024,) int64, how many matches have a key of so many `KEY_STEP`, over all calls that share it.
 
     Returns:
         keys (M,) by which matches compare, templates (M,), places (M,2) of the offsets' origin in full pixels.
@@ -240,7 +244,7 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
     rows, columns = phases.shape[3], phases.shape[4]
     flat = phases.reshape((phases.shape[0] * step * step, rows * columns))
     points = bins.shape[1]
-    total = np.empty(TILE, dtype=np.uint16)
+    total = np.empty(rows * columns + BLOCK, dtype=np.uint16)
     source = np.empty(points, dtype=np.int64)
     shift = np.empty(points, dtype=np.int64)
     room = 4 * kept
@@ -250,6 +254,7 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
     found = 0
     full = 63.0 * points
     first_full = 63.0 * FIRST_POINTS
+    bar = 0.0
     for t in range(first_template, last_template):
         reach_x = 0
         reach_y = 0
@@ -264,72 +269,73 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
         if last_row < 1 or last_column < 1:
             continue
         span = (last_row - 1) * columns + last_column
-        # What this template scores anywhere in this picture, from the first points in samples all over it.
+        for start in range(0, span, TILE):
+            size = min(TILE, span - start)
+            total[start : start + size] = 0
+            _add_points(total[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
+        # What this template scores anywhere in this picture.
         count = 0
-        mean = 0.0
-        square = 0.0
+        sums = np.uint64(0)
+        squares = np.uint64(0)
         for start in range(0, span, SAMPLE_EVERY):
             size = min(SAMPLE, span - start)
-            total[:size] = 0
-            _add_points(total, flat, source, shift, start, size, 0, FIRST_POINTS)
-            sums = np.uint64(0)
-            squares = np.uint64(0)
-            for k in range(size):
+            for k in range(start, start + size):
                 value = np.uint64(total[k])
                 sums += value
                 squares += value * value
             count += size
-            mean += sums
-            square += squares
-        mean /= count
-        deviation = np.sqrt(max(square / count - mean * mean, 1.0)) / first_full
+        mean = sums / count
+        deviation = np.sqrt(max(squares / count - mean * mean, 1.0)) / first_full
         mean /= first_full
         gain = gains[t] / np.sqrt(deviation)
-        asked = max(lowest, mean + bar[0] / gain)
+        if t % 16 == 0:
+            above = 0
+            for level in range(len(votes) - 1, 0, -1):
+                above += votes[level]
+                if above >= kept:
+                    bar = max(bar, level * KEY_STEP)
+                    break
+        asked = max(lowest, mean + bar / gain)
         if asked > 1.0:
             continue
-        for start in range(0, span, TILE):
-            size = min(TILE, span - start)
-            total[:size] = 0
-            _add_points(total, flat, source, shift, start, size, 0, FIRST_POINTS)
+        limit = np.uint16(max((asked - FIRST_MARGIN) * first_full, 1.0))
+        for start in range(0, span, BLOCK):
+            stop = min(start + BLOCK, span)
             highest = np.uint16(0)
-            for k in range(size):
+            for k in range(start, stop):
                 highest = max(highest, total[k])
-            if highest < (asked - FIRST_MARGIN) * first_full:
+            if highest < limit:
                 continue
-            _add_points(total, flat, source, shift, start, size, FIRST_POINTS, points)
-            highest = np.uint16(0)
-            for k in range(size):
-                highest = max(highest, total[k])
-            if highest < asked * full:
-                continue
-            limit = np.uint16(np.ceil(asked * full))
-            for k in range(size):
+            for k in range(start, stop):
                 value = total[k]
-                if value < limit or (start + k) % columns >= last_column:
+                if value < limit or k % columns >= last_column:
                     continue
-                if (k > 0 and total[k - 1] > value) or (k + 1 < size and total[k + 1] >= value):
+                # One of several places side by side is enough.
+                if (k > 0 and total[k - 1] > value) or (k + 1 < span and total[k + 1] >= value):
                     continue
-                if (k >= columns and total[k - columns] > value) or (
-                    k + columns < size and total[k + columns] >= value
-                ):
+                if (k >= columns and total[k - columns] > value) or (k + columns < span and total[k + columns] >= value):
                     continue
-                keys[found] = (value / full - mean) * gain
+                sum_all = np.int64(value)
+                for i in range(FIRST_POINTS, points):
+                    sum_all += np.int64(flat[source[i], shift[i] + k])
+                share = sum_all / full
+                if share < asked:
+                    continue
+                key = (share - mean) * gain
+                keys[found] = key
                 templates[found] = t
-                cells[found] = start + k
+                cells[found] = k
                 found += 1
+                votes[min(int(key / KEY_STEP), len(votes) - 1)] += 1
                 if found == room:
                     best = np.argsort(-keys)[:kept]
-                    bar[0] = max(bar[0], keys[best[kept - 1]])
+                    bar = max(bar, keys[best[kept - 1]])
                     keys[:kept] = keys[best]
                     templates[:kept] = templates[best]
                     cells[:kept] = cells[best]
                     found = kept
-                    asked = max(asked, mean + bar[0] / gain)
-                    limit = np.uint16(np.ceil(min(asked, 1.0) * full))
+                    asked = max(asked, mean + bar / gain)
     best = np.argsort(-keys[:found])[:kept]
-    if found >= kept:
-        bar[0] = max(bar[0], keys[best[kept - 1]])
     places = np.empty((len(best), 2), dtype=np.int32)
     for n in range(len(best)):
         places[n, 0] = cells[best[n]] % columns * step
