@@ -230,6 +230,7 @@ Examples:
   arview annotate "shots/*.jpg" --part part.toml --camera exif --start 10 --end 200
   arview annotate rtsp://camera.local/1 --part part.toml --camera camera.json -o live.mp4
   arview annotate 0 --part part.toml --camera fov:65 --init guide:iso -o live.mp4
+  arview annotate 0 --part part.toml --camera fov:65 --learned bracket.learned -o live.mp4
 
 \b
 Without --init the part is searched for. --init POSE.json, {"cam_from_model": 4x4}, begins near that pose.
@@ -238,6 +239,12 @@ brought within about 15 degrees and 15 % of it. NAME is a view of the part file 
 these as far as the declared range has them: front (camera at -Y), back (+Y), left (-X), right (+X),
 top (+Z), bottom (-Z), iso (front, right and above), middle (of the range); or a direction like
 az45_el30, with _d650 for the distance in mm and _r10 for the roll.
+
+\b
+While the part is tracked well, up to 48 small pictures of it from different sides are kept in memory; after
+a loss it is looked for there first, in every frame. --learned FILE takes such pictures from an earlier run
+(where the file exists) and writes all to it at the end, so that the part is found sooner in the next run under
+the same light. They only say where to look: what is found must fit the CAD as always.
 
 \b
 CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt), fov:DEG
@@ -254,6 +261,7 @@ Ctrl-C ends the run and finishes the files.""",
 @click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
 @click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
 @click.option("--init", metavar="WHERE", help="Pose of the first frame, or guide:NAME to align with; see below.")
+@click.option("--learned", "learned_path", metavar="FILE", help="Learned views: read if there, written at the end.")
 @click.option("--start", callback=_parse_moment, metavar="S", help="First frame: number, or seconds like 2.5s.")
 @click.option("--end", callback=_parse_moment, metavar="S", help="Where to stop: number, or seconds like 8s.")
 @click.option("--stride", type=click.IntRange(min=1), default=1, help="Take every N-th frame.", metavar="N")
@@ -276,6 +284,7 @@ def annotate(
     output: str | None,
     poses_path: str | None,
     init: str | None,
+    learned_path: str | None,
     start: int | float | None,
     end: int | float | None,
     stride: int,
@@ -314,6 +323,8 @@ def annotate(
     inputs = [source, part.path, part.cad_path, views_path, camera_spec, inspection_path, init_path]
     video_path = _output_path(output, inputs) if output else None
     poses_file = _output_path(poses_path, [*inputs, output]) if poses_path else None
+    outputs = [output, poses_path]
+    learned_file = _output_path(learned_path, [*inputs, *outputs]) if learned_path else None
     first = start if isinstance(start, int) else None
     last = end if isinstance(end, int) else None
     with open_source(source, first, last, stride, fps) as frames:
@@ -335,6 +346,8 @@ def annotate(
             initial_cam_from_model=first_pose,
             guide_cam_from_model=guide,
         )
+        if learned_file is not None and learned_file.exists():
+            session.learned.load(learned_file)
         overlay = sink = None
         if video_path is not None:
             looks = OverlayOptions(
@@ -359,6 +372,9 @@ def annotate(
     if sink is not None and sink.audio_note:
         _say(f"warning: {sink.audio_note}")
     _print_annotated(summary, [path for path in (video_path, poses_file) if path is not None])
+    if learned_file is not None:
+        session.learned.save(learned_file)
+        click.echo(f"wrote {learned_file}: {len(session.learned)} learned views")
     if summary.is_interrupted:
         _say("interrupted")
         ctx.exit(EXIT_INTERRUPTED)

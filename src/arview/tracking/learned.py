@@ -37,10 +37,12 @@ WINDOW, WINDOW_DIAMETER = 8, 8.0
 NOISE = 4.0
 """Deviation in grey levels below which a picture shows nothing."""
 CHANNELS = 3
-TEMPLATES_A_PLACE = 3
-"""So many are looked at closer."""
-SEARCHED = 16
-"""So many of the first search's best are improved."""
+VIEWS_A_PLACE = 4
+"""So many of the first search are looked at closer."""
+SEARCHED, STARTS_A_PLACE = 24, 3
+"""So many of these are improved, and in one place."""
+HOPPED, HOPS, HOP_DEG = 3, 6, 40.0
+"""For the best of those so many other views, from directions no farther off, are tried in the same place."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +82,9 @@ class LearnedOptions:
     near_views: int = 12
     near_deg: float = 45.0
     near_stretch: float = 1.5
-    least_score: float = 0.6
+    least_score: float = 0.55
     least_share: float = 0.8
-    windows: int = 12
+    windows: int = 18
     proposals: int = 2
 
     def __post_init__(self) -> None:
@@ -280,7 +282,7 @@ class LearnedViews:
         if not len(chosen) or not len(distances_mm):
             return []
         kept, rolls = chosen.T
-        windows = _Windows(self._templates[kept, rolls], self._weights[kept, rolls])
+        windows = _Windows(self._templates[kept, rolls], self._weights[kept, rolls], kept)
         pictures = self._pictures_at(image, distances_mm)
         starts, views, levels = [], [], []
         for level, picture in enumerate(pictures):
@@ -342,30 +344,52 @@ class LearnedViews:
                 for start, view, level in zip(starts, views, levels, strict=True)
             ]
         )
+        # In diameters of the part at its distance.
+        widths = np.array([picture.shape[1] - 2 * FINE_PAD for picture in pictures])[levels]
+        spots = (starts[:, :2] - FINE_PAD) / widths[:, None]
+        reach = (0.3 * FINE_DIAMETER / widths) ** 2
         chosen: list[int] = []
         for k in np.argsort(-first):
             if len(chosen) == SEARCHED:
                 break
-            if not any(
-                _is_beside(starts[k], starts[i]) and (views[k], levels[k]) == (views[i], levels[i]) for i in chosen
-            ):
+            apart = ((spots[chosen] - spots[k]) ** 2).sum(axis=1)
+            if np.count_nonzero(apart < reach[k]) < STARTS_A_PLACE:
                 chosen.append(int(k))
         steps = np.array([1.0, 1.0, np.pi / o.roll_steps, 0.5 * (o.stretch - 1.0)])
-        found = [
-            (*search(pictures[levels[k]], self._pictures[views[k]], self._masks[views[k]], starts[k], steps, 2), k)
-            for k in chosen
-        ]
+        found = []
+        for k in chosen:
+            level, view = int(levels[k]), int(views[k])
+            score, place = search(pictures[level], self._pictures[view], self._masks[view], starts[k], steps, 2)
+            found.append((float(score), place, level, view))
+        found.sort(key=lambda item: -item[0])
+        found[:HOPPED] = [self._hopped(pictures[item[2]], *item) for item in found[:HOPPED]]
         found.sort(key=lambda item: -item[0])
         least = max(o.least_score, o.least_share * found[0][0]) if found else 0.0
         result: list[Proposal] = []
-        for score, place, k in found:
+        for score, place, level, view in found:
             if score < least or len(result) == o.proposals:
                 break
-            pose = self._pose(pictures[levels[k]], int(views[k]), place)
-            proposal = Proposal(float(score), pose, int(views[k]))
+            proposal = Proposal(score, self._pose(pictures[level], view, place), view)
             if not any(self._same(proposal, other) for other in result):
                 result.append(proposal)
         return result
+
+    def _hopped(
+        self, picture: NDArray[np.float32], score: float, place: Array, level: int, view: int
+    ) -> tuple[float, Array, int, int]:
+        """A find, or that of a kept view from a direction nearby if it fits better there."""
+        best = (score, place, level, view)
+        rotation = exp_so3(np.array([0.0, 0.0, place[2]])) @ self._rotations[view]
+        cosines = self.rotations[:, 2] @ rotation[2]
+        for k in np.argsort(-cosines)[: HOPS + 1]:
+            if k == view or cosines[k] < np.cos(np.deg2rad(HOP_DEG)):
+                continue
+            start = place.copy()
+            start[2] = _roll_between(self._rotations[k], rotation)
+            score, there = search(picture, self._pictures[k], self._masks[k], start, np.array([1.0, 1.0, 0.1, 0.05]), 1)
+            if score > best[0]:
+                best = (float(score), there, level, int(k))
+        return best
 
     def _pose(self, picture: NDArray[np.float32], view: int, found: Array) -> Array:
         """(4,4) of a view found at (u, v, roll, ratio of sizes) in a picture."""
@@ -438,15 +462,22 @@ class LearnedViews:
 
 
 class _Windows:
-    """The first search: grey templates (T,W²), of mean 0 and unit norm under their weights (T,W²), in all places."""
+    """The first search: grey templates in all places.
 
-    def __init__(self, templates: NDArray[np.float32], weights: NDArray[np.float32]) -> None:
+    Args:
+        templates: (T,W²) of mean 0 and unit norm under their weights.
+        weights: (T,W²).
+        views: (T,) that the templates are of, ascending.
+    """
+
+    def __init__(self, templates: NDArray[np.float32], weights: NDArray[np.float32], views: NDArray[np.intp]) -> None:
+        self._firsts = np.flatnonzero(np.diff(views, prepend=-1))
         self._templates = np.ascontiguousarray(templates.T)
         self._weights = np.ascontiguousarray(weights.T)
         self._sums = self._weights.sum(axis=0)
 
     def best(self, picture: NDArray[np.float32], most: int) -> list[tuple[Array, int]]:
-        """The best of a picture for the second search: (centre there (2,) px, template), a few for each place."""
+        """The best of a picture for the second search: (centre there (2,) px, template), one of each of a few views."""
         shrink = WINDOW_DIAMETER / FINE_DIAMETER
         width, height = round(picture.shape[1] * shrink), round(picture.shape[0] * shrink)
         if min(height, width) < WINDOW:
@@ -469,8 +500,13 @@ class _Windows:
         order = np.argsort(-np.where(peaks, values, -1.0), axis=None)[:most]
         centers = np.stack([order % columns, order // columns], axis=1) + 0.5 * WINDOW
         places = centers * (np.array(picture.shape[1::-1]) / (width, height)) - 0.5
-        likeliest = np.argsort(-scores[order], axis=1)[:, :TEMPLATES_A_PLACE]
-        return [(place, int(k)) for place, some in zip(places, likeliest, strict=True) for k in some]
+        found = []
+        for place, row in zip(places, scores[order], strict=True):
+            of_views = np.maximum.reduceat(row, self._firsts)
+            for view in np.argsort(-of_views)[:VIEWS_A_PLACE]:
+                first = self._firsts[view]
+                found.append((place, int(first + np.argmax(row[first:] == of_views[view]))))
+        return found
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -558,11 +594,6 @@ def _turn_to(ray: Array) -> Array:
     x, y, z = ray
     k = 1.0 / (1.0 + z)
     return np.array([[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]])
-
-
-def _is_beside(a: Array, b: Array) -> bool:
-    """Whether two starts (4,) of one view in one picture would come to the same."""
-    return bool(abs(a[0] - b[0]) + abs(a[1] - b[1]) < 6.0 and np.cos(a[2] - b[2]) > 0.9)
 
 
 def _roll_between(kept: Array, seen: Array) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,8 @@ from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.tracking.ambiguity import Rivals
 from arview.tracking.components import ComponentCheck
-from arview.tracking.detector import Detector, DetectorOptions
+from arview.tracking.detector import Candidate, Detection, Detector, DetectorOptions
+from arview.tracking.learned import LearnedViews, Proposal
 from arview.tracking.snap import Snap
 from arview.tracking.tracker import Estimate, Tracker, TrackerOptions
 from arview.tracking.why_not import NOTHING, Rejected, poor_picture, why_lost, why_not
@@ -35,6 +37,7 @@ class SessionOptions:
 
     Attributes:
         use_region, use_edge, use_feature: modalities of the tracker.
+        use_learned: remember how the part looks while it is tracked well, and look for that after a loss.
         lock_quality: a detection must be this good to be believed at once; a weaker one must hold a second frame.
         tracked_quality: at least this to be or become ``tracked``.
         critical_quality: a tracked pose turns ``critical`` only below this (hysteresis).
@@ -50,6 +53,7 @@ class SessionOptions:
     use_region: bool = True
     use_edge: bool = True
     use_feature: bool = True
+    use_learned: bool = True
     lock_quality: float = 0.8
     tracked_quality: float = 0.5
     critical_quality: float = 0.25
@@ -67,6 +71,24 @@ class SessionOptions:
             raise InputError("session: expected 0 ≤ lost_quality ≤ critical_quality ≤ tracked_quality ≤ 1")
 
 
+class _GuidedDetector(Detector):
+    """A detector that can be kept from looking anywhere but at the guesses it is given."""
+
+    _is_guided = False
+
+    def detect_near(self, image: NDArray[np.uint8], guesses: list[Array]) -> list[Detection]:
+        """The best pose (or none) that one of some rough ones (4,4) leads to."""
+        self._is_guided = True
+        try:
+            return self.detect(image, max_results=1, guesses=guesses)
+        finally:
+            self._is_guided = False
+
+    def starts(self, *arguments: Any, **named: Any) -> list[Candidate]:
+        """As `Detector.starts`, or none."""
+        return [] if self._is_guided else super().starts(*arguments, **named)
+
+
 class TrackingSession:
     """Detects and tracks a part through a stream of frames.
 
@@ -78,6 +100,8 @@ class TrackingSession:
         initial_cam_from_model: (4,4) mm; the first frame snaps to it and does not search.
         guide_cam_from_model: (4,4) mm; the part is first found by bringing it near this pose, not by a search,
             and by both when it has been lost for a while.
+
+    ``learned`` holds how the part looked while it was tracked well: a lost part is looked for there first.
 
     Raises:
         MismatchError: guide views of another model.
@@ -111,18 +135,23 @@ class TrackingSession:
             ),
             model,
         )
-        self._detector: Detector | None = None
+        self._detector: _GuidedDetector | None = None
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
         self._snap: Snap | None = None
         self.components = ComponentCheck(views, model, camera)
+        self.learned = LearnedViews(views, camera)
         self.reset()
 
     @property
     def detector(self) -> Detector:
         """The detector, made when first needed."""
+        return self._guided_detector
+
+    @property
+    def _guided_detector(self) -> _GuidedDetector:
         if self._detector is None:
-            self._detector = Detector(self._views, self.camera, self.options.detector)
+            self._detector = _GuidedDetector(self._views, self.camera, self.options.detector)
         return self._detector
 
     @property
@@ -139,7 +168,7 @@ class TrackingSession:
         return self._guide is not None and (self.state == TrackingState.SEARCHING or has_waited)
 
     def reset(self) -> None:
-        """Forget the part's place: search again."""
+        """Forget the part's place: search again. What was learned of its look is kept."""
         self.state = TrackingState.SEARCHING
         self._poor = 0
         self._critical = 0
@@ -148,6 +177,7 @@ class TrackingSession:
         self._borne_out = False
         self._was_found = False
         self._recent: list[Array] = []
+        self._last_seen: Array | None = None
         self._rivals = Rivals([])
         self._why = self._why_lost = ""
 
@@ -174,6 +204,11 @@ class TrackingSession:
         if estimate is not None:
             estimate, reason = self._tell_apart(image, estimate, reason)
             reason = self._compare(image, estimate, reason)
+            is_sure = self.state == TrackingState.TRACKED and self._confirmed
+            if self.options.use_learned:
+                self.learned.learn(image, estimate, is_sure)
+            if is_sure:
+                self._last_seen = estimate.cam_from_model
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
             guide = self._guide if self.is_aligning else None
@@ -277,12 +312,12 @@ class TrackingSession:
             return self._align(image, self._guide)
         else:
             rests = self._lost_frames > o.eager_frames and self._lost_frames % o.search_every != 0
-            if self.state == TrackingState.LOST and rests:
+            rests = rests and self.state == TrackingState.LOST
+            detections = self._detect(image, rests)
+            if not detections and rests:
                 if self._guide is not None and self.is_aligning:
                     return self._align(image, self._guide)
                 return None, self._why
-            is_thorough = self.state == TrackingState.SEARCHING or self._lost_frames % (2 * o.search_every) == 0
-            detections = self.detector.detect(image, max_results=1, is_thorough=is_thorough)
             if not detections:
                 return None, self._why_not(image, self.detector.best_rejected)
             start = detections[0].cam_from_model
@@ -298,6 +333,22 @@ class TrackingSession:
         self._recent = []
         self.state = TrackingState.TRACKED if self._confirmed else TrackingState.CRITICAL
         return estimate, "" if self._confirmed else "found, to be confirmed"
+
+    def _detect(self, image: NDArray[np.uint8], rests: bool) -> list[Detection]:
+        """Look for the part, first where it looks as it did; nowhere else while the search rests."""
+        o = self.options
+        proposals: list[Proposal] = []
+        if o.use_learned and self._last_seen is not None and (rests or self._lost_frames <= o.eager_frames):
+            proposals = self.learned.propose(image, self._last_seen)
+        if o.use_learned and not proposals and not rests:
+            proposals = self.learned.propose(image)
+        detector = self._guided_detector
+        guesses = [proposal.cam_from_model for proposal in proposals]
+        found = detector.detect_near(image, guesses) if guesses else []
+        if found or rests:
+            return found
+        is_thorough = self.state == TrackingState.SEARCHING or self._lost_frames % (2 * o.search_every) == 0
+        return detector.detect(image, max_results=1, is_thorough=is_thorough)
 
     def _align(self, image: NDArray[np.uint8], guide_cam_from_model: Array) -> tuple[Estimate | None, str]:
         """Look whether the part has been brought near the guide pose; what is found must hold a second frame."""

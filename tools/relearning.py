@@ -1,0 +1,96 @@
+"""Finding the part again after a loss on the recorded sequences, with and without learned views."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from arview.evaluation import PoseMeter, Scene
+from arview.evaluation.run import COARSE, IN_VIEW
+from arview.pose import TrackingState
+from arview.tracking import SessionOptions, TrackingSession
+from lines import Line, watched
+from sections import BOXES, box_symmetries, recorded_views
+
+LOSSES = 30
+
+
+@dataclass(frozen=True)
+class Relearned:
+    """Losses, how many the next frame ended, how many with a wrong pose, and the search's CPU time in each, ms."""
+
+    losses: int
+    found: int
+    wrong: int
+    cpu_ms: tuple[float, ...]
+    views: int
+
+    @property
+    def median_ms(self) -> float:
+        """Of the frames after a loss."""
+        return float(np.median(self.cpu_ms)) if self.cpu_ms else float("inf")
+
+    def format(self) -> str:
+        """For the table."""
+        return f"{self.found} of {self.losses}, {self.wrong} wrong, median {self.median_ms:.0f} ms CPU"
+
+
+def relearn_lines(found: dict[str, Scene], details: dict[str, Any], losses: int | None = None) -> list[Line]:
+    """A line a sequence."""
+    lines = []
+    for name, scene in watched(found.items(), "relearn"):
+        without, learned = (lose_and_find(name, scene, use, losses or LOSSES) for use in (False, True))
+        details.setdefault("relearn", {})[name] = {"without": asdict(without), "learned": asdict(learned)}
+        text = f"{learned.format()}; without {without.format()}"
+        reached = learned.wrong == 0 and learned.found >= without.found and learned.median_ms < without.median_ms
+        target = "0 wrong; with learned views no fewer, sooner"
+        lines.append(Line("found in the frame after a loss", f"{name}, {learned.views} views", text, target, reached))
+    return lines
+
+
+def lose_and_find(name: str, scene: Scene, use_learned: bool, losses: int) -> Relearned:
+    """Track the first half; before frames of the second the camera is covered until the part is lost.
+
+    The guide views are those of the full sphere. Where a frame does not find the part, the session goes on from truth.
+    """
+    views, model = recorded_views(scene), scene.part.model
+    meter = PoseMeter(
+        model,
+        scene.camera,
+        symmetries=box_symmetries(model) if name in BOXES else scene.part.symmetries,
+        symmetric_poses=scene.symmetric_poses,
+    )
+    options = SessionOptions(use_learned=use_learned)
+    frames = [f for f in scene.frames if f.cam_from_model is not None]
+    half = len(frames) // 2
+    step = max(1, round((len(frames) - half) / losses))
+    session = TrackingSession(views, model, scene.camera, options, frames[0].cam_from_model)
+    session.detector.detect(scene.image(frames[0]), max_results=1)  # compiled code is loaded
+    covered = np.full((scene.camera.height, scene.camera.width, 3), 90, dtype=np.uint8)
+    count, right, wrong, cpu_ms = 0, 0, 0, []
+    for number, frame in enumerate(frames):
+        image = scene.image(frame)
+        is_tried = number >= half and number % step == 0 and (frame.visible is None or frame.visible >= IN_VIEW)
+        is_tried = is_tried and session.state == TrackingState.TRACKED
+        while is_tried and session.state != TrackingState.LOST:
+            session.process(covered, frame.index, number / 30.0)
+        began = time.process_time()
+        pose = session.process(image, frame.index, number / 30.0)
+        if not is_tried:
+            continue
+        cpu_ms.append(1e3 * (time.process_time() - began))
+        count += 1
+        is_right = pose.cam_from_model is not None and meter.measure(pose.cam_from_model, frame.cam_from_model).within(
+            *COARSE
+        )
+        right += is_right
+        wrong += pose.cam_from_model is not None and not is_right
+        if not is_right:
+            kept = session.learned
+            session = TrackingSession(views, model, scene.camera, options, frame.cam_from_model)
+            session.learned = kept
+            session.process(image, frame.index, number / 30.0)
+    return Relearned(count, right, wrong, tuple(cpu_ms), len(session.learned))
