@@ -45,6 +45,7 @@ class SessionOptions:
         lost_frames: frames in a row.
         critical_frames: so many critical frames in a row end in ``lost`` too.
         eager_frames, search_every: a lost part is looked for in so many frames at once, then in every n-th.
+        likely_look: between these searches only what looks so much (correlation) as it did is looked at closer.
         align_again_frames: a part that is not found again in so many frames may be aligned with the guide again.
         min_in_picture: less of the outline inside the picture cannot hold a pose.
         detector: None chooses by the declared range.
@@ -62,6 +63,7 @@ class SessionOptions:
     critical_frames: int = 45
     eager_frames: int = 2
     search_every: int = 3
+    likely_look: float = 0.7
     align_again_frames: int = 60
     min_in_picture: float = 0.25
     detector: DetectorOptions | None = None
@@ -343,7 +345,8 @@ class TrackingSession:
         if o.use_learned and not proposals and not rests:
             proposals = self.learned.propose(image)
         detector = self._guided_detector
-        guesses = [proposal.cam_from_model for proposal in proposals]
+        least = o.likely_look if rests else 0.0
+        guesses = [proposal.cam_from_model for proposal in proposals if proposal.score >= least]
         found = detector.detect_near(image, guesses) if guesses else []
         if found or rests:
             return found
