@@ -80,7 +80,7 @@ class Level:
         magnification: the part's size against that of the templates.
         turn_step_deg, stretch_step: first steps of rotations and of the distance as a share.
         rounds, halvings: see `climb`.
-        kept: hypotheses left afterwards; apart_deg: no two nearer than this.
+        apart_deg: no two hypotheses nearer than this are left.
         points: of outline and, as many, of design edges that are looked at.
     """
 
@@ -89,14 +89,13 @@ class Level:
     stretch_step: float
     rounds: int
     halvings: int
-    kept: int
     apart_deg: float
     points: int
 
 
 LEVELS = (
-    Level(2.6, 4.0, 0.04, 2, 0, 14, 4.0, 64),
-    Level(5.2, 2.0, 0.017, 2, 1, 6, 2.5, 96),
+    Level(2.6, 4.0, 0.04, 2, 0, 4.0, 64),
+    Level(5.2, 2.0, 0.017, 2, 1, 2.5, 96),
 )
 
 
@@ -108,16 +107,18 @@ class Effort:
         matches: of templates that are improved once as outlines; skipped: the best of them, which were tried before.
         improved: of these, how many are improved further.
         starts: of these, how many poses are searched around.
+        kept: hypotheses left after each level of that search.
     """
 
     matches: int
     skipped: int
     improved: int
     starts: int
+    kept: tuple[int, ...]
 
 
-QUICK = Effort(2500, 0, 800, 40)
-WIDE = Effort(30000, 2500, 6000, 100)
+QUICK = Effort(2500, 0, 800, 40, (12, 5))
+WIDE = Effort(20000, 2500, 6000, 200, (24, 8))
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 
@@ -347,7 +348,7 @@ class Detector:
             if settled and self.qualities(settled)[0] >= SURE_QUALITY:
                 return settled
         for effort in self.options.efforts if is_thorough else self.options.efforts[:1]:
-            starts = self.climbed(picture, self.starts(picture, effort))
+            starts = self.climbed(picture, self.starts(picture, effort), effort)
             settled = self._ordered([*settled, *self._settle(picture, starts)], 5.0)
             if settled and self.qualities(settled)[0] >= SURE_QUALITY:
                 break
@@ -396,10 +397,10 @@ class Detector:
         o = self.options
         return _Picture(image, self.camera, round(0.6 * o.radius_px))
 
-    def climbed(self, picture: _Picture, starts: list[Candidate]) -> list[Candidate]:
+    def climbed(self, picture: _Picture, starts: list[Candidate], effort: Effort = QUICK) -> list[Candidate]:
         """The likeliest hypotheses after all levels of the search from some starts, best first."""
-        for level in self.options.levels:
-            starts = self._climb(picture, starts, level)
+        for level, kept in zip(self.options.levels, effort.kept, strict=True):
+            starts = self._climb(picture, starts, level, kept)
         return starts
 
     def starts(self, picture: _Picture, effort: Effort = QUICK) -> list[Candidate]:
@@ -415,6 +416,8 @@ class Detector:
         if not raw:
             return []
         matches = self._distinct(_joined(raw), effort.matches, effort.skipped)
+        if not len(matches.keys):
+            return []
         matches = self._improved(picture, self._improved(picture, matches, 1).best(effort.improved), 2)
         matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.starts)
         return [Candidate(float(k), rigid(r, p)) for k, r, p in zip(matches.keys, *self._posed(matches), strict=True)]
@@ -490,7 +493,7 @@ class Detector:
 
         return _joined(list(_pool().map(improve, jobs)))
 
-    def _climb(self, picture: _Picture, candidates: list[Candidate], level: Level) -> list[Candidate]:
+    def _climb(self, picture: _Picture, candidates: list[Candidate], level: Level, kept: int) -> list[Candidate]:
         """The hypotheses after a pattern search around each, apart from each other, best first."""
         by_step: dict[int, list[Array]] = {}
         for candidate in candidates:
@@ -522,7 +525,7 @@ class Detector:
         reach = np.full(len(poses), 0.01 * level.apart_deg * self.views.diameter_mm) / poses[:, 2, 3]
         chosen = choose_apart(
             np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), reach,
-            np.cos(np.deg2rad(level.apart_deg)), 1.0 + 0.01 * level.apart_deg, level.kept,
+            np.cos(np.deg2rad(level.apart_deg)), 1.0 + 0.01 * level.apart_deg, kept,
         )  # fmt: skip
         return [Candidate(float(scores[i]), poses[i]) for i in chosen]
 

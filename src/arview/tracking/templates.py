@@ -34,9 +34,13 @@ TILE = 1024
 """Places looked at together: their sums stay in the nearest cache."""
 SAMPLE, SAMPLE_EVERY = 64, 192
 """Runs of places from which a template's usual score is taken."""
+USUAL_SHARE = 0.7
+"""So much of what a template scores anywhere in a picture says nothing of a place."""
+LINES_POWER = 0.2
+"""Of the distinct lines of a view, by which its matches count."""
 BLOCK = 64
 """Places passed over together where none of them bodes well."""
-KEY_STEP = 0.02
+KEY_STEP = 0.005
 """Keys are counted in steps of this."""
 
 
@@ -69,7 +73,7 @@ class TemplateBank:
         offsets: (T,N,2) int32 dx, dy ≥ 0 of the points; bins: (T,N) orientations, see `orientation_bins`.
         origins: (T,2) place of the part's centre in the frame of the offsets.
         views: (T,) of the outlines; rolls: (T,) rad.
-        gains: (T,) by which a match counts: the square root of the distinct lines that the view shows.
+        gains: (T,) by which a match counts: more for views that show many distinct lines.
         radius_px: half the part's diameter.
     """
 
@@ -176,7 +180,7 @@ def make_bank(
         origins=-low,
         views=shown.astype(np.int32),
         rolls=rolls,
-        gains=np.sqrt(outlines.lines[shown]),
+        gains=outlines.lines[shown] ** LINES_POWER,
         radius_px=radius_px,
     )
 
@@ -276,18 +280,13 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
         # What this template scores anywhere in this picture.
         count = 0
         sums = np.uint64(0)
-        squares = np.uint64(0)
         for start in range(0, span, SAMPLE_EVERY):
             size = min(SAMPLE, span - start)
             for k in range(start, start + size):
-                value = np.uint64(total[k])
-                sums += value
-                squares += value * value
+                sums += np.uint64(total[k])
             count += size
-        mean = sums / count
-        deviation = np.sqrt(max(squares / count - mean * mean, 1.0)) / first_full
-        mean /= first_full
-        gain = gains[t] / np.sqrt(deviation)
+        usual = USUAL_SHARE * sums / (count * first_full)
+        gain = gains[t]
         if t % 16 == 0:
             above = 0
             for level in range(len(votes) - 1, 0, -1):
@@ -295,7 +294,7 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
                 if above >= kept:
                     bar = max(bar, level * KEY_STEP)
                     break
-        asked = max(lowest, mean + bar / gain)
+        asked = max(lowest, usual + bar / gain)
         if asked > 1.0:
             continue
         limit = np.uint16(max((asked - FIRST_MARGIN) * first_full, 1.0))
@@ -321,7 +320,7 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
                 share = sum_all / full
                 if share < asked:
                     continue
-                key = (share - mean) * gain
+                key = (share - usual) * gain
                 keys[found] = key
                 templates[found] = t
                 cells[found] = k
@@ -334,7 +333,7 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
                     templates[:kept] = templates[best]
                     cells[:kept] = cells[best]
                     found = kept
-                    asked = max(asked, mean + bar / gain)
+                    asked = max(asked, usual + bar / gain)
     best = np.argsort(-keys[:found])[:kept]
     places = np.empty((len(best), 2), dtype=np.int32)
     for n in range(len(best)):
