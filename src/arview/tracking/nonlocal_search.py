@@ -8,9 +8,7 @@ the best are climbed (`climb`) there and once more at twice the resolution.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array, exp_so3
+from arview.tracking import threads
 from arview.tracking.climb import climb
 from arview.tracking.matching import response_maps, score_around
 from arview.tracking.region import BINS
@@ -110,7 +109,7 @@ class NonlocalSearch:
                 o.shift_step_px, o.points, o.points,
             )  # fmt: skip
 
-        found = list(_pool().map(score, np.array_split(self._turns, 2)))
+        found = list(threads.pool().map(score, np.array_split(self._turns, 2)))
         scores, poses = np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
         poses = self._apart(scores, poses, 10.0, o.climbed[0])[1]
         scores, poses = self._climb(maps, poses, intrinsics, 7.0, 0.04)
@@ -139,7 +138,9 @@ class NonlocalSearch:
             )  # fmt: skip
 
         # Every other one: the first are not much alike in what they cost.
-        results = list(_pool().map(search, [np.ascontiguousarray(poses[k::2]) for k in range(2) if len(poses[k::2])]))
+        results = list(
+            threads.pool().map(search, [np.ascontiguousarray(poses[k::2]) for k in range(2) if len(poses[k::2])])
+        )
         return np.concatenate([r[0] for r in results]), np.concatenate([r[1] for r in results])
 
     def _apart(self, scores: Array, poses: Array, apart_deg: float, most: int) -> tuple[Array, Array]:
@@ -178,12 +179,6 @@ class NonlocalSearch:
         intrinsics[:2] *= stretch
         intrinsics[2:4] = (intrinsics[2:4] - first + 0.5) * stretch - 0.5
         return response_maps(crop, 1, 0, pool), intrinsics
-
-
-@lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    """Threads for poses: the kernels release the interpreter."""
-    return ThreadPoolExecutor(2, thread_name_prefix="nonlocal")
 
 
 @njit(cache=True, nogil=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.tracking.ambiguity import Rivals
 from arview.tracking.components import ComponentCheck
-from arview.tracking.detector import Candidate, Detection, Detector, DetectorOptions
+from arview.tracking.detector import Detection, Detector, DetectorOptions
 from arview.tracking.learned import LearnedViews, Proposal
 from arview.tracking.snap import Snap
 from arview.tracking.tracker import Estimate, Tracker, TrackerOptions
@@ -73,24 +72,6 @@ class SessionOptions:
             raise InputError("session: expected 0 ≤ lost_quality ≤ critical_quality ≤ tracked_quality ≤ 1")
 
 
-class _GuidedDetector(Detector):
-    """A detector that can be kept from looking anywhere but at the guesses it is given."""
-
-    _is_guided = False
-
-    def detect_near(self, image: NDArray[np.uint8], guesses: list[Array]) -> list[Detection]:
-        """The best pose (or none) that one of some rough ones (4,4) leads to."""
-        self._is_guided = True
-        try:
-            return self.detect(image, max_results=1, guesses=guesses)
-        finally:
-            self._is_guided = False
-
-    def starts(self, *arguments: Any, **named: Any) -> list[Candidate]:
-        """As `Detector.starts`, or none."""
-        return [] if self._is_guided else super().starts(*arguments, **named)
-
-
 class TrackingSession:
     """Detects and tracks a part through a stream of frames.
 
@@ -137,7 +118,7 @@ class TrackingSession:
             ),
             model,
         )
-        self._detector: _GuidedDetector | None = None
+        self._detector: Detector | None = None
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
         self._snap: Snap | None = None
@@ -148,12 +129,8 @@ class TrackingSession:
     @property
     def detector(self) -> Detector:
         """The detector, made when first needed."""
-        return self._guided_detector
-
-    @property
-    def _guided_detector(self) -> _GuidedDetector:
         if self._detector is None:
-            self._detector = _GuidedDetector(self._views, self.camera, self.options.detector)
+            self._detector = Detector(self._views, self.camera, self.options.detector)
         return self._detector
 
     @property
@@ -344,14 +321,15 @@ class TrackingSession:
             proposals = self.learned.propose(image, self._last_seen)
         if o.use_learned and not proposals and not rests:
             proposals = self.learned.propose(image)
-        detector = self._guided_detector
         least = o.likely_look if rests else 0.0
         guesses = [proposal.cam_from_model for proposal in proposals if proposal.score >= least]
-        found = detector.detect_near(image, guesses) if guesses else []
+        found = self.detector.detect_near(image, guesses) if guesses else []
         if found or rests:
             return found
-        is_thorough = self.state == TrackingState.SEARCHING or self._lost_frames % (2 * o.search_every) == 0
-        return detector.detect(image, max_results=1, is_thorough=is_thorough)
+        # The wide search takes long: not in every frame.
+        turn = self._lost_frames % (2 * o.search_every)
+        is_thorough = turn == 1 if self.state == TrackingState.SEARCHING else turn == 0
+        return self.detector.detect(image, max_results=1, is_thorough=is_thorough)
 
     def _align(self, image: NDArray[np.uint8], guide_cam_from_model: Array) -> tuple[Estimate | None, str]:
         """Look whether the part has been brought near the guide pose; what is found must hold a second frame."""

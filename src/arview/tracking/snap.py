@@ -7,10 +7,7 @@ are refined by the tracker and judged by the same evidence as a tracked pose.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -22,6 +19,7 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
 from arview.tracking.matching import response_maps, score_around
 from arview.tracking.quality import Evidence
+from arview.tracking.threads import pool
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions, intrinsics_of, smoothed
 
 
@@ -218,7 +216,7 @@ class Snap:
                         break
             return best
 
-        found = sorted((item for best in _pool().map(search, starts) for item in best), key=lambda item: -item[0])
+        found = sorted((item for best in pool().map(search, starts) for item in best), key=lambda item: -item[0])
         apart: list[Array] = []
         for score, pose in found:
             if score < least:
@@ -265,15 +263,9 @@ class Snap:
             quality = evidence.quality if is_inside else 0.0
             return Snapped(pose @ self._tracker.part.body_from_model, evidence, quality)
 
-        return max(_pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.worth))
+        return max(pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.worth))
 
     def _same(self, a: Array, b: Array, angle_deg: float) -> bool:
         near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.01 * angle_deg * self._tracker.diameter_mm
         cosine = 0.5 * (float(np.sum(a[:3, :3] * b[:3, :3])) - 1.0)
         return bool(near and cosine > np.cos(np.deg2rad(angle_deg)))
-
-
-@lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    """Threads for starts: the kernels release the interpreter."""
-    return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)), thread_name_prefix="snap")

@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from arview.errors import InputError
-from arview.geometry import Array, exp_so3
+from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.guideviews.extract import ViewFeatures
 from arview.guideviews.mesh_edges import EDGE_CONTOUR
@@ -312,7 +312,9 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
                 # One of several places side by side is enough.
                 if (k > 0 and total[k - 1] > value) or (k + 1 < span and total[k + 1] >= value):
                     continue
-                if (k >= columns and total[k - columns] > value) or (k + columns < span and total[k + columns] >= value):
+                if (k >= columns and total[k - columns] > value) or (
+                    k + columns < span and total[k + columns] >= value
+                ):
                     continue
                 sum_all = np.int64(value)
                 for i in range(FIRST_POINTS, points):

@@ -1,0 +1,252 @@
+"""The first search of the detector: where in the picture might which view of the part be, over the whole range?
+
+Templates (`templates`) give tens of thousands of rough matches. In clutter the right one is seldom among the first
+hundred of them, but nearly always among the first twenty thousand; and once each is improved as an outline in the
+picture (`climb_outlines`, some 20 µs), on maps of a finer scale, it comes to the front. This is what makes clutter
+tractable on a CPU; own here, measured on semi-synthetic sequences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.camera import Camera
+from arview.geometry import Array, rigid
+from arview.guideviews import GuideViewSet
+from arview.guideviews.sphere import icosphere_directions
+from arview.tracking.climb import climb_outlines
+from arview.tracking.picture import STEPS_PER_OCTAVE, Picture
+from arview.tracking.templates import choose_apart, decimate, make_bank, make_outlines, match_templates
+from arview.tracking.threads import pool
+
+POINTS = 64
+"""Points of an outline, a multiple of 4."""
+GRID_PX = 4
+"""Places that templates are matched at are so far apart."""
+LARGEST_SCALE = 1.5
+"""The picture is not enlarged more than this."""
+LOWEST_SCORE = 0.3
+"""Template matches below this are noise."""
+CELL_PX, CELL_ROLL = 4.0, 0.33
+"""Of matches whose place and roll (rad) fall in one cell, and whose view and scale are alike, the best is enough."""
+STEPS_UP, ROLL_STEP, STRETCH_STEP, SHIFT_PX = 2, 0.16, 0.07, 2
+"""Matches are improved on maps so many scale steps larger, in steps of so many rad, so large a share and so many px."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How far a search goes.
+
+    Attributes:
+        matches: of templates that are improved once as outlines; skipped: the best of them, which were tried before.
+        improved: of these, how many are improved further.
+        starts: of these, how many poses are searched around.
+        kept: hypotheses left after each level of that search.
+    """
+
+    matches: int
+    skipped: int
+    improved: int
+    starts: int
+    kept: tuple[int, ...]
+
+
+QUICK = Effort(2500, 0, 800, 40, (12, 5))
+WIDE = Effort(20000, 2500, 6000, 200, (24, 8))
+"""For clutter, in which thousands of wrong matches come before the right one."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis: score for comparing, and the pose it stands for, about the model's centre."""
+
+    score: float
+    cam_from_body: Array
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matches of outlines in the picture.
+
+    Attributes:
+        keys: (M,) by which they compare.
+        steps: (M,) scales, in steps.
+        views: (M,) of the outlines; rolls: (M,) rad.
+        radii_px: (M,) half diameters; places: (M,2) px of the part's centre, both at that scale.
+    """
+
+    keys: Array
+    steps: NDArray[np.int64]
+    views: NDArray[np.int32]
+    rolls: Array
+    radii_px: Array
+    places: Array
+
+    def best(self, most: int) -> Matches:
+        """The best, best first."""
+        return self.of(np.argsort(-self.keys, kind="stable")[:most])
+
+    def of(self, index: NDArray[np.intp]) -> Matches:
+        """Some of them."""
+        return Matches(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+def _joined(parts: list[Matches]) -> Matches:
+    return Matches(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Matches)))
+
+
+class FirstSearch:
+    """The first search for one part with one camera.
+
+    Args:
+        views: of the part, for the declared range.
+        model_from_body: (4,4) to the model's centre.
+        camera: of the pictures.
+        radius_px: half the part's diameter in the templates.
+        roll_step_deg: spacing of the templates.
+        subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
+
+    Raises:
+        InputError: no view shows an outline.
+    """
+
+    def __init__(
+        self,
+        views: GuideViewSet,
+        model_from_body: Array,
+        camera: Camera,
+        radius_px: float,
+        roll_step_deg: float,
+        subdivisions: int,
+    ) -> None:
+        self.camera = camera
+        self._radius_px = radius_px
+        self._diameter_mm = views.diameter_mm
+        self._focal_px = 0.5 * (camera.fx + camera.fy)
+        self.outlines = make_outlines(views, model_from_body, POINTS, max(3, subdivisions))
+        # Views that count as one when alike matches are thinned out.
+        self._clusters = np.argmax(self.outlines.rotations[:, 2] @ icosphere_directions(1).T, axis=1)
+        # Scale steps of the templates, large distances (large pictures) first.
+        low, high = views.view_range.distance_mm
+        near, far = self.step_at(low), self.step_at(high)
+        top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
+        self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
+        self.banks = {
+            step: make_bank(
+                views, self.outlines, radius_px, radius_px / (self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE)),
+                roll_step_deg, subdivisions,
+            )
+            for step in self._steps
+        }  # fmt: skip
+
+    def step_at(self, distance_mm: float, magnification: float = 1.0) -> float:
+        """Scale step at which the part at a distance has the size of the templates, times the magnification."""
+        radius_px = self._focal_px * 0.5 * self._diameter_mm / distance_mm
+        return STEPS_PER_OCTAVE * float(np.log2(magnification * self._radius_px / radius_px))
+
+    def starts(self, picture: Picture, effort: Effort = QUICK) -> list[Candidate]:
+        """Poses for the best matches over the whole range, apart from each other, best first."""
+        picture.make(self._steps)
+        count = len(next(iter(self.banks.values())).bins)
+        halves = [0, count // 2, count]
+        # Small pictures first: what is found there raises the bar for the large ones.
+        votes = np.zeros(1024, dtype=np.int64)
+        jobs = [(step, first, last) for step in reversed(self._steps) for first, last in pairwise(halves)]
+        found = pool().map(lambda job: self._match(picture, votes, effort.matches, *job), jobs)
+        raw = [m for m in found if m is not None]
+        if not raw:
+            return []
+        matches = self._distinct(_joined(raw), effort.matches, effort.skipped)
+        if not len(matches.keys):
+            return []
+        matches = self._improved(picture, self._improved(picture, matches, 1).best(effort.improved), 2)
+        matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.starts)
+        return [Candidate(float(k), rigid(r, p)) for k, r, p in zip(matches.keys, *self._posed(matches), strict=True)]
+
+    def _match(
+        self, picture: Picture, votes: NDArray[np.int64], kept: int, step: int, first: int, last: int
+    ) -> Matches | None:
+        """The matches of some templates at one scale."""
+        bank = self.banks[step]
+        maps, _ = picture.maps(step)
+        if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
+            return None
+        keys, templates, places = match_templates(
+            decimate(maps, GRID_PX), bank.offsets, bank.bins, bank.gains, first, last, kept, LOWEST_SCORE, votes
+        )
+        return Matches(
+            keys, np.full(len(keys), step), bank.views[templates], bank.rolls[templates],
+            np.full(len(keys), self._radius_px), places + bank.origins[templates] - picture.pad_px,
+        )  # fmt: skip
+
+    def _posed(self, matches: Matches) -> tuple[Array, Array]:
+        """Rotations (M,3,3) and positions (M,3) mm of the part's centre."""
+        scales = 2.0 ** (matches.steps / STEPS_PER_OCTAVE)
+        rays = self.camera.unproject((matches.places + 0.5) / scales[:, None] - 0.5)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        distances_mm = self._focal_px * 0.5 * self._diameter_mm * scales / matches.radii_px
+        c, s, zero = np.cos(matches.rolls), np.sin(matches.rolls), np.zeros(len(matches.rolls))
+        turns = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], axis=1).reshape(-1, 3, 3)
+        rotations = turns @ self.outlines.rotations[matches.views]
+        return _turned_with_rays(rotations, rays), rays * distances_mm[:, None]
+
+    def _best_apart(self, matches: Matches, reach_px: float, angle_rad: float, ratio: float, most: int) -> Matches:
+        """The best, none near a better one."""
+        matches = matches.of(np.argsort(-matches.keys, kind="stable"))
+        rotations, positions = self._posed(matches)
+        # Pixels of the templates' scale: as many times further off as the part is larger than there.
+        reach = np.full(len(positions), reach_px / self._radius_px) * 0.5 * self._diameter_mm
+        return matches.of(choose_apart(rotations, positions, reach / positions[:, 2], np.cos(angle_rad), ratio, most))
+
+    def _distinct(self, matches: Matches, most: int, skipped: int) -> Matches:
+        """The best, one for each cell of places, scales and rotations, but the first."""
+        matches = matches.best(len(matches.keys))
+        cells = np.floor(matches.places / CELL_PX).astype(np.int64) + 4096
+        rolls = np.floor(matches.rolls / CELL_ROLL).astype(np.int64) + 64
+        code = ((cells[:, 0] * 8192 + cells[:, 1]) * 128 + rolls) * 1024 + self._clusters[matches.views]
+        code = code * 128 + matches.steps + 64
+        _, first = np.unique(code, return_index=True)
+        return matches.of(np.sort(first)[skipped:most])
+
+    def _improved(self, picture: Picture, matches: Matches, rounds: int) -> Matches:
+        """The matches after some rounds of improving each by itself."""
+        shapes = self.outlines
+        jobs = []
+        for step in np.unique(matches.steps):
+            group = np.flatnonzero(matches.steps == step)
+            # Those that have been improved once lie on their maps.
+            up = 0 if rounds > 1 else STEPS_UP
+            jobs += [(min(0, step + up), part) for part in np.array_split(group, 2)]
+        picture.make([step for step, _ in jobs])
+
+        def improve(job: tuple[int, NDArray[np.intp]]) -> Matches:
+            step, index = job
+            some = matches.of(index)
+            focal_px = self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE)
+            scale = 2.0 ** ((step - some.steps) / STEPS_PER_OCTAVE)
+            maps, _ = picture.maps(step)
+            places = (some.places + 0.5) * scale[:, None] - 0.5 + picture.pad_px
+            scores, views, rolls, radii, places = climb_outlines(
+                maps, shapes.points, shapes.angles, shapes.neighbours, shapes.turns, some.views, some.rolls,
+                some.radii_px * scale, places, focal_px, ROLL_STEP, STRETCH_STEP, rounds, SHIFT_PX, SHIFT_PX,
+            )  # fmt: skip
+            keys = scores * shapes.lines[views] ** 0.25
+            return Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
+
+        return _joined(list(pool().map(improve, jobs)))
+
+
+def _turned_with_rays(rotations: Array, rays: Array) -> Array:
+    """Rotations (N,3,3) of views seen along the optical axis, turned to be seen along unit rays (N,3)."""
+    # The smallest rotation that takes +Z to the ray (Rodrigues with the axis z × ray).
+    x, y, z = rays.T
+    turn = np.empty((len(rays), 3, 3))
+    k = 1.0 / (1.0 + z)
+    turn[:, 0] = np.stack([1.0 - k * x * x, -k * x * y, x], axis=1)
+    turn[:, 1] = np.stack([-k * x * y, 1.0 - k * y * y, y], axis=1)
+    turn[:, 2] = np.stack([-x, -y, z], axis=1)
+    return turn @ rotations
