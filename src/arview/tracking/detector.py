@@ -21,7 +21,6 @@ from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
-from arview.guideviews.uniqueness import view_lines
 from arview.tracking.ambiguity import LEAD, find_symmetries
 from arview.tracking.climb import climb
 from arview.tracking.components import ComponentCheck
@@ -183,7 +182,6 @@ class Detector:
         self._components = ComponentCheck(views, model, camera) if model and len(model.components) > 1 else None
         self.symmetries = find_symmetries(views)
         self._turns = np.concatenate([self.symmetries.exact, self.symmetries.near])
-        self._lines: dict[int, float] = {}
 
     def detect(self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True) -> list[Detection]:
         """Poses of the part in a frame, best first; an empty list when it is not found.
@@ -361,10 +359,9 @@ class Detector:
 
     def _view_lines(self, cam_from_body: Array) -> float:
         """Distinct lines of the view nearest to a pose."""
-        index = self.tracker.part.nearest(cam_from_body)
-        if index not in self._lines:
-            self._lines[index] = max(view_lines(self.views.view(index), self.views.diameter_mm), 1.0)
-        return self._lines[index]
+        ray = cam_from_body[:3, :3].T @ cam_from_body[:3, 3]
+        outlines = self.search.outlines
+        return float(outlines.lines[np.argmax(outlines.rotations[:, 2] @ ray)])
 
     def _same(self, a: Array, b: Array, angle_deg: float = 5.0) -> bool:
         near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.01 * angle_deg * self.views.diameter_mm

@@ -215,6 +215,8 @@ class FirstSearch:
     def _improved(self, picture: Picture, matches: Matches, rounds: int) -> Matches:
         """The matches after some rounds of improving each by itself."""
         shapes = self.outlines
+        # The first round goes through all, with every other point.
+        points = POINTS // 2 if rounds == 1 else POINTS
         jobs = []
         for step in np.unique(matches.steps):
             group = np.flatnonzero(matches.steps == step)
@@ -231,7 +233,7 @@ class FirstSearch:
             maps, _ = picture.maps(step)
             places = (some.places + 0.5) * scale[:, None] - 0.5 + picture.pad_px
             scores, views, rolls, radii, places = climb_outlines(
-                maps, shapes.points, shapes.angles, shapes.neighbours, shapes.turns, some.views, some.rolls,
+                maps, shapes.points[:, :points], shapes.angles[:, :points], shapes.neighbours, shapes.turns, some.views, some.rolls,
                 some.radii_px * scale, places, focal_px, ROLL_STEP, STRETCH_STEP, rounds, SHIFT_PX, SHIFT_PX,
             )  # fmt: skip
             keys = scores * shapes.lines[views] ** 0.25
