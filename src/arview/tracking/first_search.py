@@ -55,8 +55,8 @@ class Effort:
     kept: tuple[int, ...]
 
 
-QUICK = Effort(2500, 0, 800, 40, (12, 5))
-WIDE = Effort(20000, 2500, 6000, 200, (24, 8))
+QUICK = Effort(1000, 0, 400, 30, (8, 3))
+WIDE = Effort(20000, 1000, 6000, 200, (24, 8))
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 
@@ -216,7 +216,8 @@ class FirstSearch:
         """The matches after some rounds of improving each by itself."""
         shapes = self.outlines
         # The first round goes through all, with every other point.
-        points = POINTS // 2 if rounds == 1 else POINTS
+        count = POINTS // 2 if rounds == 1 else POINTS
+        points, angles = shapes.points[:, :count], shapes.angles[:, :count]
         jobs = []
         for step in np.unique(matches.steps):
             group = np.flatnonzero(matches.steps == step)
@@ -233,7 +234,7 @@ class FirstSearch:
             maps, _ = picture.maps(step)
             places = (some.places + 0.5) * scale[:, None] - 0.5 + picture.pad_px
             scores, views, rolls, radii, places = climb_outlines(
-                maps, shapes.points[:, :points], shapes.angles[:, :points], shapes.neighbours, shapes.turns, some.views, some.rolls,
+                maps, points, angles, shapes.neighbours, shapes.turns, some.views, some.rolls,
                 some.radii_px * scale, places, focal_px, ROLL_STEP, STRETCH_STEP, rounds, SHIFT_PX, SHIFT_PX,
             )  # fmt: skip
             keys = scores * shapes.lines[views] ** 0.25
