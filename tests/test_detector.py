@@ -12,10 +12,11 @@ from arview.cad.view_range import ViewRange
 from arview.errors import InputError
 from arview.geometry import apply
 from arview.guideviews import GuideViewOptions, make_guide_views
-from arview.tracking import Detector, DetectorOptions
+from arview.pose import TrackingState
+from arview.tracking import Detector, DetectorOptions, TrackingSession
 from arview.tracking.ambiguity import find_symmetries
 from cad_files import box
-from synthetic import CAMERA, RANGE, assembly, assembly_views, block, component, error, picture, pose_from, post
+from synthetic import CAMERA, RANGE, assembly, assembly_views, block, component, error, picture, pose_from, post, wrong
 
 
 @cache
@@ -121,6 +122,40 @@ def test_a_key_decides_between_twins_and_where_it_cannot_be_seen_the_view_is_amb
             wrong_by = [error(pose, truth, model)[2] for pose in poses]
             right += wrong_by[0] < 3.0 and len(poses) == 1 if is_told else len(poses) > 1 and min(wrong_by) < 3.0
     assert right >= 4
+
+
+def test_the_poses_of_an_ambiguous_view_say_which_others_fit() -> None:
+    model = knob(1.8)
+    views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
+    session = TrackingSession(views, model, CAMERA)
+    truth = pose_from(15.0, 50.0, 380.0, model)
+    pose = session.process(picture(truth, model, seed=1, scene=1), 0, 0.0)
+    assert pose.state == TrackingState.CRITICAL and pose.reason.startswith("ambiguous")
+    assert pose.cam_from_model is not None and pose.alternatives
+    assert min(error(p, truth, model)[2] for p in (pose.cam_from_model, *pose.alternatives)) < 3.0
+
+
+def test_rough_poses_are_tried_by_themselves() -> None:
+    truth = pose_from(30, 40, 520)
+    image = picture(truth, seed=1)
+    near = wrong(truth, np.random.default_rng(1), 8.0, 12.0)
+    found = detector().detect_near(image, [near])
+    assert len(found) == 1 and error(found[0].cam_from_model, truth)[2] < 1.5
+    away = pose_from(30, 40, 520, roll_deg=180.0)
+    assert detector().detect_near(image, [away]) == []
+
+
+def test_a_detection_names_the_component_that_is_not_there() -> None:
+    sought = Detector(assembly_views(), CAMERA, model=assembly())
+    without_post = make_model("look-alike", tuple(p for p in assembly().components if p.name != "post_3"))
+    right, named = [], 0
+    for k in range(5):
+        truth = pose_from(-60.0 + 30.0 * k, 45.0, 480.0, roll_deg=5.0 * k)
+        right += [d.mismatches for d in sought.detect(picture(truth, seed=k, scene=k), max_results=1)]
+        for found in sought.detect(picture(truth, without_post, seed=k, scene=k), max_results=1):
+            named += found.mismatches == ("mismatch: post_3 not seen where expected",)
+    assert right == [()] * 5
+    assert named >= 4
 
 
 def test_results_are_apart_and_no_more_than_asked_for() -> None:

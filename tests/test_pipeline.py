@@ -82,8 +82,8 @@ def test_video_and_poses_hold_every_frame_in_order(tmp_path: Path) -> None:
     assert done == [(k + 1, k) for k in range(12)]
     lines = [json.loads(line) for line in (tmp_path / "poses.jsonl").read_text().splitlines()]
     assert [line["index"] for line in lines] == list(range(12))
-    poses = {"index", "time_s", "state", "quality", "cam_from_model", "covariance", "ms", "reason", "mismatches"}
-    assert set(lines[0]) == poses
+    pose = {"index", "time_s", "state", "quality", "cam_from_model", "covariance", "ms", "reason"}
+    assert set(lines[0]) == pose | {"mismatches", "alternatives"}
     assert lines[5]["cam_from_model"][0] == [1.0, 0.0, 0.0, 5.0] and lines[5]["time_s"] == 0.5
     assert lines[3]["cam_from_model"] is None and lines[3]["state"] == "lost"
     with open_source(tmp_path / "out.mp4") as video:

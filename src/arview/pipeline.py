@@ -270,7 +270,8 @@ class PoseWriter:
     """Writes poses as JSON lines under a temporary name; `close` gives the file its name.
 
     A line holds ``index``, ``time_s``, ``state``, ``quality``, ``cam_from_model`` (4×4 row-major, mm, or
-    null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty) and ``mismatches`` (list).
+    null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches`` (list) and
+    ``alternatives`` (list of 4×4 poses that fit as well).
 
     Raises:
         OutputError: the file cannot be written.
@@ -327,6 +328,7 @@ def pose_line(pose: Pose) -> str:
             "ms": round(pose.ms, 4),
             "reason": pose.reason,
             "mismatches": list(pose.mismatches),
+            "alternatives": [alternative.tolist() for alternative in pose.alternatives],
         },
         allow_nan=False,
     )

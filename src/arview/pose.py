@@ -33,6 +33,7 @@ class Pose:
         reason: for ``searching``, ``critical`` and ``lost``: why, in words.
         mismatches: what is not as the CAD says, e.g. ``mismatch: nut_2 not seen where expected``; a part with
             any is never ``tracked`` but ``critical``: it may be another part of the family.
+        alternatives: other poses (4,4) that the frames so far bear out as well; not empty: the view is ambiguous.
         guide_cam_from_model: (4,4) where the user should bring the part; None unless the session waits for that.
     """
 
@@ -45,4 +46,5 @@ class Pose:
     ms: float = 0.0
     reason: str = ""
     mismatches: tuple[str, ...] = ()
+    alternatives: tuple[Array, ...] = ()
     guide_cam_from_model: Array | None = None

@@ -202,6 +202,7 @@ class TrackingSession:
             ms=ms,
             reason=reason,
             mismatches=self.components.mismatches,
+            alternatives=tuple(estimate.cam_from_model @ turn for turn in self._rivals.model_from_twins),
         )
 
     def _tell_apart(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> tuple[Estimate, str]:
