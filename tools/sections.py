@@ -39,6 +39,7 @@ from arview.evaluation.semisynthetic import (
 from arview.geometry import Array, apply
 from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewSet
+from arview.pose import TrackingState
 from arview.tracking import Detector, TrackingSession
 from lines import Line, timing, watched
 from photos import all_photos, background_photos
@@ -218,9 +219,9 @@ class Sections:
             session.reset()
             for _ in range(2):  # a detection must hold a second frame before it is believed
                 pose = session.process(image, frame.index, frame.index / 30.0)
-            found = tuple(getattr(pose, "mismatches", ()))
+            found = pose.mismatches
             is_named = any(part in words(text) for text in found for part in look_alike.components)
-            yield LookAlikeResult(look_alike.name, frame.index, pose.cam_from_model is not None, is_named, found)
+            yield LookAlikeResult(look_alike.name, frame.index, str(pose.state), is_named, found)
 
 
 @dataclass(frozen=True)
@@ -229,14 +230,19 @@ class LookAlikeResult:
 
     look_alike: str
     frame: int
-    is_locked: bool
+    state: str
     is_named: bool
     mismatches: tuple[str, ...]
 
     @property
+    def is_locked(self) -> bool:
+        """Whether it was found, as whatever."""
+        return self.state in (TrackingState.TRACKED, TrackingState.CRITICAL)
+
+    @property
     def is_clean(self) -> bool:
         """True when it was taken for the right part."""
-        return self.is_locked and not self.mismatches
+        return self.state == TrackingState.TRACKED and not self.mismatches
 
 
 class _AlikeMeter:
