@@ -55,8 +55,8 @@ class Effort:
     kept: tuple[int, ...]
 
 
-QUICK = Effort(1000, 0, 400, 30, (8, 3))
-WIDE = Effort(20000, 1000, 6000, 200, (24, 8))
+QUICK = Effort(1500, 0, 500, 40, (12, 5))
+WIDE = Effort(20000, 1500, 6000, 200, (24, 8))
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 
