@@ -1,0 +1,1 @@
+"""Photos → camera poses → metric scale → dense cloud."""

@@ -1,0 +1,114 @@
+"""What the stages of a reconstruction hand to each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.camera import Camera
+from arview.errors import InputError
+from arview.geometry import Array, apply, invert, rigid
+
+Indices = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photo that passed intake.
+
+    Attributes:
+        name: unique in the reconstruction; the path below the photo folder, or ``frame_000123.png`` of a video.
+        path: file on disk; of a video frame, the picture that intake wrote.
+        width, height: in px, upright (EXIF orientation applied).
+        lens: photos of the same lens, zoom and size share this key and their intrinsics.
+        camera: first guess of the intrinsics, upright; exact when ``is_calibrated``.
+        is_calibrated: True when the camera came from a calibration, which self-calibration must not change.
+    """
+
+    name: str
+    path: Path
+    width: int
+    height: int
+    lens: str
+    camera: Camera
+    is_calibrated: bool = False
+
+
+@dataclass(frozen=True)
+class PosedPhoto:
+    """A photo with the camera that SfM found: intrinsics with distortion, and ``cam_from_scan`` (4,4)."""
+
+    name: str
+    path: Path
+    camera: Camera
+    cam_from_scan: Array
+
+    @property
+    def centre_in_scan(self) -> Array:
+        """(3,) camera centre."""
+        return -self.cam_from_scan[:3, :3].T @ self.cam_from_scan[:3, 3]
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """Camera poses and the points they were found with, in the ``scan`` frame and its unit.
+
+    The unit is arbitrary until ``transformed`` has brought the model to millimetres in the CAD's rough frame.
+
+    Attributes:
+        photos: placed photos.
+        points_in_scan: (N,3).
+        colors: (N,3) uint8 RGB.
+        point_errors_px: (N,) mean reprojection error.
+        observed_point, observed_photo: (K,) int32 indices, one entry for each time a point was seen.
+        observed_px: (K,2) where, in the distorted photo; integers are pixel centres.
+        unplaced: (name, reason) of photos that could not be placed.
+    """
+
+    photos: tuple[PosedPhoto, ...]
+    points_in_scan: Array
+    colors: NDArray[np.uint8]
+    point_errors_px: Array
+    observed_point: Indices
+    observed_photo: Indices
+    observed_px: Array
+    unplaced: tuple[tuple[str, str], ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        if len(self.observed_point) != len(self.observed_photo) or len(self.observed_point) != len(self.observed_px):
+            raise InputError("sparse model: observations of unequal length")
+        if not np.isfinite(self.points_in_scan).all():
+            raise InputError("sparse model: a point is NaN or infinite")
+
+    def transformed(self, scale: float, new_from_scan: Array) -> SparseModel:
+        """The model after ``x_new = new_from_scan @ (scale * x_scan)``; scale > 0, ``new_from_scan`` rigid (4,4)."""
+        if not scale > 0:
+            raise InputError(f"sparse model: scale {scale} is not positive")
+        photos = []
+        for photo in self.photos:
+            scaled = rigid(photo.cam_from_scan[:3, :3], scale * photo.cam_from_scan[:3, 3])
+            photos.append(replace(photo, cam_from_scan=scaled @ invert(new_from_scan)))
+        points = apply(new_from_scan, scale * self.points_in_scan)
+        return replace(self, photos=tuple(photos), points_in_scan=points)
+
+
+@dataclass(frozen=True)
+class DenseCloud:
+    """A fused cloud in the frame of the sparse model that it was made with.
+
+    Attributes:
+        points: (N,3) float64.
+        normals: (N,3) float32 unit, towards the cameras.
+        colors: (N,3) uint8 RGB.
+        sigma: (N,) float32, standard deviation of the point along its normal, unit of ``points``.
+        views: (N,) uint8, number of photos that agree on it.
+    """
+
+    points: Array
+    normals: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    sigma: NDArray[np.float32]
+    views: NDArray[np.uint8]
