@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from arview import __version__
+from arview.atomic import replacing
 from arview.errors import ArviewError, InputError, OutputError
 
 if TYPE_CHECKING:
@@ -552,14 +553,11 @@ def _output_path(path: str, inputs: list[Any]) -> Path:
 
 def _write_bytes(path: Path, content: bytes) -> None:
     """Write a file that appears complete or not at all."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_bytes(content)
-        part.replace(path)
+        with replacing(path) as file:
+            file.write(content)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.atomic import replacing
 from arview.errors import InputError, OutputError
 
 _MAGIC = b"ARVIEW-GUIDEVIEWS\n"
@@ -31,24 +30,17 @@ def write_arrays(path: Path, meta: dict[str, Any], arrays: dict[str, NDArray[Any
     start = len(_MAGIC) + 8 + len(header)
     padding = -start % _ALIGNMENT
     header += b" " * padding
-    temporary = ""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(handle, "wb") as file:
+        with replacing(path) as file:
             file.write(_MAGIC)
             file.write(len(header).to_bytes(8, "little"))
             file.write(header)
             for array in arrays.values():
                 data = np.ascontiguousarray(array).tobytes()
                 file.write(data + b"\0" * (-len(data) % _ALIGNMENT))
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
 
 
 def read_arrays(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:

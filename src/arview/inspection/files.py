@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Iterator
 from datetime import datetime
 from functools import cache
@@ -14,6 +13,7 @@ from typing import Any
 
 import jsonschema
 
+from arview.atomic import replacing
 from arview.cad.model import Model
 from arview.errors import InputError, MismatchError, OutputError
 from arview.inspection.record import (
@@ -62,20 +62,12 @@ def save_inspection(inspection: Inspection, path: str | Path) -> None:
     """
     path = Path(path)
     text = json.dumps(_to_document(inspection), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    temporary: Path | None = None
     try:
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=path.parent, prefix=f".{path.name}.", delete=False
-        ) as stream:
-            temporary = Path(stream.name)
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
+        with replacing(path) as file:
+            file.write(text.encode())
+            file.flush()
+            os.fsync(file.fileno())
     except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
         raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
 
 

@@ -9,8 +9,6 @@ What is found is a rough pose and no more: whether the part is there is for the 
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from arview.atomic import replacing
 from arview.camera import Camera
 from arview.errors import InputError, MismatchError, OutputError
 from arview.geometry import Array, exp_so3, rigid
@@ -419,10 +418,8 @@ class LearnedViews:
             "model_name": self.views.model_name,
             "model_hash": self.views.model_hash,
         }
-        temporary = ""
         try:
-            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-            with os.fdopen(handle, "wb") as file:
+            with replacing(path) as file:
                 np.savez_compressed(
                     file,
                     meta=np.array(json.dumps(meta)),
@@ -430,13 +427,8 @@ class LearnedViews:
                     pictures=self._pictures[order],
                     masks=self._masks[order],
                 )
-            Path(temporary).chmod(0o644)
-            Path(temporary).replace(path)
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
-        finally:
-            if temporary:
-                Path(temporary).unlink(missing_ok=True)
 
     def load(self, path: Path) -> None:
         """Take over the views of a file instead of those kept.
