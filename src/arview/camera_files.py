@@ -20,7 +20,7 @@ import numpy as np
 
 from arview.camera import Camera
 from arview.errors import ArviewError, InputError, MismatchError, OutputError
-from arview.photo_exif import PHOTO_SUFFIXES, read_exif
+from arview.photo_exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, focal_length_px, read_exif
 
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "cam_K", "K", "k", "mtx")
 DIST_KEYS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "distortion", "dist", "D", "d")
@@ -32,32 +32,6 @@ PLAIN_MODELS = ("", "plumb_bob", "rational_polynomial", "pinhole", "radtan", "op
 
 FORMATS = "arview or BOP JSON, OpenCV YAML/XML, ROS camera_info YAML or COLMAP cameras.txt"
 _NUMBER = re.compile(r"[-+]?\.?(?:nan|inf)\b|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.IGNORECASE)
-
-# Sensor widths in mm by the start of the EXIF model name, for cameras that write no 35 mm equivalent.
-# From the makers' data sheets; the longest matching name wins.
-SENSOR_WIDTHS_MM = {
-    "Canon EOS 5D": 36.0,
-    "Canon EOS 6D": 35.8,
-    "Canon EOS R5": 36.0,
-    "Canon EOS R6": 35.9,
-    "Canon EOS R7": 22.3,
-    "Canon EOS R10": 22.3,
-    "Canon EOS": 22.3,
-    "Canon PowerShot G7 X": 13.2,
-    "DSC-RX100": 13.2,
-    "ILCE-7": 35.8,
-    "ILCE-6": 23.5,
-    "NIKON D6": 35.9,
-    "NIKON D7": 23.5,
-    "NIKON D8": 35.9,
-    "NIKON D3": 23.5,
-    "NIKON D5": 23.5,
-    "NIKON Z 6": 35.9,
-    "NIKON Z 7": 35.9,
-    "NIKON Z 50": 23.5,
-    "X-T": 23.5,
-    "HERO": 6.17,
-}
 
 
 @dataclass(frozen=True)
@@ -454,22 +428,16 @@ def _camera_from_exif(source: str | Path | None, width: int | None, height: int 
     photo = _first_photo(Path(source))
     exif = read_exif(photo)
     if width is None or height is None:
-        width, height = exif.width, exif.height
-    equivalent_mm, focal_mm = exif.focal_length_35mm_mm, exif.focal_length_mm
-    if equivalent_mm:
-        # The 35 mm equivalent compares diagonals (CIPA DCG-001): 43.27 mm for 36 × 24 mm film.
-        focal_px = equivalent_mm * math.hypot(width, height) / math.hypot(36.0, 24.0)
+        width, height = exif.upright_size
+    focal_px = focal_length_px(exif, width, height)
+    if focal_px is not None:
         return _centred_camera(focal_px, width, height)
-    if not focal_mm:
+    if not exif.focal_length_mm:
         raise InputError(f"{photo}: no focal length in its EXIF data; give a camera file or fov:DEG")
-    names = [name for name in SENSOR_WIDTHS_MM if name.lower() in exif.model.lower()]
-    if not names:
-        raise InputError(
-            f"{photo}: the EXIF data give {focal_mm:g} mm but no 35 mm equivalent, and the sensor of "
-            f"'{exif.model}' is not known; give a camera file or fov:DEG"
-        )
-    sensor_width_mm = SENSOR_WIDTHS_MM[max(names, key=len)]
-    return _centred_camera(focal_mm / sensor_width_mm * max(width, height), width, height)
+    raise InputError(
+        f"{photo}: the EXIF data give {exif.focal_length_mm:g} mm but no 35 mm equivalent, and the sensor of "
+        f"'{exif.model}' is not known; give a camera file or fov:DEG"
+    )
 
 
 def _first_photo(source: Path) -> Path:
@@ -479,7 +447,7 @@ def _first_photo(source: Path) -> Path:
         candidates = sorted(source.iterdir())
     else:
         candidates = sorted(source.parent.glob(source.name)) if source.parent.is_dir() else []
-    photos = [path for path in candidates if path.suffix.lower() in PHOTO_SUFFIXES]
+    photos = [path for path in candidates if path.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES]
     if not photos:
         raise InputError(
             f"{source}: no photo with EXIF data there (a video holds no focal length); give a camera file or fov:DEG"
