@@ -1,0 +1,280 @@
+"""Scale and frame from the CAD: the part is detected in a few photos, the detections vote, all photos refine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.model import Model
+from arview.cad.part import Part
+from arview.cad.view_range import ViewRange
+from arview.camera import Camera
+from arview.geometry import Array, invert, rigid
+from arview.guideview_cache import cached_guide_views
+from arview.guideviews import GuideViewOptions, GuideViewSet
+from arview.reconstruction.scale.refine import Fit, JointRefiner, RefineOptions, Support, View
+from arview.reconstruction.scale.similarity import Similarity
+from arview.reconstruction.scale.vote import Sighting, Vote, vote
+from arview.reconstruction.types import PosedPhoto
+from arview.tracking import Detector
+
+Pixels = NDArray[np.uint8]
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how many are done and how many there are."""
+
+
+@dataclass(frozen=True)
+class CadOptions:
+    """Options of finding the CAD in the photos.
+
+    Attributes:
+        detect_width_px: longer side of the pictures that the part is searched in.
+        most_detections: photos searched at most; and without any sighting so far, at most ``first_detections``.
+        agreeing: so many photos end the search.
+        subdivisions: of the guide views' directions: 3 is about 8° apart, enough to start from.
+        spans: smallest and largest part of the longer side that the part is expected to span.
+        max_side_px: photos are refined at this size at most: memory.
+        max_views: photos refined at most, spread: time.
+        rival_views: photos in which rivals of the best vote are judged.
+        least_support: a similarity borne out by less is no find, see `Support`.
+        clear_lead: a rival with so little less support makes the frame ambiguous.
+        refine: of the joint refinement.
+    """
+
+    detect_width_px: int = 800
+    most_detections: int = 12
+    first_detections: int = 6
+    agreeing: int = 3
+    subdivisions: int = 3
+    spans: tuple[float, float] = (0.2, 1.2)
+    max_side_px: int = 2000
+    max_views: int = 30
+    rival_views: int = 6
+    least_support: float = 0.25
+    clear_lead: float = 0.08
+    refine: RefineOptions = field(default_factory=RefineOptions)
+
+
+@dataclass(frozen=True)
+class CadFind:
+    """The CAD found in the photos: the fit, its support, what it was fitted to, and words for the evidence."""
+
+    fit: Fit
+    support: Support
+    refiner: JointRefiner
+    detail: str
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class NotFound:
+    """Why the CAD was not found; ``is_contradiction`` when it was seen, but not where the reconstruction says."""
+
+    reason: str
+    is_contradiction: bool = False
+
+
+def base_names(part: Part) -> tuple[str, ...]:
+    """The components that define the frame: those of role ``base``, else the largest."""
+    present = {component.name for component in part.model.components}
+    base = tuple(s.name for s in part.settings if s.role == "base" and s.name in present)
+    if base:
+        return base
+    sizes = [float(np.linalg.norm(np.diff(c.bounds_in_model, axis=0))) for c in part.model.components]
+    return (part.model.components[int(np.argmax(sizes))].name,)
+
+
+def spread_order(photos: Sequence[PosedPhoto]) -> list[int]:
+    """Indices of the photos such that those at the front look from as different places as possible."""
+    centres = np.array([photo.centre_in_scan for photo in photos])
+    ahead = np.array([photo.cam_from_scan[2, :3] for photo in photos])
+    size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean() or 1.0
+    places = np.concatenate([centres / size, ahead], axis=1)
+    order = [int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
+    distance = np.full(len(places), np.inf)
+    while len(order) < len(places):
+        distance = np.minimum(distance, np.linalg.norm(places - places[order[-1]], axis=1))
+        distance[order] = -1.0
+        order.append(int(np.argmax(distance)))
+    return order
+
+
+def make_view(photo: PosedPhoto, image: Pixels, max_side_px: int) -> View:
+    """A photo in linear light (sRGB's curve), smoothed a little, and no larger than ``max_side_px``."""
+    camera, gray = shrunk(photo.camera, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), max_side_px)
+    levels = np.arange(256) / 255.0
+    linear = 255.0 * np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+    light = cv2.GaussianBlur(linear.astype(np.float32)[gray], (0, 0), 0.7)
+    return View(photo.name, camera, np.ascontiguousarray(light), photo.cam_from_scan)
+
+
+def shrunk(camera: Camera, image: Pixels, max_side_px: int) -> tuple[Camera, Pixels]:
+    """Camera and picture no larger than ``max_side_px``."""
+    scale = max_side_px / max(camera.width, camera.height)
+    if scale >= 1.0:
+        return camera, image
+    small = camera.scaled(round(camera.width * scale), round(camera.height * scale))
+    return small, np.asarray(cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA))
+
+
+def search_ranges(part: Part, cameras: Sequence[Camera], spans: tuple[float, float]) -> list[ViewRange]:
+    """Where to look for the part, likelier first: from above, then from below, unless its file says from where.
+
+    Distances follow from the lenses, in steps of the root of two so that guide views can be kept.
+    """
+    longer = np.array([camera.fx / max(camera.width, camera.height) for camera in cameras])
+    diameter = part.model.diameter_mm
+    # Nearer than 0.75 diameters guide views cannot be made.
+    low = max(0.75, 2.0 ** (np.floor(2.0 * np.log2(longer.min() / spans[1])) / 2.0)) * diameter
+    high = max(1.5 * low, 2.0 ** (np.ceil(2.0 * np.log2(longer.max() / spans[0])) / 2.0) * diameter)
+    distances = (float(low), float(high))
+    declared = part.view_range
+    if declared is not None:
+        return [ViewRange(distances, declared.elevation_deg, declared.azimuth_deg)]
+    return [ViewRange(distances, (0.0, 90.0)), ViewRange(distances, (-90.0, 0.0))]
+
+
+def find_cad(
+    photos: Sequence[PosedPhoto],
+    read: Callable[[PosedPhoto], Pixels],
+    part: Part,
+    options: CadOptions,
+    progress: Progress | None = None,
+) -> CadFind | NotFound:
+    """The similarity that puts the CAD into the photos, or why it was not found.
+
+    Args:
+        photos: placed photos.
+        read: the (H,W,3) uint8 RGB picture of one, upright, of its camera's size.
+        part: that is looked for.
+        options: see CadOptions.
+        progress: see Progress.
+    """
+    order = spread_order(photos)
+    reasons: list[NotFound] = []
+    for view_range in search_ranges(part, [photo.camera for photo in photos], options.spans):
+        views = cached_guide_views(
+            part.model, view_range, GuideViewOptions(subdivisions=options.subdivisions),
+            lambda done, total: progress("guide views", done, total) if progress else None,
+        )  # fmt: skip
+        votes, turns, reason = _search(photos, order, read, views, options, progress)
+        if votes:
+            return _refined(photos, order, read, part, votes, turns, options, progress)
+        reasons.append(reason)
+        if reason.is_contradiction:
+            break
+    return reasons[-1] if reasons[-1].is_contradiction else reasons[0]
+
+
+def _search(
+    photos: Sequence[PosedPhoto],
+    order: Sequence[int],
+    read: Callable[[PosedPhoto], Pixels],
+    views: GuideViewSet,
+    options: CadOptions,
+    progress: Progress | None,
+) -> tuple[list[Vote], Array, NotFound]:
+    """Votes of the detections, turns (N,3,3) that make the part look much the same, and why not when no vote."""
+    from arview.tracking.why_not import why_not
+
+    detectors: dict[tuple[float, ...], Detector] = {}
+    sightings: list[Sighting] = []
+    reasons: list[str] = []
+    enough = min(options.agreeing, len(photos))
+    for count, index in enumerate(order[: options.most_detections]):
+        if count >= options.first_detections and not sightings:
+            break
+        if progress:
+            progress("finding the part", count, min(len(order), options.most_detections))
+        camera, image = shrunk(photos[index].camera, read(photos[index]), options.detect_width_px)
+        key = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist)
+        detector = detectors.get(key)
+        if detector is None:
+            detector = detectors[key] = Detector(views, camera)
+        found = detector.detect(image)
+        if not found:
+            reasons.append(why_not(image, camera, views, detector.best_rejected))
+        for d in found:
+            poses = (d.cam_from_model, *d.alternatives)
+            sightings += [Sighting(index, photos[index].cam_from_scan, pose, d.quality) for pose in poses]
+        votes = vote(sightings, views.center_in_model, views.diameter_mm)
+        if votes and len(votes[0].sightings) >= enough:
+            return votes, next(iter(detectors.values())).symmetries.near, NotFound("")
+    seen = len({sighting.photo for sighting in sightings})
+    if seen < enough:
+        reason = max(reasons, key=reasons.count) if reasons else "it was found in too few photos"
+        few = f"the part was found in only {seen} photos; in the others: {reason}"
+        return [], np.zeros((0, 3, 3)), NotFound(few if seen else reason)
+    apart = f"the part was found in {seen} photos, but they do not agree about where it is"
+    return [], np.zeros((0, 3, 3)), NotFound(apart, is_contradiction=True)
+
+
+def _refined(
+    photos: Sequence[PosedPhoto],
+    order: Sequence[int],
+    read: Callable[[PosedPhoto], Pixels],
+    part: Part,
+    votes: Sequence[Vote],
+    turns: Array,
+    options: CadOptions,
+    progress: Progress | None,
+) -> CadFind | NotFound:
+    """The vote, or a twin of it, that the edges of several photos bear out best, refined in all; or why none is."""
+    chosen = list(order[: options.max_views])
+    done = 0
+
+    def load(index: int) -> View:
+        nonlocal done
+        done += 1
+        if progress:
+            progress("reading photos", done, len(chosen))
+        return make_view(photos[index], read(photos[index]), options.max_side_px)
+
+    views = [load(index) for index in chosen]
+    base, model = base_names(part), part.model
+    judge = JointRefiner(model, base, views[: options.rival_views], options.refine)
+    starts = [v.similarity for v in votes[:3] if v.score >= 0.4 * votes[0].score]
+    starts += [_turned(votes[0].similarity, turn, model) for turn in turns]
+    judged = []
+    for start in starts:
+        rough = judge.refine(start, options.refine.reaches_px[:4])
+        judged.append((judge.support(rough.similarity, rough.samples).score, rough.similarity))
+    judged.sort(key=lambda pair: -pair[0])
+    warnings = []
+    rivals = [score for score, other in judged[1:] if _is_other(judged[0][1], other)]
+    if rivals and judged[0][0] - max(rivals) < options.clear_lead:
+        warnings.append("the part looks much the same after a turn: the frame may be that of its twin")
+    if progress:
+        progress("fitting the CAD", 0, 1)
+    refiner = JointRefiner(model, base, views, options.refine)
+    fit = refiner.refine(judged[0][1])
+    support = refiner.support(fit.similarity, fit.samples)
+    if not support.score >= options.least_support:
+        reason = (
+            f"the part was found in {len(votes[0].sightings)} photos, but with the photos' poses only "
+            f"{100 * support.share:.0f} % of its edges are where they should be "
+            f"({100 * support.chance:.0f} % by chance)"
+        )
+        return NotFound(reason, is_contradiction=True)
+    detail = (
+        f"CAD edges in {len(views)} photos, {', '.join(base)} taken to be as drawn: "
+        f"{100 * support.share:.0f} % found, {fit.sigma_px:.2f} px"
+    )
+    return CadFind(fit, support, refiner, detail, tuple(warnings))
+
+
+def _turned(similarity: Similarity, turn: Array, model: Model) -> Similarity:
+    """The similarity with the part turned (3,3) about its middle."""
+    to_center = rigid(np.eye(3), model.center_in_model)
+    back = to_center @ rigid(turn.T, np.zeros(3)) @ invert(to_center)
+    return Similarity(similarity.scale, back @ similarity.model_from_scan)
+
+
+def _is_other(a: Similarity, b: Similarity) -> bool:
+    """Whether two refined similarities are apart: a rival that slid into the best is none."""
+    cosine = 0.5 * (float(np.sum(a.model_from_scan[:3, :3] * b.model_from_scan[:3, :3])) - 1.0)
+    return bool(cosine < np.cos(np.deg2rad(2.0)) or abs(np.log(a.scale / b.scale)) > 0.02)

@@ -1,0 +1,114 @@
+"""Does the reconstruction have the shape of the CAD? Registered photos and small residuals prove nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arview.cad.model import Model
+from arview.geometry import Array, apply
+from arview.reconstruction.scale.cad import CadFind
+from arview.reconstruction.scale.similarity import Similarity
+from arview.reconstruction.scale.types import Consistency
+from arview.reconstruction.types import SparseModel
+from arview.render import ZBufferRenderer
+from arview.tracking.threads import pool
+
+DRAWN_PX = 600
+"""Longer side at which the CAD is drawn for the points."""
+NEAR_SHARE = 0.006
+"""Points this near to the CAD's surface lie on it, in diameters of the part: rough surfaces, displaced components."""
+RIM_PX = 3
+"""Points this near to an outline, in px drawn, may belong to what is behind it."""
+LEAST_POINTS = 60
+LEAST_NEAR, MOST_BEHIND = 0.6, 0.15
+LEAST_EDGES, LEAST_OF_OTHERS = 0.25, 0.45
+"""Share of edges found beyond chance in all; in a photo, of what the others show."""
+MOST_MISFITS = 0.1
+"""Share of photos that may not fit."""
+
+
+def check_consistency(sparse: SparseModel, model: Model, found: CadFind, similarity: Similarity) -> Consistency:
+    """Edges of the CAD in every photo, and sparse points against the CAD's surface.
+
+    Args:
+        sparse: the reconstruction, unit arbitrary.
+        model: the CAD.
+        found: the CAD in the photos.
+        similarity: the one that is kept.
+    """
+    support = found.refiner.support(similarity)
+    usual = float(np.nanmedian(support.by_view))
+    is_misfit = support.by_view < LEAST_OF_OTHERS * usual
+    misfits = tuple(v.name for v, bad in zip(found.refiner.views, is_misfit, strict=True) if bad)
+    ahead = points_before_surface(sparse, model, similarity)
+    tolerance_mm = NEAR_SHARE * model.diameter_mm
+    near = float(np.mean(np.abs(ahead) < tolerance_mm)) if len(ahead) >= LEAST_POINTS else None
+    behind = float(np.mean(ahead < -tolerance_mm)) if len(ahead) >= LEAST_POINTS else None
+    against = []
+    if usual < LEAST_EDGES:
+        against.append(
+            f"only {100 * support.share:.0f} % of the CAD's edges are where they should be "
+            f"({100 * support.chance:.0f} % would be by chance)"
+        )
+    if len(misfits) > MOST_MISFITS * len(is_misfit):
+        names = ", ".join(misfits[:5]) + (" …" if len(misfits) > 5 else "")
+        against.append(f"{len(misfits)} of {len(is_misfit)} photos do not fit the CAD where the others do: {names}")
+    if near is not None and behind is not None and (near < LEAST_NEAR or behind > MOST_BEHIND):
+        against.append(
+            f"of the points on the part only {100 * near:.0f} % lie within {tolerance_mm:.1f} mm of the CAD's surface, "
+            f"{100 * behind:.0f} % lie behind it"
+        )
+    if against:
+        reason = "the reconstruction does not have the CAD's shape: " + "; ".join(against)
+    else:
+        reason = f"{100 * support.share:.0f} % of the CAD's edges found in {len(is_misfit)} photos"
+        if near is not None:
+            reason += f", {100 * near:.0f} % of {len(ahead)} points within {tolerance_mm:.1f} mm of its surface"
+    return Consistency(
+        not against, reason, support.share, support.chance, found.fit.sigma_px, near, behind, misfits
+    )  # fmt: skip
+
+
+def points_before_surface(sparse: SparseModel, model: Model, similarity: Similarity) -> Array:
+    """How far (N,) mm the sparse points on the part lie before the CAD's surface, seen by their photos.
+
+    Negative is behind: nothing can be seen there if the CAD is right. Each point's median over the photos that see it
+    on the part, where at least half of those that see it do.
+    """
+    points = similarity.points_in_model(sparse.points_in_scan)
+
+    def look(index: int) -> tuple[Array, Array]:
+        photo = sparse.photos[index]
+        shrink = min(1.0, DRAWN_PX / max(photo.camera.width, photo.camera.height))
+        camera = photo.camera.without_distortion().scaled(
+            round(photo.camera.width * shrink), round(photo.camera.height * shrink)
+        )
+        pose = similarity.cam_from_model(photo.cam_from_scan)
+        depth = ZBufferRenderer(model, camera).render(pose).depth_mm
+        which = sparse.observed_point[sparse.observed_photo == index]
+        in_cam = apply(pose, points[which])
+        pixels = camera.project(in_cam)
+        ok = np.all(np.isfinite(pixels) & (pixels >= RIM_PX), axis=1)
+        ok &= np.all(pixels < np.array([camera.width, camera.height]) - RIM_PX - 1, axis=1)
+        before = np.full(len(which), np.nan)
+        u, v = np.round(pixels[ok]).astype(np.intp).T
+        around = [depth[v + dv, u + du] for dv in (-RIM_PX, 0, RIM_PX) for du in (-RIM_PX, 0, RIM_PX)]
+        lowest, highest = np.min(around, axis=0), np.max(around, axis=0)
+        # Between the nearest and the farthest surface around a point it is on it, on steps and slopes too.
+        z = in_cam[ok, 2]
+        gap = np.where(z < lowest, lowest - z, np.where(z > highest, highest - z, 0.0))
+        before[ok] = np.where(lowest > 0, gap, np.nan)
+        return which, before
+
+    seen = list(pool().map(look, range(len(sparse.photos))))
+    if not seen:
+        return np.zeros(0)
+    which, before = np.concatenate([s[0] for s in seen]), np.concatenate([s[1] for s in seen])
+    is_on = np.isfinite(before)
+    on, total = np.bincount(which[is_on], minlength=len(points)), np.bincount(which, minlength=len(points))
+    kept = is_on & (on >= 2)[which] & (2 * on >= total)[which]
+    order = np.lexsort((before[kept], which[kept]))
+    values, owners = before[kept][order], which[kept][order]
+    starts = np.flatnonzero(np.r_[True, owners[1:] != owners[:-1]]) if len(owners) else np.zeros(0, dtype=np.intp)
+    counts = np.diff(np.r_[starts, len(owners)])
+    return np.asarray(values[starts + counts // 2]) if len(owners) else np.zeros(0)

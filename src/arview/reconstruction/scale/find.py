@@ -1,0 +1,144 @@
+"""Scale and rough frame of a reconstruction from everything that is known about them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.part import Part
+from arview.geometry import Array
+from arview.reconstruction.scale.cad import CadFind, CadOptions, NotFound, Pixels, Progress, find_cad
+from arview.reconstruction.scale.consistency import check_consistency
+from arview.reconstruction.scale.specs import ScaleSources
+from arview.reconstruction.scale.targets import scale_from_rig, scale_from_targets
+from arview.reconstruction.scale.types import TRUST, Consistency, ScaleEvidence, ScaleResult
+from arview.reconstruction.types import PosedPhoto, SparseModel
+
+DISAGREE = 4.0
+"""Sources that differ by more standard deviations disagree."""
+NO_CHECK = Consistency(True, "not checked against the CAD")
+
+
+@dataclass(frozen=True)
+class Combined:
+    """The scale that the evidence agrees on, its relative standard deviation, the evidence, and disagreements."""
+
+    scale: float
+    std: float
+    evidence: tuple[ScaleEvidence, ...]
+    warnings: tuple[str, ...]
+
+
+def find_scale(
+    sparse: SparseModel,
+    part: Part | None,
+    sources: ScaleSources | None = None,
+    options: CadOptions | None = None,
+    read: Callable[[PosedPhoto], Pixels] | None = None,
+    progress: Progress | None = None,
+) -> ScaleResult:
+    """Scale (mm per unit) and rough CAD frame of a sparse model.
+
+    Args:
+        sparse: poses in an arbitrary frame and unit.
+        part: to be found in the photos; None: only ``sources`` are used, and there is no frame.
+        sources: boards, tags, scale bars and rig that are known.
+        options: of finding the CAD.
+        read: the (H,W,3) uint8 RGB picture of a photo, upright, of its camera's size; by default its file is read.
+        progress: called with (what, done, total).
+
+    Raises:
+        InputError: a photo cannot be read.
+    """
+    sources = sources or ScaleSources()
+    read = read or _read_file
+    evidence, missing = scale_from_targets(
+        sparse.photos, lambda photo: np.asarray(cv2.cvtColor(read(photo), cv2.COLOR_RGB2GRAY)), sources
+    )
+    if sources.rig is not None:
+        of_rig, not_in_rig = scale_from_rig(sparse.photos, sources.rig)
+        evidence, missing = evidence + of_rig, missing + not_in_rig
+    found: CadFind | NotFound = NotFound("no part was given")
+    if part is not None:
+        found = find_cad(sparse.photos, read, part, options or CadOptions(), progress)
+    if isinstance(found, CadFind):
+        std = float(np.sqrt(found.fit.covariance[6, 6]))
+        evidence.append(ScaleEvidence("cad", found.fit.similarity.scale, std, found.detail))
+    combined = combine(evidence)
+    warnings = [*missing, *(combined.warnings if combined else ())]
+    if isinstance(found, NotFound) or combined is None or part is None:
+        no_fit = NotFound("") if isinstance(found, CadFind) else found
+        consistency = Consistency(False, no_fit.reason) if no_fit.is_contradiction else NO_CHECK
+        warnings += [no_fit.reason] if no_fit.is_contradiction else []
+        return ScaleResult(
+            combined.scale if combined else None, combined.std if combined else None, None, None,
+            combined.evidence if combined else (), tuple(warnings), no_fit.reason, consistency,
+        )  # fmt: skip
+    # What the other sources add to the scale moves the frame as far as the two depend on each other.
+    fit = found.fit
+    change = float(np.log(combined.scale / fit.similarity.scale))
+    by_scale = fit.covariance[:, 6] / fit.covariance[6, 6]
+    similarity = fit.similarity.moved(by_scale * change, part.model.center_in_model)
+    covariance = fit.covariance[:6, :6] + np.outer(by_scale[:6], by_scale[:6]) * (
+        combined.std**2 - fit.covariance[6, 6]
+    )
+    consistency = check_consistency(sparse, part.model, found, similarity)
+    against = [e for e in combined.evidence if e.kind == "cad" and not e.is_used]
+    if against:
+        reason = f"the CAD has another size than {combined.evidence[0].detail}"
+        consistency = replace(consistency, is_consistent=False, reason=f"{reason}; {consistency.reason}")
+    warnings += found.warnings
+    if not consistency.is_consistent:
+        warnings.append(consistency.reason)
+    return ScaleResult(
+        combined.scale, combined.std, similarity.model_from_scan, _positive(covariance), combined.evidence,
+        tuple(warnings), "", consistency,
+    )  # fmt: skip
+
+
+def combine(evidence: Sequence[ScaleEvidence]) -> Combined | None:
+    """The mean of the evidence by inverse variance, in order of trust; None without any.
+
+    What disagrees with the more trusted (by more than DISAGREE standard deviations) is set aside, with a warning that
+    names both. What scatters more than it should has a standard deviation as much larger.
+    """
+    ordered = sorted(evidence, key=lambda e: TRUST.index(e.kind))
+    judged: list[ScaleEvidence] = []
+    warnings = []
+    for e in ordered:
+        trusted = [other for other in judged if other.is_used]
+        apart = [abs(np.log(e.mm_per_unit / t.mm_per_unit)) / np.hypot(e.std, t.std) for t in trusted]
+        is_used = not apart or max(apart) <= DISAGREE
+        judged.append(replace(e, is_used=is_used))
+        if not is_used:
+            rival = trusted[int(np.argmax(apart))]
+            percent = 100.0 * (e.mm_per_unit / rival.mm_per_unit - 1.0)
+            warnings.append(
+                f"the scale of [{e.detail}] differs by {percent:+.3f} % ({max(apart):.0f} σ) from that of "
+                f"[{rival.detail}], which is trusted more and was used"
+            )
+    used = [e for e in judged if e.is_used]
+    if not used:
+        return None
+    weights = np.array([1.0 / e.std**2 for e in used])
+    logs = np.log([e.mm_per_unit for e in used])
+    mean = float(weights @ logs / weights.sum())
+    excess = float(weights @ (logs - mean) ** 2) / max(1, len(used) - 1)
+    std = float(np.sqrt(max(1.0, excess) / weights.sum()))
+    return Combined(float(np.exp(mean)), std, tuple(judged), tuple(warnings))
+
+
+def _positive(covariance: Array) -> Array:
+    """The nearest covariance without negative variances."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _read_file(photo: PosedPhoto) -> NDArray[np.uint8]:
+    from arview.reconstruction.intake.reading import read_photo
+
+    return read_photo(photo.path)

@@ -1,0 +1,76 @@
+"""Similarities: scaled rigid motions between the reconstruction and the CAD, or between two sets of points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from arview.errors import InputError
+from arview.geometry import Array, apply, exp_se3, invert, orthonormalise, rigid
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``x_model = model_from_scan @ (scale * x_scan)``: scale in mm per unit, ``model_from_scan`` rigid (4,4)."""
+
+    scale: float
+    model_from_scan: Array
+
+    def cam_from_model(self, cam_from_scan: Array) -> Array:
+        """(4,4) in mm of a photo whose pose in the reconstruction is known."""
+        scaled = rigid(cam_from_scan[:3, :3], self.scale * cam_from_scan[:3, 3])
+        return np.asarray(scaled @ invert(self.model_from_scan))
+
+    def points_in_model(self, points_in_scan: Array) -> Array:
+        """(N,3) mm of points in the reconstruction."""
+        return apply(self.model_from_scan, self.scale * points_in_scan)
+
+    def moved(self, step: Array, center_in_model: Array) -> Similarity:
+        """After a step (7,): twist about the model's centre on the right of ``cam_from_model``, and d log(scale).
+
+        The scale leaves the centre where it is in the reconstruction.
+        """
+        to_center = rigid(np.eye(3), center_in_model)
+        scan_from_model = invert(to_center @ exp_se3(-step[:6]) @ invert(to_center) @ self.model_from_scan)
+        factor = float(np.exp(step[6]))
+        scan_from_model[:3, 3] += (factor - 1.0) * apply(scan_from_model, center_in_model)
+        return Similarity(self.scale * factor, orthonormalise(invert(scan_from_model)))
+
+
+@dataclass(frozen=True)
+class PointFit:
+    """A similarity between points, its relative standard deviation of the scale, and the rms residual in mm."""
+
+    similarity: Similarity
+    scale_std: float
+    rms_mm: float
+
+
+def fit_points(points_in_scan: Array, points_in_mm: Array, scale: float | None = None) -> PointFit:
+    """The least-squares similarity that takes points (N,3) of the reconstruction to the same points in mm.
+
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (PAMI 1991); the
+    uncertainty of the scale comes from the residuals. With ``scale`` given only the rigid motion is fitted.
+
+    Raises:
+        InputError: fewer than three points, or all at one place.
+    """
+    source, target = np.asarray(points_in_scan, np.float64), np.asarray(points_in_mm, np.float64)
+    if len(source) < 3 or source.shape != target.shape:
+        raise InputError(f"similarity: {len(source)} and {len(target)} points; at least three pairs are needed")
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    spread = float(np.sum(a * a))
+    if not spread > 0 or not np.sum(b * b) > 0:
+        raise InputError("similarity: all points are at the same place")
+    u, singular, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * sign) @ vt
+    if scale is None:
+        scale = float(np.sum(singular * sign) / spread)
+    left = b - scale * a @ rotation.T
+    freedom = max(1, 3 * len(a) - 7)
+    variance = float(np.sum(left * left)) / freedom
+    std = float(np.sqrt(variance / np.sum(b * b)))
+    similarity = Similarity(scale, rigid(rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)))
+    return PointFit(similarity, std, float(np.sqrt(np.mean(np.sum(left * left, axis=1)))))

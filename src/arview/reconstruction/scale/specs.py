@@ -1,0 +1,249 @@
+"""Descriptions of what gives the scale: boards, tags, scale bars and camera rigs, from the command line or a file."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from arview.errors import InputError
+from arview.geometry import Array, check_rigid
+
+BOARD_FORMS = (
+    "charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY or grid:COLUMNSxROWS:MARKER_MM:GAP_MM:DICTIONARY, "
+    "e.g. charuco:8x6:30:22:DICT_5X5_100"
+)
+TAG_FORM = "DICTIONARY:SIDE_MM, e.g. apriltag36h11:20"
+BAR_FORM = "ID1:ID2:LENGTH_MM or DICTIONARY:ID1:ID2:LENGTH_MM, e.g. 3:7:500.02"
+DEFAULT_DICTIONARY = "DICT_APRILTAG_36H11"
+
+
+@dataclass(frozen=True)
+class Board:
+    """A printed board of OpenCV.
+
+    Attributes:
+        is_charuco: chessboard with markers in its white squares, else a grid of markers.
+        columns, rows: squares (ChArUco) or markers.
+        cell_mm: side of a square; of a grid, from marker to marker.
+        marker_mm: side of a marker.
+        dictionary: OpenCV's name.
+    """
+
+    is_charuco: bool
+    columns: int
+    rows: int
+    cell_mm: float
+    marker_mm: float
+    dictionary: str
+
+    def __str__(self) -> str:
+        kind = "ChArUco board" if self.is_charuco else "marker board"
+        return f"{kind} {self.columns}×{self.rows}, {self.cell_mm:g} mm"
+
+
+@dataclass(frozen=True)
+class Tags:
+    """All tags of a dictionary that are no part of a board: the side of each, mm; ``ids`` empty means any."""
+
+    dictionary: str
+    side_mm: float
+    ids: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class ScaleBar:
+    """The known distance between the centres of two tags, mm, and its standard deviation."""
+
+    dictionary: str
+    first: int
+    second: int
+    length_mm: float
+    std_mm: float = 0.02
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What is known about the cameras: centres (3,) mm by photo, or distances (photo, photo, mm)."""
+
+    centres_mm: dict[str, Array] = field(default_factory=dict)
+    distances_mm: tuple[tuple[str, str, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class ScaleSources:
+    """All that is known to be in view, or about the cameras."""
+
+    boards: tuple[Board, ...] = ()
+    tags: tuple[Tags, ...] = ()
+    bars: tuple[ScaleBar, ...] = ()
+    rig: Rig | None = None
+
+
+def dictionary_name(text: str) -> str:
+    """OpenCV's name of a dictionary of markers: ``DICT_5X5_100``, ``5x5_100``, ``apriltag36h11``, ``tag36h11``."""
+    import cv2
+
+    known = {name.upper(): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
+    wanted = text.strip().upper().replace("-", "_")
+    family = re.fullmatch(r"(?:APRIL_?)?TAG_?(\d\dH\d\d)", wanted)
+    for name in (wanted, f"DICT_{wanted}", f"DICT_APRILTAG_{family[1]}" if family else ""):
+        if name in known:
+            return known[name]
+    some = "DICT_4X4_50, DICT_5X5_100, DICT_6X6_250, DICT_ARUCO_ORIGINAL, apriltag36h11, apriltag25h9, apriltag16h5"
+    raise InputError(f"unknown dictionary of markers {text!r}; there are e.g. {some}")
+
+
+def parse_board(text: str) -> Board:
+    """Board of a command line, see BOARD_FORMS. Raises InputError."""
+    match = re.fullmatch(r"(charuco|grid):(\d+)x(\d+):([\d.]+):([\d.]+):([\w-]+)", text.strip(), re.IGNORECASE)
+    if not match:
+        raise InputError(f"board {text!r}: expected {BOARD_FORMS}")
+    kind, columns, rows, first, second, dictionary = match.groups()
+    if kind.lower() == "charuco":
+        return _board(text, True, int(columns), int(rows), _length(text, first), _length(text, second), dictionary)
+    marker = _length(text, first)
+    return _board(text, False, int(columns), int(rows), marker + _length(text, second), marker, dictionary)
+
+
+def parse_tags(text: str) -> Tags:
+    """Tags of a command line, see TAG_FORM. Raises InputError."""
+    dictionary, _, side = text.rpartition(":")
+    if not dictionary:
+        raise InputError(f"tag {text!r}: expected {TAG_FORM}")
+    return Tags(dictionary_name(dictionary), _length(text, side))
+
+
+def parse_scale_bar(text: str, default_dictionary: str = DEFAULT_DICTIONARY) -> ScaleBar:
+    """Scale bar of a command line, see BAR_FORM. Raises InputError."""
+    match = re.fullmatch(r"(?:([A-Za-z][\w-]*|\d+x[\w-]+):)?(\d+):(\d+):([\d.]+)", text.strip())
+    if not match:
+        raise InputError(f"scale bar {text!r}: expected {BAR_FORM}")
+    dictionary, first, second, length = match.groups()
+    name = dictionary_name(dictionary) if dictionary else default_dictionary
+    return _bar(text, name, int(first), int(second), _length(text, length))
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Rig of a JSON file.
+
+    Any of ``{"centres_mm": {photo: [x, y, z]}}``, ``{"cam_from_rig_mm": {photo: 4×4}}`` and
+    ``{"distances_mm": [[photo, photo, mm], …]}``.
+
+    Raises:
+        InputError: unreadable, no JSON, none of these, or a value that cannot be.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read rig {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise InputError(f"rig {path}: is not JSON ({error})") from error
+    return _rig(content, f"rig {path}")
+
+
+def load_scale_file(path: str | Path) -> ScaleSources:
+    """Sources of a TOML file with ``[[board]]``, ``[[tag]]``, ``[[scale_bar]]`` and ``[rig]``.
+
+    A board has ``spec`` as on the command line, a tag ``dictionary``, ``side_mm`` and perhaps ``ids``, a bar ``ids``
+    (two), ``length_mm`` and perhaps ``dictionary`` and ``std_mm``, the rig what `load_rig` reads.
+
+    Raises:
+        InputError: unreadable, no TOML, an unknown key or a value that cannot be.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    _only(content, ("board", "tag", "scale_bar", "rig"), f"{path}:")
+    boards, tags, bars = [], [], []
+    for entry in _entries(content, "board", ("spec",), (), path):
+        boards.append(parse_board(str(entry["spec"])))
+    for entry in _entries(content, "tag", ("dictionary", "side_mm"), ("ids",), path):
+        ids = tuple(int(i) for i in entry.get("ids", ()))
+        tags.append(Tags(dictionary_name(str(entry["dictionary"])), _length(f"{path}", entry["side_mm"]), ids))
+    for entry in _entries(content, "scale_bar", ("ids", "length_mm"), ("dictionary", "std_mm"), path):
+        if not isinstance(entry["ids"], list) or len(entry["ids"]) != 2:
+            raise InputError(f"{path}: [[scale_bar]] ids = {entry['ids']!r}: expected two numbers of tags")
+        name = dictionary_name(str(entry.get("dictionary", DEFAULT_DICTIONARY)))
+        first, second = (int(i) for i in entry["ids"])
+        std_mm = _length(f"{path}", entry.get("std_mm", ScaleBar.std_mm))
+        bars.append(_bar(f"{path}", name, first, second, _length(f"{path}", entry["length_mm"]), std_mm))
+    rig = _rig(content["rig"], f"{path}: [rig]") if "rig" in content else None
+    return ScaleSources(tuple(boards), tuple(tags), tuple(bars), rig)
+
+
+def _board(text: str, charuco: bool, columns: int, rows: int, cell: float, marker: float, dictionary: str) -> Board:
+    least = 3 if charuco else 1
+    if columns < least or rows < least or columns * rows > 2000:
+        raise InputError(f"board {text!r}: {columns}×{rows} cells, expected at least {least}×{least}")
+    if marker >= cell:
+        raise InputError(f"board {text!r}: markers of {marker:g} mm do not fit in cells of {cell:g} mm")
+    return Board(charuco, columns, rows, cell, marker, dictionary_name(dictionary))
+
+
+def _bar(text: str, dictionary: str, first: int, second: int, length_mm: float, std_mm: float = 0.02) -> ScaleBar:
+    if first == second:
+        raise InputError(f"scale bar {text!r}: both ends are tag {first}")
+    return ScaleBar(dictionary, first, second, length_mm, std_mm)
+
+
+def _rig(content: Any, where: str) -> Rig:
+    if not isinstance(content, dict):
+        raise InputError(f"{where}: expected an object")
+    known = ("centres_mm", "cam_from_rig_mm", "distances_mm")
+    if not any(key in content for key in known):
+        raise InputError(f"{where}: expected one of {', '.join(known)}")
+    try:
+        centres = {str(k): np.array(v, dtype=np.float64).reshape(3) for k, v in content.get(known[0], {}).items()}
+        for name, matrix in content.get(known[1], {}).items():
+            pose = check_rigid(matrix, f"{where}: {known[1]} of {name}")
+            centres[str(name)] = -pose[:3, :3].T @ pose[:3, 3]
+        distances = tuple((str(a), str(b), float(mm)) for a, b, mm in content.get(known[2], ()))
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{where}: a value is not what it should be ({error})") from error
+    if not all(np.isfinite(c).all() for c in centres.values()) or not all(0 < d[2] < np.inf for d in distances):
+        raise InputError(f"{where}: centres must be finite, distances positive")
+    return Rig(centres, distances)
+
+
+def _entries(
+    content: dict[str, Any], key: str, needed: tuple[str, ...], optional: tuple[str, ...], path: Path
+) -> list[dict[str, Any]]:
+    entries = content.get(key, [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{path}: {key}: expected tables [[{key}]]")
+    for entry in entries:
+        _only(entry, needed + optional, f"{path}: [[{key}]]")
+        for name in needed:
+            if name not in entry:
+                raise InputError(f"{path}: [[{key}]] the key {name!r} is missing")
+    return entries
+
+
+def _only(table: dict[str, Any], allowed: tuple[str, ...], where: str) -> None:
+    for key in table:
+        if key not in allowed:
+            raise InputError(f"{where} unknown key {key!r}; allowed: {', '.join(allowed)}")
+
+
+def _length(text: str, value: object) -> float:
+    def fail() -> NoReturn:
+        raise InputError(f"{text}: {value!r} is not a positive length in mm")
+
+    try:
+        length = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        fail()
+    if not 0 < length < 1e6:
+        fail()
+    return length

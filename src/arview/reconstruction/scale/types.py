@@ -1,0 +1,113 @@
+"""What finding the scale takes and gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from arview.geometry import Array
+from arview.reconstruction.scale.similarity import Similarity
+
+Kind = Literal["board", "tag", "scale_bar", "rig", "cad"]
+TRUST: tuple[Kind, ...] = ("board", "tag", "scale_bar", "rig", "cad")
+"""Kinds of evidence in order of trust."""
+
+
+@dataclass(frozen=True)
+class ScaleEvidence:
+    """One source of the scale: its kind, mm per unit, relative standard deviation, and in words what was used."""
+
+    kind: Kind
+    mm_per_unit: float
+    std: float
+    detail: str
+    is_used: bool = True
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "kind": self.kind,
+            "mm_per_unit": self.mm_per_unit,
+            "std_relative": self.std,
+            "detail": self.detail,
+            "used": self.is_used,
+        }
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Whether the reconstruction has the shape of the CAD.
+
+    Attributes:
+        is_consistent: nothing speaks against it; also True when nothing could be checked, see ``reason``.
+        reason: in words, what speaks against it or what was checked.
+        edges_found, edges_by_chance: shares of predicted CAD edges with a step of brightness, at and beside them.
+        residual_px: robust standard deviation of the edges' offsets.
+        points_near, points_behind: shares of the sparse points on the part near the CAD's surface, and behind it.
+        misfits: names of photos in which the edges are not where the others say.
+    """
+
+    is_consistent: bool
+    reason: str
+    edges_found: float | None = None
+    edges_by_chance: float | None = None
+    residual_px: float | None = None
+    points_near: float | None = None
+    points_behind: float | None = None
+    misfits: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ScaleResult:
+    """Scale and place of a reconstruction.
+
+    Attributes:
+        scale: mm per unit; None when no source said it.
+        scale_std: relative standard deviation; None without a scale.
+        model_from_scan: (4,4) rigid, to be used after scaling (`SparseModel.transformed`); None when the CAD was not
+            found, see ``why_no_frame``.
+        covariance: (6,6) of ``model_from_scan``: twist (rad, mm) about the model's centre; None without it.
+        evidence: every source, in order of trust; those set aside have ``is_used`` False.
+        warnings: disagreements of the sources and doubts, in words.
+        why_no_frame: why the part was not found; empty when it was.
+        consistency: of the reconstruction's shape with the CAD's.
+    """
+
+    scale: float | None
+    scale_std: float | None
+    model_from_scan: Array | None
+    covariance: Array | None
+    evidence: tuple[ScaleEvidence, ...]
+    warnings: tuple[str, ...]
+    why_no_frame: str
+    consistency: Consistency
+
+    @property
+    def similarity(self) -> Similarity | None:
+        """Scale and frame together; None when one is missing."""
+        if self.scale is None or self.model_from_scan is None:
+            return None
+        return Similarity(self.scale, self.model_from_scan)
+
+    def provenance(self) -> dict[str, Any]:
+        """What ``mm_per_unit`` comes from, for JSON."""
+        c = self.consistency
+        return {
+            "mm_per_unit": self.scale,
+            "std_relative": self.scale_std,
+            "evidence": [evidence.as_dict() for evidence in self.evidence],
+            "warnings": list(self.warnings),
+            "model_from_scan": None if self.model_from_scan is None else self.model_from_scan.tolist(),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "why_no_frame": self.why_no_frame,
+            "consistency": {
+                "is_consistent": c.is_consistent,
+                "reason": c.reason,
+                "edges_found": c.edges_found,
+                "edges_by_chance": c.edges_by_chance,
+                "residual_px": c.residual_px,
+                "points_near": c.points_near,
+                "points_behind": c.points_behind,
+                "misfits": list(c.misfits),
+            },
+        }

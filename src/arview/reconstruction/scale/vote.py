@@ -1,0 +1,123 @@
+"""Which similarity do detections of the part in several photos agree on?
+
+Each detection says where the part is before its camera, the reconstruction says where the cameras are. Any two that
+agree make a similarity; it counts in how many photos a detection bears it out (consensus: Fischler & Bolles 1981).
+Wrong detections and symmetric twins agree with few others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from arview.geometry import Array, apply, invert, orthonormalise, rigid, rotation_angle_rad
+from arview.reconstruction.scale.similarity import Similarity
+
+AGREE_RAD = np.deg2rad(5.0)
+ACROSS, AHEAD = 0.04, 0.08
+"""Detections agree when they place the middle this near across the view and along it, in diameters of the part."""
+SAME_RAD, SAME_PLACE, SAME_SCALE = np.deg2rad(8.0), 0.1, 0.06
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A detection in one photo: index of the photo, its pose in the reconstruction, ``cam_from_model``, quality."""
+
+    photo: int
+    cam_from_scan: Array
+    cam_from_model: Array
+    quality: float
+
+
+@dataclass(frozen=True)
+class Vote:
+    """A similarity, the detections that bear it out (one a photo), and the sum of their qualities."""
+
+    similarity: Similarity
+    sightings: tuple[Sighting, ...]
+    score: float
+
+
+def vote(sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: float) -> list[Vote]:
+    """The similarities that at least two photos agree on, best first, each apart from those before it.
+
+    Args:
+        sightings: detections, several of one photo allowed.
+        center_in_model, diameter_mm: of the part.
+    """
+    votes = []
+    for a, b in combinations(sightings, 2):
+        if a.photo == b.photo or rotation_angle_rad(_rotation(a), _rotation(b)) > AGREE_RAD:
+            continue
+        chosen: Sequence[Sighting] = (a, b)
+        for _ in range(2):
+            similarity = _fit(chosen, center_in_model)
+            chosen = _bearing_out(similarity, sightings, center_in_model, diameter_mm) if similarity else ()
+            if len(chosen) < 2:
+                break
+        if similarity is not None and len(chosen) >= 2:
+            votes.append(Vote(similarity, tuple(chosen), sum(sighting.quality for sighting in chosen)))
+    votes.sort(key=lambda v: -v.score)
+    apart: list[Vote] = []
+    for candidate in votes:
+        if not any(_same(candidate.similarity, v.similarity, center_in_model, diameter_mm) for v in apart):
+            apart.append(candidate)
+    return apart
+
+
+def _rotation(sighting: Sighting) -> Array:
+    """``model_from_scan``'s rotation (3,3) according to one detection."""
+    return np.asarray(sighting.cam_from_model[:3, :3].T @ sighting.cam_from_scan[:3, :3])
+
+
+def _fit(sightings: Sequence[Sighting], center_in_model: Array) -> Similarity | None:
+    """Least squares: the mean rotation, and place and size such that all see the middle where they detect it."""
+    rotation = orthonormalise(rigid(np.mean([_rotation(s) for s in sightings], axis=0), np.zeros(3)))[:3, :3]
+    rows, right = [], []
+    for s in sightings:
+        scan_from_cam = s.cam_from_scan[:3, :3].T
+        towards = scan_from_cam @ apply(s.cam_from_model, center_in_model)
+        rows.append(np.column_stack([np.eye(3), -towards]))
+        right.append(-scan_from_cam @ s.cam_from_scan[:3, 3])
+    solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
+    if not solution[3] > 0:
+        return None
+    scale = 1.0 / float(solution[3])
+    return Similarity(scale, rigid(rotation, center_in_model - scale * rotation @ solution[:3]))
+
+
+def _bearing_out(
+    similarity: Similarity, sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: float
+) -> list[Sighting]:
+    """The best sighting of each photo that agrees with a similarity."""
+    best: dict[int, Sighting] = {}
+    for sighting in sightings:
+        if _agrees(similarity, sighting, center_in_model, diameter_mm):
+            rival = best.get(sighting.photo)
+            if rival is None or sighting.quality > rival.quality:
+                best[sighting.photo] = sighting
+    return list(best.values())
+
+
+def _agrees(similarity: Similarity, sighting: Sighting, center_in_model: Array, diameter_mm: float) -> bool:
+    """Whether a detection is where the similarity says."""
+    expected = similarity.cam_from_model(sighting.cam_from_scan)
+    if rotation_angle_rad(expected, sighting.cam_from_model) > AGREE_RAD:
+        return False
+    middle = apply(sighting.cam_from_model, center_in_model)
+    away = apply(expected, center_in_model) - middle
+    ahead = away @ middle / np.linalg.norm(middle)
+    across = float(np.sqrt(max(0.0, away @ away - ahead**2)))
+    return bool(across < ACROSS * diameter_mm and abs(ahead) < AHEAD * diameter_mm)
+
+
+def _same(a: Similarity, b: Similarity, center_in_model: Array, diameter_mm: float) -> bool:
+    """Whether two similarities are one for all purposes."""
+    if rotation_angle_rad(a.model_from_scan, b.model_from_scan) > SAME_RAD:
+        return False
+    middles = [apply(invert(s.model_from_scan), center_in_model) / s.scale for s in (a, b)]
+    is_near = np.linalg.norm(middles[0] - middles[1]) * a.scale < SAME_PLACE * diameter_mm
+    return bool(is_near and abs(np.log(a.scale / b.scale)) < SAME_SCALE)
