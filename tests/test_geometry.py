@@ -10,6 +10,7 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import (
     apply,
+    are_near,
     check_rigid,
     exp_se3,
     exp_so3,
@@ -19,7 +20,10 @@ from arview.geometry import (
     look_at,
     orthonormalise,
     rigid,
+    rolls_between,
     rotation_angle_rad,
+    turn_ball,
+    turns_to_rays,
 )
 
 LENS = np.array([-0.21, 0.08, 0.0012, -0.0017, -0.015])
@@ -34,6 +38,38 @@ def test_a_quarter_turn_about_z() -> None:
     b_from_a[:3, 3] = [10, 20, 30]
     assert apply(b_from_a, [1.0, 2.0, 3.0]) == pytest.approx([8.0, 21.0, 33.0])
     assert apply(invert(b_from_a), [8.0, 21.0, 33.0]) == pytest.approx([1.0, 2.0, 3.0])
+
+
+def test_the_turn_to_a_ray_is_the_smallest_and_the_roll_between_two_views_is_the_nearest() -> None:
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(20, 3)) * 0.5 + [0, 0, 1.5]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    turns = turns_to_rays(rays)
+    assert turns[..., 2] == pytest.approx(rays)
+    angles = [rotation_angle_rad(np.eye(3), turn) for turn in turns]
+    assert angles == pytest.approx(np.arccos(rays[:, 2]))
+    views = np.stack([exp_so3(v) for v in rng.normal(size=(20, 3))])
+    rolls = rng.uniform(-3.0, 3.0, 20)
+    rolled = np.stack([exp_so3([0, 0, roll]) for roll in rolls]) @ views
+    assert rolls_between(views, rolled) == pytest.approx(rolls)
+
+
+def test_a_ball_of_turns_leaves_no_gap_and_ends_at_its_reach() -> None:
+    ball = turn_ball(20.0, 8.0)
+    angles = np.rad2deg([rotation_angle_rad(np.eye(3), turn) for turn in ball])
+    assert angles.min() < 1e-6 and angles.max() <= 20.0
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        wanted = exp_so3(np.deg2rad(rng.uniform(-8.0, 8.0, 3)))
+        # Half the longest edge of a cell of the body-centred grid is √5/4 of its step.
+        assert min(rotation_angle_rad(wanted, turn) for turn in ball) < np.deg2rad(0.6 * 8.0)
+
+
+def test_near_means_near_in_place_and_in_angle() -> None:
+    pose = rigid(exp_so3([0.3, 0.1, -0.5]), [10, 20, 500])
+    for turn_deg, way, expected in ((4.9, 0.9, True), (5.1, 0.9, False), (4.9, 1.1, False)):
+        other = pose @ rigid(exp_so3(np.deg2rad([0, turn_deg, 0])), [way, 0, 0])
+        assert are_near(pose, other, 1.0, 5.0) == expected
 
 
 def test_a_screw_moves_along_an_arc() -> None:

@@ -107,6 +107,39 @@ def rotation_angle_rad(rotation_a: Array, rotation_b: Array) -> float:
     return float(np.linalg.norm(log_so3(rotation_a[:3, :3].T @ rotation_b[:3, :3])))
 
 
+def are_near(a: Array, b: Array, reach: float, angle_deg: float) -> bool:
+    """Whether two poses (4,4) of one thing are nearer than a distance, in their unit, and an angle."""
+    # cos of the angle between them from the trace: cheap, it is asked often.
+    cosine = 0.5 * (float(np.sum(a[:3, :3] * b[:3, :3])) - 1.0)
+    return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) < reach and cosine > np.cos(np.deg2rad(angle_deg)))
+
+
+def turn_ball(reach_deg: float, step_deg: float) -> Array:
+    """(R,3,3) rotations on a body-centred grid of rotation vectors inside a ball, none at all among them."""
+    steps = int(np.ceil(reach_deg / step_deg))
+    axis = np.arange(-steps, steps + 1) * step_deg
+    corners = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    vectors = np.concatenate([corners, corners + 0.5 * step_deg])
+    vectors = vectors[np.linalg.norm(vectors, axis=1) <= reach_deg]
+    return np.stack([exp_so3(np.deg2rad(v)) for v in vectors])
+
+
+def turns_to_rays(rays: Array) -> Array:
+    """The smallest rotations (..., 3,3) that take +Z to unit rays (..., 3) in front of the camera."""
+    # Rodrigues with the axis z × ray.
+    x, y, z = np.moveaxis(rays, -1, 0)
+    k = 1.0 / (1.0 + z)
+    rows = [[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rolls_between(a: Array, b: Array) -> Array:
+    """Angles in rad about +Z that, after rotations ``a`` (..., 3,3), come nearest to rotations ``b``."""
+    # The largest trace of Rz(roll) a bᵀ.
+    between = b @ np.swapaxes(a, -1, -2)
+    return np.asarray(np.arctan2(between[..., 1, 0] - between[..., 0, 1], between[..., 0, 0] + between[..., 1, 1]))
+
+
 def orthonormalise(b_from_a: Array) -> Array:
     """Nearest rigid transform: the rotation block is projected onto SO(3) by SVD."""
     u, _, vt = np.linalg.svd(b_from_a[:3, :3])

@@ -125,8 +125,12 @@ class GuideViewSet:
 
     def nearest(self, cam_from_model: Array) -> GuideView:
         """The view whose direction is nearest to that of the camera at this pose."""
+        return self.view(self.nearest_index(cam_from_model))
+
+    def nearest_index(self, cam_from_model: Array) -> int:
+        """Index of that view."""
         eye = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3]
-        return self.view(int(np.argmax(self.directions @ (eye - self.center_in_model))))
+        return int(np.argmax(self.directions @ (eye - self.center_in_model)))
 
     def save(self, path: Path) -> None:
         """Write the set to one file, atomically. Raises OutputError."""

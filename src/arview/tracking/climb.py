@@ -10,10 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.tracking.matching import ORIENTATIONS, best_shift
+from arview.tracking.matching import best_shift, collect_points
 from arview.tracking.refine import nearest_view
-from arview.tracking.solver import project_lines
 
 
 @njit(cache=True, nogil=True)
@@ -29,39 +27,11 @@ def pose_score(maps, part, pose, intrinsics, step_mm, contour_count, edge_count,
         shift_px, shift_step: shifts of ± shift_px are tried; ``sums`` (S,S) int32 is room for them.
         room: (3, contour_count + edge_count + 96) int64 to work in.
     """
-    directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
-    view = nearest_view(directions, pose)
-    count = 0
-    for group in range(2):
-        if group == 0:
-            first, last = c_start[view], c_start[view + 1]
-            stride = max(1, (last - first) // contour_count)
-            px, normals, depths = project_lines(
-                c_points[first:last:stride], c_normals[first:last:stride], False, pose, intrinsics, step_mm
-            )
-            limit = contour_count + 32
-        else:
-            first, last = e_start[view], e_start[view + 1]
-            stride = max(1, (last - first) // (2 * edge_count))
-            px, normals, depths = project_lines(
-                e_points[first:last:stride], e_tangents[first:last:stride], True, pose, intrinsics, step_mm
-            )
-            limit = contour_count + edge_count + 96
-        for i in range(px.shape[0]):
-            if group == 1:
-                kind = e_kinds[first + i * stride]
-                if (kind & EDGE_CONTOUR) > 0 or (kind & EDGE_SHARP) == 0:
-                    continue
-            if depths[i] <= 0 or count >= limit:
-                continue
-            room[0, count] = int(np.round(px[i, 0]))
-            room[1, count] = int(np.round(px[i, 1]))
-            turn = np.arctan2(normals[i, 1], normals[i, 0]) / np.pi * ORIENTATIONS
-            room[2, count] = int(np.round(turn)) % ORIENTATIONS
-            count += 1
+    view = nearest_view(part[0], pose)
+    count = collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, room)
     if count < 16:
         return 0.0, 0, 0
-    best, dx, dy = best_shift(maps, room[0], room[1], room[2], count, shift_px, shift_step, sums)
+    best, dx, dy = best_shift(maps, room, count, shift_px, shift_step, sums)
     return best / (255.0 * count), dx, dy
 
 
@@ -99,7 +69,7 @@ def climb(  # type: ignore[no-untyped-def]
     """
     steps = 2 * (shift_px // shift_step) + 1
     sums = np.empty((steps, steps), dtype=np.int32)
-    room = np.empty((3, contour_count + edge_count + 128), dtype=np.int64)
+    room = np.empty((3, contour_count + edge_count + 96), dtype=np.int64)
     scores = np.zeros(poses.shape[0])
     found = poses.copy()
     for n in range(poses.shape[0]):
@@ -148,7 +118,7 @@ def outline_score(maps, points, angles, roll, radius_px, nearness, x0, y0, shift
         room[0, i] = int(np.floor(a * x - b * y + left))
         room[1, i] = int(np.floor(b * x + a * y + top))
         room[2, i] = ((angles[i] + turn) >> 5) & 7
-    best, dx, dy = best_shift(maps, room[0], room[1], room[2], points.shape[0], shift_px, shift_step, sums)
+    best, dx, dy = best_shift(maps, room, points.shape[0], shift_px, shift_step, sums)
     return best / (255.0 * points.shape[0]), dx, dy
 
 

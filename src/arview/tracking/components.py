@@ -690,15 +690,12 @@ class ComponentCheck:
 
     def _sheet(self, cam_from_model: Array) -> ComponentSheet:
         """The edges of the guide view whose direction is nearest, made when first needed."""
-        index = self._sheet_index(cam_from_model)
+        index = self.views.nearest_index(cam_from_model)
         if index not in self._sheets:
             if len(self._sheets) >= KEPT_SHEETS:
                 del self._sheets[next(iter(self._sheets))]
             self._sheets[index] = self._make_sheet(self.views.poses[index])
         return self._sheets[index]
-
-    def _sheet_index(self, cam_from_model: Array) -> int:
-        return int(np.argmax(self.views.directions @ self._direction(cam_from_model)))
 
     def _make_sheet(self, cam_from_model: Array) -> ComponentSheet:
         camera, edges = self.views.camera, self._edges

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.geometry import Array, exp_so3, rigid
+from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
 from arview.tracking.ambiguity import LEAD, find_symmetries
 from arview.tracking.climb import climb
 from arview.tracking.components import ComponentCheck
-from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch
+from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch, weighed
 from arview.tracking.picture import Picture
 from arview.tracking.quality import RIGHT_WORTH, Evidence, found_logit, found_probability
 from arview.tracking.templates import choose_apart
@@ -311,7 +311,7 @@ class Detector:
         if not results:
             return []
         scores, poses = np.concatenate([r[0] for r in results]), np.concatenate([r[1] for r in results])
-        scores = scores * np.array([self._view_lines(pose) for pose in poses]) ** 0.25
+        scores = weighed(scores, np.array([self._view_lines(pose) for pose in poses]))
         order = np.argsort(-scores, kind="stable")
         scores, poses = scores[order], poses[order]
         reach = np.full(len(poses), 0.01 * level.apart_deg * self.views.diameter_mm) / poses[:, 2, 3]
@@ -363,11 +363,8 @@ class Detector:
         outlines = self.search.outlines
         return float(outlines.lines[np.argmax(outlines.rotations[:, 2] @ ray)])
 
-    def _same(self, a: Array, b: Array, angle_deg: float = 5.0) -> bool:
-        near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.01 * angle_deg * self.views.diameter_mm
-        # cos of the angle between them from the trace: cheap, it is asked often.
-        cosine = 0.5 * (float(np.sum(a[:3, :3] * b[:3, :3])) - 1.0)
-        return bool(near and cosine > np.cos(np.deg2rad(angle_deg)))
+    def _same(self, a: Array, b: Array, angle_deg: float) -> bool:
+        return are_near(a, b, 0.01 * angle_deg * self.views.diameter_mm, angle_deg)
 
     def _is_plausible(self, hypothesis: Hypothesis) -> bool:
         """Within a margin of the declared distances and in front of the camera."""

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.geometry import Array, rigid
+from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
 from arview.tracking.climb import climb_outlines
 from arview.tracking.picture import STEPS_PER_OCTAVE, Picture
-from arview.tracking.templates import choose_apart, decimate, make_bank, make_outlines, match_templates
+from arview.tracking.templates import choose_apart, decimate, make_bank, make_outlines, match_templates, outlines_around
 from arview.tracking.threads import pool
 
 POINTS = 64
@@ -42,7 +42,7 @@ class Effort:
     """How far a search goes.
 
     Attributes:
-        matches: of templates that are improved once as outlines; skipped: the best of them, which were tried before.
+        matches: of templates that are improved once as outlines; skipped: the best of them, tried by the effort before.
         improved: of these, how many are improved further.
         starts: of these, how many poses are searched around.
         kept: hypotheses left after each level of that search.
@@ -56,7 +56,7 @@ class Effort:
 
 
 QUICK = Effort(1500, 0, 500, 40, (12, 5))
-WIDE = Effort(20000, 1500, 6000, 200, (24, 8))
+WIDE = Effort(20000, QUICK.matches, 6000, 200, (24, 8))
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 
@@ -99,6 +99,11 @@ def _joined(parts: list[Matches]) -> Matches:
     return Matches(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Matches)))
 
 
+def weighed(scores: Array, lines: Array) -> Array:
+    """Scores by which poses of different views compare: one that shows few distinct lines often fits by chance."""
+    return np.asarray(scores * lines**0.25)
+
+
 class FirstSearch:
     """The first search for one part with one camera.
 
@@ -135,13 +140,13 @@ class FirstSearch:
         near, far = self.step_at(low), self.step_at(high)
         top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
+        chosen = outlines_around(views, self.outlines, subdivisions)
+        rolls = np.deg2rad(views.view_range.rolls_deg(roll_step_deg))
+        focals_px = {step: self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE) for step in self._steps}
         self.banks = {
-            step: make_bank(
-                views, self.outlines, radius_px, radius_px / (self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE)),
-                roll_step_deg, subdivisions,
-            )
-            for step in self._steps
-        }  # fmt: skip
+            step: make_bank(self.outlines, chosen, rolls, radius_px, radius_px / focal_px)
+            for step, focal_px in focals_px.items()
+        }
 
     def step_at(self, distance_mm: float, magnification: float = 1.0) -> float:
         """Scale step at which the part at a distance has the size of the templates, times the magnification."""
@@ -151,11 +156,13 @@ class FirstSearch:
     def starts(self, picture: Picture, effort: Effort = QUICK) -> list[Candidate]:
         """Poses for the best matches over the whole range, apart from each other, best first."""
         picture.make(self._steps)
+        phases = list(pool().map(lambda step: decimate(picture.maps(step)[0], GRID_PX), self._steps))
         count = len(next(iter(self.banks.values())).bins)
         halves = [0, count // 2, count]
         # Small pictures first: what is found there raises the bar for the large ones.
         votes = np.zeros(1024, dtype=np.int64)
-        jobs = [(step, first, last) for step in reversed(self._steps) for first, last in pairwise(halves)]
+        smallest_first = list(zip(self._steps, phases, strict=True))[::-1]
+        jobs = [(*level, first, last) for level in smallest_first for first, last in pairwise(halves)]
         found = pool().map(lambda job: self._match(picture, votes, effort.matches, *job), jobs)
         raw = [m for m in found if m is not None]
         if not raw:
@@ -163,12 +170,21 @@ class FirstSearch:
         matches = self._distinct(_joined(raw), effort.matches, effort.skipped)
         if not len(matches.keys):
             return []
-        matches = self._improved(picture, self._improved(picture, matches, 1).best(effort.improved), 2)
+        # The first round goes through all, with every other point, on larger maps; there the best go on.
+        matches = self._improved(picture, matches, 1, POINTS // 2, STEPS_UP).best(effort.improved)
+        matches = self._improved(picture, matches, 2, POINTS, 0)
         matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.starts)
         return [Candidate(float(k), rigid(r, p)) for k, r, p in zip(matches.keys, *self._posed(matches), strict=True)]
 
     def _match(
-        self, picture: Picture, votes: NDArray[np.int64], kept: int, step: int, first: int, last: int
+        self,
+        picture: Picture,
+        votes: NDArray[np.int64],
+        kept: int,
+        step: int,
+        phases: NDArray[np.uint8],
+        first: int,
+        last: int,
     ) -> Matches | None:
         """The matches of some templates at one scale."""
         bank = self.banks[step]
@@ -176,7 +192,7 @@ class FirstSearch:
         if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
             return None
         keys, templates, places = match_templates(
-            decimate(maps, GRID_PX), bank.offsets, bank.bins, bank.gains, first, last, kept, LOWEST_SCORE, votes
+            phases, bank.offsets, bank.bins, bank.gains, first, last, kept, LOWEST_SCORE, votes
         )
         return Matches(
             keys, np.full(len(keys), step), bank.views[templates], bank.rolls[templates],
@@ -192,7 +208,7 @@ class FirstSearch:
         c, s, zero = np.cos(matches.rolls), np.sin(matches.rolls), np.zeros(len(matches.rolls))
         turns = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], axis=1).reshape(-1, 3, 3)
         rotations = turns @ self.outlines.rotations[matches.views]
-        return _turned_with_rays(rotations, rays), rays * distances_mm[:, None]
+        return turns_to_rays(rays) @ rotations, rays * distances_mm[:, None]
 
     def _best_apart(self, matches: Matches, reach_px: float, angle_rad: float, ratio: float, most: int) -> Matches:
         """The best, none near a better one."""
@@ -212,17 +228,13 @@ class FirstSearch:
         _, first = np.unique(code, return_index=True)
         return matches.of(np.sort(first)[skipped:most])
 
-    def _improved(self, picture: Picture, matches: Matches, rounds: int) -> Matches:
-        """The matches after some rounds of improving each by itself."""
+    def _improved(self, picture: Picture, matches: Matches, rounds: int, count: int, up: int) -> Matches:
+        """The matches after some rounds of improving each by itself, with so many points, so many scale steps up."""
         shapes = self.outlines
-        # The first round goes through all, with every other point.
-        count = POINTS // 2 if rounds == 1 else POINTS
         points, angles = shapes.points[:, :count], shapes.angles[:, :count]
         jobs = []
         for step in np.unique(matches.steps):
             group = np.flatnonzero(matches.steps == step)
-            # Those that have been improved once lie on their maps.
-            up = 0 if rounds > 1 else STEPS_UP
             jobs += [(min(0, step + up), part) for part in np.array_split(group, 2)]
         picture.make([step for step, _ in jobs])
 
@@ -237,19 +249,7 @@ class FirstSearch:
                 maps, points, angles, shapes.neighbours, shapes.turns, some.views, some.rolls,
                 some.radii_px * scale, places, focal_px, ROLL_STEP, STRETCH_STEP, rounds, SHIFT_PX, SHIFT_PX,
             )  # fmt: skip
-            keys = scores * shapes.lines[views] ** 0.25
+            keys = weighed(scores, shapes.lines[views])
             return Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
 
         return _joined(list(pool().map(improve, jobs)))
-
-
-def _turned_with_rays(rotations: Array, rays: Array) -> Array:
-    """Rotations (N,3,3) of views seen along the optical axis, turned to be seen along unit rays (N,3)."""
-    # The smallest rotation that takes +Z to the ray (Rodrigues with the axis z × ray).
-    x, y, z = rays.T
-    turn = np.empty((len(rays), 3, 3))
-    k = 1.0 / (1.0 + z)
-    turn[:, 0] = np.stack([1.0 - k * x * x, -k * x * y, x], axis=1)
-    turn[:, 1] = np.stack([-k * x * y, 1.0 - k * y * y, y], axis=1)
-    turn[:, 2] = np.stack([-x, -y, z], axis=1)
-    return turn @ rotations

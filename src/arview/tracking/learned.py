@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from arview.atomic import replacing
 from arview.camera import Camera
 from arview.errors import InputError, MismatchError, OutputError
-from arview.geometry import Array, exp_so3, rigid
+from arview.geometry import Array, are_near, exp_so3, rigid, rolls_between, turns_to_rays
 from arview.guideviews import GuideViewSet
 from arview.tracking.tracker import Estimate
 
@@ -178,7 +178,7 @@ class LearnedViews:
             middle = 0.5 * (SIDE - 1)
             seen = picture.astype(np.float32)
             for k in near:
-                start = np.array([middle, middle, _roll_between(self._rotations[k], rotation), 1.0])
+                start = np.array([middle, middle, rolls_between(self._rotations[k], rotation), 1.0])
                 score = search(seen, self._pictures[k], self._masks[k], start, np.array([1.0, 1.0, 0.1, 0.05]), 1)[0]
                 if score >= self.options.same_look:
                     return False
@@ -190,7 +190,7 @@ class LearnedViews:
         center = cam_from_model[:3, :3] @ self.views.center_in_model + cam_from_model[:3, 3]
         distance_mm = float(np.sqrt(center @ center))
         ray = center / distance_mm
-        return _turn_to(ray).T @ cam_from_model[:3, :3], ray, distance_mm
+        return turns_to_rays(ray).T @ cam_from_model[:3, :3], ray, distance_mm
 
     def _cut(
         self, image: NDArray[np.uint8], cam_from_model: Array
@@ -227,7 +227,7 @@ class LearnedViews:
         The outline's points are so dense at this size that, made thicker, they close; what the outside cannot reach
         is the part.
         """
-        index = int(np.argmax(self.views.directions @ self._direction(cam_from_model)))
+        index = self.views.nearest_index(cam_from_model)
         first, last = self._contour_start[index : index + 2]
         points = self._contour_points[first:last] @ cam_from_model[:3, :3].T + cam_from_model[:3, 3]
         center = cam_from_model[:3, :3] @ self.views.center_in_model + cam_from_model[:3, 3]
@@ -244,10 +244,6 @@ class LearnedViews:
         cv2.floodFill(lines, outside, (0, 0), 2)
         part = np.where(lines == 2, 0, 255).astype(np.uint8)
         return np.ascontiguousarray(cv2.erode(part, np.ones((3, 3), dtype=np.uint8))[1:-1, 1:-1])
-
-    def _direction(self, cam_from_model: Array) -> Array:
-        """(3,) from the part's centre towards the camera."""
-        return -cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - self.views.center_in_model
 
     def _add(self, rotation: Array, picture: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
         """Keep a view; when there are too many, the older of the two that are nearest in direction goes."""
@@ -306,8 +302,8 @@ class LearnedViews:
             cosine = np.cos(np.deg2rad(o.near_deg))
             cosines = self.rotations[:, 2] @ rotation[2]
             is_near = (cosines > cosine) & (cosines >= np.sort(cosines)[-o.near_views :][:1].min(initial=1.0))
-            last = np.array([_roll_between(kept, rotation) for kept in self.rotations])
-            is_chosen = is_near[:, None] & (np.cos(rolls - last.reshape(-1, 1)) > cosine)
+            last = rolls_between(self.rotations, rotation)
+            is_chosen = is_near[:, None] & (np.cos(rolls - last[:, None]) > cosine)
             low, high = max(low, distance_mm / o.near_stretch), min(high, distance_mm * o.near_stretch)
         count = int(np.ceil(np.log(max(high / low, 1.0)) / np.log(o.stretch))) + 1
         return np.argwhere(is_chosen), np.geomspace(low, max(high, low), count)
@@ -384,7 +380,7 @@ class LearnedViews:
             if k == view or cosines[k] < np.cos(np.deg2rad(HOP_DEG)):
                 continue
             start = place.copy()
-            start[2] = _roll_between(self._rotations[k], rotation)
+            start[2] = rolls_between(self._rotations[k], rotation)
             score, there = search(picture, self._pictures[k], self._masks[k], start, np.array([1.0, 1.0, 0.1, 0.05]), 1)
             if score > best[0]:
                 best = (float(score), there, level, int(k))
@@ -398,15 +394,14 @@ class LearnedViews:
         ray = self.camera.unproject(np.array([u, v]))
         ray /= np.linalg.norm(ray)
         real = self._focal * self.views.diameter_mm * np.sqrt(scale[0] * scale[1]) / (SIDE_DIAMETER * found[3])
-        rotation = _turn_to(ray) @ exp_so3(np.array([0.0, 0.0, found[2]])) @ self._rotations[view]
+        rotation = turns_to_rays(ray) @ exp_so3(np.array([0.0, 0.0, found[2]])) @ self._rotations[view]
         return rigid(rotation, ray * real - rotation @ self.views.center_in_model)
 
     def _same(self, a: Proposal, b: Proposal) -> bool:
         """Whether the detector would come from one to the other."""
-        center = np.append(self.views.center_in_model, 1.0)
-        apart = (a.cam_from_model - b.cam_from_model) @ center
-        cosine = 0.5 * (float(np.sum(a.cam_from_model[:3, :3] * b.cam_from_model[:3, :3])) - 1.0)
-        return bool(np.linalg.norm(apart) < 0.15 * self.views.diameter_mm and cosine > np.cos(np.deg2rad(25.0)))
+        model_from_body = rigid(np.eye(3), self.views.center_in_model)
+        poses = a.cam_from_model @ model_from_body, b.cam_from_model @ model_from_body
+        return are_near(*poses, 0.15 * self.views.diameter_mm, 25.0)
 
     # --- Files ------------------------------------------------------------------------------------------
 
@@ -579,19 +574,6 @@ def search(image, picture, mask, start, steps, halvings):  # type: ignore[no-unt
             left -= 1
             step *= 0.5
     return top, best
-
-
-def _turn_to(ray: Array) -> Array:
-    """The smallest rotation (3,3) that takes the optical axis to a unit ray (3,) in front of the camera."""
-    x, y, z = ray
-    k = 1.0 / (1.0 + z)
-    return np.array([[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]])
-
-
-def _roll_between(kept: Array, seen: Array) -> float:
-    """Roll in rad that, after the one rotation (3,3), comes nearest to the other."""
-    b = seen @ kept.T
-    return float(np.arctan2(b[1, 0] - b[0, 1], b[0, 0] + b[1, 1]))
 
 
 def _rolled(

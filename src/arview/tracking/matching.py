@@ -137,6 +137,44 @@ def orientation_bins(normals_px: Array) -> NDArray[np.uint8]:
 
 
 @njit(cache=True, nogil=True)
+def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, room):  # type: ignore[no-untyped-def]
+    """Project a guide view's outline and design edges; returns the number of points.
+
+    ``room`` (3,N) int64 becomes their columns, rows and orientation bins; see `score_around` for the rest.
+    """
+    _, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
+    count = 0
+    for group in range(2):
+        if group == 0:
+            first, last = c_start[view], c_start[view + 1]
+            stride = max(1, (last - first) // contour_count)
+            limit = contour_count + 32
+            px, normals, depths = project_lines(
+                c_points[first:last:stride], c_normals[first:last:stride], False, pose, intrinsics, step_mm
+            )
+        else:
+            first, last = e_start[view], e_start[view + 1]
+            stride = max(1, (last - first) // (2 * edge_count))
+            limit = room.shape[1]
+            px, normals, depths = project_lines(
+                e_points[first:last:stride], e_tangents[first:last:stride], True, pose, intrinsics, step_mm
+            )
+        for i in range(px.shape[0]):
+            if group == 1:
+                kind = e_kinds[first + i * stride]
+                if (kind & EDGE_CONTOUR) > 0 or (kind & EDGE_SHARP) == 0:
+                    continue
+            if depths[i] <= 0 or count >= limit:
+                continue
+            room[0, count] = int(np.round(px[i, 0]))
+            room[1, count] = int(np.round(px[i, 1]))
+            turn = np.arctan2(normals[i, 1], normals[i, 0]) / np.pi * ORIENTATIONS
+            room[2, count] = int(np.round(turn)) % ORIENTATIONS
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
 def score_around(  # type: ignore[no-untyped-def]
     maps, part, cam_from_body, intrinsics, step_mm, turns, stretches, shift_px, shift_step, contour_count, edge_count
 ):
@@ -156,15 +194,12 @@ def score_around(  # type: ignore[no-untyped-def]
     Returns:
         scores (R·D,) 0–1 and poses (R·D,4,4), the best shift applied.
     """
-    directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
     total = turns.shape[0] * stretches.shape[0]
     scores = np.zeros(total)
     poses = np.zeros((total, 4, 4))
     steps = 2 * (shift_px // shift_step) + 1
     sums = np.empty((steps, steps), dtype=np.int32)
-    columns = np.empty(contour_count + edge_count + 64, dtype=np.int64)
-    rows = np.empty(contour_count + edge_count + 64, dtype=np.int64)
-    bins = np.empty(contour_count + edge_count + 64, dtype=np.int64)
+    room = np.empty((3, contour_count + edge_count + 64), dtype=np.int64)
     for t in range(turns.shape[0]):
         pose = cam_from_body.copy()
         for i in range(3):
@@ -174,41 +209,16 @@ def score_around(  # type: ignore[no-untyped-def]
                     + turns[t, i, 1] * cam_from_body[1, j]
                     + turns[t, i, 2] * cam_from_body[2, j]
                 )
-        view = nearest_view(directions, pose)
-        c_size = c_start[view + 1] - c_start[view]
-        e_size = e_start[view + 1] - e_start[view]
-        c_stride = max(1, c_size // contour_count)
-        e_stride = max(1, e_size // (2 * edge_count))
-        contour = c_points[c_start[view] : c_start[view + 1] : c_stride]
-        contour_normals = c_normals[c_start[view] : c_start[view + 1] : c_stride]
-        edges = e_points[e_start[view] : e_start[view + 1] : e_stride]
-        edge_tangents = e_tangents[e_start[view] : e_start[view + 1] : e_stride]
-        kinds = e_kinds[e_start[view] : e_start[view + 1] : e_stride]
+        view = nearest_view(part[0], pose)
         for d in range(stretches.shape[0]):
             index = t * stretches.shape[0] + d
             for i in range(3):
                 pose[i, 3] = cam_from_body[i, 3] * stretches[d]
             poses[index] = pose
-            count = 0
-            for group in range(2):
-                if group == 0:
-                    px, normals, depths = project_lines(contour, contour_normals, False, pose, intrinsics, step_mm)
-                else:
-                    px, normals, depths = project_lines(edges, edge_tangents, True, pose, intrinsics, step_mm)
-                limit = contour_count + 32 if group == 0 else contour_count + edge_count + 64
-                for i in range(px.shape[0]):
-                    if group == 1 and ((kinds[i] & EDGE_CONTOUR) > 0 or (kinds[i] & EDGE_SHARP) == 0):
-                        continue
-                    if depths[i] <= 0 or count >= limit:
-                        continue
-                    columns[count] = int(np.round(px[i, 0]))
-                    rows[count] = int(np.round(px[i, 1]))
-                    turn = np.arctan2(normals[i, 1], normals[i, 0]) / np.pi * 8.0
-                    bins[count] = int(np.round(turn)) % 8
-                    count += 1
+            count = collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, room)
             if count < 16:
                 continue
-            best, best_dx, best_dy = best_shift(maps, columns, rows, bins, count, shift_px, shift_step, sums)
+            best, best_dx, best_dy = best_shift(maps, room, count, shift_px, shift_step, sums)
             scores[index] = best / (255.0 * count)
             poses[index, 0, 3] += best_dx * pose[2, 3] / intrinsics[0]
             poses[index, 1, 3] += best_dy * pose[2, 3] / intrinsics[1]
@@ -216,19 +226,20 @@ def score_around(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def best_shift(maps, columns, rows, bins, count, shift_px, shift_step, sums):  # type: ignore[no-untyped-def]
+def best_shift(maps, room, count, shift_px, shift_step, sums):  # type: ignore[no-untyped-def]
     """Highest sum of responses under the first ``count`` points over all shifts, and that shift dx, dy in px.
 
-    ``sums`` (S,S) int32 is room to work in. Points that a shift moves outside the maps add nothing.
+    ``room`` holds the points, see `collect_points`; ``sums`` (S,S) int32 is room to work in. Points that a shift moves
+    outside the maps add nothing.
     """
     height, width = maps.shape[1], maps.shape[2]
     steps = sums.shape[0]
     reach = shift_px // shift_step * shift_step
     sums[:] = 0
     for i in range(count):
-        x0 = columns[i] - reach
-        y0 = rows[i] - reach
-        plane = maps[bins[i]]
+        x0 = room[0, i] - reach
+        y0 = room[1, i] - reach
+        plane = maps[room[2, i]]
         if x0 >= 0 and y0 >= 0 and x0 + 2 * reach < width and y0 + 2 * reach < height:
             for sy in range(steps):
                 line = plane[y0 + sy * shift_step]

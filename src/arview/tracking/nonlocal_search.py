@@ -16,22 +16,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.geometry import Array, exp_so3
+from arview.geometry import Array, turn_ball
 from arview.tracking import threads
 from arview.tracking.climb import climb
 from arview.tracking.matching import response_maps, score_around
 from arview.tracking.region import BINS
 from arview.tracking.templates import choose_apart
-
-
-def turn_ball(reach_deg: float, step_deg: float) -> Array:
-    """(R,3,3) rotations on a body-centred grid of rotation vectors inside a ball, none at all among them."""
-    steps = int(np.ceil(reach_deg / step_deg))
-    axis = np.arange(-steps, steps + 1) * step_deg
-    corners = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    vectors = np.concatenate([corners, corners + 0.5 * step_deg])
-    vectors = vectors[np.linalg.norm(vectors, axis=1) <= reach_deg]
-    return np.stack([exp_so3(np.deg2rad(v)) for v in vectors])
 
 
 @dataclass(frozen=True)

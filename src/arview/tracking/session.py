@@ -213,9 +213,7 @@ class TrackingSession:
         better = self._rivals.update(estimate.evidence.worth, self.tracker.worths_near(image, twins))
         if better is not None:
             self._rivals = Rivals([])
-            self.tracker.start(image, estimate.cam_from_model @ better)
-            self.components.reset()
-            return self.tracker.track(image), reason
+            return self._begun(image, estimate.cam_from_model @ better), reason
         count = len(self._rivals.model_from_twins)
         if count == 0 or reason:
             return estimate, reason
@@ -302,9 +300,7 @@ class TrackingSession:
                 return None, self._why_not(image, self.detector.best_rejected)
             start = detections[0].cam_from_model
             self._rivals = Rivals([invert(start) @ twin for twin in detections[0].alternatives])
-        self.tracker.start(image, start)
-        self.components.reset()
-        estimate = self.tracker.track(image)
+        estimate = self._begun(image, start)
         if estimate.quality < o.tracked_quality or not self._is_possible(estimate):
             return None, self._why_not(image, Rejected(estimate.cam_from_model, estimate.evidence, estimate.quality))
         self._poor = self._critical = 0
@@ -313,6 +309,12 @@ class TrackingSession:
         self._recent = []
         self.state = TrackingState.TRACKED if self._confirmed else TrackingState.CRITICAL
         return estimate, "" if self._confirmed else "found, to be confirmed"
+
+    def _begun(self, image: NDArray[np.uint8], cam_from_model: Array) -> Estimate:
+        """Track from a pose on; nothing is known of the components yet."""
+        self.tracker.start(image, cam_from_model)
+        self.components.reset()
+        return self.tracker.track(image)
 
     def _detect(self, image: NDArray[np.uint8], rests: bool) -> list[Detection]:
         """Look for the part, first where it looks as it did; nowhere else while the search rests."""
@@ -336,9 +338,7 @@ class TrackingSession:
         """Look whether the part has been brought near the guide pose; what is found must hold a second frame."""
         snapped = self.snap.lock(image, guide_cam_from_model, self.options.lock_quality)
         if snapped is not None:
-            self.tracker.start(image, snapped.cam_from_model)
-            self.components.reset()
-            estimate = self.tracker.track(image)
+            estimate = self._begun(image, snapped.cam_from_model)
             is_good = estimate.quality >= self.options.lock_quality and self._is_possible(estimate)
             if is_good and self.snap.is_near(estimate.cam_from_model, guide_cam_from_model):
                 self._why = ALIGN

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.geometry import Array, apply, exp_so3, rotation_angle_rad
+from arview.geometry import Array, apply, are_near, rotation_angle_rad, turn_ball
 from arview.guideviews import GuideViewSet
 from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
 from arview.tracking.matching import response_maps, score_around
@@ -77,21 +77,11 @@ class SearchLevel:
     apart_deg: float
 
 
-def turn_grid(reach_deg: float, step_deg: float) -> Array:
-    """(R,3,3) rotations on a body-centred grid of rotation vectors inside a ball."""
-    steps = int(np.ceil(reach_deg / step_deg))
-    axis = np.arange(-steps, steps + 1) * step_deg
-    corners = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    vectors = np.concatenate([corners, corners + 0.5 * step_deg])
-    vectors = vectors[np.linalg.norm(vectors, axis=1) <= reach_deg]
-    return np.stack([exp_so3(np.deg2rad(v)) for v in vectors])
-
-
-COARSE = SearchLevel(26.0, turn_grid(16.0, 9.0), np.geomspace(0.85, 1.15, 7), 8, 2, 8, 8, 4.0)
+COARSE = SearchLevel(26.0, turn_ball(16.0, 9.0), np.geomspace(0.85, 1.15, 7), 8, 2, 8, 8, 4.0)
 """15° all around, 15 % of the distance, 15 % of the diameter aside."""
-FINE = SearchLevel(80.0, turn_grid(3.6, 2.4), np.linspace(0.97, 1.03, 5), 4, 2, 1, 4, 1.5)
+FINE = SearchLevel(80.0, turn_ball(3.6, 2.4), np.linspace(0.97, 1.03, 5), 4, 2, 1, 4, 1.5)
 """Between the poses of the coarse grid."""
-RIVAL = SearchLevel(26.0, turn_grid(22.0, 10.0), np.geomspace(0.69, 1.38, 8), 12, 3, 3, 3, 4.0)
+RIVAL = SearchLevel(26.0, turn_ball(22.0, 10.0), np.geomspace(0.69, 1.38, 8), 12, 3, 3, 3, 4.0)
 """Around the found pose at RIVAL_DISTANCE: 0.38 to 0.76 of its distance."""
 RIVAL_DISTANCE = 0.55
 NEARER = 0.85
@@ -266,6 +256,4 @@ class Snap:
         return max(pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.worth))
 
     def _same(self, a: Array, b: Array, angle_deg: float) -> bool:
-        near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.01 * angle_deg * self._tracker.diameter_mm
-        cosine = 0.5 * (float(np.sum(a[:3, :3] * b[:3, :3])) - 1.0)
-        return bool(near and cosine > np.cos(np.deg2rad(angle_deg)))
+        return are_near(a, b, 0.01 * angle_deg * self._tracker.diameter_mm, angle_deg)

@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from arview.errors import InputError
-from arview.geometry import Array
+from arview.geometry import Array, rolls_between
 from arview.guideviews import GuideViewSet
 from arview.guideviews.extract import ViewFeatures
 from arview.guideviews.mesh_edges import EDGE_CONTOUR
@@ -74,7 +74,6 @@ class TemplateBank:
         origins: (T,2) place of the part's centre in the frame of the offsets.
         views: (T,) of the outlines; rolls: (T,) rad.
         gains: (T,) by which a match counts: more for views that show many distinct lines.
-        radius_px: half the part's diameter.
     """
 
     offsets: NDArray[np.int32]
@@ -83,7 +82,6 @@ class TemplateBank:
     views: NDArray[np.int32]
     rolls: Array
     gains: Array
-    radius_px: float
 
 
 def make_outlines(views: GuideViewSet, model_from_body: Array, points: int, subdivisions: int) -> Outlines:
@@ -126,16 +124,13 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int, subd
     np.fill_diagonal(cosines, -2.0)
     count = min(6, len(rows) - 1)
     nearest = np.argsort(-cosines, axis=1, kind="stable")[:, :count]
-    # The roll ψ for which Rz(ψ) R' is closest to R: the largest trace of Rz(ψ) R' Rᵀ.
-    between = np.einsum("vnij,vkj->vnik", rotations[nearest], rotations)
-    turns = np.arctan2(between[..., 0, 1] - between[..., 1, 0], between[..., 0, 0] + between[..., 1, 1])
     return Outlines(
         points=shown.astype(np.float32),
         angles=(np.round(angles * 256.0).astype(np.int64) % 256).astype(np.uint8),
         rotations=rotations,
         lines=lines_shown,
         neighbours=nearest.astype(np.int32),
-        turns=turns,
+        turns=rolls_between(rotations[nearest], rotations[:, None]),
     )
 
 
@@ -148,22 +143,23 @@ def _nearest_views(views: GuideViewSet, subdivisions: int) -> NDArray[np.intp]:
     return np.unique(np.argmax(wanted[inside] @ views.directions.T, axis=1))
 
 
+def outlines_around(views: GuideViewSet, outlines: Outlines, subdivisions: int) -> NDArray[np.intp]:
+    """Indices of the outlines nearest to the directions of an icosphere; 2 gives 162 directions, about 17° apart."""
+    wanted = np.stack([views.view(int(i)).cam_from_model[2, :3] for i in _nearest_views(views, subdivisions)])
+    return np.unique(np.argmax(wanted @ outlines.rotations[:, 2].T, axis=1))
+
+
 def make_bank(
-    views: GuideViewSet, outlines: Outlines, radius_px: float, nearness: float, roll_step_deg: float, subdivisions: int
+    outlines: Outlines, chosen: NDArray[np.intp], rolls: Array, radius_px: float, nearness: float
 ) -> TemplateBank:
-    """Templates of the outlines nearest to the directions of an icosphere, at all rolls of the declared range.
+    """Templates of chosen outlines at all of some rolls.
 
     Args:
-        views: of the part.
-        outlines: of at least these directions, see `make_outlines`.
+        outlines: see `make_outlines`; chosen: (C,) indices of them.
+        rolls: (R,) rad.
         radius_px: half the part's diameter in the templates.
         nearness: half the part's diameter over its distance.
-        roll_step_deg: between templates.
-        subdivisions: of the icosphere; 2 gives 162 directions, about 17° apart.
     """
-    wanted = np.stack([views.view(int(i)).cam_from_model[2, :3] for i in _nearest_views(views, subdivisions)])
-    chosen = np.unique(np.argmax(wanted @ outlines.rotations[:, 2].T, axis=1))
-    rolls = np.deg2rad(views.view_range.rolls_deg(roll_step_deg))
     # Mixed, so that the bar rises early.
     mixed = np.random.default_rng(1).permutation(len(chosen) * len(rolls))
     shown, rolls = np.repeat(chosen, len(rolls))[mixed], np.tile(rolls, len(chosen))[mixed]
@@ -181,7 +177,6 @@ def make_bank(
         views=shown.astype(np.int32),
         rolls=rolls,
         gains=outlines.lines[shown] ** LINES_POWER,
-        radius_px=radius_px,
     )
 
 

@@ -23,13 +23,7 @@ from arview.tracking.feature import FeatureModality, Matches
 from arview.tracking.nonlocal_search import NonlocalSearch
 from arview.tracking.patch import Pyramid
 from arview.tracking.quality import Evidence, quality_of
-from arview.tracking.refine import (
-    count_colours,
-    median_brightness_ratio,
-    nearest_view,
-    run_evidence,
-    run_stages,
-)
+from arview.tracking.refine import count_colours, median_brightness_ratio, run_evidence, run_stages
 from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
 from arview.tracking.solver import apply_twist, relative_twist
 
@@ -176,10 +170,6 @@ class PartView:
             raw["edge_tangents"] * unit16,
             np.array(raw["edge_kinds"]),
         )
-
-    def nearest(self, cam_from_body: Array) -> int:
-        """Index of the guide view whose direction is nearest."""
-        return int(nearest_view(self.arrays[0], cam_from_body))
 
 
 def intrinsics_of(camera: Camera) -> Array:
