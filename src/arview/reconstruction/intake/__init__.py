@@ -1,0 +1,18 @@
+"""Intake: photos or a video become upright photos with a first camera each, and what is wrong with them in words."""
+
+from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck
+from arview.reconstruction.intake.lenses import Lens
+from arview.reconstruction.intake.photos import Intake, intake_photos
+from arview.reconstruction.intake.reading import read_photo
+from arview.reconstruction.intake.video import VideoIntakeOptions, intake_video
+
+__all__ = [
+    "CheckOptions",
+    "Intake",
+    "Lens",
+    "PhotoCheck",
+    "VideoIntakeOptions",
+    "intake_photos",
+    "intake_video",
+    "read_photo",
+]

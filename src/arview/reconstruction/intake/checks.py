@@ -1,0 +1,175 @@
+"""What can be told of a photo before any matching: blur, texture, exposure, and whether it is there twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.reconstruction.intake.reading import Pixels
+
+_FINE, _COARSE = 1.0, 2.0  # px, the two scales whose gradients are compared
+_DIRECTIONS = 6  # bins of edge direction: motion blurs the edges across it only
+_MIN_EDGES = 60  # edge points that a direction needs to have a say
+_MIN_GRADIENT, _MOST_GRADIENT = 4.0, 12.0  # grey levels per px that an edge needs, without noise and at most
+_TILES = (12, 16)  # rows and columns in which texture is looked for
+_TILE_EDGES = 0.002  # share of a tile's pixels: an edge across a quarter of it
+_THUMB = (24, 18)  # px, for finding candidates of equal pictures
+_COMPARED_PX = 400  # longest side of the pictures that duplicates are confirmed on
+_COMPARED_TILES = (6, 8)
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """When a photo is called bad. Pixels are those of a picture whose longest side is 1000 to 2000 px."""
+
+    blurred_px: float = 2.0  # edge spread (Gaussian sigma); sharp photos have 0.3 to 1.2
+    blurred_ratio: float = 1.8  # of the median photo's spread, so that one shaken photo among sharp ones is named
+    blurred_least_px: float = 1.3  # below, a photo that is worse than the others is still sharp enough
+    useless_px: float = 3.5  # features cannot be placed any more
+    useless_ratio: float = 3.0  # and the others are so much better that it is not missed
+    least_textured: float = 0.02  # share of the picture's tiles with edges; an outline of a plain part gives 0.1
+    clipped: float = 0.4  # share of white pixels: a white background gives 0.3
+    clipped_more: float = 0.2  # above the median photo's share: overexposed against the others
+    dark_level: float = 50.0  # grey level that 95 % of the pixels stay below
+    least_side_px: int = 320  # shorter side; below are thumbnails and icons
+    longest_aspect: float = 2.6  # above are panoramas, which no pinhole camera made
+    same_thumbs: float = 0.95  # correlation above which two pictures are compared in detail
+    same_shift: float = 0.00125  # of the longer side: pictures that differ by less than such a shift are the same view
+
+
+@dataclass(frozen=True)
+class PhotoCheck:
+    """Measures of one photo.
+
+    Attributes:
+        name: of the photo.
+        blur_px: spread of its edges (Gaussian sigma in px of a picture of 1000 to 2000 px); NaN without edges.
+        textured: share of its tiles that hold edges, 0–1.
+        clipped: share of pixels that are white, 0–1.
+        level_95: grey level that 95 % of the pixels stay below, 0–255.
+    """
+
+    name: str
+    blur_px: float
+    textured: float
+    clipped: float
+    level_95: float
+
+
+def check_photo(name: str, gray: Pixels) -> PhotoCheck:
+    """Measures of an upright grey picture (H,W) uint8."""
+    blur_px, textured = blur_and_texture(gray)
+    sample = gray[::3, ::3]
+    return PhotoCheck(name, blur_px, textured, float(np.mean(sample >= 250)), float(np.percentile(sample, 95)))
+
+
+def blur_and_texture(gray: Pixels) -> tuple[float, float]:
+    """Edge spread in px (NaN without edges) and the share of tiles with edges, of a (H,W) uint8 picture.
+
+    An edge of spread s has a gradient of 1 / sqrt(s² + t²) after smoothing with t: the ratio of the gradients at two
+    scales tells s and does not depend on contrast, so that a sharp photo of little texture counts as sharp (Zhuo and
+    Sim 2011, Defocus map estimation from a single image). Of the strongest quarter of the edge points the median
+    counts, in the direction where it is worst.
+    """
+    fine = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), _FINE)
+    coarse = cv2.GaussianBlur(fine, (0, 0), float(np.sqrt(_COARSE**2 - _FINE**2)))
+    # White noise of sigma n leaves gradients of 0.2 n at the fine scale; its sigma shows in what that scale took away.
+    noise = float(np.percentile(np.abs(gray[::4, ::4] - fine[::4, ::4]), 20)) / 0.22
+    floor = min(max(_MIN_GRADIENT, 1.2 * noise), _MOST_GRADIENT)
+    rows, columns, direction, strength, spread = _edge_points(fine, coarse, floor)
+    tile = rows * _TILES[0] // gray.shape[0] * _TILES[1] + columns * _TILES[1] // gray.shape[1]
+    enough = max(3.0, _TILE_EDGES * gray.size / (_TILES[0] * _TILES[1]))
+    textured = float(np.mean(np.bincount(tile, minlength=_TILES[0] * _TILES[1]) >= enough))
+    worst = float("nan")
+    for k in range(_DIRECTIONS):
+        mine = np.flatnonzero(direction == k)
+        if len(mine) >= _MIN_EDGES:
+            count = max(_MIN_EDGES, len(mine) // 4)
+            strongest = mine[np.argpartition(strength[mine], -count)[-count:]]
+            worst = float(np.fmax(worst, np.median(spread[strongest])))
+    return worst, textured
+
+
+@njit(cache=True, nogil=True)
+def _edge_points(
+    fine: NDArray[np.float32], coarse: NDArray[np.float32], floor: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+    """Row, column, bin of direction, gradient and spread (px) of the points where the gradient is at its ridge."""
+    height, width = fine.shape
+    squared = np.zeros((height, width), np.float32)
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            gx = fine[y, x + 1] - fine[y, x - 1]
+            gy = fine[y + 1, x] - fine[y - 1, x]
+            squared[y, x] = 0.25 * (gx * gx + gy * gy)
+    capacity = height * width // 2
+    row, column = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    direction = np.empty(capacity, np.uint8)
+    strength, spread = np.empty(capacity, np.float32), np.empty(capacity, np.float32)
+    count = 0
+    for y in range(2, height - 2):
+        for x in range(2, width - 2):
+            here = squared[y, x]
+            if here <= floor * floor:
+                continue
+            gx = fine[y, x + 1] - fine[y, x - 1]
+            gy = fine[y + 1, x] - fine[y - 1, x]
+            if abs(gx) >= abs(gy):
+                ridge = here >= squared[y, x - 1] and here > squared[y, x + 1]
+            else:
+                ridge = here >= squared[y - 1, x] and here > squared[y + 1, x]
+            if not ridge or count == capacity:
+                continue
+            cx = 0.5 * (coarse[y, x + 1] - coarse[y, x - 1])
+            cy = 0.5 * (coarse[y + 1, x] - coarse[y - 1, x])
+            ratio = here / max(cx * cx + cy * cy, 1e-6)
+            s2 = (_COARSE * _COARSE - ratio * _FINE * _FINE) / max(ratio - 1.0, 1e-3)
+            row[count], column[count] = y, x
+            direction[count] = int((np.arctan2(gy, gx) / np.pi % 1.0) * _DIRECTIONS) % _DIRECTIONS
+            strength[count] = here
+            spread[count] = np.sqrt(min(max(s2, 0.0), 100.0))
+            count += 1
+    return row[:count], column[:count], direction[:count], strength[:count], spread[:count]
+
+
+def thumbnail(gray: Pixels) -> Pixels:
+    """The picture at a longest side of 400 px, on which duplicates are looked for."""
+    scale = _COMPARED_PX / max(gray.shape)
+    size = max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+
+
+def same_views(thumbnails: list[Pixels], options: CheckOptions) -> list[tuple[int, int]]:
+    """Pairs (i < j) of pictures taken from the same place in the same direction, whatever their size and exposure.
+
+    Candidates are found by the correlation of tiny pictures; in each tile of a candidate pair the difference, after
+    fitting brightness and contrast, must be smaller than that of the picture to itself moved by ``same_shift``.
+    """
+    if len(thumbnails) < 2:
+        return []
+    tiny = np.stack([cv2.resize(t, _THUMB, interpolation=cv2.INTER_AREA).ravel() for t in thumbnails]).astype(float)
+    tiny -= tiny.mean(axis=1, keepdims=True)
+    tiny /= np.maximum(np.linalg.norm(tiny, axis=1, keepdims=True), 1e-9)
+    candidates = np.argwhere(np.triu(tiny @ tiny.T > options.same_thumbs, 1))
+    return [(int(i), int(j)) for i, j in candidates if _is_same_view(thumbnails[i], thumbnails[j], options)]
+
+
+def _is_same_view(first: Pixels, second: Pixels, options: CheckOptions) -> bool:
+    if np.abs(np.subtract(first.shape, second.shape)).max() > 2:  # a turned or cropped picture; 2 px are rounding
+        return False
+    size = first.shape[1], first.shape[0]
+    a = cv2.GaussianBlur(first.astype(np.float32), (0, 0), 1.0)
+    b = cv2.GaussianBlur(cv2.resize(second, size).astype(np.float32), (0, 0), 1.0)
+    gain, offset = np.polyfit(b.ravel(), a.ravel(), 1) if b.std() > 0 else (1.0, 0.0)
+    shift_px = options.same_shift * max(size)
+    moved = shift_px * np.hypot(np.gradient(a, axis=0), np.gradient(a, axis=1))
+
+    def tile_rms(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.sqrt(cv2.resize(values.astype(np.float32) ** 2, _COMPARED_TILES[::-1], interpolation=cv2.INTER_AREA))
+
+    noise = 2.0  # grey levels: JPEG, and what a single gain does not explain
+    return bool(np.all(tile_rms(a - gain * b - offset) <= tile_rms(moved) + noise))

@@ -1,0 +1,149 @@
+"""A first camera for every photo, and which photos share it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from arview.camera import Camera
+from arview.camera_files import guess_camera, load_camera
+from arview.errors import MismatchError
+from arview.photo_exif import PhotoExif, focal_length_px
+
+_FOCAL_ROUNDING_MM = 0.055  # programs write the focal length in tenths of a millimetre, or more finely
+_EQUIVALENT_ROUNDING_MM = 0.5  # the 35 mm equivalent is written in whole millimetres
+_ZOOM_TOLERANCE = 0.01
+_FOCAL_DISAGREES = 0.15  # an EXIF focal length is right within a few per cent; more is another zoom
+
+
+@dataclass(frozen=True)
+class Lens:
+    """One lens at one zoom and picture size, whose photos share their intrinsics.
+
+    Portrait and landscape photos of one phone are two lenses here: their upright pictures have different cameras.
+
+    Attributes:
+        key: unique, readable ("iPhone 12 4.2 mm 4032×3024").
+        camera: first guess of the intrinsics, upright.
+        is_calibrated: True when the camera is a calibration, which self-calibration must not change.
+        focal_from: in words, where the focal length came from.
+    """
+
+    key: str
+    camera: Camera
+    is_calibrated: bool
+    focal_from: str
+
+
+def lenses_of(exifs: Sequence[PhotoExif], camera: str | Path | None) -> tuple[list[Lens | MismatchError], list[str]]:
+    """The lens of each photo, or why the given camera does not fit it; and warnings.
+
+    Photos share a lens when make, model, focal lengths (within the rounding of EXIF), digital zoom, upright size and,
+    where known, the serial number agree; without EXIF data by size. A calibrated lens is told apart by its turn too,
+    since turning mirrors the principal point. The focal length comes from ``camera``, else the
+    35 mm equivalent, else the focal length and the sensor's width, else 1.2 × the longer side.
+
+    Args:
+        exifs: of the photos.
+        camera: camera file or ``fov:DEG`` as for ``load_camera``; None or ``exif`` for what the photos say.
+
+    Raises:
+        InputError: the camera file cannot be used at all.
+    """
+    is_file = camera is not None and str(camera) != "exif" and not str(camera).startswith("fov:")
+    firsts: list[PhotoExif] = []
+    lenses: list[Lens | MismatchError] = []
+    index_of_photo: list[int] = []
+    warnings: list[str] = []
+    for exif in exifs:
+        index = next((i for i, first in enumerate(firsts) if _same_lens(exif, first, is_file)), len(firsts))
+        if index == len(firsts):
+            firsts.append(exif)
+            try:
+                lenses.append(_new_lens(exif, camera, is_file, [lens.key for lens in lenses if isinstance(lens, Lens)]))
+            except MismatchError as error:
+                lenses.append(error)
+        index_of_photo.append(index)
+    if is_file:
+        warnings += [
+            f"photos of {lens.key} are upright without saying how the camera was turned; the calibration, turned by "
+            "90°, is only their first guess"
+            for lens in lenses
+            if isinstance(lens, Lens) and not lens.is_calibrated
+        ]
+        warnings += _drop_calibration_of_other_zooms(lenses, firsts)
+    return [lenses[index] for index in index_of_photo], warnings
+
+
+def _same_lens(a: PhotoExif, b: PhotoExif, turns_matter: bool) -> bool:
+    def close(x: float | None, y: float | None, tolerance: float) -> bool:
+        return x is y if x is None or y is None else abs(x - y) <= tolerance + 1e-9
+
+    return (
+        a.upright_size == b.upright_size
+        and (a.quarter_turns_clockwise == b.quarter_turns_clockwise or not turns_matter)
+        and (a.make.lower(), a.model.lower()) == (b.make.lower(), b.model.lower())
+        and (a.serial == b.serial or not a.serial or not b.serial)
+        and close(a.focal_length_mm, b.focal_length_mm, _FOCAL_ROUNDING_MM)
+        and close(a.focal_length_35mm_mm, b.focal_length_35mm_mm, _EQUIVALENT_ROUNDING_MM)
+        and close(a.digital_zoom, b.digital_zoom, _ZOOM_TOLERANCE * a.digital_zoom)
+    )
+
+
+def _new_lens(exif: PhotoExif, camera: str | Path | None, is_file: bool, taken: Sequence[str]) -> Lens:
+    width, height = exif.upright_size
+    focal = f"{exif.focal_length_mm:.1f} mm" if exif.focal_length_mm else ""
+    equivalent = f"({exif.focal_length_35mm_mm:g} mm equivalent)" if exif.focal_length_35mm_mm else ""
+    name = " ".join(word for word in (exif.model or exif.make, focal, equivalent, f"{width}×{height}") if word)
+    key = next(key for n in range(1, len(taken) + 2) if (key := name if n == 1 else f"{name} #{n}") not in taken)
+    if camera is None or str(camera) == "exif":
+        return _lens_from_exif(key, exif)
+    if not is_file:
+        return Lens(key, load_camera(camera, width, height), False, f"the given {camera}")
+    turns = exif.quarter_turns_clockwise
+    try:
+        return Lens(key, load_camera(camera, width, height, quarter_turns_clockwise=turns), True, str(camera))
+    except MismatchError:
+        if turns % 2:
+            raise
+        # Upright pixels without an orientation: which way the camera was turned is not known, so the principal point
+        # may be mirrored, and the calibration is a first guess only.
+        turned = load_camera(camera, width, height, quarter_turns_clockwise=1)
+        return Lens(key, turned, False, f"{camera}, turned by 90°")
+
+
+def _lens_from_exif(key: str, exif: PhotoExif) -> Lens:
+    width, height = exif.upright_size
+    guess = guess_camera(width, height)
+    focal_px = focal_length_px(exif, width, height)
+    if focal_px is None:
+        return Lens(key, guess, False, "a guess: 1.2 × the longer side")
+    source = "the 35 mm equivalent" if exif.focal_length_35mm_mm else "the focal length and the sensor's width"
+    return Lens(key, replace(guess, fx=focal_px, fy=focal_px), False, source)
+
+
+def _drop_calibration_of_other_zooms(lenses: list[Lens | MismatchError], firsts: Sequence[PhotoExif]) -> list[str]:
+    """Replace the calibration of lenses whose EXIF says another zoom, if it says so of some lenses only; warnings."""
+    off = {}
+    for index, (lens, exif) in enumerate(zip(lenses, firsts, strict=True)):
+        focal_px = focal_length_px(exif, *exif.upright_size)
+        if isinstance(lens, Lens) and focal_px is not None:
+            off[index] = abs(math.log(focal_px / lens.camera.fx))
+    warnings = []
+    for index, disagreement in off.items():
+        lens = lenses[index]
+        if isinstance(lens, Lens) and disagreement > _FOCAL_DISAGREES >= min(off.values()):
+            own = _lens_from_exif(lens.key, firsts[index])
+            lenses[index] = own
+            warnings.append(
+                f"photos of {lens.key}: their EXIF data tell a focal length of {own.camera.fx:.0f} px, the camera file "
+                f"{lens.camera.fx:.0f} px: another zoom; they are calibrated anew"
+            )
+        elif isinstance(lens, Lens) and disagreement > _FOCAL_DISAGREES:
+            warnings.append(
+                f"the camera file gives a focal length of {lens.camera.fx:.0f} px, the EXIF data of {lens.key} tell "
+                "another; check that the camera file belongs to these photos"
+            )
+    return warnings

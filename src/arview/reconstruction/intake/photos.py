@@ -1,0 +1,262 @@
+"""intake_photos: photo files become Photos with a first camera each, and what is wrong with them is said in words."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from arview.errors import InputError, MismatchError
+from arview.photo_exif import PhotoExif
+from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck, check_photo, same_views, thumbnail
+from arview.reconstruction.intake.lenses import Lens, lenses_of
+from arview.reconstruction.intake.reading import RAW_SUFFIXES, Pixels, glance, photo_paths
+from arview.reconstruction.types import Photo
+
+Progress = Callable[[int, int], None]
+
+LEAST_PHOTOS = 3  # a third photo is the first that can contradict the other two
+GOOD_NUMBER = "20 to 40 photos from all around the part, each sharing more than half of what it shows with the next"
+_FEW_PHOTOS = 8
+_NAMES_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Intake:
+    """What intake made of the photos.
+
+    Attributes:
+        photos: usable ones, in natural order of their names.
+        rejected: (name, reason) of the others.
+        warnings: sentences on what is usable and yet not good.
+        checks: measures of every photo that could be read.
+        lenses: of the usable photos, the one with most photos first.
+    """
+
+    photos: tuple[Photo, ...]
+    rejected: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    checks: tuple[PhotoCheck, ...]
+    lenses: tuple[Lens, ...]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One photo that was read: what the file says of itself, its measures and its thumbnail."""
+
+    name: str
+    path: Path
+    exif: PhotoExif
+    check: PhotoCheck
+    thumbnail: Pixels
+
+
+def intake_photos(
+    source: str | Path | Sequence[str | Path],
+    camera: str | Path | None = None,
+    options: CheckOptions | None = None,
+    progress: Progress | None = None,
+) -> Intake:
+    """Read, judge and sort the photos of a folder.
+
+    Left out, with a reason, are files that cannot be read, thumbnails, panoramas, photos without any texture,
+    duplicates, photos blurred beyond use and those that the camera file does not fit. What is merely poor is kept and
+    said in a warning. Photos that show something else are found later, when photos are matched.
+
+    Args:
+        source: folder, glob, or list of photo files; other files in a folder are passed over.
+        camera: camera file, ``fov:DEG`` or, as None, ``exif``; see ``lenses_of``.
+        options: thresholds of the checks.
+        progress: called with the number of photos done and in all.
+
+    Raises:
+        InputError: nothing there, fewer than three usable photos, hardly any texture, or an unusable camera file.
+        MismatchError: the camera file fits none of the photos.
+    """
+    paths, names = photo_paths(source)
+    with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
+        seen: list[Seen] = []
+        rejected: dict[str, str] = {}
+        for done, (name, result) in enumerate(zip(names, pool.map(_look_at, paths, names), strict=True), 1):
+            if isinstance(result, Seen):
+                seen.append(result)
+            else:
+                rejected[name] = result
+            if progress:
+                progress(done, len(paths))
+    label = str(source) if isinstance(source, str | Path) else f"{len(paths)} files"
+    return assess(label, seen, rejected, camera, options or CheckOptions())
+
+
+def assess(
+    label: str, seen: Sequence[Seen], rejected: dict[str, str], camera: str | Path | None, options: CheckOptions
+) -> Intake:
+    """Intake of photos that have been looked at; ``rejected`` holds the reasons found so far. Raises as its caller."""
+    rejected = dict(rejected)
+    total = len(seen) + len(rejected)
+    for photo in seen:
+        reason = _unusable(photo, options)
+        if reason:
+            rejected[photo.name] = reason
+    _check_texture(label, seen, options)
+    usable = [photo for photo in seen if photo.name not in rejected]
+    rejected |= _duplicates(usable, options)
+    usable = [photo for photo in usable if photo.name not in rejected]
+    rejected |= _blurred_beyond_use(usable, options)
+    usable = [photo for photo in usable if photo.name not in rejected]
+    warnings = _judge_exposure(usable, options) + _judge_blur(usable, options)
+
+    lenses, lens_warnings = lenses_of([photo.exif for photo in usable], camera)
+    warnings += lens_warnings
+    photos = []
+    for photo, lens in zip(usable, lenses, strict=True):
+        if isinstance(lens, Lens):
+            width, height = photo.exif.upright_size
+            photos.append(Photo(photo.name, photo.path, width, height, lens.key, lens.camera, lens.is_calibrated))
+        else:
+            rejected[photo.name] = str(lens)
+    misfits = [lens for lens in lenses if isinstance(lens, MismatchError)]
+    if misfits and not photos:
+        raise misfits[0]
+    _check_number(label, photos, rejected, total)
+    used = {photo.lens for photo in photos}
+    by_key = {lens.key: lens for lens in lenses if isinstance(lens, Lens) and lens.key in used}
+    counts = {key: sum(photo.lens == key for photo in photos) for key in by_key}
+    warnings += _judge_numbers(photos, counts)
+    return Intake(
+        photos=tuple(photos),
+        rejected=tuple(rejected.items()),
+        warnings=tuple(warnings),
+        checks=tuple(photo.check for photo in seen),
+        lenses=tuple(sorted(by_key.values(), key=lambda lens: -counts[lens.key])),
+    )
+
+
+def _look_at(path: Path, name: str) -> Seen | str:
+    """The photo as far as needed to judge it, or why it cannot be read."""
+    if path.suffix.lower() in RAW_SUFFIXES:
+        return "is a raw photo; develop it to JPEG, with the same settings for all"
+    try:
+        seen = glance(path.read_bytes())
+    except OSError as error:
+        return f"cannot be read: {error.strerror or error}"
+    except InputError as error:
+        return str(error)
+    return Seen(name, path, seen.exif, check_photo(name, seen.gray), thumbnail(seen.gray))
+
+
+def _unusable(photo: Seen, options: CheckOptions) -> str:
+    """Why this photo is of no use whatever the others are like, else empty."""
+    width, height = photo.exif.upright_size
+    check = photo.check
+    if min(width, height) < options.least_side_px:
+        return f"has only {width}×{height} px; give the photo itself, not a thumbnail"
+    if max(width, height) > options.longest_aspect * min(width, height):
+        return f"is a panorama ({width}×{height} px), which no single camera position shows; give plain photos"
+    if check.textured >= options.least_textured:
+        return ""
+    if check.level_95 < options.dark_level:
+        return "is black or nearly so; take it again with more light"
+    if check.clipped > options.clipped:
+        return "is overexposed to white; take it again with less light"
+    return "shows no texture: a plain surface, or wholly out of focus"
+
+
+def _check_texture(label: str, seen: Sequence[Seen], options: CheckOptions) -> None:
+    plain = [photo.name for photo in seen if photo.check.textured < options.least_textured]
+    if plain and 2 * len(plain) > len(seen):
+        raise InputError(
+            f"{label}: {len(plain)} of {len(seen)} photos show no texture at all ({_listed(plain)}), so that there is "
+            "nothing to match; bring the part itself into view, in focus, on a patterned surface such as newspaper"
+        )
+
+
+def _duplicates(photos: Sequence[Seen], options: CheckOptions) -> dict[str, str]:
+    """Of photos of the same view, all but the largest and sharpest, with the reason."""
+
+    def rank(index: int) -> tuple[int, float, int]:
+        check = photos[index].check
+        size = photos[index].exif.width * photos[index].exif.height
+        return -size, check.blur_px if np.isfinite(check.blur_px) else np.inf, index
+
+    dropped: dict[str, str] = {}
+    for pair in same_views([photo.thumbnail for photo in photos], options):
+        best, other = (photos[index].name for index in sorted(pair, key=rank))
+        if best not in dropped and other not in dropped:
+            dropped[other] = f"shows the same as {best} from the same place; it adds nothing"
+    return dropped
+
+
+def _blurred_beyond_use(photos: Sequence[Seen], options: CheckOptions) -> dict[str, str]:
+    least = max(options.useless_px, options.useless_ratio * _usual_blur(photos))
+    reason = "is blurred beyond use (shaken or out of focus); take it again"
+    return {photo.name: reason for photo in photos if photo.check.blur_px > least}
+
+
+def _judge_blur(photos: Sequence[Seen], options: CheckOptions) -> list[str]:
+    worse = max(options.blurred_ratio * _usual_blur(photos), options.blurred_least_px)
+    least = min(worse, options.blurred_px)
+    # Where a photo is white, its edges end in white and look soft.
+    blurred = [p.name for p in photos if p.check.blur_px > least and p.check.clipped <= options.clipped]
+    if not blurred:
+        return []
+    advice = "focus on the part, hold the camera still and give it more light"
+    return [f"{_counted(blurred, len(photos), 'blurred')}, out of focus or shaken: {advice}"]
+
+
+def _usual_blur(photos: Sequence[Seen]) -> float:
+    """Median blur in px; 0 when no photo has edges."""
+    blurs = [photo.check.blur_px for photo in photos if np.isfinite(photo.check.blur_px)]
+    return float(np.median(blurs)) if blurs else 0.0
+
+
+def _judge_exposure(photos: Sequence[Seen], options: CheckOptions) -> list[str]:
+    usual = float(np.median([photo.check.clipped for photo in photos])) if photos else 0.0
+    most = min(options.clipped, usual + options.clipped_more)
+    bright = [photo.name for photo in photos if photo.check.clipped > most]
+    dark = [photo.name for photo in photos if photo.check.level_95 < options.dark_level]
+    warnings = []
+    if bright:
+        warnings.append(f"{_counted(bright, len(photos), 'overexposed')}: white areas cannot be measured; expose less")
+    if dark:
+        warnings.append(f"{_counted(dark, len(photos), 'very dark')}: give the part more light")
+    return warnings
+
+
+def _check_number(label: str, photos: Sequence[Photo], rejected: dict[str, str], total: int) -> None:
+    if len(photos) >= LEAST_PHOTOS:
+        return
+    usable = f"only {len(photos)}" if photos else "none"
+    reasons = "; ".join(f"{name} {reason}" for name, reason in list(rejected.items())[:_NAMES_SHOWN])
+    more = f"; and {len(rejected) - _NAMES_SHOWN} more" if len(rejected) > _NAMES_SHOWN else ""
+    why = f" ({reasons}{more})" if rejected else ""
+    raise InputError(
+        f"{label}: {usable} of {total} photos can be used{why}; take at least {LEAST_PHOTOS}, better {GOOD_NUMBER}"
+    )
+
+
+def _judge_numbers(photos: Sequence[Photo], counts: dict[str, int]) -> list[str]:
+    warnings = []
+    if len(photos) < _FEW_PHOTOS:
+        warnings.append(f"only {len(photos)} photos: the result will have gaps; take {GOOD_NUMBER}")
+    for key, count in counts.items():
+        if count < LEAST_PHOTOS and count < len(photos):
+            names = _listed([photo.name for photo in photos if photo.lens == key])
+            warnings.append(
+                f"{names} differs from the other photos in camera, zoom or size ({key}): with so few photos of it its "
+                "focal length is uncertain; use one camera without zoom, and photos that are not cropped"
+            )
+    return warnings
+
+
+def _counted(names: Sequence[str], total: int, state: str) -> str:
+    return f"{len(names)} of {total} photos {'is' if len(names) == 1 else 'are'} {state} ({_listed(names)})"
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+    return ", ".join(names[:_NAMES_SHOWN]) + more

@@ -1,0 +1,197 @@
+"""intake_video: sharp, well-spread frames of a video become photos."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.atomic import replacing
+from arview.errors import InputError, OutputError
+from arview.photo_exif import PhotoExif
+from arview.reconstruction.intake.checks import CheckOptions, check_photo, thumbnail
+from arview.reconstruction.intake.photos import LEAST_PHOTOS, Intake, Seen, assess
+from arview.reconstruction.intake.reading import GLANCE_PX, Pixels
+from arview.video import Frame, FrameSource, open_source
+
+_QUANTUM = 0.01  # of the diagonal: a move smaller than this may be the hand's tremble, and is not added up
+_MIN_TRACKED = 20  # points, and share of those found, below which the track has broken
+_MIN_TRACKED_SHARE = 0.3
+
+
+@dataclass(frozen=True)
+class VideoIntakeOptions:
+    """How frames are picked; raises InputError for values that pick none."""
+
+    max_frames: int = 60  # as many as sparse reconstruction places in about a minute
+    min_step: float = 0.025  # of the diagonal between frames: about 6° around a part that fills a third of the picture
+    looks_per_s: float = 10.0  # frames looked at; a hand-held camera hardly moves in a tenth of a second
+    tracked_px: int = 480  # longest side of the pictures that motion is tracked in
+    middle: float = 0.7  # share of each step that its frame is chosen from, so that two frames do not meet at its end
+    checks: CheckOptions = field(default_factory=CheckOptions)
+
+    def __post_init__(self) -> None:
+        if self.max_frames < LEAST_PHOTOS or not self.min_step > 0 or not self.looks_per_s > 0:
+            raise InputError(
+                f"max_frames {self.max_frames}, min_step {self.min_step}, looks_per_s {self.looks_per_s}: expected at "
+                f"least {LEAST_PHOTOS} frames and positive numbers"
+            )
+
+
+def intake_video(
+    path: str | Path,
+    folder: str | Path,
+    options: VideoIntakeOptions | None = None,
+    camera: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Intake:
+    """Pick frames of a video and write them into ``folder`` as ``frame_000123.png``, numbered as in the video.
+
+    The video is looked through once for the path of the picture's motion (median motion of tracked corners) and the
+    sharpness of each frame. The path is cut into equal steps, and the sharpest frame of each step's middle is taken.
+
+    Args:
+        path: video file, or folder or glob of its frames.
+        folder: where the frames are written; made when missing. Each file appears complete or not at all.
+        options: how frames are picked.
+        camera: camera file or ``fov:DEG``, as for ``intake_photos``.
+        progress: called with frames done and in all, over both passes; not when the number is unknown.
+
+    Raises:
+        InputError: no readable video, the camera does not move, or no texture.
+        MismatchError: the camera file does not fit the video.
+        OutputError: the frames cannot be written.
+    """
+    options = options or VideoIntakeOptions()
+    with open_source(path) as source:
+        if source.is_live:
+            raise InputError(f"{path}: is a live source; record a video first and give its file")
+        stride = max(1, round((source.fps or 30.0) / options.looks_per_s))
+    with open_source(path, stride=stride) as source:
+        total = 2 * (source.frame_count or 0)
+        indices, travel, sharpness = _look_through(source, options, progress, total)
+        chosen = {indices[k] for k in choose_frames(travel, sharpness, options)}
+        if len(chosen) < LEAST_PHOTOS:
+            raise InputError(
+                f"{path}: the camera hardly moves (the picture shifts by {100 * travel[-1]:.1f} % of its diagonal in "
+                "all); walk around the part while recording"
+            )
+        seen = []
+        for done, frame in enumerate(source, 1):
+            if frame.index in chosen:
+                seen.append(_written(frame, Path(folder), source.quarter_turns_clockwise))
+            if progress and total:
+                progress(min(total // 2 + done, total), total)
+            if len(seen) == len(chosen):
+                break
+        cut_short = source.ended_reason
+    intake = assess(str(path), seen, {}, camera, options.checks)
+    return replace(intake, warnings=(*intake.warnings, cut_short)) if cut_short else intake
+
+
+def choose_frames(
+    travel: NDArray[np.float64], sharpness: NDArray[np.float64], options: VideoIntakeOptions
+) -> list[int]:
+    """Indices of the sharpest frame in the middle of each of equal steps of ``travel`` (N,), which never falls."""
+    count = min(options.max_frames, int(travel[-1] / options.min_step) + 1)
+    place = travel / max(travel[-1], 1e-12) * count
+    step = np.minimum(place.astype(int), count - 1)
+    in_middle = np.abs(place - step - 0.5) <= 0.5 * options.middle
+    chosen = []
+    for k in range(count):
+        candidates = np.flatnonzero((step == k) & in_middle)
+        if len(candidates) == 0:
+            candidates = np.flatnonzero(step == k)
+        if len(candidates):
+            chosen.append(int(candidates[np.argmax(sharpness[candidates])]))
+    return chosen
+
+
+def _look_through(
+    source: FrameSource, options: VideoIntakeOptions, progress: Callable[[int, int], None] | None, total: int
+) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
+    """Index of each frame, how far the picture has travelled (in diagonals, never falling), and its sharpness."""
+    indices: list[int] = []
+    travel: list[float] = []
+    sharpness: list[float] = []
+    motion = _Motion(options)
+    for done, frame in enumerate(source, 1):
+        gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        travel.append(motion.add(_shrunk(gray, options.tracked_px)))
+        # Neighbouring frames show the same, so that plain contrast of fine detail tells which is the sharpest.
+        sharpness.append(float(cv2.Laplacian(_shrunk(gray, 2 * options.tracked_px), cv2.CV_32F).var()))
+        indices.append(frame.index)
+        if progress and total:
+            progress(min(done, total // 2), total)
+    if not indices:
+        raise InputError(f"{source.name}: no frame could be read; record or copy the video again")
+    return indices, np.maximum.accumulate(np.array(travel)), np.array(sharpness)
+
+
+class _Motion:
+    """Sums the picture's motion: corners are tracked from a reference, which is renewed after each real move."""
+
+    def __init__(self, options: VideoIntakeOptions) -> None:
+        self._lost_step = options.min_step  # what a broken track counts for: the view has changed
+        self._travelled = 0.0
+        self._previous: Pixels | None = None
+        self._reference: NDArray[np.float32] | None = None  # (N,1,2) px, in the reference picture
+        self._now: NDArray[np.float32] | None = None  # the same corners in the previous picture
+        self._found = 0
+
+    def add(self, gray: Pixels) -> float:
+        """Travel in picture diagonals up to this picture."""
+        previous, self._previous = self._previous, gray
+        if previous is None or self._now is None or self._reference is None:
+            self._restart(gray)
+            return self._travelled
+        now, forward, _ = cv2.calcOpticalFlowPyrLK(previous, gray, self._now, None)
+        back, backward, _ = cv2.calcOpticalFlowPyrLK(gray, previous, now, None)
+        good = (forward.ravel() > 0) & (backward.ravel() > 0) & (np.abs(back - self._now).max(axis=(1, 2)) < 1.0)
+        self._now, self._reference = now[good], self._reference[good]
+        if good.sum() < max(_MIN_TRACKED, _MIN_TRACKED_SHARE * self._found):
+            self._travelled += self._lost_step
+            self._restart(gray)
+            return self._travelled
+        moved_px = float(np.median(np.linalg.norm(self._now - self._reference, axis=2)))
+        moved = moved_px / float(np.hypot(*gray.shape))
+        if moved >= _QUANTUM:
+            self._travelled += moved
+            self._restart(gray)
+            return self._travelled
+        return self._travelled + moved
+
+    def _restart(self, gray: Pixels) -> None:
+        corners = cv2.goodFeaturesToTrack(gray, 300, 0.01, 8)
+        enough = corners is not None and len(corners) >= _MIN_TRACKED
+        self._reference = self._now = corners if enough else None
+        self._found = len(corners) if enough else 0
+
+
+def _shrunk(gray: Pixels, longest_px: int) -> Pixels:
+    scale = longest_px / max(gray.shape)
+    if scale >= 1:
+        return gray
+    size = round(gray.shape[1] * scale), round(gray.shape[0] * scale)
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+
+
+def _written(frame: Frame, folder: Path, turns: int) -> Seen:
+    """Write the frame as PNG and look at it."""
+    name = f"frame_{frame.index:06d}.png"
+    bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
+    _, png = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(folder / name) as file:
+            file.write(png.tobytes())
+    except OSError as error:
+        raise OutputError(f"cannot write {folder / name}: {error.strerror or error}") from error
+    gray = _shrunk(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), GLANCE_PX)
+    height, width = frame.image.shape[:2]
+    exif = PhotoExif(width, height, quarter_turns_clockwise=turns)
+    return Seen(name, folder / name, exif, check_photo(name, gray), thumbnail(gray))
