@@ -1,0 +1,253 @@
+"""Coverage guidance: from how many photos and directions each component is seen, and where photos are missing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from arview.cad.model import Model
+from arview.camera import Camera
+from arview.errors import InputError
+from arview.geometry import Array, apply, look_at
+from arview.raster import rasterise
+from arview.render import ZBufferRenderer
+
+
+@dataclass(frozen=True)
+class CoverageOptions:
+    """When a component counts as seen, and from how many places it should be."""
+
+    longest_px: int = 400  # of the pictures rendered; a component of 1 % of the width still has 16 px
+    least_px: int = 12  # visible pixels at that size, below which nothing can be matched on it
+    least_share: float = 0.3  # visible share of the component's own outline; less is a glimpse past others
+    direction_deg: float = 15.0  # views that differ by less count as one direction
+    photos_wanted: int = 4  # one more than the least that can contradict each other
+    directions_wanted: int = 3  # two give a distance, the third confirms it
+    one_side_deg: float = 40.0  # widest angle between two views of the part, below which depth is poorly known
+    alone_deg: float = 35.0  # a photo whose nearest neighbour is farther shares too little with it to be matched
+    gap_deg: float = 150.0  # azimuth range without photos that is worth a word
+    tried_directions: int = 80  # about 22° apart, from which a poorly seen component is looked for in the CAD
+
+
+@dataclass(frozen=True)
+class ComponentCoverage:
+    """How one component is seen.
+
+    Attributes:
+        name: of the component.
+        photos: indices of the poses from which it is seen.
+        directions: how many of its viewing directions differ by more than 15°.
+        spread_deg: widest angle between two of its viewing directions.
+        gap_deg: widest range of azimuth, about the axis of the photos' orbit, without a photo of it; 360 with none.
+    """
+
+    name: str
+    photos: tuple[int, ...]
+    directions: int
+    spread_deg: float
+    gap_deg: float
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Coverage of each component, and advice in words (empty when nothing is missing)."""
+
+    components: tuple[ComponentCoverage, ...]
+    advice: tuple[str, ...]
+
+
+def coverage(
+    model: Model,
+    views: Sequence[tuple[Camera, Array]],
+    options: CoverageOptions | None = None,
+    names: Sequence[str] | None = None,
+) -> Coverage:
+    """From how many photos and directions each component is seen, not hidden by others.
+
+    Args:
+        model: the nominal CAD.
+        views: (camera, ``cam_from_model`` (4,4)) of each photo.
+        options: thresholds.
+        names: of the photos, for the advice; else they are numbered from 1.
+
+    Raises:
+        InputError: no views, or names of another number.
+    """
+    options = options or CoverageOptions()
+    if not views:
+        raise InputError("coverage: no camera poses given; place the photos first")
+    names = [f"photo {number}" for number in range(1, len(views) + 1)] if names is None else names
+    if len(names) != len(views):
+        raise InputError(f"coverage: {len(names)} names for {len(views)} camera poses")
+    centres = np.array([-pose[:3, :3].T @ pose[:3, 3] for _, pose in views])
+    axis = _orbit_axis(_unit(centres - model.center_in_model))
+    seen = np.array([_seen(model, camera, pose, options) for camera, pose in views])
+    components = []
+    for index, component in enumerate(model.components):
+        photos = np.flatnonzero(seen[:, index])
+        directions = _unit(centres[photos] - component.bounds_in_model.mean(axis=0))
+        components.append(
+            ComponentCoverage(
+                component.name,
+                tuple(int(photo) for photo in photos),
+                _distinct(directions, options.direction_deg),
+                _spread_deg(directions),
+                _gap(directions, axis)[0],
+            )
+        )
+    advice = _advice_on_part(model, names, centres, axis, options)
+    advice += _advice_on_components(model, components, views[0][0], centres, axis, options)
+    return Coverage(tuple(components), tuple(advice))
+
+
+def _seen(model: Model, camera: Camera, cam_from_model: Array, options: CoverageOptions) -> list[bool]:
+    """For each component whether the photo shows enough of it."""
+    scale = min(1.0, options.longest_px / max(camera.width, camera.height))
+    small = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    ids = ZBufferRenderer(model, small).render(cam_from_model).component_ids
+    visible = np.bincount(ids[ids >= 0], minlength=len(model.components))
+    result = []
+    for component, pixels in zip(model.components, visible, strict=True):
+        enough = bool(pixels >= options.least_px)
+        if enough:
+            points = apply(cam_from_model, component.vertices_in_model)
+            _, faces = rasterise(
+                points, component.faces, small.fx, small.fy, small.cx, small.cy, small.width, small.height
+            )
+            enough = bool(pixels >= options.least_share * np.count_nonzero(faces >= 0))
+        result.append(enough)
+    return result
+
+
+def _advice_on_part(
+    model: Model, names: Sequence[str], centres: Array, axis: Array, options: CoverageOptions
+) -> list[str]:
+    directions = _unit(centres - model.center_in_model)
+    spread_deg = _spread_deg(directions)
+    if spread_deg < options.one_side_deg:
+        return [
+            f"all photos are taken from one side (within {spread_deg:.0f}°): depth is poorly known; walk around the "
+            "part, or at least a quarter of the way"
+        ]
+    advice = []
+    cosines = directions @ directions.T
+    np.fill_diagonal(cosines, -1.0)
+    nearest_deg = np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))
+    for photo in np.flatnonzero(nearest_deg > options.alone_deg):
+        advice.append(
+            f"{names[photo]} overlaps too little with the others (the nearest was taken {nearest_deg[photo]:.0f}° "
+            "away); add photos between them"
+        )
+    gap_deg, towards = _gap(directions, axis)
+    if gap_deg > options.gap_deg:
+        advice.append(f"no photo within {gap_deg:.0f}° around the side {_named(towards)}; take some from there")
+    return advice
+
+
+def _advice_on_components(
+    model: Model,
+    components: Sequence[ComponentCoverage],
+    camera: Camera,
+    centres: Array,
+    axis: Array,
+    options: CoverageOptions,
+) -> list[str]:
+    poor = [
+        index
+        for index, covered in enumerate(components)
+        if len(covered.photos) < options.photos_wanted or covered.directions < options.directions_wanted
+    ]
+    if not poor:
+        return []
+    # Where else each component could be seen from, as the CAD tells: cameras all around at the photos' distance.
+    distance_mm = float(np.median(np.linalg.norm(centres - model.center_in_model, axis=1)))
+    tried = model.center_in_model + distance_mm * _sphere(options.tried_directions)
+    up = np.array([0.0, 0.0, 1.0])
+    visible = np.array([_seen(model, camera, look_at(eye, model.center_in_model, up), options) for eye in tried])
+    lowest = float((_unit(centres - model.center_in_model) @ axis).min())
+    in_reach = _unit(tried - model.center_in_model) @ axis >= lowest - 0.1
+
+    advice = []
+    for index in poor:
+        covered, middle = components[index], model.components[index].bounds_in_model.mean(axis=0)
+        if covered.photos:
+            photos, directions = _count(len(covered.photos), "photo"), _count(covered.directions, "direction")
+            state = f"{covered.name} is seen in {photos} from {directions} only"
+        else:
+            state = f"{covered.name} is seen in no photo"
+        where = visible[:, index] & in_reach if np.any(visible[:, index] & in_reach) else visible[:, index]
+        if not where.any():
+            advice.append(f"{state}; other components hide it from every side, so that photos cannot measure it")
+            continue
+        candidates = _unit(tried[where] - middle)
+        taken = _unit(centres[list(covered.photos)] - middle)
+        nearest = (candidates @ taken.T).max(axis=1) if len(taken) else -(candidates @ axis)
+        missing = max(options.photos_wanted - len(covered.photos), options.directions_wanted - covered.directions)
+        side = _named(_unit(tried[where][np.argmin(nearest)] - model.center_in_model))
+        advice.append(f"{state}; take {missing} more of it, for example from the side {side}")
+    return advice
+
+
+def _sphere(count: int) -> Array:
+    """Directions (count, 3) spread evenly over the sphere (Fibonacci lattice)."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], axis=1)
+
+
+def _orbit_axis(directions: Array) -> Array:
+    """The axis about which the photos were taken: normal to their widest plane, on their side of the part."""
+    mean = directions.mean(axis=0)
+    if len(directions) < 3:
+        return _unit(mean)
+    axis = np.linalg.svd(directions - mean)[2][2]
+    return np.asarray(axis if axis @ mean >= 0 else -axis)
+
+
+def _distinct(directions: Array, apart_deg: float) -> int:
+    """How many directions (N,3) remain when those closer than an angle to one already kept are left out."""
+    kept: list[Array] = []
+    for direction in directions:
+        if all(direction @ other < math.cos(math.radians(apart_deg)) for other in kept):
+            kept.append(direction)
+    return len(kept)
+
+
+def _spread_deg(directions: Array) -> float:
+    if len(directions) < 2:
+        return 0.0
+    return math.degrees(math.acos(float(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
+
+
+def _gap(directions: Array, axis: Array) -> tuple[float, Array]:
+    """Widest range of azimuth about ``axis`` without a direction, in degrees, and the unit vector into its middle."""
+    across = _unit(np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0]))
+    up = np.cross(axis, across)
+    off_axis = directions[np.linalg.norm(np.cross(directions, axis), axis=1) > math.sin(math.radians(5.0))]
+    if len(off_axis) == 0:
+        return 360.0, across
+    azimuth = np.sort(np.arctan2(off_axis @ up, off_axis @ across))
+    gaps = np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi))
+    widest = int(np.argmax(gaps))
+    middle = azimuth[widest] + 0.5 * gaps[widest]
+    return math.degrees(gaps[widest]), math.cos(middle) * across + math.sin(middle) * up
+
+
+def _named(direction: Array) -> str:
+    """A direction by the model's axes, e.g. ``+x −y``."""
+    words = [
+        f"{'+' if value > 0 else '−'}{name}" for name, value in zip("xyz", direction, strict=True) if abs(value) > 0.38
+    ]
+    return " ".join(words) + " of the model"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
