@@ -138,7 +138,7 @@ def _advice_on_part(
     nearest_deg = np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))
     for photo in np.flatnonzero(nearest_deg > options.alone_deg):
         advice.append(
-            f"{names[photo]} overlaps too little with the others (the nearest was taken {nearest_deg[photo]:.0f}° "
+            f"{names[int(photo)]} overlaps too little with the others (the nearest was taken {nearest_deg[photo]:.0f}° "
             "away); add photos between them"
         )
     gap_deg, towards = _gap(directions, axis)
