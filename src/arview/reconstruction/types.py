@@ -66,6 +66,8 @@ class SparseModel:
         observed_point, observed_photo: (K,) int32 indices, one entry for each time a point was seen.
         observed_px: (K,2) where, in the distorted photo; integers are pixel centres.
         unplaced: (name, reason) of photos that could not be placed.
+        pose_covariance: (6M,6M) of the poses together, from bundle adjustment: for each photo a twist (rad, unit)
+            applied on the left of ``cam_from_scan``. The scan frame is that in which the cameras together vary least.
     """
 
     photos: tuple[PosedPhoto, ...]
@@ -76,6 +78,7 @@ class SparseModel:
     observed_photo: Indices
     observed_px: Array
     unplaced: tuple[tuple[str, str], ...] = field(default=())
+    pose_covariance: Array | None = None
 
     def __post_init__(self) -> None:
         if len(self.observed_point) != len(self.observed_photo) or len(self.observed_point) != len(self.observed_px):
@@ -92,7 +95,11 @@ class SparseModel:
             scaled = rigid(photo.cam_from_scan[:3, :3], scale * photo.cam_from_scan[:3, 3])
             photos.append(replace(photo, cam_from_scan=scaled @ invert(new_from_scan)))
         points = apply(new_from_scan, scale * self.points_in_scan)
-        return replace(self, photos=tuple(photos), points_in_scan=points)
+        covariance = self.pose_covariance
+        if covariance is not None:
+            factors = np.tile([1.0, 1.0, 1.0, scale, scale, scale], len(photos))
+            covariance = covariance * np.outer(factors, factors)
+        return replace(self, photos=tuple(photos), points_in_scan=points, pose_covariance=covariance)
 
 
 @dataclass(frozen=True)

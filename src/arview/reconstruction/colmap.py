@@ -1,0 +1,104 @@
+"""The one place that knows pycolmap: its import, its half pixel, its cameras and reconstructions.
+
+COLMAP puts the centre of the first pixel at (0.5, 0.5), arview at (0, 0).
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arview.camera import Camera
+from arview.errors import MissingDependencyError
+from arview.geometry import rigid
+from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
+
+HALF_PX = 0.5
+SELF_CALIBRATED_MODEL, CALIBRATED_MODEL = "RADIAL", "FULL_OPENCV"
+
+
+def import_pycolmap() -> Any:
+    """The module pycolmap, quiet, and loaded after Python's own zlib: the other order corrupts the heap.
+
+    Raises MissingDependencyError when it is not installed.
+    """
+    zlib.crc32(b"")
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise MissingDependencyError(f"pycolmap cannot be loaded ({error}); pip install pycolmap") from error
+    pycolmap.logging.minloglevel = 3
+    return pycolmap
+
+
+def colmap_camera(camera: Camera, is_calibrated: bool) -> Any:
+    """A pycolmap camera: RADIAL (one focal length, k1, k2) to be refined, FULL_OPENCV when calibrated."""
+    pycolmap = import_pycolmap()
+    cx, cy = camera.cx + HALF_PX, camera.cy + HALF_PX
+    k1, k2, p1, p2, k3 = camera.dist
+    if is_calibrated:
+        model, params = CALIBRATED_MODEL, [camera.fx, camera.fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
+    else:
+        model, params = SELF_CALIBRATED_MODEL, [0.5 * (camera.fx + camera.fy), cx, cy, k1, k2]
+    return pycolmap.Camera(
+        model=model, width=camera.width, height=camera.height, params=params, has_prior_focal_length=True
+    )
+
+
+def camera_of(camera: Any) -> Camera:
+    """A Camera from a pycolmap camera of one of the models that ``colmap_camera`` makes."""
+    params = np.asarray(camera.params, dtype=np.float64)
+    if camera.model.name == SELF_CALIBRATED_MODEL:
+        focal, cx, cy, k1, k2 = params
+        fx = fy = focal
+        dist = np.array([k1, k2, 0.0, 0.0, 0.0])
+    else:
+        fx, fy, cx, cy, k1, k2, p1, p2, k3 = params[:9]
+        dist = np.array([k1, k2, p1, p2, k3])
+    return Camera(camera.width, camera.height, fx, fy, cx - HALF_PX, cy - HALF_PX, dist)
+
+
+def sparse_model_of(
+    reconstruction: Any, photos: Sequence[Photo], unplaced: Sequence[tuple[str, str]] = ()
+) -> SparseModel:
+    """The SparseModel of a pycolmap reconstruction; photos keep their order."""
+    paths = {photo.name: photo.path for photo in photos}
+    order = {photo.name: place for place, photo in enumerate(photos)}
+    images = sorted(
+        (image for image in reconstruction.images.values() if image.has_pose and image.name in paths),
+        key=lambda image: order[image.name],
+    )
+    place_of = {image.image_id: place for place, image in enumerate(images)}
+    posed = []
+    for image in images:
+        matrix = np.asarray(image.cam_from_world().matrix())
+        camera = camera_of(reconstruction.cameras[image.camera_id])
+        posed.append(PosedPhoto(image.name, paths[image.name], camera, rigid(matrix[:, :3], matrix[:, 3])))
+    point_ids = sorted(reconstruction.points3D)
+    seen_point, seen_photo, seen_px = [], [], []
+    for row, point_id in enumerate(point_ids):
+        for element in reconstruction.points3D[point_id].track.elements:
+            if element.image_id in place_of:
+                seen_point.append(row)
+                seen_photo.append(place_of[element.image_id])
+                seen_px.append(reconstruction.images[element.image_id].points2D[element.point2D_idx].xy)
+    points = [reconstruction.points3D[point_id] for point_id in point_ids]
+    return SparseModel(
+        photos=tuple(posed),
+        points_in_scan=np.array([point.xyz for point in points]).reshape(-1, 3),
+        colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        point_errors_px=np.array([point.error for point in points], dtype=np.float64),
+        observed_point=np.array(seen_point, dtype=np.int32),
+        observed_photo=np.array(seen_photo, dtype=np.int32),
+        observed_px=np.array(seen_px, dtype=np.float64).reshape(-1, 2) - HALF_PX,
+        unplaced=tuple(unplaced),
+    )
+
+
+def read_reconstruction(folder: Path) -> Any:
+    """The pycolmap reconstruction written in ``folder``."""
+    return import_pycolmap().Reconstruction(str(folder))

@@ -1,0 +1,87 @@
+"""How well the camera poses are known, from bundle adjustment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from arview.geometry import Array, skew
+from arview.reconstruction.colmap import import_pycolmap
+from arview.reconstruction.types import SparseModel
+
+# Ceres moves a unit quaternion by half the rotation vector: its covariance is a quarter of the rotation's.
+_RAD_PER_TANGENT = 2.0
+
+
+def pose_covariance(sparse: SparseModel, model: Any, adjuster: Any) -> Array | None:
+    """(6M,6M) covariance of the poses of ``sparse.photos``, see ``SparseModel``; None when it cannot be computed.
+
+    The inverse of the adjustment's information holds for observations with 1 px of noise and with three points
+    held. It is scaled by the noise that the residuals show, and moved to the frame in which the cameras together
+    vary least (S-transformation, Baarda 1973): no camera is then better than the others by being held.
+    """
+    pycolmap = import_pycolmap()
+    options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POSES)
+    estimate = pycolmap.estimate_ba_covariance(options, model, adjuster)
+    if estimate is None:
+        return None
+    ids = {model.images[image_id].name: image_id for image_id in model.reg_image_ids()}
+    size = 6 * len(sparse.photos)
+    joint = np.zeros((size, size))
+    maps = []
+    for i, photo in enumerate(sparse.photos):
+        # COLMAP's parameters are the rotation, moved on the left, and the translation, moved by itself.
+        twist_from_tangent = np.eye(6)
+        twist_from_tangent[:3, :3] *= _RAD_PER_TANGENT
+        twist_from_tangent[3:, :3] = _RAD_PER_TANGENT * skew(photo.cam_from_scan[:3, 3])
+        maps.append(twist_from_tangent)
+        for j in range(i + 1):
+            block = estimate.get_cam_cross_cov_from_world(ids[photo.name], ids[sparse.photos[j].name])
+            if block is not None:
+                moved = maps[i] @ np.asarray(block) @ maps[j].T
+                joint[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = moved
+                joint[6 * j : 6 * j + 6, 6 * i : 6 * i + 6] = moved.T
+    joint *= _noise_variance(sparse)
+    projection = free_frame_projection(sparse)
+    return projection @ joint @ projection.T
+
+
+def _noise_variance(sparse: SparseModel) -> float:
+    """Variance in px² of one coordinate of an observation, robust against the outliers that are left."""
+    residuals = reprojection_residuals(sparse)
+    unknowns = 3 * len(sparse.points_in_scan) + 6 * len(sparse.photos)
+    fit = residuals.size / max(1, residuals.size - unknowns)  # the unknowns take up a share of the noise
+    return float((1.4826 * np.median(np.abs(residuals))) ** 2 * fit)
+
+
+def reprojection_residuals(sparse: SparseModel) -> Array:
+    """(K,2) observed minus projected pixels of every observation."""
+    residuals = np.empty_like(sparse.observed_px)
+    for index, photo in enumerate(sparse.photos):
+        seen = sparse.observed_photo == index
+        points = sparse.points_in_scan[sparse.observed_point[seen]]
+        in_cam = points @ photo.cam_from_scan[:3, :3].T + photo.cam_from_scan[:3, 3]
+        residuals[seen] = sparse.observed_px[seen] - photo.camera.project(in_cam)
+    return residuals
+
+
+def free_frame_projection(sparse: SparseModel) -> Array:
+    """(6M,6M) projection of left twists of the poses that leaves out what only moves, turns or scales the frame."""
+    blocks = []
+    for photo in sparse.photos:
+        # Left twists that a small turn, shift and scaling of the scan frame about its origin amount to.
+        rotation, translation = photo.cam_from_scan[:3, :3], photo.cam_from_scan[:3, 3]
+        block = np.zeros((6, 7))
+        block[:3, :3] = rotation
+        block[3:, :3] = skew(translation) @ rotation
+        block[3:, 3:6] = rotation
+        block[3:, 6] = translation
+        blocks.append(block)
+    gauge = np.concatenate(blocks)
+    centres = np.array([photo.centre_in_scan for photo in sparse.photos])
+    unit = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
+    # Lengths are weighed against angles by the size of the cameras' path.
+    weights = np.tile([1.0, 1.0, 1.0, 1.0 / unit, 1.0 / unit, 1.0 / unit], len(sparse.photos))
+    weighed = gauge * weights[:, None]
+    return np.eye(len(gauge)) - (gauge @ np.linalg.pinv(weighed)) * weights[None, :]

@@ -1,0 +1,104 @@
+"""SIFT features of the photos, by OpenCV."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.reconstruction.intake import read_photo
+from arview.reconstruction.types import Photo
+
+Descriptors = NDArray[np.float32]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """How features are found."""
+
+    max_features: int = 8000  # a photo; more cost time in matching and add little but short tracks
+    max_side_px: int = 2000  # larger photos are reduced to this: SIFT's time grows with the area
+    contrast_threshold: float = 0.02  # OpenCV's default 0.04 leaves little on mill scale and brushed metal
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of one photo, the strongest of every region of it first.
+
+    Attributes:
+        points_px: (N,2) float32 in the photo at full size; integers are pixel centres.
+        descriptors: (N,128) float32 unit vectors, RootSIFT (Arandjelović and Zisserman 2012).
+        sizes_px: (N,) float32 diameter of the described neighbourhood.
+    """
+
+    points_px: NDArray[np.float32]
+    descriptors: Descriptors
+    sizes_px: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.points_px)
+
+
+def find_features(image: NDArray[np.uint8], options: FeatureOptions | None = None) -> Features:
+    """SIFT features of an (H,W,3) RGB picture, spread over it.
+
+    ``enable_precise_upscale`` matters: without it OpenCV's key points are shifted by a quarter of a pixel.
+    """
+    options = options or FeatureOptions()
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    height, width = grey.shape
+    reduction = max(1.0, max(height, width) / options.max_side_px)
+    if reduction > 1.0:
+        size = (round(width / reduction), round(height / reduction))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    scale = np.array([width / grey.shape[1], height / grey.shape[0]], dtype=np.float32)
+    sift = cv2.SIFT_create(
+        nfeatures=options.max_features,
+        contrastThreshold=options.contrast_threshold,
+        enable_precise_upscale=True,
+    )
+    keys, sums = sift.detectAndCompute(grey, None)
+    if not keys:
+        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
+    points = np.array([key.pt for key in keys], dtype=np.float32)
+    strength = np.array([key.response for key in keys])
+    order = _spread(points, strength, grey.shape)[: options.max_features]
+    roots = np.sqrt(sums / np.maximum(sums.sum(axis=1, keepdims=True), 1e-9))
+    roots /= np.maximum(np.linalg.norm(roots, axis=1, keepdims=True), 1e-9)
+    return Features(
+        points_px=(points[order] + 0.5) * scale - 0.5,
+        descriptors=np.ascontiguousarray(roots[order], dtype=np.float32),
+        sizes_px=np.array([key.size for key in keys], dtype=np.float32)[order] * scale.mean(),
+    )
+
+
+def _spread(points: NDArray[np.float32], strength: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.intp]:
+    """The order in which the first n, for any n, are strong and spread over an 8×8 grid of the picture."""
+    cells = np.minimum((points / (shape[1], shape[0]) * 8).astype(int), 7)
+    cell = np.maximum(cells, 0) @ (1, 8)
+    by_cell = np.lexsort((-strength, cell))
+    starts = np.searchsorted(cell[by_cell], np.arange(64))
+    rank = np.empty(len(points))
+    rank[by_cell] = np.arange(len(points)) - starts[cell[by_cell]]
+    return np.lexsort((-strength, rank))
+
+
+def find_all_features(
+    photos: Sequence[Photo], options: FeatureOptions, threads: int, progress: Progress | None = None
+) -> list[Features]:
+    """Features of every photo, in their order; photos are read and searched by ``threads`` at a time.
+
+    Raises InputError when a photo cannot be read.
+    """
+    found: list[Features] = []
+    with ThreadPoolExecutor(threads) as pool:
+        for features in pool.map(lambda photo: find_features(read_photo(photo.path), options), photos):
+            found.append(features)
+            if progress:
+                progress(len(found), len(photos))
+    return found

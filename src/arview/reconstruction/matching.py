@@ -1,0 +1,184 @@
+"""Which features of two photos are the same place: by appearance, then along the epipolar lines."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.geometry import Array
+from arview.reconstruction.features import Descriptors, Features
+
+Matches = NDArray[np.uint32]
+
+MAX_RATIO = 0.8  # angle to the best against the second best; Lowe 2004
+MAX_ANGLE_RAD = 0.7  # between descriptors of one place
+_BLOCK = 512  # rows of similarities held at a time: they stay in the cache
+
+
+@njit(cache=True, nogil=True)
+def _best(similarity, first_row, partner, best, second, column_best, column_row):  # type: ignore[no-untyped-def]
+    """Best and second best column of each row, best row of each column; rows start at ``first_row``."""
+    for i in range(similarity.shape[0]):
+        row = i + first_row
+        high, next_high, at = np.float32(-2.0), np.float32(-2.0), 0
+        for j in range(similarity.shape[1]):
+            value = similarity[i, j]
+            if value > next_high:
+                if value > high:
+                    next_high, high, at = high, value, j
+                else:
+                    next_high = value
+            if value > column_best[j]:
+                column_best[j] = value
+                column_row[j] = row
+        partner[row], best[row], second[row] = at, high, next_high
+
+
+def match_descriptors(ones: Descriptors, others: Descriptors) -> Matches:
+    """(M,2) rows of ``ones`` and ``others`` that are each other's nearest and clearly nearer than the next."""
+    if len(ones) < 2 or len(others) < 2:
+        return np.zeros((0, 2), np.uint32)
+    partner = np.empty(len(ones), np.int32)
+    best, second = np.empty(len(ones), np.float32), np.empty(len(ones), np.float32)
+    column_best, column_row = np.full(len(others), -2.0, np.float32), np.zeros(len(others), np.int32)
+    for start in range(0, len(ones), _BLOCK):
+        similarity = ones[start : start + _BLOCK] @ others.T
+        _best(similarity, start, partner, best, second, column_best, column_row)
+    rows = np.arange(len(ones))
+    angle, next_angle = np.arccos(np.clip(best, -1, 1)), np.arccos(np.clip(second, -1, 1))
+    good = (angle < MAX_RATIO * next_angle) & (angle < MAX_ANGLE_RAD) & (column_row[partner] == rows)
+    return np.stack([rows[good], partner[good]], axis=1).astype(np.uint32)
+
+
+def epipolar_inliers(ones: Features, others: Features, matches: Matches, max_error_px: float) -> Matches:
+    """The matches that lie near epipolar lines of one fundamental matrix (MAGSAC++, Barath 2020)."""
+    if len(matches) < 8:
+        return matches[:0]
+    points = ones.points_px[matches[:, 0]].astype(np.float64)
+    partners = others.points_px[matches[:, 1]].astype(np.float64)
+    # OpenCV's USAC starts from a fixed seed: the same matches give the same inliers.
+    matrix, mask = cv2.findFundamentalMat(points, partners, cv2.USAC_MAGSAC, max_error_px, 0.999, 5000)
+    if matrix is None or mask is None:
+        return matches[:0]
+    return matches[mask.ravel() > 0]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _match_along(
+    rays,
+    other_px,
+    descriptors,
+    others,
+    sizes,
+    other_sizes,
+    essential,
+    focal,
+    band_px,
+    cells,
+    starts,
+    cell_px,
+    columns,
+    rows,
+    partner,
+    best,
+    second,
+):  # type: ignore[no-untyped-def]
+    """Best and second best of ``others`` within ``band_px`` of each ray's epipolar line.
+
+    ``rays`` are ideal directions (N,2), ``other_px`` ideal pixels about the principal point; ``cells`` lists
+    the features of each cell of a grid over ``other_px`` from ``starts``.
+    """
+    low_x, low_y = cell_px[1], cell_px[2]
+    step = cell_px[0]
+    for i in range(rays.shape[0]):
+        x, y = rays[i, 0], rays[i, 1]
+        a = essential[0, 0] * x + essential[0, 1] * y + essential[0, 2]
+        b = essential[1, 0] * x + essential[1, 1] * y + essential[1, 2]
+        c = (essential[2, 0] * x + essential[2, 1] * y + essential[2, 2]) * focal
+        norm = np.sqrt(a * a + b * b)
+        if norm < 1e-12:
+            continue
+        a, b, c = a / norm, b / norm, c / norm
+        is_flat = abs(b) > abs(a)
+        high, next_high, at = np.float32(-2.0), np.float32(-2.0), -1
+        for along in range(columns if is_flat else rows):
+            # Where the line crosses this column (row) of cells, and the cells within the band of it.
+            if is_flat:
+                u0, u1 = low_x + along * step, low_x + (along + 1) * step
+                v0, v1 = -(a * u0 + c) / b, -(a * u1 + c) / b
+                first = int(np.floor((min(v0, v1) - 1.5 * band_px - low_y) / step))
+                last = int(np.floor((max(v0, v1) + 1.5 * band_px - low_y) / step))
+                first, last = max(first, 0), min(last, rows - 1)
+            else:
+                v0, v1 = low_y + along * step, low_y + (along + 1) * step
+                u0, u1 = -(b * v0 + c) / a, -(b * v1 + c) / a
+                first = int(np.floor((min(u0, u1) - 1.5 * band_px - low_x) / step))
+                last = int(np.floor((max(u0, u1) + 1.5 * band_px - low_x) / step))
+                first, last = max(first, 0), min(last, columns - 1)
+            for across in range(first, last + 1):
+                cell = across * columns + along if is_flat else along * columns + across
+                for k in range(starts[cell], starts[cell + 1]):
+                    j = cells[k]
+                    if abs(a * other_px[j, 0] + b * other_px[j, 1] + c) > band_px:
+                        continue
+                    if sizes[i] > 2.5 * other_sizes[j] or other_sizes[j] > 2.5 * sizes[i]:
+                        continue
+                    value = np.float32(0.0)
+                    for d in range(descriptors.shape[1]):
+                        value += descriptors[i, d] * others[j, d]
+                    # A key point may be there twice, with two directions: it is no rival of itself.
+                    is_same = at >= 0 and (
+                        abs(other_px[j, 0] - other_px[at, 0]) + abs(other_px[j, 1] - other_px[at, 1]) < band_px
+                    )
+                    if value > high:
+                        if not is_same:
+                            next_high = high
+                        high, at = value, j
+                    elif value > next_high and not is_same:
+                        next_high = value
+        partner[i], best[i], second[i] = at, high, next_high
+
+
+def match_along_lines(
+    rays: tuple[Array, Array], focal_px: float, features: tuple[Features, Features], essential: Array, band_px: float
+) -> Matches:
+    """Matches of two photos whose relative pose is known, searched along the epipolar lines only.
+
+    ``rays`` are the ideal directions (N,2), at z = 1, of the features of both photos, ``essential`` (3,3) maps a ray
+    of the first to its line in the second. So few candidates are compared that weak features, and those that
+    occur many times in a photo, find their partners too.
+    """
+    there = _along_one_way(rays, focal_px, features, essential, band_px)
+    back = _along_one_way(rays[::-1], focal_px, features[::-1], essential.T.copy(), band_px)
+    rows = np.flatnonzero(there >= 0)
+    mutual = rows[back[there[rows]] == rows]
+    return np.stack([mutual, there[mutual]], axis=1).astype(np.uint32)
+
+
+def _along_one_way(
+    rays: tuple[Array, ...], focal_px: float, features: tuple[Features, ...], essential: Array, band_px: float
+) -> NDArray[np.int32]:
+    """For each feature of the first photo its partner in the second, or −1."""
+    ones, others = features
+    partner = np.full(len(ones), -1, np.int32)
+    if len(ones) == 0 or len(others) == 0:
+        return partner
+    best, second = np.full(len(ones), -2.0, np.float32), np.full(len(ones), -2.0, np.float32)
+    other_px = rays[1] * focal_px
+    step = 8.0
+    low = other_px.min(axis=0)
+    at = ((other_px - low) / step).astype(np.int32)
+    columns, rows = (at.max(axis=0) + 1).tolist()
+    cell = at[:, 1] * columns + at[:, 0]
+    cells = np.argsort(cell, kind="stable").astype(np.int32)
+    starts = np.searchsorted(cell[cells], np.arange(columns * rows + 1)).astype(np.int32)
+    grid = np.array([step, low[0], low[1]])
+    _match_along(
+        rays[0], other_px, ones.descriptors, others.descriptors, ones.sizes_px, others.sizes_px, essential, focal_px,
+        band_px, cells, starts, grid, columns, rows, partner, best, second,
+    )  # fmt: skip
+    angle, next_angle = np.arccos(np.clip(best, -1, 1)), np.arccos(np.clip(second, -1, 1))
+    partner[(angle > MAX_RATIO * next_angle) | (angle > MAX_ANGLE_RAD)] = -1
+    return partner

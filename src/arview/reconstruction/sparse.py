@@ -1,0 +1,399 @@
+"""Structure from motion: where each photo was taken from, and the intrinsics of its lens.
+
+Two passes. The strongest features of every photo are matched by appearance and give the poses (COLMAP's incremental
+mapper, Schönberger and Frahm 2016). With the poses known, all features are matched again along the epipolar lines,
+which costs little and finds many more partners; the points are triangulated anew and everything is adjusted
+together (Triggs et al. 2000).
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arview.camera import Camera
+from arview.errors import InputError
+from arview.geometry import Array, invert, skew
+from arview.reconstruction.colmap import CALIBRATED_MODEL, HALF_PX, colmap_camera, import_pycolmap, sparse_model_of
+from arview.reconstruction.covariance import pose_covariance
+from arview.reconstruction.features import FeatureOptions, Features, find_all_features
+from arview.reconstruction.matching import Matches, epipolar_inliers, match_along_lines, match_descriptors
+from arview.reconstruction.types import Photo, SparseModel
+
+Progress = Callable[[str, int, int], None]
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class SparseOptions:
+    """How photos are placed."""
+
+    features: FeatureOptions = field(default_factory=FeatureOptions)
+    first_features: int = 3000  # a photo, in the first pass: matching by appearance grows with the square
+    preview_features: int = 400  # a photo, to choose the pairs worth matching; Wu 2013
+    preview_matches: int = 5  # of those, in a pair worth matching; chance gives 0 to 3
+    all_pairs_up_to: int = 12  # photos; every pair is matched
+    neighbours: int = 3  # next photos in order that are matched in any case: a walk round the part, a video
+    max_epipolar_px: float = 4.0  # first pass, before the distortion is known
+    band_px: float = 2.0  # second pass, about the epipolar lines
+    min_matches: int = 15  # a pair with fewer is chance
+    max_error_px: float = 2.0  # observations further from their point are left out of the last adjustment
+    min_centre_move: float = 0.001  # of the longer side; smaller moves of the principal point are not believed
+    max_centre_move: float = 0.05  # and larger ones are not a lens's: the views do not determine it
+    min_angle_deg: float = 1.5  # between two rays to a point: depth is not determined below
+    seed: int = 0
+    threads: int = 0  # 0: all cores
+
+
+def reconstruct_sparse(
+    photos: Sequence[Photo], folder: Path, options: SparseOptions | None = None, progress: Progress | None = None
+) -> SparseModel:
+    """Poses and points of the photos; COLMAP's database and model are left in ``folder``.
+
+    Raises InputError when fewer than three photos can be placed together, with the likely reason.
+    """
+    options = options or SparseOptions()
+    tell = progress or (lambda stage, done, total: None)
+    threads = options.threads or os.cpu_count() or 1
+    folder.mkdir(parents=True, exist_ok=True)
+    features = find_all_features(photos, options.features, threads, lambda i, n: tell("features", i, n))
+    pairs = _match_by_appearance(features, options, threads, tell)
+    database_path = folder / "database.db"
+    _write_database(database_path, photos, features, pairs, options)
+    models = _map(database_path, folder, options, len(photos), tell)
+    if not models or max(model.num_reg_images() for model in models) < 3:
+        raise InputError(_why_nothing(photos, features, pairs))
+    chosen = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    unplaced = _unplaced(photos, features, pairs, models, chosen)
+    matches = _match_along_lines(chosen, photos, features, options, threads, tell)
+    _write_matches(database_path, matches)
+    chosen, adjuster = _triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
+    chosen.write(str(_emptied(folder / "model")))
+    sparse = sparse_model_of(chosen, photos, unplaced)
+    return replace(sparse, pose_covariance=pose_covariance(sparse, chosen, adjuster))
+
+
+# --- first pass ------------------------------------------------------------------------------------------
+
+
+def _match_by_appearance(
+    features: Sequence[Features], options: SparseOptions, threads: int, tell: Progress
+) -> dict[Pair, Matches]:
+    """Matches of every pair of photos that has enough of them near epipolar lines."""
+
+    def match(pair: Pair) -> Matches:
+        one, other = (features[index] for index in pair)
+        count = options.first_features
+        matches = match_descriptors(one.descriptors[:count], other.descriptors[:count])
+        return epipolar_inliers(one, other, matches, options.max_epipolar_px)
+
+    chosen = _pairs_worth_matching(features, options, threads)
+    found: dict[Pair, Matches] = {}
+    with ThreadPoolExecutor(threads) as pool:
+        for done, (pair, matches) in enumerate(zip(chosen, pool.map(match, chosen), strict=True)):
+            if len(matches) >= options.min_matches:
+                found[pair] = matches
+            tell("matching", done + 1, len(chosen))
+    return found
+
+
+def _pairs_worth_matching(features: Sequence[Features], options: SparseOptions, threads: int) -> list[Pair]:
+    """Pairs of photos whose largest features match often enough (preemptive matching, Wu 2013)."""
+    pairs = list(itertools.combinations(range(len(features)), 2))
+    if len(features) <= options.all_pairs_up_to:
+        return pairs
+    largest = [
+        np.ascontiguousarray(one.descriptors[np.argsort(-one.sizes_px, kind="stable")[: options.preview_features]])
+        for one in features
+    ]
+
+    def is_worth(pair: Pair) -> bool:
+        if pair[1] - pair[0] <= options.neighbours:
+            return True
+        return len(match_descriptors(largest[pair[0]], largest[pair[1]])) >= options.preview_matches
+
+    with ThreadPoolExecutor(threads) as pool:
+        return [pair for pair, worth in zip(pairs, pool.map(is_worth, pairs), strict=True) if worth]
+
+
+def _write_database(
+    path: Path,
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    pairs: dict[Pair, Matches],
+    options: SparseOptions,
+) -> None:
+    """COLMAP's database; photo i has image id i + 1."""
+    pycolmap = import_pycolmap()
+    path.unlink(missing_ok=True)
+    with pycolmap.Database.open(str(path)) as database:
+        cameras: dict[str, Any] = {}
+        for index, photo in enumerate(photos):
+            if photo.lens not in cameras:
+                camera = colmap_camera(photo.camera, photo.is_calibrated)
+                camera.camera_id = database.write_camera(camera)
+                cameras[photo.lens] = camera
+                rig = pycolmap.Rig(rig_id=camera.camera_id)
+                rig.add_ref_sensor(camera.sensor_id)
+                database.write_rig(rig, use_rig_id=True)
+            camera = cameras[photo.lens]
+            image = pycolmap.Image(name=photo.name, camera_id=camera.camera_id, image_id=index + 1)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=index + 1, rig_id=camera.camera_id)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(index + 1, features[index].points_px + np.float32(HALF_PX))
+        verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=options.min_matches)
+        verification.ransac.random_seed = options.seed
+        verification.ransac.max_num_trials = 2000
+        for (i, j), matches in pairs.items():
+            geometry = pycolmap.estimate_two_view_geometry(
+                cameras[photos[i].lens],
+                features[i].points_px.astype(np.float64) + HALF_PX,
+                cameras[photos[j].lens],
+                features[j].points_px.astype(np.float64) + HALF_PX,
+                matches,
+                verification,
+            )
+            if len(geometry.inlier_matches) >= options.min_matches:
+                database.write_matches(i + 1, j + 1, matches)
+                database.write_two_view_geometry(i + 1, j + 1, geometry)
+
+
+def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tell: Progress) -> list[Any]:
+    """The reconstructions that COLMAP's incremental mapper finds."""
+    pycolmap = import_pycolmap()
+    mapping = pycolmap.IncrementalPipelineOptions(
+        random_seed=options.seed, min_model_size=3, extract_colors=False, num_threads=options.threads or -1
+    )
+    placed = itertools.count(3)
+    tell("placing", 0, photo_count)
+    models = pycolmap.incremental_mapping(
+        str(path),
+        str(folder),
+        str(_emptied(folder / "mapper")),
+        mapping,
+        initial_image_pair_callback=lambda: tell("placing", 2, photo_count),
+        next_image_callback=lambda: tell("placing", min(next(placed), photo_count), photo_count),
+    )
+    return [models[key] for key in sorted(models)]
+
+
+def _emptied(folder: Path) -> Path:
+    """The folder, there and without files of an earlier run."""
+    folder.mkdir(exist_ok=True)
+    for old in folder.rglob("*"):
+        if old.is_file():
+            old.unlink()
+    return folder
+
+
+# --- second pass -----------------------------------------------------------------------------------------
+
+
+def _match_along_lines(
+    model: Any,
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    options: SparseOptions,
+    threads: int,
+    tell: Progress,
+) -> dict[Pair, Matches]:
+    """All features of placed photos matched again, now that the relative poses are known."""
+    cameras, poses = _cameras_and_poses(model, photos)
+    rays = {
+        index: np.ascontiguousarray(camera.unproject(features[index].points_px)[:, :2])
+        for index, camera in cameras.items()
+    }
+
+    def match(pair: Pair) -> Matches:
+        i, j = pair
+        second_from_first = poses[j] @ invert(poses[i])
+        essential = skew(second_from_first[:3, 3]) @ second_from_first[:3, :3]
+        focal = 0.5 * (cameras[i].fx + cameras[j].fx)
+        return match_along_lines((rays[i], rays[j]), focal, (features[i], features[j]), essential, options.band_px)
+
+    chosen = _pairs_in_common_view(model, poses)
+    found: dict[Pair, Matches] = {}
+    with ThreadPoolExecutor(threads) as pool:
+        for done, (pair, matches) in enumerate(zip(chosen, pool.map(match, chosen), strict=True)):
+            found[pair] = matches
+            tell("matching again", done + 1, len(chosen))
+    return found
+
+
+def _cameras_and_poses(model: Any, photos: Sequence[Photo]) -> tuple[dict[int, Camera], dict[int, Array]]:
+    """Camera and ``cam_from_scan`` of each placed photo, by its index."""
+    sparse = sparse_model_of(model, photos)
+    place = {photo.name: index for index, photo in enumerate(photos)}
+    cameras = {place[photo.name]: photo.camera for photo in sparse.photos}
+    return cameras, {place[photo.name]: photo.cam_from_scan for photo in sparse.photos}
+
+
+MAX_PAIR_ANGLE_DEG = 60.0
+"""Between the viewing directions of a pair: SIFT finds nothing in common beyond."""
+
+
+def _pairs_in_common_view(model: Any, poses: dict[int, Array]) -> list[Pair]:
+    """Pairs of placed photos that look in similar enough directions."""
+    limit = np.cos(np.radians(MAX_PAIR_ANGLE_DEG))
+    return [(i, j) for i, j in itertools.combinations(sorted(poses), 2) if poses[i][2, :3] @ poses[j][2, :3] > limit]
+
+
+def _write_matches(path: Path, pairs: dict[Pair, Matches]) -> None:
+    """Put the matches of the second pass in the place of the first ones."""
+    pycolmap = import_pycolmap()
+    with pycolmap.Database.open(str(path)) as database:
+        database.clear_matches()
+        database.clear_two_view_geometries()
+        for (i, j), matches in pairs.items():
+            if len(matches) == 0:
+                continue
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = matches
+            database.write_matches(i + 1, j + 1, matches)
+            database.write_two_view_geometry(i + 1, j + 1, geometry)
+
+
+def _triangulate_and_adjust(
+    model: Any, path: Path, folder: Path, options: SparseOptions, threads: int, tell: Progress
+) -> tuple[Any, Any]:
+    """Points triangulated from all matches; then poses, points and intrinsics adjusted together.
+
+    Returns the model and the adjuster of the last step.
+    """
+    pycolmap = import_pycolmap()
+    tell("adjusting", 0, 3)
+    triangulation = pycolmap.IncrementalPipelineOptions(random_seed=options.seed, num_threads=threads)
+    triangulation.triangulation.ignore_two_view_tracks = False
+    model = pycolmap.triangulate_points(
+        model, str(path), str(folder), str(_emptied(folder / "triangulated")), True, triangulation
+    )
+    tell("adjusting", 1, 3)
+    refines_centre = _adjust_with_centre(model, options, threads)
+    tell("adjusting", 2, 3)
+    pycolmap.ObservationManager(model).filter_all_points3D(options.max_error_px, options.min_angle_deg)
+    adjuster = adjust(model, threads, refines_centre=refines_centre)
+    tell("adjusting", 3, 3)
+    return model, adjuster
+
+
+def _adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> bool:
+    """Adjust everything, the principal points too; put back those that moved less than they are known by.
+
+    Returns whether the principal points are to be refined from here on. Feature errors that go together move a
+    principal point by half a pixel on good photos, and the focal length with it, so a small move is no finding.
+    """
+    before = {key: np.array(camera.params[1:3]) for key, camera in model.cameras.items() if _is_refined(camera)}
+    adjust(model, threads, refines_centre=True, iterations=30)
+    moved = [float(np.abs(model.cameras[key].params[1:3] - centre).max()) for key, centre in before.items()]
+    sizes = [max(model.cameras[key].width, model.cameras[key].height) for key in before]
+    if any(
+        options.min_centre_move < move / size < options.max_centre_move for move, size in zip(moved, sizes, strict=True)
+    ):
+        return True
+    for key, centre in before.items():
+        model.cameras[key].params = np.concatenate(
+            [model.cameras[key].params[:1], centre, model.cameras[key].params[3:]]
+        )
+    return False
+
+
+def _is_refined(camera: Any) -> bool:
+    return bool(camera.model.name != CALIBRATED_MODEL)
+
+
+def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 50) -> Any:
+    """Bundle adjustment in place: poses, points, and the intrinsics of lenses that are not calibrated.
+
+    Returns the solved pycolmap adjuster, from which covariances can be computed.
+    """
+    pycolmap = import_pycolmap()
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_principal_point=refines_centre)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = 0.5
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.max_num_iterations = iterations
+    options.ceres.solver_options.function_tolerance = 1e-7
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
+    for camera in model.cameras.values():
+        if not _is_refined(camera):
+            config.set_constant_cam_intrinsics(camera.camera_id)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    adjuster.solve()
+    model.update_point_3d_errors()
+    return adjuster
+
+
+# --- what could not be placed ----------------------------------------------------------------------------
+
+FEW_FEATURES = 200
+"""A photo with fewer is blurred, or shows nothing but bare surfaces."""
+
+
+def _unplaced(
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    pairs: dict[Pair, Matches],
+    models: Sequence[Any],
+    chosen: Any,
+) -> list[tuple[str, str]]:
+    """(name, reason) of every photo that is not in the chosen model."""
+    groups = [_names(model) for model in models]
+    placed = _names(chosen)
+    reasons = []
+    for index, photo in enumerate(photos):
+        if photo.name in placed:
+            continue
+        partners = {photos[other].name for pair in pairs for other in pair if index in pair and other != index}
+        group = next((names for names in groups if photo.name in names and names != placed), set())
+        if len(features[index]) < FEW_FEATURES:
+            reason = f"only {len(features[index])} features: blurred, too dark, or nothing but bare surfaces in view"
+        elif not partners:
+            reason = "nothing in common with the other photos: another part, or a view too far from the others"
+        elif not partners & placed:
+            reason = f"has something in common only with {_some(group or partners)}, not with the other {len(placed)}"
+        else:
+            reason = "too little in common with the placed photos: take more photos between this view and theirs"
+        reasons.append((photo.name, reason))
+    return reasons
+
+
+def _names(model: Any) -> set[str]:
+    return {model.images[image_id].name for image_id in model.reg_image_ids()}
+
+
+def _some(names: Iterable[str]) -> str:
+    """The first names of many, for a message."""
+    listed = sorted(names)
+    return ", ".join(listed[:3]) + (f" and {len(listed) - 3} more" if len(listed) > 3 else "")
+
+
+def _why_nothing(photos: Sequence[Photo], features: Sequence[Features], pairs: dict[Pair, Matches]) -> str:
+    """Why no three photos fit together, and what to do."""
+    poor = [photo.name for photo, found in zip(photos, features, strict=True) if len(found) < FEW_FEATURES]
+    if 2 * len(poor) > len(photos):
+        return (
+            f"photos: {len(poor)} of {len(photos)} show almost no texture ({_some(poor)}); better light, or a "
+            "patterned mat or printed sheets around the part, give features"
+        )
+    if not pairs:
+        return (
+            f"photos: no two of the {len(photos)} have enough in common; take them 10 to 20 degrees apart, all of the "
+            "same part in one place"
+        )
+    return (
+        f"photos: no three of the {len(photos)} could be placed together ({len(pairs)} pairs have features in common); "
+        "take more, 10 to 20 degrees apart, moving the camera sideways rather than turning it"
+    )
