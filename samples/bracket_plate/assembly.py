@@ -6,9 +6,8 @@ side. The plate spans x ±110, y ±80, z −10…0.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import build123d as bd
+from solids import box, on_plate, post, ring
 
 STEEL_DARK = (0.25, 0.26, 0.28)
 STEEL_LIGHT = (0.66, 0.66, 0.64)
@@ -20,24 +19,9 @@ DATUM_B = (-97.0, -67.0)
 DATUM_C = (97.0, -67.0)
 
 
-def _on_plate(x: float, y: float, turn_deg: float = 0.0) -> bd.Location:
-    return bd.Location((x, y, 0.0), (0.0, 0.0, turn_deg))
-
-
-def _post(diameter: float, height: float) -> bd.Part:
-    """Round post standing on z = 0 with a 1 mm chamfer at its top."""
-    post = bd.Solid.make_cylinder(diameter / 2, height)
-    return post.chamfer(1.0, None, post.edges().sort_by(bd.Axis.Z)[-1:])
-
-
 def _nut(across_flats: float, height: float, hole: float) -> bd.Part:
     hexagon = bd.RegularPolygon(across_flats / 2, 6, major_radius=False)
     return bd.extrude(hexagon, height) - bd.Cylinder(hole / 2, 3 * height)
-
-
-def _box(x: float, y: float, z: float) -> bd.Part:
-    """Box centred in x and y, standing on z = 0."""
-    return bd.Pos(0, 0, z / 2) * bd.Box(x, y, z)
 
 
 def _base_plate() -> bd.Part:
@@ -52,14 +36,14 @@ def _base_plate() -> bd.Part:
 
 
 def _block() -> bd.Part:
-    block = _box(44, 30, 22)
+    block = box(44, 30, 22)
     edge = block.edges().filter_by(bd.Axis.Y).sort_by(lambda e: e.center().X + e.center().Z)[-1]
     return bd.chamfer(edge, 8.0)
 
 
 def _bracket() -> bd.Part:
     """L-bracket: foot along +Y, wall in the XZ plane, with a hole in the foot and two in the wall."""
-    bracket = bd.Pos(0, 16, 0) * _box(46, 32, 4) + bd.Pos(0, 2, 0) * _box(46, 4, 40)
+    bracket = bd.Pos(0, 16, 0) * box(46, 32, 4) + bd.Pos(0, 2, 0) * box(46, 4, 40)
     bracket -= bd.Pos(0, 20, 0) * bd.Cylinder(4.5, 20)
     for x in (-12, 12):
         bracket -= bd.Pos(x, 0, 26) * bd.Rot(90, 0, 0) * bd.Cylinder(4.0, 20)
@@ -74,40 +58,23 @@ def _rib() -> bd.Part:
 
 def _lug() -> bd.Part:
     """Flat lug with one round end, a slot and a round hole."""
-    lug = _box(34, 22, 8) + bd.Pos(17, 0, 4) * bd.Cylinder(11, 8)
+    lug = box(34, 22, 8) + bd.Pos(17, 0, 4) * bd.Cylinder(11, 8)
     lug -= bd.Pos(17, 0, 0) * bd.Cylinder(5.5, 40)
-    return lug - bd.Pos(-5, 0, 0) * _box(14, 7, 40)
+    return lug - bd.Pos(-5, 0, 0) * box(14, 7, 40)
 
 
 def components() -> list[tuple[str, object, tuple[float, float, float]]]:
     """Name, solid at its nominal place and colour of every component; the plate comes first."""
     return [
         ("base_plate", _base_plate(), STEEL_DARK),
-        ("post_1", _on_plate(-82, 52) * _post(14, 45), STEEL_LIGHT),
-        ("post_2", _on_plate(-12, -50) * _post(18, 28), STEEL_LIGHT),
-        ("post_3", _on_plate(62, 28) * _post(12, 62), STEEL_LIGHT),
-        ("nut_1", _on_plate(-66, -38, 12) * _nut(19, 10, 10.2), ZINC),
-        ("nut_2", _on_plate(30, 58, 25) * _nut(24, 13, 13.8), ZINC),
-        ("block_1", _on_plate(46, -38, 18) * _block(), STEEL_LIGHT),
-        ("bracket_1", _on_plate(-46, 26, -20) * _bracket(), STEEL_BLUE),
-        ("rib_1", _on_plate(84, -14, 70) * _rib(), STEEL_BLUE),
-        ("boss_1", _on_plate(-20, -6) * _ring(36, 21, 12), STEEL_LIGHT),
-        ("lug_1", _on_plate(20, 14, 35) * _lug(), STEEL_BLUE),
+        ("post_1", on_plate(-82, 52) * post(14, 45), STEEL_LIGHT),
+        ("post_2", on_plate(-12, -50) * post(18, 28), STEEL_LIGHT),
+        ("post_3", on_plate(62, 28) * post(12, 62), STEEL_LIGHT),
+        ("nut_1", on_plate(-66, -38, 12) * _nut(19, 10, 10.2), ZINC),
+        ("nut_2", on_plate(30, 58, 25) * _nut(24, 13, 13.8), ZINC),
+        ("block_1", on_plate(46, -38, 18) * _block(), STEEL_LIGHT),
+        ("bracket_1", on_plate(-46, 26, -20) * _bracket(), STEEL_BLUE),
+        ("rib_1", on_plate(84, -14, 70) * _rib(), STEEL_BLUE),
+        ("boss_1", on_plate(-20, -6) * ring(36, 21, 12), STEEL_LIGHT),
+        ("lug_1", on_plate(20, 14, 35) * _lug(), STEEL_BLUE),
     ]
-
-
-def _ring(outer: float, inner: float, height: float) -> bd.Part:
-    ring = bd.Cylinder(outer / 2, height) - bd.Cylinder(inner / 2, 3 * height)
-    return bd.Pos(0, 0, height / 2) * ring
-
-
-def write_step(path: Path) -> None:
-    """The assembly as STEP AP214 with product names, colours and millimetres."""
-    children = []
-    for name, shape, color in components():
-        solid = shape.solid() if hasattr(shape, "solid") else shape
-        solid.label = name
-        solid.color = bd.Color(*color)
-        children.append(solid)
-    assembly = bd.Compound(label="bracket_plate", children=children)
-    bd.export_step(assembly, str(path), unit=bd.Unit.MM)

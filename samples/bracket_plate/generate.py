@@ -14,18 +14,21 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
 FOLDER = Path(__file__).resolve().parent
+sys.path.insert(0, str(FOLDER.parent / "common"))
 
 
 def make_step() -> None:
     import assembly
+    from solids import write_step
 
-    assembly.write_step(FOLDER / "bracket_plate.step")
+    write_step(FOLDER / "bracket_plate.step", "bracket_plate", assembly.components())
 
 
 def make_clip(first: int, last: int, work: Path) -> None:

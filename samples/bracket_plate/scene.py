@@ -14,8 +14,8 @@ import mitsuba as mi
 import motion
 import numpy as np
 import textures as tx
-
-mi.set_variant("llvm_ad_rgb")
+from rendering import denoise, develop, lamp, matte, mesh, page, sensor, steel, to_world, undistortion_maps
+from solids import tessellated
 
 SEED = 20261
 SHUTTER = 0.4  # of the frame interval
@@ -51,11 +51,7 @@ def measured_from_nominal(name: str):
 
 def component_meshes() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Finely tessellated components at their nominal place: name → vertices, faces."""
-    meshes = {}
-    for name, shape, _ in assembly.components():
-        vertices, faces = shape.tessellate(0.02, 0.12)
-        meshes[name] = np.array([tuple(v) for v in vertices]), np.array(faces)
-    return meshes
+    return tessellated(assembly.components())
 
 
 def as_built_meshes():
@@ -64,84 +60,6 @@ def as_built_meshes():
         pose = measured_from_nominal(name)
         meshes[name] = vertices @ pose[:3, :3].T + pose[:3, 3], faces
     return meshes
-
-
-# ------------------------------------------------------------------------------------------- surfaces
-
-
-def _bitmap(array, raw: bool):
-    data = np.ascontiguousarray(array, dtype=np.float32)
-    if data.ndim == 2:
-        data = data[..., None]
-    # Row 0 of a texture is its largest v here. Colours are given linear: nothing is decoded from sRGB.
-    data = np.ascontiguousarray(data[::-1])
-    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": raw, "wrap_mode": "repeat"}
-
-
-def steel(maps, metallic: float, bump_mm: float = 0.0):
-    color, rough, bump = maps
-    surface = {
-        "type": "principled",
-        "base_color": _bitmap(np.clip(color, 0.002, 0.95), True),
-        "roughness": _bitmap(rough, True),
-        "metallic": metallic,
-        "specular": 0.5,
-    }
-    if bump_mm == 0.0:
-        return mi.load_dict({"type": "twosided", "nested": surface})
-    bumped = {"type": "bumpmap", "bump": _bitmap(bump, True), "scale": bump_mm, "nested": surface}
-    return mi.load_dict({"type": "twosided", "nested": bumped})
-
-
-def matte(color, roughness: float = 0.5, specular: float = 0.4):
-    texture = _bitmap(np.clip(color, 0.002, 0.95), True) if isinstance(color, np.ndarray) else {
-        "type": "rgb", "value": list(color)}  # fmt: skip
-    surface = {"type": "principled", "base_color": texture, "roughness": roughness, "specular": specular}
-    return mi.load_dict({"type": "twosided", "nested": surface})
-
-
-def _corner_normals(vertices, faces, crease_deg: float):
-    """(F,3,3) normals per face corner, smoothed over neighbours within the crease angle."""
-    corner = vertices[faces]
-    area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
-    _, merged = np.unique(np.round(vertices, 3), axis=0, return_inverse=True)
-    around: dict[int, list[int]] = {}
-    for face, triple in enumerate(merged.reshape(-1)[faces]):
-        for vertex in triple:
-            around.setdefault(int(vertex), []).append(face)
-    normals = np.empty((len(faces), 3, 3))
-    limit = np.cos(np.deg2rad(crease_deg))
-    for face, triple in enumerate(merged.reshape(-1)[faces]):
-        for k, vertex in enumerate(triple):
-            near = np.array(around[int(vertex)])
-            near = near[unit[near] @ unit[face] > limit]
-            total = area[near].sum(axis=0)
-            normals[face, k] = total / max(np.linalg.norm(total), 1e-12)
-    return normals
-
-
-def mesh(name, vertices, faces, surface, tile_mm=(240.0, 240.0), offset_mm=(0.0, 0.0), crease_deg=35.0):
-    """Mitsuba mesh with box-projected texture coordinates and crease-aware normals."""
-    corner = vertices[faces]
-    flat = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    axis = np.abs(flat).argmax(axis=1)
-    first, second = np.array([1, 0, 0])[axis], np.array([2, 2, 1])[axis]
-    rows = np.arange(len(faces))[:, None]
-    columns = np.arange(3)[None]
-    uv = np.stack([corner[rows, columns, first[:, None]], corner[rows, columns, second[:, None]]], axis=-1)
-    uv = (uv + np.asarray(offset_mm) + 37.0 * (axis[:, None, None] != 2)) / np.asarray(tile_mm)
-    normals = _corner_normals(vertices, faces, crease_deg)
-    props = mi.Properties()
-    props["surface"] = surface
-    out = mi.Mesh(name, 3 * len(faces), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=props)
-    params = mi.traverse(out)
-    params["vertex_positions"] = mi.Float(corner.reshape(-1).astype(np.float32))
-    params["vertex_normals"] = mi.Float(normals.reshape(-1).astype(np.float32))
-    params["vertex_texcoords"] = mi.Float(uv.reshape(-1).astype(np.float32))
-    params["faces"] = mi.UInt32(np.arange(3 * len(faces), dtype=np.uint32))
-    params.update()
-    return out
 
 
 def _part(shapes, rng):
@@ -249,15 +167,7 @@ def _clutter(shapes, rng):
         (-292, 152, 24, "Work order 0417"), (215, -215, -18, "Weld plan BP"), (560, 40, 65, "Checklist")
     ]):  # fmt: skip
         sheet = matte(tx.printed_sheet(1100, 780, rng, title), 0.75)
-        corners = np.array([(-74, -105, 0), (74, -105, 0), (74, 105, 0), (-74, 105, 0)], float)
-        geometry = (corners @ tx.turn_z(turn).T + (x, y, floor + 0.4), np.array([[0, 1, 2], [0, 2, 3]]))
-        # A sheet carries its own texture coordinates: the page exactly once, turned with it.
-        paper = mesh(f"sheet_{k}", *geometry, sheet)
-        params = mi.traverse(paper)
-        uv = np.array([(0, 0), (1, 0), (1, 1), (0, 0), (1, 1), (0, 1)], np.float32)
-        params["vertex_texcoords"] = mi.Float(uv.reshape(-1))
-        params.update()
-        shapes[f"sheet_{k}"] = paper
+        shapes[f"sheet_{k}"] = page(f"sheet_{k}", sheet, (148, 210), (x, y, floor + 0.4), turn)
     s = np.linspace(0, 1, 120)
     cable = np.column_stack([-420 + 330 * s, -330 + 190 * np.sin(2.2 * s) + 30 * np.sin(11 * s), floor + 4 + 0 * s])
     add("cable_green", tx.sweep(cable, 4.0, 12), matte((0.03, 0.33, 0.09), 0.35), crease=60)
@@ -291,30 +201,10 @@ def build(width_height=MARGIN_FILM, focal_px=1130.0):
     _part(shapes, rng)
     _clutter(shapes, rng)
     _occluders(shapes, rng)
-    look = mi.ScalarTransform4f().look_at
-    width, height = width_height
-
-    def lamp(origin, target, size, radiance):
-        to_world = look(origin, target, [0, 0.01, 1]) @ mi.ScalarTransform4f().scale([size[0] / 2, size[1] / 2, 1])
-        light = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
-        return {"type": "rectangle", "to_world": to_world, "emitter": light}
 
     scene = {
         "type": "scene",
-        "sensor": {
-            "type": "thinlens",
-            "fov": float(np.rad2deg(2 * np.arctan(width / 2 / focal_px))),
-            "fov_axis": "x",
-            "aperture_radius": APERTURE_MM,
-            "focus_distance": 505.0,
-            "near_clip": 10.0,
-            "far_clip": 9000.0,
-            "film": {
-                "type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
-                "pixel_format": "rgb", "component_format": "float32",
-            },
-            "sampler": {"type": "independent", "sample_count": 4},
-        },
+        "sensor": sensor(width_height, focal_px, APERTURE_MM, 505.0),
         "strip_1": lamp([-350, 250, 1750], [-300, 200, 0], (1500, 260), [10.5, 10.3, 9.8]),
         "strip_2": lamp([600, -250, 1750], [550, -200, 0], (1500, 260), [9.0, 8.9, 8.6]),
         "window": lamp([-1700, 300, 900], [0, 0, 0], (1500, 1200), [3.2, 3.6, 4.3]),
@@ -343,17 +233,12 @@ class Shot:
     def pose_all(self, t: float) -> None:
         """Place camera and occluders at time ``t`` (frames)."""
         cam_from_model = motion.cam_from_model(t)
-        model_from_cam = np.linalg.inv(cam_from_model)
         place_occluders(self.params, self.rest, t)
-        # Mitsuba looks along +Z with +X to the left and +Y up; OpenCV has +X right and +Y down.
-        to_world = model_from_cam @ np.diag([-1.0, -1.0, 1.0, 1.0])
-        self.params["sensor.to_world"] = mi.Transform4f(to_world)
+        self.params["sensor.to_world"] = to_world(cam_from_model)
         self.params.update()
 
     def linear(self, index: int) -> np.ndarray:
         """Linear RGB (H,W,3) of the distorted picture of frame ``index``, denoised, with motion blur."""
-        import mitsuba_oidn
-
         steps = subframes(self.camera, index)
         samples = max(SAMPLES // steps, 1)
         color, guide = 0.0, 0.0
@@ -363,21 +248,12 @@ class Shot:
             color = color + np.array(mi.render(self.scene, integrator=self.light, spp=samples, seed=seed)) / steps
             seed += 1 << 20
             guide = guide + np.array(mi.render(self.scene, integrator=self.guides, spp=2, seed=seed)) / steps
-        color = np.minimum(np.nan_to_num(color), 30.0).astype(np.float32)
-        albedo, normal = (np.ascontiguousarray(part, np.float32) for part in np.split(guide[..., -6:], 2, axis=2))
-        albedo = np.clip(albedo, 0, 1)
-        clean = mitsuba_oidn.denoise(
-            np.ascontiguousarray(color),
-            albedo=albedo,
-            normal=normal,
-            hdr=True,
-            quality=mitsuba_oidn.Quality.Fast,
-        )
-        return cv2.remap(np.asarray(clean), *self.maps, cv2.INTER_CUBIC)
+        return cv2.remap(denoise(color, guide), *self.maps, cv2.INTER_CUBIC)
 
     def frame(self, index: int) -> np.ndarray:
         """The finished BGR picture (H,W,3) uint8 of frame ``index``."""
-        return develop(self.linear(index), index)
+        gain = motion.exposure_gain(index) * EXPOSURE
+        return develop(self.linear(index), gain, np.random.default_rng(SEED + 7919 * index))
 
 
 def place_occluders(params, rest, t: float) -> None:
@@ -442,24 +318,6 @@ class Sight:
         return {"in_picture": shown.sum() / on_part.sum(), "visible": seen.sum() / on_part.sum()}
 
 
-def undistortion_maps(camera: dict, film: tuple[int, int]):
-    """Where in the undistorted film each pixel of the distorted picture lies (cv2.remap maps)."""
-    u, v = np.meshgrid(np.arange(camera["width"], dtype=np.float64), np.arange(camera["height"], dtype=np.float64))
-    k1, k2, *others = camera["dist"]
-    assert not any(others), "only radial distortion k1, k2 is rendered"
-    distorted = (u - camera["cx"]) / camera["fx"], (v - camera["cy"]) / camera["fy"]
-    x, y = distorted
-    for _ in range(30):
-        r2 = x * x + y * y
-        factor = 1.0 + r2 * (k1 + r2 * k2)
-        x, y = distorted[0] / factor, distorted[1] / factor
-    # The film's principal point is its middle: width / 2 counted from the edge, half a pixel less
-    # counted from the middle of the first pixel.
-    map_x = x * camera["fx"] + film[0] / 2 - 0.5
-    map_y = y * camera["fx"] + film[1] / 2 - 0.5
-    return map_x.astype(np.float32), map_y.astype(np.float32)
-
-
 def subframes(camera: dict, index: int) -> int:
     """How many sub-frames: enough that picture and card move at most about 3 px between two of them.
 
@@ -472,23 +330,6 @@ def subframes(camera: dict, index: int) -> int:
     if len(cards) == 2:
         flow_px = max(flow_px, np.linalg.norm(cards[1] - cards[0]) / cards[0][2] * camera["fx"])
     return next((n for n in (2, 4) if n >= flow_px / 3), 8)
-
-
-def develop(linear: np.ndarray, index: int) -> np.ndarray:
-    """Linear light to an 8-bit BGR picture: exposure, vignetting, sensor noise, tone curve, sharpening."""
-    rng = np.random.default_rng(SEED + 7919 * index)
-    height, width = linear.shape[:2]
-    y, x = np.mgrid[:height, :width]
-    radius = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
-    light = np.maximum(linear, 0) * (1.0 - 0.10 * radius)[..., None] * motion.exposure_gain(index) * EXPOSURE
-    noise = rng.normal(size=light.shape).astype(np.float32)
-    noise = 0.75 * noise + 0.5 * cv2.GaussianBlur(noise, (0, 0), 0.8)
-    light = np.maximum(light + noise * np.sqrt(2.2e-5 + 1.3e-4 * light), 0)
-    # A soft shoulder above 0.7, then the sRGB curve.
-    light = np.where(light > 0.7, 0.7 + 0.3 * np.tanh((light - 0.7) / 0.6), light)
-    tone = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-6) ** (1 / 2.4) - 0.055)
-    tone = tone + 0.25 * (tone - cv2.GaussianBlur(tone, (0, 0), 1.0))
-    return np.round(np.clip(tone, 0, 1) * 255).astype(np.uint8)[..., ::-1]
 
 
 def load_camera(folder: Path) -> dict:

@@ -44,6 +44,13 @@ def scratches(height: int, width: int, count: int, rng, length=(20, 220), turn=n
     return layer.astype(np.float64) / 255.0
 
 
+def specks(height: int, width: int, size_px: float, rng):
+    """Scattered spots of about that size (H, W) in 0–1, on some 5 % of the area."""
+    noise = rng.normal(size=(height, width)).astype(np.float32)
+    noise = cv2.GaussianBlur(noise, (0, 0), size_px)
+    return smoothstep(noise / noise.std(), 1.5, 2.1)
+
+
 def _mix(a, b, weight):
     return a + (np.asarray(b, dtype=np.float64) - a) * weight[..., None]
 
@@ -98,8 +105,25 @@ def zinc(height: int, width: int, rng):
     return color, rough, bump
 
 
-def bench_top(width_mm: float, depth_mm: float, px_per_mm: float, rng, stamp: str):
-    """Worn aluminium breadboard with a 25 mm hole grid; color, roughness, bump."""
+def _drilled(color, rough, px_per_mm: float, rng):
+    """A breadboard's 25 mm grid of holes with bright rims."""
+    height, width = rough.shape
+    holes = np.zeros((height, width), np.uint8)
+    rims = np.zeros((height, width), np.uint8)
+    for j in range(int(height / px_per_mm // 25)):
+        for i in range(int(width / px_per_mm // 25)):
+            x = (12.5 + 25 * i + rng.normal(0, 0.05)) * px_per_mm
+            y = (12.5 + 25 * j + rng.normal(0, 0.05)) * px_per_mm
+            center = (round(x * 16), round(y * 16))
+            cv2.circle(rims, center, round(4.1 * px_per_mm * 16), int(rng.uniform(90, 255)), -1, cv2.LINE_AA, 4)
+            cv2.circle(holes, center, round(3.2 * px_per_mm * 16), 255, -1, cv2.LINE_AA, 4)
+    color = _mix(color, (0.66, 0.66, 0.66), 0.45 * rims / 255.0)
+    color = _mix(color, (0.012, 0.012, 0.013), holes / 255.0)
+    return color, np.maximum(rough, holes / 255.0)
+
+
+def bench_top(width_mm: float, depth_mm: float, px_per_mm: float, rng, stamp: str, holes: bool = True):
+    """Worn aluminium bench, with ``holes`` a breadboard's 25 mm grid of them; color, roughness, bump."""
     height, width = int(depth_mm * px_per_mm), int(width_mm * px_per_mm)
     cloud = fft_noise(height, width, 1.35, rng)
     grain = fft_noise(height, width, 0.5, rng)
@@ -113,18 +137,8 @@ def bench_top(width_mm: float, depth_mm: float, px_per_mm: float, rng, stamp: st
     color = _mix(color, (0.68, 0.68, 0.68), 0.5 * lines)
     rough = np.clip(0.40 + 0.3 * (cloud - 0.5) + 0.15 * stain + 0.1 * grain, 0.2, 0.9)
     bump = 0.4 * grain - 0.5 * lines
-    holes = np.zeros((height, width), np.uint8)
-    rims = np.zeros((height, width), np.uint8)
-    for j in range(int(depth_mm // 25)):
-        for i in range(int(width_mm // 25)):
-            x = (12.5 + 25 * i + rng.normal(0, 0.05)) * px_per_mm
-            y = (12.5 + 25 * j + rng.normal(0, 0.05)) * px_per_mm
-            center = (round(x * 16), round(y * 16))
-            cv2.circle(rims, center, round(4.1 * px_per_mm * 16), int(rng.uniform(90, 255)), -1, cv2.LINE_AA, 4)
-            cv2.circle(holes, center, round(3.2 * px_per_mm * 16), 255, -1, cv2.LINE_AA, 4)
-    color = _mix(color, (0.66, 0.66, 0.66), 0.45 * rims / 255.0)
-    color = _mix(color, (0.012, 0.012, 0.013), holes / 255.0)
-    rough = np.maximum(rough, holes / 255.0)
+    if holes:
+        color, rough = _drilled(color, rough, px_per_mm, rng)
     # A felt-tip note and a strip of old tape, so that the bench has places one can tell apart.
     note = np.zeros((height, width), np.uint8)
     spots = [(0.36, 0.43), (0.62, 0.36), (0.70, 0.62), (0.27, 0.66)]
