@@ -14,7 +14,7 @@ import numpy as np
 
 from arview.camera import Camera
 from arview.errors import MissingDependencyError
-from arview.geometry import rigid
+from arview.geometry import Array, rigid
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
 
 HALF_PX = 0.5
@@ -102,3 +102,13 @@ def sparse_model_of(
 def read_reconstruction(folder: Path) -> Any:
     """The pycolmap reconstruction written in ``folder``."""
     return import_pycolmap().Reconstruction(str(folder))
+
+
+def write_model(source: Path, target: Path, scale: float, new_from_scan: Array) -> None:
+    """Copy a COLMAP model, moved by ``x_new = new_from_scan @ (scale * x)``."""
+    pycolmap = import_pycolmap()
+    model = read_reconstruction(source)
+    rotation = pycolmap.Rotation3d(new_from_scan[:3, :3])
+    model.transform(pycolmap.Sim3d(scale, rotation, new_from_scan[:3, 3]))
+    target.mkdir(exist_ok=True)
+    model.write(str(target))

@@ -34,14 +34,21 @@ class Features:
         points_px: (N,2) float32 in the photo at full size; integers are pixel centres.
         descriptors: (N,128) float32 unit vectors, RootSIFT (Arandjelović and Zisserman 2012).
         sizes_px: (N,) float32 diameter of the described neighbourhood.
+        colors: (N,3) uint8 RGB there.
     """
 
     points_px: NDArray[np.float32]
     descriptors: Descriptors
     sizes_px: NDArray[np.float32]
+    colors: NDArray[np.uint8]
 
     def __len__(self) -> int:
         return len(self.points_px)
+
+
+_NONE = Features(
+    np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.uint8)
+)
 
 
 def find_features(image: NDArray[np.uint8], options: FeatureOptions | None = None) -> Features:
@@ -57,23 +64,26 @@ def find_features(image: NDArray[np.uint8], options: FeatureOptions | None = Non
         size = (round(width / reduction), round(height / reduction))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     scale = np.array([width / grey.shape[1], height / grey.shape[0]], dtype=np.float32)
-    sift = cv2.SIFT_create(
+    sift = cv2.SIFT_create(  # type: ignore[attr-defined]
         nfeatures=options.max_features,
         contrastThreshold=options.contrast_threshold,
         enable_precise_upscale=True,
     )
     keys, sums = sift.detectAndCompute(grey, None)
     if not keys:
-        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
+        return _NONE
     points = np.array([key.pt for key in keys], dtype=np.float32)
     strength = np.array([key.response for key in keys])
     order = _spread(points, strength, grey.shape)[: options.max_features]
     roots = np.sqrt(sums / np.maximum(sums.sum(axis=1, keepdims=True), 1e-9))
     roots /= np.maximum(np.linalg.norm(roots, axis=1, keepdims=True), 1e-9)
+    points_px = (points[order] + 0.5) * scale - 0.5
+    columns, rows = np.clip(np.rint(points_px), 0, (width - 1, height - 1)).astype(int).T
     return Features(
-        points_px=(points[order] + 0.5) * scale - 0.5,
+        points_px=points_px,
         descriptors=np.ascontiguousarray(roots[order], dtype=np.float32),
         sizes_px=np.array([key.size for key in keys], dtype=np.float32)[order] * scale.mean(),
+        colors=image[rows, columns],
     )
 
 

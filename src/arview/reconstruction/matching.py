@@ -66,7 +66,7 @@ def epipolar_inliers(ones: Features, others: Features, matches: Matches, max_err
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _match_along(
+def _match_along(  # type: ignore[no-untyped-def]
     rays,
     other_px,
     descriptors,
@@ -84,7 +84,7 @@ def _match_along(
     partner,
     best,
     second,
-):  # type: ignore[no-untyped-def]
+):
     """Best and second best of ``others`` within ``band_px`` of each ray's epipolar line.
 
     ``rays`` are ideal directions (N,2), ``other_px`` ideal pixels about the principal point; ``cells`` lists

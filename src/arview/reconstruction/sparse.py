@@ -75,6 +75,7 @@ def reconstruct_sparse(
     matches = _match_along_lines(chosen, photos, features, options, threads, tell)
     _write_matches(database_path, matches)
     chosen, adjuster = _triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
+    _color(chosen, features)
     chosen.write(str(_emptied(folder / "model")))
     sparse = sparse_model_of(chosen, photos, unplaced)
     return replace(sparse, pose_covariance=pose_covariance(sparse, chosen, adjuster))
@@ -305,6 +306,13 @@ def _adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> boo
             [model.cameras[key].params[:1], centre, model.cameras[key].params[3:]]
         )
     return False
+
+
+def _color(model: Any, features: Sequence[Features]) -> None:
+    """Give every point the colour of the place where it was first seen."""
+    for point in model.points3D.values():
+        first = point.track.elements[0]
+        point.color = features[first.image_id - 1].colors[first.point2D_idx]
 
 
 def _is_refined(camera: Any) -> bool:

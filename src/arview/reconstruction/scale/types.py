@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from arview.geometry import Array
 from arview.reconstruction.scale.similarity import Similarity
 
@@ -111,3 +113,25 @@ class ScaleResult:
                 "misfits": list(c.misfits),
             },
         }
+
+    @classmethod
+    def from_provenance(cls, content: dict[str, Any]) -> ScaleResult:
+        """The inverse of ``provenance``."""
+        c = dict(content["consistency"])
+        matrices = [None if content[name] is None else np.array(content[name]) for name in _MATRICES]
+        return cls(
+            scale=content["mm_per_unit"],
+            scale_std=content["std_relative"],
+            model_from_scan=matrices[0],
+            covariance=matrices[1],
+            evidence=tuple(
+                ScaleEvidence(e["kind"], e["mm_per_unit"], e["std_relative"], e["detail"], e["used"])
+                for e in content["evidence"]
+            ),
+            warnings=tuple(content["warnings"]),
+            why_no_frame=content["why_no_frame"],
+            consistency=Consistency(**{**c, "misfits": tuple(c["misfits"])}),
+        )
+
+
+_MATRICES = ("model_from_scan", "covariance")

@@ -1,0 +1,343 @@
+"""Photos or a video → poses → millimetres in the rough CAD frame → dense cloud, stage by stage into a folder.
+
+| file | stage |
+|---|---|
+| ``photos.json`` | intake: what each photo is worth, what was left out and why |
+| ``frames/`` | the chosen frames, of a video |
+| ``sparse/model/``, ``sparse/database.db`` | COLMAP model in its own unit, features and matches |
+| ``sparse/points.ply``, ``sparse/covariance.npy`` | its points; covariance of the poses, see ``SparseModel`` |
+| ``scale.json`` | mm per unit and rough CAD frame, with what they come from |
+| ``metric/`` | the COLMAP model in mm in the rough CAD frame |
+| ``dense/stereo/`` | depth and normal maps in COLMAP's format |
+| ``cloud.ply`` | the dense cloud |
+| ``reconstruction.json`` | summary of all |
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from arview import __version__
+from arview.atomic import replacing
+from arview.cad import Part
+from arview.errors import InputError, OutputError
+from arview.geometry import Array
+from arview.reconstruction.colmap import read_reconstruction, sparse_model_of, write_model
+from arview.reconstruction.coverage import Coverage, coverage
+from arview.reconstruction.dense import Cad, DenseOptions, read_ply, reconstruct_dense, write_ply
+from arview.reconstruction.intake import Intake, VideoIntakeOptions, intake_photos, intake_video
+from arview.reconstruction.quality import Quality, quality_of
+from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
+from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
+from arview.reconstruction.stages import Stages, content_key, key_of, write_json
+from arview.reconstruction.types import DenseCloud, Photo, SparseModel
+
+Stage = Literal["photos", "sparse", "scale", "dense"]
+STAGES: tuple[Stage, ...] = ("photos", "sparse", "scale", "dense")
+Progress = Callable[[str, int, int], None]
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mts", ".3gp"})
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """Options of a run: those of its stages, and how far to go."""
+
+    video: VideoIntakeOptions = field(default_factory=VideoIntakeOptions)
+    sparse: SparseOptions = field(default_factory=SparseOptions)
+    scale: CadOptions = field(default_factory=CadOptions)
+    sources: ScaleSources = field(default_factory=ScaleSources)
+    dense: DenseOptions = field(default_factory=DenseOptions)
+    last_stage: Stage = "dense"
+    starts_over: bool = False  # forget what an earlier run left in the folder
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What a run found.
+
+    Attributes:
+        folder: where its files are.
+        intake: photos and what is wrong with them.
+        sparse: poses and points; in mm in the rough CAD frame when ``scale.similarity`` is known.
+        scale: None when the run ended before.
+        cloud: in the frame of ``sparse``; None when the run ended before.
+        coverage: of the part's components; None without a frame.
+        quality: reprojection error, tracks, noise.
+        seconds: wall time of each stage that was done now; finished ones of an earlier run are missing.
+    """
+
+    folder: Path
+    intake: Intake
+    sparse: SparseModel | None
+    scale: ScaleResult | None
+    cloud: DenseCloud | None
+    coverage: Coverage | None
+    quality: Quality | None
+    seconds: dict[str, float]
+
+    @property
+    def is_metric(self) -> bool:
+        """True when lengths are in mm."""
+        return self.scale is not None and self.scale.scale is not None
+
+
+def reconstruct(
+    source: str | Path,
+    folder: str | Path,
+    part: Part | None = None,
+    camera: str | None = None,
+    options: ReconstructOptions | None = None,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Reconstruct what the photos show.
+
+    Stages that an earlier run finished in ``folder`` with the same photos and options are read, not repeated.
+
+    Args:
+        source: folder or glob of photos, or a video file.
+        folder: where everything is written; made when missing.
+        part: gives the scale and the frame, the region of the dense cloud and the coverage.
+        camera: camera file or ``fov:DEG``; without it, EXIF data or a guess, refined with the poses.
+        options: of the stages.
+        progress: called with (what, done, total).
+
+    Raises:
+        InputError: too few or unusable photos, or photos that do not fit together; the message says what to do.
+        MismatchError: the camera does not fit the photos.
+        OutputError: the folder cannot be written to.
+    """
+    run = _Run(Path(folder), part, options or ReconstructOptions(), progress or (lambda what, done, total: None))
+    return run.all(source, camera)
+
+
+class _Run:
+    """One run: its folder, its options and the time its stages took."""
+
+    def __init__(self, folder: Path, part: Part | None, options: ReconstructOptions, tell: Progress) -> None:
+        self.folder, self.part, self.options, self.tell = folder, part, options, tell
+        self.stages = Stages(folder)
+        self.seconds: dict[str, float] = {}
+        if options.starts_over:
+            for stage in ("frames", *STAGES):
+                self.stages.restart(stage)
+
+    def all(self, source: str | Path, camera: str | None) -> Reconstruction:
+        """The stages in their order."""
+        intake = self._photos(source, camera)
+        sparse, scale, cloud, cover = None, None, None, None
+        last = STAGES.index(self.options.last_stage)
+        if last >= 1:
+            key = key_of([replace(photo, path=Path()) for photo in intake.photos], self.options.sparse)
+            key = key_of(key, content_key(photo.path for photo in intake.photos))
+            sparse = self._sparse(intake.photos, key)
+        if last >= 2 and sparse is not None:
+            part_key = None if self.part is None else (self.part.model.source_hash, self.part.effective_view_range)
+            key = key_of(key, part_key, self.options.sources, self.options.scale)
+            scale = self._scale(sparse, key)
+            sparse, cad = self._metric(sparse, scale)
+            cover = self._coverage(sparse, cad)
+        if last >= 3 and sparse is not None:
+            key = key_of(key, self.options.dense)
+            cloud = self._dense(sparse, cad, key)
+        quality = None if sparse is None else quality_of(sparse, cloud)
+        result = Reconstruction(self.folder, intake, sparse, scale, cloud, cover, quality, self.seconds)
+        write_json(self.folder / "reconstruction.json", summary(result))
+        return result
+
+    def _timed(self, name: str, began: float) -> None:
+        self.seconds[name] = round(time.perf_counter() - began, 2)
+
+    def _photos(self, source: str | Path, camera: str | None) -> Intake:
+        began = time.perf_counter()
+        if Path(source).suffix.lower() in VIDEO_SUFFIXES and Path(source).is_file():
+            intake = self._frames(Path(source), camera)
+        else:
+            intake = intake_photos(source, camera, progress=lambda i, n: self.tell("photos", i, n))
+        write_json(self.folder / "photos.json", intake_summary(intake))
+        self._timed("photos", began)
+        return intake
+
+    def _frames(self, video: Path, camera: str | None) -> Intake:
+        frames = self.folder / "frames"
+        key = key_of(content_key([video]), self.options.video)
+        if self.stages.is_finished("frames", key) and frames.is_dir():
+            return intake_photos(frames, camera, self.options.video.checks, lambda i, n: self.tell("photos", i, n))
+        self.stages.restart("frames")
+        for old in frames.glob("frame_*.png"):
+            old.unlink()
+        intake = intake_video(video, frames, self.options.video, camera, lambda i, n: self.tell("frames", i, n))
+        self.stages.finish("frames", key)
+        return intake
+
+    def _sparse(self, photos: tuple[Photo, ...], key: str) -> SparseModel:
+        began = time.perf_counter()
+        folder = self.folder / "sparse"
+        if self.stages.is_finished("sparse", key):
+            return _read_sparse(folder, photos)
+        self.stages.restart("sparse")
+        sparse = reconstruct_sparse(photos, folder, self.options.sparse, self.tell)
+        _write_sparse(folder, sparse)
+        self.stages.finish("sparse", key)
+        self._timed("sparse", began)
+        return sparse
+
+    def _scale(self, sparse: SparseModel, key: str) -> ScaleResult:
+        began = time.perf_counter()
+        path = self.folder / "scale.json"
+        if self.stages.is_finished("scale", key):
+            return ScaleResult.from_provenance(json.loads(path.read_text(encoding="utf-8")))
+        self.stages.restart("scale")
+        scale = find_scale(sparse, self.part, self.options.sources, self.options.scale, progress=self.tell)
+        write_json(path, scale.provenance())
+        self.stages.finish("scale", key)
+        self._timed("scale", began)
+        return scale
+
+    def _metric(self, sparse: SparseModel, scale: ScaleResult) -> tuple[SparseModel, Cad | None]:
+        """The model in mm and, where the CAD was found, in its frame; a COLMAP model of it is written."""
+        if scale.scale is None:
+            return sparse, None
+        frame = scale.model_from_scan if scale.model_from_scan is not None else np.eye(4)
+        metric = sparse.transformed(scale.scale, frame)
+        write_model(self.folder / "sparse" / "model", self.folder / "metric", scale.scale, frame)
+        if self.part is None or scale.model_from_scan is None or not scale.consistency.is_consistent:
+            return metric, None
+        return metric, Cad(self.part.model, np.eye(4))
+
+    def _coverage(self, sparse: SparseModel, cad: Cad | None) -> Coverage | None:
+        if cad is None:
+            return None
+        views = [(photo.camera, photo.cam_from_scan) for photo in sparse.photos]
+        return coverage(cad.model, views, names=[photo.name for photo in sparse.photos])
+
+    def _dense(self, sparse: SparseModel, cad: Cad | None, key: str) -> DenseCloud:
+        began = time.perf_counter()
+        path = self.folder / "cloud.ply"
+        if self.stages.is_finished("dense", key):
+            return read_ply(path)
+        self.stages.restart("dense")
+        cloud = reconstruct_dense(sparse, self.options.dense, cad, self.folder / "dense", self.tell)
+        write_ply(cloud, path)
+        self.stages.finish("dense", key)
+        self._timed("dense", began)
+        return cloud
+
+
+# --- files -----------------------------------------------------------------------------------------------
+
+
+def _write_sparse(folder: Path, sparse: SparseModel) -> None:
+    """What COLMAP's model, already in the folder, does not hold."""
+    write_json(folder / "unplaced.json", dict(sparse.unplaced))
+    try:
+        if sparse.pose_covariance is not None:
+            with replacing(folder / "covariance.npy") as file:
+                np.save(file, sparse.pose_covariance)
+        with replacing(folder / "points.ply") as file:
+            file.write(points_ply(sparse))
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written to ({error.strerror or error})") from error
+
+
+def _read_sparse(folder: Path, photos: tuple[Photo, ...]) -> SparseModel:
+    """What ``reconstruct_sparse`` and ``_write_sparse`` left. Raises InputError when files are missing."""
+    try:
+        unplaced = json.loads((folder / "unplaced.json").read_text(encoding="utf-8"))
+        sparse = sparse_model_of(read_reconstruction(folder / "model"), photos, tuple(unplaced.items()))
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"{folder}: files are missing or damaged ({error}); run again with --force") from error
+    path = folder / "covariance.npy"
+    return replace(sparse, pose_covariance=np.load(path)) if path.exists() else sparse
+
+
+def points_ply(sparse: SparseModel) -> bytes:
+    """The sparse points as a binary PLY."""
+    rows = np.zeros(len(sparse.points_in_scan), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = sparse.points_in_scan, sparse.colors
+    fields = [*(f"float {name}" for name in "xyz"), *(f"uchar {name}" for name in ("red", "green", "blue"))]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {name}" for name in fields]
+    return "\n".join([*lines, "end_header", ""]).encode() + rows.tobytes()
+
+
+# --- summaries -------------------------------------------------------------------------------------------
+
+
+def intake_summary(intake: Intake) -> dict[str, Any]:
+    """Intake for ``photos.json``."""
+    return {
+        "photos": [
+            {"name": photo.name, "lens": photo.lens, "width": photo.width, "height": photo.height}
+            for photo in intake.photos
+        ],
+        "rejected": dict(intake.rejected),
+        "warnings": list(intake.warnings),
+        "lenses": [
+            {"key": lens.key, "focal_px": lens.camera.fx, "focal_from": lens.focal_from} for lens in intake.lenses
+        ],
+        "checks": [vars(check) for check in intake.checks],
+    }
+
+
+def summary(result: Reconstruction) -> dict[str, Any]:
+    """A run for ``reconstruction.json``; transforms are 4×4 row-major."""
+    content: dict[str, Any] = {
+        "version": __version__,
+        "unit": "mm" if result.is_metric else None,
+        "rejected": dict(result.intake.rejected),
+        "warnings": list(result.intake.warnings),
+        "seconds": result.seconds,
+    }
+    sparse = result.sparse
+    if sparse is not None:
+        deviations = pose_deviations(sparse)
+        content["unplaced"] = dict(sparse.unplaced)
+        content["photos"] = {
+            photo.name: {
+                "camera": camera_summary(photo.camera),
+                "cam_from_scan": photo.cam_from_scan.tolist(),
+                **({} if deviations is None else {"std_rad": deviations[i, 0], "std_position": deviations[i, 1]}),
+            }
+            for i, photo in enumerate(sparse.photos)
+        }
+    if result.scale is not None:
+        content["scale"] = result.scale.provenance()
+    if result.quality is not None:
+        content["quality"] = result.quality.as_dict()
+    if result.coverage is not None:
+        content["coverage"] = {
+            "components": {
+                one.name: {"photos": len(one.photos), "directions": one.directions, "spread_deg": one.spread_deg}
+                for one in result.coverage.components
+            },
+            "advice": list(result.coverage.advice),
+        }
+    return content
+
+
+def camera_summary(camera: Any) -> dict[str, Any]:
+    """A Camera for JSON, in arview's own format."""
+    return {
+        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx,
+        "cy": camera.cy, "dist": camera.dist.tolist(),
+    }  # fmt: skip
+
+
+def pose_deviations(sparse: SparseModel) -> Array | None:
+    """(M,2) standard deviation of each photo's rotation (rad) and centre (unit), per axis in the mean."""
+    if sparse.pose_covariance is None:
+        return None
+    rows = []
+    for i in range(len(sparse.photos)):
+        block = sparse.pose_covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
+        # A left twist (w, v) moves the centre, seen from the camera, by −v alone: the centre is its origin.
+        rows.append(np.sqrt([np.trace(block[:3, :3]) / 3.0, np.trace(block[3:, 3:]) / 3.0]))
+    return np.array(rows)
