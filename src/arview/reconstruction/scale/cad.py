@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from arview.camera import Camera
 from arview.geometry import Array, invert, rigid
 from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewOptions, GuideViewSet
+from arview.reconstruction.scale.edges import linear_light
 from arview.reconstruction.scale.refine import Fit, JointRefiner, RefineOptions, Support, View
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.vote import Sighting, Vote, vote
@@ -27,14 +28,20 @@ Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many are done and how many there are."""
 
 
+FOUND_QUALITY = 0.5
+"""A detection of this quality is believed alone."""
+
+
 @dataclass(frozen=True)
 class CadOptions:
     """Options of finding the CAD in the photos.
 
     Attributes:
         detect_width_px: longer side of the pictures that the part is searched in.
-        most_detections: photos searched at most; and without any sighting so far, at most ``first_detections``.
+        most_detections: photos searched at most; while no two agree, at most ``first_detections``.
         agreeing: so many photos end the search.
+        least_quality: detections that would not be believed alone vote too: with others they may agree.
+        sightings: detections taken of a photo.
         subdivisions: of the guide views' directions: 3 is about 8° apart, enough to start from.
         spans: smallest and largest part of the longer side that the part is expected to span.
         max_side_px: photos are refined at this size at most: memory.
@@ -49,6 +56,8 @@ class CadOptions:
     most_detections: int = 12
     first_detections: int = 6
     agreeing: int = 3
+    least_quality: float = 0.1
+    sightings: int = 5
     subdivisions: int = 3
     spans: tuple[float, float] = (0.2, 1.2)
     max_side_px: int = 2000
@@ -104,12 +113,9 @@ def spread_order(photos: Sequence[PosedPhoto]) -> list[int]:
 
 
 def make_view(photo: PosedPhoto, image: Pixels, max_side_px: int) -> View:
-    """A photo in linear light (sRGB's curve), smoothed a little, and no larger than ``max_side_px``."""
+    """A photo in linear light, no larger than ``max_side_px``."""
     camera, gray = shrunk(photo.camera, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), max_side_px)
-    levels = np.arange(256) / 255.0
-    linear = 255.0 * np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
-    light = cv2.GaussianBlur(linear.astype(np.float32)[gray], (0, 0), 0.7)
-    return View(photo.name, camera, np.ascontiguousarray(light), photo.cam_from_scan)
+    return View(photo.name, camera, linear_light(gray), photo.cam_from_scan)
 
 
 def shrunk(camera: Camera, image: Pixels, max_side_px: int) -> tuple[Camera, Pixels]:
@@ -179,14 +185,17 @@ def _search(
     progress: Progress | None,
 ) -> tuple[list[Vote], Array, NotFound]:
     """Votes of the detections, turns (N,3,3) that make the part look much the same, and why not when no vote."""
+    from arview.tracking.detector import options_for
     from arview.tracking.why_not import why_not
 
     detectors: dict[tuple[float, ...], Detector] = {}
     sightings: list[Sighting] = []
+    votes: list[Vote] = []
     reasons: list[str] = []
+    sure = 0
     enough = min(options.agreeing, len(photos))
     for count, index in enumerate(order[: options.most_detections]):
-        if count >= options.first_detections and not sightings:
+        if count >= options.first_detections and not votes:
             break
         if progress:
             progress("finding the part", count, min(len(order), options.most_detections))
@@ -194,9 +203,12 @@ def _search(
         key = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist)
         detector = detectors.get(key)
         if detector is None:
-            detector = detectors[key] = Detector(views, camera)
-        found = detector.detect(image)
-        if not found:
+            unsure = replace(options_for(views), min_quality=options.least_quality)
+            detector = detectors[key] = Detector(views, camera, unsure)
+        found = detector.detect(image, options.sightings)
+        if found and found[0].quality >= FOUND_QUALITY:
+            sure += 1
+        elif not found:
             reasons.append(why_not(image, camera, views, detector.best_rejected))
         for d in found:
             poses = (d.cam_from_model, *d.alternatives)
@@ -204,13 +216,12 @@ def _search(
         votes = vote(sightings, views.center_in_model, views.diameter_mm)
         if votes and len(votes[0].sightings) >= enough:
             return votes, next(iter(detectors.values())).symmetries.near, NotFound("")
-    seen = len({sighting.photo for sighting in sightings})
-    if seen < enough:
-        reason = max(reasons, key=reasons.count) if reasons else "it was found in too few photos"
-        few = f"the part was found in only {seen} photos; in the others: {reason}"
-        return [], np.zeros((0, 3, 3)), NotFound(few if seen else reason)
-    apart = f"the part was found in {seen} photos, but they do not agree about where it is"
-    return [], np.zeros((0, 3, 3)), NotFound(apart, is_contradiction=True)
+    if sure >= enough:
+        apart = f"the part was found in {sure} photos, but they do not agree about where it is"
+        return [], np.zeros((0, 3, 3)), NotFound(apart, is_contradiction=True)
+    reason = max(reasons, key=reasons.count) if reasons else "it looks much the same from several sides"
+    few = f"the part was found in only {sure} of the photos; in others: {reason}"
+    return [], np.zeros((0, 3, 3)), NotFound(few if sure else reason)
 
 
 def _refined(

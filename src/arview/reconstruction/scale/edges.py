@@ -6,8 +6,10 @@ ISMAR 2004). Profiles are means over short parallel lines, in linear light: ther
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from arview.geometry import Array
 
@@ -15,6 +17,13 @@ HYPOTHESES = 4
 """Steps kept per point, the strongest."""
 STEP_PX = 0.5
 """Distance between samples of a profile."""
+
+
+def linear_light(gray: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(H,W) grey levels 0–255 in linear light by the curve of sRGB, smoothed a little against noise."""
+    levels = np.arange(256) / 255.0
+    linear = 255.0 * np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+    return np.ascontiguousarray(cv2.GaussianBlur(linear.astype(np.float32)[gray], (0, 0), 0.7))
 
 
 @njit(cache=True, nogil=True)

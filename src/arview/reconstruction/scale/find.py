@@ -112,7 +112,7 @@ def combine(evidence: Sequence[ScaleEvidence]) -> Combined | None:
     for e in ordered:
         trusted = [other for other in judged if other.is_used]
         apart = [abs(np.log(e.mm_per_unit / t.mm_per_unit)) / np.hypot(e.std, t.std) for t in trusted]
-        is_used = not apart or max(apart) <= DISAGREE
+        is_used = not apart or bool(max(apart) <= DISAGREE)
         judged.append(replace(e, is_used=is_used))
         if not is_used:
             rival = trusted[int(np.argmax(apart))]

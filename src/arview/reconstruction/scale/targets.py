@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array
+from arview.reconstruction.scale.edges import choose_steps, find_steps, linear_light
 from arview.reconstruction.scale.similarity import fit_points
 from arview.reconstruction.scale.specs import Board, Rig, ScaleBar, ScaleSources, Tags
 from arview.reconstruction.scale.types import ScaleEvidence
@@ -31,6 +32,10 @@ LEAST_SIGMA_PX = 0.05
 """Corners are never taken to be better than this."""
 MIN_ANGLE_DEG = 2.0
 """Corners seen under a smaller parallax have no place."""
+TAG_EDGE_STD_PX = 0.1
+"""All sides of tags may lie so far out or in together: an unknown tone curve. Chessboard corners and centres do not."""
+SIDE_REACH_PX = 3.0
+"""How far from where OpenCV sees it the side of a tag is looked for."""
 OUTLIER = 4.0
 """Observations off by so many standard deviations are left out."""
 
@@ -44,11 +49,12 @@ class Corners:
     sigma_px: float
 
 
-def find_corners(gray: NDArray[np.uint8], sources: ScaleSources) -> dict[Key, Array]:
+def find_corners(gray: NDArray[np.uint8], camera: Camera, sources: ScaleSources) -> dict[Key, Array]:
     """Corners (2,) px of all boards and tags that one photo (H,W) uint8 shows, integers at pixel centres."""
     import cv2
 
     found: dict[Key, Array] = {}
+    light = linear_light(gray)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     taken: dict[str, set[int]] = defaultdict(set)
@@ -66,9 +72,36 @@ def find_corners(gray: NDArray[np.uint8], sources: ScaleSources) -> dict[Key, Ar
         detector = cv2.aruco.ArucoDetector(_dictionary(name), parameters)
         quads, ids, _ = detector.detectMarkers(gray)
         for quad, index in zip(quads, _flat(ids, 1), strict=True):
-            for corner, place in enumerate(_flat(quad, 2)):
+            for corner, place in enumerate(refined_quad(light, camera, _flat(quad, 2))):
                 found[name, int(index[0]), corner] = place
     return found
+
+
+def refined_quad(light: NDArray[np.float32], camera: Camera, quad: Array) -> Array:
+    """Corners (4,2) of a tag where straight lines through its four sides meet, the lens taken into account.
+
+    OpenCV's corner refinement is made for chessboards: at the lone corner of a tag it ends inside, by 0.1 to 0.3 px.
+    """
+    lines = []
+    for a, b in zip(quad, np.roll(quad, -1, axis=0), strict=True):
+        along = (b - a) / np.linalg.norm(b - a)
+        normal = np.array([-along[1], along[0]])
+        count = int(np.clip(np.linalg.norm(b - a) / 2.0, 8, 60))
+        points = a + np.linspace(0.12, 0.88, count)[:, None] * (b - a)
+        offsets, slopes, _ = find_steps(light, points, np.tile(normal, (count, 1)), SIDE_REACH_PX, 1.0, 1.0)
+        offset, slope = choose_steps(offsets, slopes, 0.5 * SIDE_REACH_PX, 6.0)
+        is_found = slope != 0.0
+        is_found &= np.abs(offset - np.median(offset[is_found])) < 0.6 if is_found.any() else False
+        if np.count_nonzero(is_found) < 6:
+            return quad
+        rays = camera.unproject(points[is_found] + offset[is_found, None] * normal)
+        # The plane through the camera that the rays of a side lie in.
+        lines.append(np.linalg.svd(rays)[2][2])
+    corners = np.array([np.cross(lines[k - 1], lines[k]) for k in range(4)])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        refined = camera.project(corners / corners[:, 2:])
+    moved = np.linalg.norm(refined - quad, axis=1)
+    return refined if np.all(moved < SIDE_REACH_PX) else quad
 
 
 def scale_from_targets(
@@ -83,7 +116,7 @@ def scale_from_targets(
     """
     if not (sources.boards or sources.tags or sources.bars):
         return [], []
-    seen = list(pool().map(lambda photo: find_corners(read_gray(photo), sources), photos))
+    seen = list(pool().map(lambda photo: find_corners(read_gray(photo), photo.camera, sources), photos))
     corners = triangulate([p.camera for p in photos], [p.cam_from_scan for p in photos], seen)
     evidence: list[ScaleEvidence] = []
     missing: list[str] = []
@@ -94,7 +127,7 @@ def scale_from_targets(
             int(i) for b in sources.boards if b.dictionary == tags.dictionary for i in _cv_board(b).getIds().ravel()
         }
         what = f"tags {tags.dictionary.removeprefix('DICT_')} of {tags.side_mm:g} mm"
-        _add(evidence, missing, _tag_evidence(tags, in_boards, corners, what), what)
+        _add(evidence, missing, _tag_evidence(tags, in_boards, corners, _side_px(seen, tags), what), what)
     for bar in sources.bars:
         what = f"scale bar from tag {bar.first} to tag {bar.second}, {bar.length_mm:g} mm"
         _add(evidence, missing, _bar_evidence(bar, corners, what), what)
@@ -202,7 +235,16 @@ def _board_evidence(board: Board, number: int, corners: Corners) -> ScaleEvidenc
     return ScaleEvidence("board", fit.similarity.scale, float(np.hypot(fit.scale_std, PRINT_STD)), detail)
 
 
-def _tag_evidence(tags: Tags, in_boards: set[int], corners: Corners, what: str) -> ScaleEvidence | None:
+def _side_px(seen: Sequence[dict[Key, Array]], tags: Tags) -> float:
+    """Median side of a dictionary's tags in the photos."""
+    sides = [
+        float(np.linalg.norm(corners[key] - corners[(*key[:2], 1)]))
+        for corners in seen for key in corners if key[0] == tags.dictionary and key[2] == 0
+    ]  # fmt: skip
+    return float(np.median(sides)) if sides else 1.0
+
+
+def _tag_evidence(tags: Tags, in_boards: set[int], corners: Corners, side_px: float, what: str) -> ScaleEvidence | None:
     half = 0.5 * tags.side_mm
     square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
     ids = sorted({key[1] for key in corners.points if key[0] == tags.dictionary} - in_boards)
@@ -218,7 +260,8 @@ def _tag_evidence(tags: Tags, in_boards: set[int], corners: Corners, what: str) 
     middle = float(np.median(logs))
     from_residuals = float(np.median([fit.scale_std for fit in fits]))
     scatter = max(1.4826 * float(np.median(np.abs(logs - middle))), from_residuals)
-    std = float(np.hypot(1.2533 * scatter / np.sqrt(len(fits)), PRINT_STD))
+    from_curve = 2.0 * TAG_EDGE_STD_PX / side_px
+    std = float(np.linalg.norm([1.2533 * scatter / np.sqrt(len(fits)), from_curve, PRINT_STD]))
     rms_mm = float(np.sqrt(np.mean([fit.rms_mm**2 for fit in fits])))
     detail = f"{what}: {len(fits)} of them, {rms_mm:.3f} mm rms, {corners.sigma_px:.2f} px"
     return ScaleEvidence("tag", float(np.exp(middle)), std, detail)

@@ -16,8 +16,8 @@ import numpy as np
 from arview.geometry import Array, apply, invert, orthonormalise, rigid, rotation_angle_rad
 from arview.reconstruction.scale.similarity import Similarity
 
-AGREE_RAD = np.deg2rad(5.0)
-ACROSS, AHEAD = 0.04, 0.08
+AGREE_RAD = np.deg2rad(2.5)
+ACROSS, AHEAD = 0.02, 0.06
 """Detections agree when they place the middle this near across the view and along it, in diameters of the part."""
 SAME_RAD, SAME_PLACE, SAME_SCALE = np.deg2rad(8.0), 0.1, 0.06
 
