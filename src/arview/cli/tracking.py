@@ -1,21 +1,17 @@
-"""The command line: parse, call one function, print. Everything heavy is imported inside the commands."""
+"""The commands about finding and tracking a part: check, guideviews, annotate, evaluate."""
 
 from __future__ import annotations
 
 import json
-import os
 import time
-import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import click
 
 from arview import __version__
-from arview.atomic import replacing
-from arview.errors import ArviewError, InputError, OutputError
+from arview.cli.common import EXIT_INTERRUPTED, RENDERER, UNIT, main, output_path, progress_bar, say, write_bytes
+from arview.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from arview.camera import Camera
@@ -24,76 +20,7 @@ if TYPE_CHECKING:
     from arview.tracking import SessionOptions
     from arview.video import FrameSource
 
-EXIT_ERROR, EXIT_BUG, EXIT_INTERRUPTED = 2, 1, 130
 MODALITIES = ("region", "edge", "feature")
-Progress = Callable[[int, int], None]
-
-
-class _Group(click.Group):
-    """Turns exceptions of the commands into one line on stderr and an exit code."""
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run the chosen command."""
-        try:
-            return super().invoke(ctx)
-        except ArviewError as error:
-            _say(f"error: {error}")
-            ctx.exit(EXIT_ERROR)
-        except KeyboardInterrupt:
-            _say("interrupted")
-            ctx.exit(EXIT_INTERRUPTED)
-        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
-            raise
-        except Exception as error:
-            if os.environ.get("ARVIEW_DEBUG"):
-                traceback.print_exc()
-            hint = "" if os.environ.get("ARVIEW_DEBUG") else " with what ARVIEW_DEBUG=1 prints"
-            _say(f"internal error: {type(error).__name__}: {error}; please report this{hint}")
-            ctx.exit(EXIT_BUG)
-
-
-class _CheckCommand(click.Command):
-    """Its help ends with a complete part file."""
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the examples, then the part file."""
-        from arview.cad import PART_FILE_EXAMPLE
-
-        super().format_epilog(ctx, formatter)
-        formatter.write("\n" + PART_FILE_EXAMPLE)
-
-
-def _say(text: str) -> None:
-    """One line on stderr, whatever the text holds."""
-    click.echo("arview: " + " ".join(text.split()), err=True)
-
-
-@click.group(
-    cls=_Group,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="""\b
-Examples:
-  arview check bracket.step
-  arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json
-  arview evaluate bop/castle --init truth
-
-\b
-PART is a part file (part.toml; `arview check --help` shows one) or a CAD file (STEP, glTF, OBJ, STL,
-PLY, 3MF). Exit codes: 0 done, 2 bad input, 130 interrupted (files are finished), 1 a bug in arview.""",
-)
-@click.version_option(__version__, prog_name="arview")
-def main() -> None:
-    """AR inspection of assemblies: find and track a part in video by its CAD, draw what was measured."""
-
-
-UNIT = click.option("--unit", type=click.Choice(["mm", "cm", "m", "inch"]), help="Unit of the numbers in the CAD file.")
-RENDERER = click.option(
-    "--renderer",
-    type=click.Choice(["auto", "pyrender", "zbuffer"]),
-    default="auto",
-    show_default=True,
-    help="What draws guide views: pyrender needs a GL library, zbuffer nothing.",
-)
 
 
 def _parse_modalities(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -115,6 +42,17 @@ MODALITY = click.option(
 
 
 # --- check ----------------------------------------------------------------------------------------------
+
+
+class _CheckCommand(click.Command):
+    """Its help ends with a complete part file."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples, then the part file."""
+        from arview.cad import PART_FILE_EXAMPLE
+
+        super().format_epilog(ctx, formatter)
+        formatter.write("\n" + PART_FILE_EXAMPLE)
 
 
 @main.command(
@@ -179,13 +117,13 @@ def guideviews(
     from arview.guideviews.uniqueness import assess
 
     loaded = load_part(part, unit)
-    path = _output_path(output, [loaded.path, loaded.cad_path])
-    preview_path = _output_path(preview, [loaded.path, loaded.cad_path, path]) if preview else None
+    path = output_path(output, [loaded.path, loaded.cad_path])
+    preview_path = output_path(preview, [loaded.path, loaded.cad_path, path]) if preview else None
     if preview_path is not None and preview_path.suffix.lower() != ".png":
         raise OutputError(f"{preview}: the name of the preview must end in .png")
     model = loaded.model.only([component]) if component else loaded.model
     began = time.perf_counter()
-    with _progress("guide views") as progress:
+    with progress_bar("guide views") as progress:
         views = make_guide_views(model, loaded.effective_view_range, GuideViewOptions(renderer=renderer), progress)
     views.save(path)
     seconds = time.perf_counter() - began
@@ -202,7 +140,7 @@ def guideviews(
         from arview.guideviews.sheet import contact_sheet
 
         _, png = cv2.imencode(".png", cv2.cvtColor(contact_sheet(model, views, unique=unique), cv2.COLOR_RGB2BGR))
-        _write_bytes(preview_path, png.tobytes())
+        write_bytes(preview_path, png.tobytes())
         click.echo(f"wrote {preview_path}")
 
 
@@ -315,17 +253,17 @@ def annotate(
 
     if output is None and poses_path is None:
         output = _default_output(source)
-        _say(f"no -o or --poses given: writing {output}")
+        say(f"no -o or --poses given: writing {output}")
     part = load_part(part_path, unit)
     guide_name = init.removeprefix(GUIDE_PREFIX) if init and init.startswith(GUIDE_PREFIX) else None
     init_path = init if guide_name is None else None
     first_pose = _load_pose(init_path) if init_path else None
     inspection = load_inspection(inspection_path, part.model) if inspection_path else None
     inputs = [source, part.path, part.cad_path, views_path, camera_spec, inspection_path, init_path]
-    video_path = _output_path(output, inputs) if output else None
-    poses_file = _output_path(poses_path, [*inputs, output]) if poses_path else None
+    video_path = output_path(output, inputs) if output else None
+    poses_file = output_path(poses_path, [*inputs, output]) if poses_path else None
     outputs = [output, poses_path]
-    learned_file = _output_path(learned_path, [*inputs, *outputs]) if learned_path else None
+    learned_file = output_path(learned_path, [*inputs, *outputs]) if learned_path else None
     first = start if isinstance(start, int) else None
     last = end if isinstance(end, int) else None
     with open_source(source, first, last, stride, fps) as frames:
@@ -335,7 +273,7 @@ def annotate(
         if guide_name is not None:
             guide = guide_pose(guide_name, part, views.view_range if views else part.effective_view_range, camera)
         if views is None:
-            with _progress("guide views") as progress:
+            with progress_bar("guide views") as progress:
                 views = cached_guide_views(
                     part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress
                 )
@@ -359,7 +297,7 @@ def annotate(
             )
             overlay = OverlayRenderer(part.model, camera, inspection, looks)
             sink = VideoSink(video_path, frames.width, frames.height, frames.fps, frames)
-        with _progress("frames", frames.frame_count) as progress:
+        with progress_bar("frames", frames.frame_count) as progress:
             summary = pipeline.annotate(
                 frames,
                 session,
@@ -371,13 +309,13 @@ def annotate(
                 end if isinstance(end, float) else None,
             )
     if sink is not None and sink.audio_note:
-        _say(f"warning: {sink.audio_note}")
+        say(f"warning: {sink.audio_note}")
     _print_annotated(summary, [path for path in (video_path, poses_file) if path is not None])
     if learned_file is not None:
         session.learned.save(learned_file)
         click.echo(f"wrote {learned_file}: {len(session.learned)} learned views")
     if summary.is_interrupted:
-        _say("interrupted")
+        say("interrupted")
         ctx.exit(EXIT_INTERRUPTED)
 
 
@@ -385,7 +323,7 @@ def _print_annotated(summary: AnnotateSummary, written: list[Path]) -> None:
     from arview.pipeline import reasons_text
 
     if summary.ended_reason:
-        _say(f"warning: {summary.ended_reason}")
+        say(f"warning: {summary.ended_reason}")
     if summary.frames == 0:
         click.echo("no frame was processed; nothing is written")
         return
@@ -455,40 +393,26 @@ def evaluate(
     from arview.guideviews import GuideViewOptions
 
     folders = [folder for path in scenes for folder in find_scenes(path)]
-    output = _output_path(json_path, [part_path, reference]) if json_path else None
+    output = output_path(json_path, [part_path, reference]) if json_path else None
     part = load_part(part_path, unit) if part_path else None
     loaded = [load_scene(folder, part, reference, object_id) for folder in folders]
     results = []
     for scene in loaded:
         if reference is None and any(f.cam_from_model is not None and not f.is_truth for f in scene.frames):
-            _say(f"{scene.name}: frames without truth are compared with {scene.reference}")
-        with _progress(f"{scene.name} guide views") as progress:
+            say(f"{scene.name}: frames without truth are compared with {scene.reference}")
+        with progress_bar(f"{scene.name} guide views") as progress:
             views = scene_guide_views(scene, GuideViewOptions(renderer=renderer), progress)
-        with _progress(scene.name) as progress:
+        with progress_bar(scene.name) as progress:
             result = evaluate_scene(scene, init, _session_options(modalities), views, progress)
         click.echo(format_result(result, per_frame))
         results.append(result.to_dict())
     if output is not None:
         content = {"version": __version__, "modalities": list(modalities), "scenes": results}
-        _write_bytes(output, (json.dumps(content, indent=1) + "\n").encode())
+        write_bytes(output, (json.dumps(content, indent=1) + "\n").encode())
         click.echo(f"wrote {output}")
 
 
 # --- shared ---------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _progress(label: str, total: int | None = None) -> Iterator[Progress]:
-    """A bar on stderr, shown only on a terminal; yields a function of (done, in all)."""
-    from tqdm import tqdm
-
-    with tqdm(desc=label, total=total, disable=None, leave=False, unit="") as bar:
-
-        def update(done: int, in_all: int) -> None:
-            bar.total = in_all or None
-            bar.update(done - bar.n)
-
-        yield update
 
 
 def _session_options(modalities: tuple[str, ...]) -> SessionOptions:
@@ -506,7 +430,7 @@ def _camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
     if spec is not None:
         return load_camera(spec, frames.width, frames.height, source, frames.quarter_turns_clockwise)
     camera = guess_camera(frames.width, frames.height)
-    _say(
+    say(
         f"WARNING: no --camera given: GUESSING a focal length of {camera.fx:.0f} px (1.2 × the longer side)"
         " and no distortion; distances will be wrong by as much. Give a camera file, fov:DEG or exif"
     )
@@ -534,31 +458,3 @@ def _default_output(source: str) -> str:
         return f"camera_{source}_annotated.mp4"
     stem = "".join(letter for letter in Path(source).stem if letter.isalnum() or letter in "-_. ")
     return f"{stem.strip(' .') or 'video'}_annotated.mp4"
-
-
-def _output_path(path: str, inputs: list[Any]) -> Path:
-    """The path of an output, after making sure that it can be one and overwrites no input."""
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise OutputError(f"{path}: there is no folder {target.parent}; create it first")
-    if target.is_dir():
-        raise OutputError(f"{path}: is a folder; give the name of a file")
-    if not os.access(target.parent, os.W_OK):
-        raise OutputError(f"{path}: the folder {target.parent} cannot be written to; choose another")
-    for other in inputs:
-        if other is not None and target.resolve() == Path(other).resolve():
-            raise OutputError(f"{path}: would overwrite an input or another output; choose another name")
-    return target
-
-
-def _write_bytes(path: Path, content: bytes) -> None:
-    """Write a file that appears complete or not at all."""
-    try:
-        with replacing(path) as file:
-            file.write(content)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
-
-
-if __name__ == "__main__":
-    main()

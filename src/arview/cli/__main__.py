@@ -1,0 +1,5 @@
+"""``python -m arview.cli``."""
+
+from arview.cli import main
+
+main()

@@ -1,0 +1,181 @@
+"""The command reconstruct: photos → poses, millimetres, dense cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+import click
+
+from arview.cli.common import UNIT, main, say, stage_bar
+from arview.errors import InputError
+
+if TYPE_CHECKING:
+    from arview.reconstruction.run import Reconstruction
+    from arview.reconstruction.scale import ScaleSources
+
+STAGES = ("photos", "sparse", "scale", "dense")
+
+
+@main.command(
+    short_help="Make camera poses and a metric cloud of photos.",
+    epilog="""\b
+Examples:
+  arview reconstruct photos/ --part part.toml -o out/
+  arview reconstruct walk.mp4 --part part.toml --camera phone.json -o out/
+  arview reconstruct photos/ --part part.toml --board charuco:8x6:30:22:DICT_5X5_100 -o out/
+  arview reconstruct photos/ --scale-bar 3:7:412.55 -o out/
+  arview reconstruct photos/ --part part.toml --until sparse -o out/
+
+\b
+Photos: 20 to 60, 10 to 20 degrees apart, all around and from two heights, the part standing still, zoom and
+focus as they are, texture around the part (a patterned mat, printed sheets). JPEG, PNG, TIFF, HEIC. Without
+--camera the lens is calibrated from the photos themselves; photos of other lenses or zooms are told apart.
+
+\b
+Millimetres come from what is known, in this order of trust, combined where there are several:
+  --board charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY   or  aruco:…, lengths in mm
+  --tag FAMILY:SIDE                   every tag of the family has this side in mm, as apriltag36h11:20
+  --scale-bar ID1:ID2:LENGTH          distance in mm of the middles of two tags
+  --scale-file FILE, --rig FILE       the same in a TOML file; known poses of the cameras
+  --part PART                         the CAD, found in the photos; it also gives the frame
+
+\b
+OUT holds the files of every stage: photos.json, sparse/ (COLMAP model, points.ply), scale.json, metric/
+(COLMAP model in mm in the frame of the CAD), dense/ (depth maps in COLMAP's format), cloud.ply and
+reconstruction.json. A run that was interrupted goes on where it was; --force starts over.""",
+)
+@click.argument("source", metavar="PHOTOS|VIDEO")
+@click.option("--part", "part_path", metavar="PART", help="Part file or CAD file.")
+@click.option("-o", "--output", required=True, metavar="OUT", help="Folder for the files of all stages.")
+@click.option("--camera", metavar="CAMERA", help="Calibrated camera file, or fov:DEG as a first guess.")
+@click.option("--board", "boards", multiple=True, metavar="SPEC", help="Board of known size in view; see below.")
+@click.option("--tag", "tags", multiple=True, metavar="SPEC", help="Tags of known size in view; see below.")
+@click.option("--scale-bar", "bars", multiple=True, metavar="SPEC", help="Known distance of two tags; see below.")
+@click.option("--scale-file", metavar="FILE", help="Boards, tags, scale bars and rig in one TOML file.")
+@click.option("--rig", metavar="FILE", help="Known camera poses in mm.")
+@click.option("--until", type=click.Choice(STAGES), default="dense", show_default=True, help="Last stage to do.")
+@click.option("--band", type=click.FloatRange(min=0.1), default=5.0, show_default=True, metavar="MM",
+              help="How far components may be from their place, for the dense stage.")  # fmt: skip
+@click.option("--max-frames", type=click.IntRange(min=3), default=60, show_default=True, metavar="N",
+              help="Of a video: frames to take.")  # fmt: skip
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
+              help="What computes depth maps.")  # fmt: skip
+@click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same cloud.")
+@click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Default: all cores.")
+@click.option("--force", is_flag=True, help="Start over, though an earlier run left finished stages in OUT.")
+@UNIT
+def reconstruct(
+    source: str,
+    part_path: str | None,
+    output: str,
+    camera: str | None,
+    boards: tuple[str, ...],
+    tags: tuple[str, ...],
+    bars: tuple[str, ...],
+    scale_file: str | None,
+    rig: str | None,
+    until: str,
+    band: float,
+    max_frames: int,
+    device: str,
+    seed: int,
+    threads: int,
+    force: bool,
+    unit: str | None,
+) -> None:
+    """Reconstruct PHOTOS (a folder or glob) or VIDEO: camera poses, scale in mm, dense cloud.
+
+    With --part the result is roughly in the frame of the CAD; `arview measure` refines it on the datums.
+    """
+    from arview.cad import load_part
+    from arview.reconstruction import run
+    from arview.reconstruction.dense import DenseOptions
+    from arview.reconstruction.intake import VideoIntakeOptions
+    from arview.reconstruction.sparse import SparseOptions
+
+    folder = Path(output)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{output}: is a file; give a folder for the results")
+    if Path(source).is_dir() and folder.resolve() == Path(source).resolve():
+        raise InputError(f"{output}: is the folder of the photos; give another one for the results")
+    part = load_part(part_path, unit) if part_path else None
+    options = run.ReconstructOptions(
+        video=VideoIntakeOptions(max_frames=max_frames),
+        sparse=SparseOptions(seed=seed, threads=threads),
+        sources=_sources(boards, tags, bars, scale_file, rig),
+        dense=DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
+        last_stage=get_args(run.Stage)[STAGES.index(until)],
+        starts_over=force,
+    )
+    with stage_bar() as progress:
+        result = run.reconstruct(source, folder, part, camera, options, progress)
+    _print(result, part is not None)
+
+
+def _sources(
+    boards: tuple[str, ...], tags: tuple[str, ...], bars: tuple[str, ...], scale_file: str | None, rig: str | None
+) -> ScaleSources:
+    """What is known in the scene, from the options and the file together."""
+    from dataclasses import replace
+
+    from arview.reconstruction.scale import (
+        ScaleSources,
+        load_rig,
+        load_scale_file,
+        parse_board,
+        parse_scale_bar,
+        parse_tags,
+    )
+
+    known = load_scale_file(scale_file) if scale_file else ScaleSources()
+    return replace(
+        known,
+        boards=(*known.boards, *(parse_board(text) for text in boards)),
+        tags=(*known.tags, *(parse_tags(text) for text in tags)),
+        bars=(*known.bars, *(parse_scale_bar(text) for text in bars)),
+        rig=load_rig(rig) if rig else known.rig,
+    )
+
+
+def _print(result: Reconstruction, has_part: bool) -> None:
+    """What was found, in a few lines; doubts go to stderr."""
+    for name, reason in result.intake.rejected:
+        say(f"left out {name}: {reason}")
+    for warning in result.intake.warnings:
+        say(f"warning: {warning}")
+    for lens in result.intake.lenses:
+        click.echo(f"lens {lens.key}: {lens.focal_from}")
+    sparse, scale, quality = result.sparse, result.scale, result.quality
+    if sparse is not None and quality is not None:
+        for name, reason in sparse.unplaced:
+            say(f"not placed {name}: {reason}")
+        camera = sparse.photos[0].camera
+        click.echo(
+            f"{quality.photos} of {quality.photos + len(sparse.unplaced)} photos placed, {quality.points} points, "
+            f"{quality.reprojection_rms_px:.2f} px rms, {quality.track_length:.1f} photos a point; focal "
+            f"{camera.fx:.1f} px"
+        )
+    if scale is not None:
+        for warning in scale.warnings:
+            say(f"warning: {warning}")
+        for evidence in scale.evidence:
+            used = "" if evidence.is_used else " (not used)"
+            click.echo(f"scale from {evidence.detail}: ±{100 * evidence.std:.3f} %{used}")
+        if scale.scale is None:
+            say("warning: NO SCALE: lengths are in an arbitrary unit; give --part, --board, --tag or --scale-bar")
+        elif scale.model_from_scan is None and has_part:
+            say(f"warning: the part was not found, so there is no CAD frame: {scale.why_no_frame}")
+        elif scale.model_from_scan is not None:
+            click.echo(f"CAD frame: {scale.consistency.reason}")
+    if result.coverage is not None:
+        for advice in result.coverage.advice:
+            say(f"advice: {advice}")
+    if result.cloud is not None and quality is not None:
+        unit = "mm" if result.is_metric else "units"
+        noise = f", noise {quality.cloud_sigma:.3f} {unit}" if quality.cloud_sigma is not None else ""
+        click.echo(f"cloud of {quality.cloud_points} points{noise}")
+        if quality.cloud_points == 0:
+            say("warning: the cloud is empty: the photos agree on no surface; the part may have no texture at all")
+    times = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in result.seconds.items())
+    click.echo(f"wrote {result.folder} ({times})")
