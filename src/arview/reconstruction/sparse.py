@@ -174,6 +174,9 @@ def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tel
     mapping = pycolmap.IncrementalPipelineOptions(
         random_seed=options.seed, min_model_size=3, extract_colors=False, num_threads=options.threads or -1
     )
+    with pycolmap.Database.open(str(path)) as database:
+        cameras = database.read_all_cameras()
+    mapping.constant_cameras = {camera.camera_id for camera in cameras if not _is_refined(camera)}
     placed = itertools.count(3)
     tell("placing", 0, photo_count)
     models = pycolmap.incremental_mapping(
