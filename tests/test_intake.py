@@ -132,6 +132,11 @@ def test_heic(tmp_path: Path) -> None:
         assert np.abs(read_photo(tmp_path / name).astype(int) - truth).mean() < 4
         assert read_exif(tmp_path / name).model == "iPhone 12"
         assert read_exif(tmp_path / name).focal_length_35mm_mm == 26
+    exif[0x0112] = 6
+    heif.save(tmp_path / "turned.heic", quality=95, exif=exif.tobytes())
+    turned = read_exif(tmp_path / "turned.heic")  # its reader turns the pixels; the turn stays known for the camera
+    assert (turned.upright_size, turned.orientation, turned.quarter_turns_clockwise) == ((240, 320), 1, 1)
+    assert np.abs(read_photo(tmp_path / "turned.heic").astype(int) - np.rot90(truth, -1)).mean() < 4
     data = (tmp_path / "a.heic").read_bytes()
     (tmp_path / "cut.heic").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match=r"cut\.heic"):

@@ -150,9 +150,7 @@ def _add_heif_to_pillow() -> None:
     try:
         from pillow_heif import register_heif_opener
     except ImportError as error:
-        raise MissingDependencyError(
-            "is a HEIC photo, which needs pillow-heif; run: pip install pillow-heif"
-        ) from error
+        raise MissingDependencyError("HEIC photos need pillow-heif; run: pip install pillow-heif") from error
     register_heif_opener()
 
 

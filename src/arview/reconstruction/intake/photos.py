@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.errors import InputError, MismatchError
+from arview.errors import ArviewError, InputError, MismatchError
 from arview.photo_exif import PhotoExif
 from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck, check_photo, same_views, thumbnail
 from arview.reconstruction.intake.lenses import Lens, lenses_of
@@ -144,7 +144,7 @@ def _look_at(path: Path, name: str) -> Seen | str:
         seen = glance(path.read_bytes())
     except OSError as error:
         return f"cannot be read: {error.strerror or error}"
-    except InputError as error:
+    except ArviewError as error:
         return str(error)
     return Seen(name, path, seen.exif, check_photo(name, seen.gray), thumbnail(seen.gray))
 
