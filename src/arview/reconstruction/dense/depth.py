@@ -1,0 +1,191 @@
+"""Depth maps of all views, coarse to fine: PatchMatch at a quarter and at half of the working size, then polishing.
+
+Views are independent within a stage, so threads take one each; the second stage reads the first one's maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.camera import Camera
+from arview.reconstruction.dense.kernels import PARALLAX, Problem, make_scratch
+from arview.reconstruction.dense.options import DenseOptions
+from arview.reconstruction.dense.patchmatch import NEIGHBOURS, sweep, try_hypotheses
+from arview.reconstruction.dense.polish import polish
+from arview.reconstruction.dense.views import Cad, Floats, Planes, View, cad_planes, relative_pose, sparse_planes
+from arview.reconstruction.types import SparseModel
+
+STEPS = (4, 2)
+"""Pixels of the working size per pixel of each PatchMatch stage; the depth maps have the last one's grid."""
+POLISH_STEP = 1
+SWEEPS = (3, 2)
+RANDOMS = 6
+POLISH_ITERATIONS = 3
+T = TypeVar("T")
+Progress = Callable[[str, int, int], None]
+"""Called with the stage's name, views done and views in all."""
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Surface elements of one view.
+
+    Attributes:
+        camera: ideal camera of the map's grid. cam_from_scan: (4,4).
+        planes: (H,W,3) float32, see `views.Planes`; w = 0 where there is none.
+        scores: (H,W) mean correlation with the sources that see it.
+        sigmas: (H,W) standard deviation of w.
+        unit_w: change of w that moves a pixel of the map by one in the sources.
+    """
+
+    camera: Camera
+    cam_from_scan: NDArray[np.float64]
+    planes: Planes
+    scores: Floats
+    sigmas: Floats
+    unit_w: float
+
+
+def depth_maps(
+    views: list[View], sparse: SparseModel, order: list[int], cad: Cad | None, options: DenseOptions,
+    threads: int, progress: Progress,
+) -> list[DepthMap]:  # fmt: skip
+    """Depth maps of all views; ``order`` holds the index in the sparse model of each view."""
+    greys = [cv2.cvtColor(view.color, cv2.COLOR_RGB2GRAY).astype(np.float32) for view in views]
+    maps: list[Planes] = []
+    with ThreadPoolExecutor(threads) as pool:
+        for stage, step in enumerate(STEPS):
+            scaled = [_shrunk(grey, step) for grey in greys]
+
+            def search(i: int, stage: int = stage, step: int = step, scaled: list[Floats] = scaled) -> Planes:
+                view = views[i]
+                camera = view.camera.scaled(scaled[i].shape[1], scaled[i].shape[0])
+                hypotheses = []
+                if stage > 0:
+                    hypotheses.append(_grown(maps[i], STEPS[stage - 1] // step))
+                if cad is not None and options.cad_hypotheses:
+                    hypotheses.append(cad_planes(cad, view.cam_from_scan, camera))
+                if stage == 0:
+                    hypotheses.append(sparse_planes(sparse, order[i], camera))
+                problem = _problem(views, i, scaled, maps, step, options)
+                return _search(problem, view, np.stack(hypotheses), stage, cad, options, i)
+
+            maps = _each(pool, search, len(views), f"depth maps {stage + 1}/{len(STEPS)}", progress)
+        coarsest_first, maps = maps, []
+
+        def finish(i: int) -> DepthMap:
+            problem = _problem(views, i, [_shrunk(grey, POLISH_STEP) for grey in greys], [], POLISH_STEP, options)
+            return _polished(problem, views[i], coarsest_first[i])
+
+        return _each(pool, finish, len(views), "polishing", progress)
+
+
+def _each(pool: ThreadPoolExecutor, job: Callable[[int], T], count: int, name: str, progress: Progress) -> list[T]:
+    results = []
+    for done, result in enumerate(pool.map(job, range(count)), start=1):
+        results.append(result)
+        progress(name, done, count)
+    return results
+
+
+def _shrunk(grey: Floats, step: int) -> Floats:
+    if step == 1:
+        return grey
+    size = (grey.shape[1] // step, grey.shape[0] // step)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
+
+
+def _grown(planes: Planes, factor: int) -> Planes:
+    """The planes on a grid that is ``factor`` times as fine."""
+    fine = np.repeat(np.repeat(planes, factor, axis=0), factor, axis=1)
+    height, width = fine.shape[:2]
+    offset = (np.arange(factor) + 0.5) / factor - 0.5
+    fine[..., 0] += np.where(fine[..., 0] > 0, fine[..., 1] * np.tile(offset, width // factor), 0.0)
+    fine[..., 0] += np.where(fine[..., 0] > 0, fine[..., 2] * np.tile(offset, height // factor)[:, None], 0.0)
+    fine[..., 1:] /= factor
+    return fine
+
+
+def _problem(
+    views: list[View], index: int, greys: list[Floats], maps: list[Planes], step: int, options: DenseOptions
+) -> Problem:
+    view = views[index]
+    camera = view.camera.scaled(greys[index].shape[1], greys[index].shape[0])
+    sources = view.sources
+    inverse = np.linalg.inv(camera.matrix)
+    rows, columns = np.nonzero(view.region)
+    middle = np.array([columns.mean() / step, rows.mean() / step, 1.0])
+    w = 0.5 * (1.0 / view.nearest + 1.0 / view.farthest)
+    warps = []
+    for k in sources:
+        source_from_view = relative_pose(view, views[k])
+        matrix = views[k].camera.scaled(greys[k].shape[1], greys[k].shape[0]).matrix
+        a, t = matrix @ source_from_view[:3, :3] @ inverse, matrix @ source_from_view[:3, 3]
+        seen = a @ middle + w * t
+        parallax = np.linalg.norm(t[:2] - seen[:2] / seen[2] * t[2]) / abs(seen[2])
+        warps.append(np.concatenate([a.ravel(), t, [parallax]]))
+    maps_there = [maps[k] for k in sources] if maps else []
+    region = _shrunk(view.region.astype(np.float32), step) > 0.5
+    map_step = camera.width / maps[index].shape[1] if maps else 1.0
+    numbers = [options.noise**2, options.geometric_weight, map_step, options.best_sources]
+    return Problem(
+        grey=greys[index],
+        region=region.astype(np.uint8),
+        pixels=np.concatenate([greys[k].ravel() for k in sources]),
+        maps=np.concatenate([there.reshape(-1, 3) for there in maps_there]) if maps else np.empty((0, 3), np.float32),
+        sizes=np.concatenate(
+            [_layout([greys[k] for k in sources]), _layout(maps_there or [np.empty((0, 0, 3))] * len(sources))], axis=1
+        ),
+        warps=np.array(warps, dtype=np.float32),
+        numbers=np.array([*numbers, camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32),
+    )
+
+
+def _layout(images: list[Floats]) -> NDArray[np.int32]:
+    """(S,3) first pixel, width and height of images that lie one after another."""
+    sizes = np.array([image.shape[:2] for image in images])
+    first = np.concatenate([[0], np.cumsum(sizes[:, 0] * sizes[:, 1])[:-1]])
+    return np.stack([first, sizes[:, 1], sizes[:, 0]], axis=1).astype(np.int32)
+
+
+def _search(
+    problem: Problem, view: View, hypotheses: Planes, stage: int, cad: Cad | None, options: DenseOptions, number: int
+) -> Planes:
+    """PatchMatch of one view at one level."""
+    height, width = problem.grey.shape
+    planes, costs = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
+    scratch, index = make_scratch()
+    seed = (options.seed * 0x9E3779B1 + number * 0x85EBCA6B + stage * 0xC2B2AE35) & 0x7FFFFFFF
+    low, high = 1.0 / view.farthest, 1.0 / view.nearest
+    depth = 2.0 / (low + high)
+    spread = options.band_mm / depth**2 if cad is not None else 0.25 * (high - low)
+    try_hypotheses(
+        problem, scratch, index, planes, costs, hypotheses, np.float32(spread), RANDOMS if stage == 0 else 0,
+        np.float32(low), np.float32(high), seed,
+    )  # fmt: skip
+    unit_w = 1.0 / float(np.mean(problem.warps[:, PARALLAX]))
+    for turn in range(SWEEPS[stage]):
+        fine = 0.5 ** (turn + stage)
+        for color in (0, 1):
+            sweep(
+                problem, scratch, index, planes, costs, NEIGHBOURS, color,
+                np.float32(fine * unit_w), np.float32(0.5 * fine), seed + 101 * (turn + 1),
+            )  # fmt: skip
+    return planes
+
+
+def _polished(problem: Problem, view: View, planes: Planes) -> DepthMap:
+    height, width = planes.shape[:2]
+    step = STEPS[-1] // POLISH_STEP
+    scores, sigmas = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    unit_w = 1.0 / float(np.mean(problem.warps[:, PARALLAX]))
+    scratch, index = make_scratch(0.5 * (step - 1))
+    polish(problem, scratch, index, planes, scores, sigmas, step, POLISH_ITERATIONS, unit_w)
+    return DepthMap(view.camera.scaled(width, height), view.cam_from_scan, planes, scores, sigmas, unit_w * step)
