@@ -13,7 +13,7 @@ from arview.camera import Camera
 from arview.camera_files import save_camera
 from arview.errors import InputError, MismatchError
 from arview.photo_exif import PhotoExif, focal_length_px, read_exif, sensor_width_mm
-from arview.reconstruction.intake import VideoIntakeOptions, intake_photos, intake_video, read_photo
+from arview.reconstruction.intake import VideoIntakeOptions, intake_frames, intake_photos, intake_video, read_photo
 from arview.reconstruction.intake.checks import CheckOptions, blur_and_texture, same_views, thumbnail
 from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.intake.reading import glance
@@ -446,6 +446,9 @@ def test_video_frames_are_sharp_and_spread(tmp_path: Path) -> None:
     assert sum(40 <= index < 60 for index in indices) <= 1  # the pause gives one frame at most
     assert np.abs(read_photo(intake.photos[2].path).astype(int) - view(*places[indices[2]])).mean() < 8
     assert calls[-1][0] <= calls[-1][1] == 200
+    again = intake_frames(path, tmp_path / "frames", options)
+    assert repr(again.photos) == repr(intake.photos)
+    assert (again.rejected, again.warnings) == (intake.rejected, intake.warnings)
     few = intake_video(path, tmp_path / "few", VideoIntakeOptions(max_frames=7, looks_per_s=30.0))
     assert 5 <= len(few.photos) <= 7
     assert sorted(p.name for p in (tmp_path / "few").iterdir()) == sorted(photo.name for photo in few.photos)

@@ -4,7 +4,7 @@ from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck
 from arview.reconstruction.intake.lenses import Lens
 from arview.reconstruction.intake.photos import Intake, intake_photos
 from arview.reconstruction.intake.reading import read_photo
-from arview.reconstruction.intake.video import VideoIntakeOptions, intake_video
+from arview.reconstruction.intake.video import VideoIntakeOptions, intake_frames, intake_video
 
 __all__ = [
     "CheckOptions",
@@ -12,6 +12,7 @@ __all__ = [
     "Lens",
     "PhotoCheck",
     "VideoIntakeOptions",
+    "intake_frames",
     "intake_photos",
     "intake_video",
     "read_photo",

@@ -81,7 +81,7 @@ def intake_photos(
     with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
         seen: list[Seen] = []
         rejected: dict[str, str] = {}
-        for done, (name, result) in enumerate(zip(names, pool.map(_look_at, paths, names), strict=True), 1):
+        for done, (name, result) in enumerate(zip(names, pool.map(look_at, paths, names), strict=True), 1):
             if isinstance(result, Seen):
                 seen.append(result)
             else:
@@ -136,7 +136,7 @@ def assess(
     )
 
 
-def _look_at(path: Path, name: str) -> Seen | str:
+def look_at(path: Path, name: str) -> Seen | str:
     """The photo as far as needed to judge it, or why it cannot be read."""
     if path.suffix.lower() in RAW_SUFFIXES:
         return "is a raw photo; develop it to JPEG, with the same settings for all"

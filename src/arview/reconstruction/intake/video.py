@@ -14,7 +14,7 @@ from arview.atomic import replacing
 from arview.errors import InputError, OutputError
 from arview.photo_exif import PhotoExif
 from arview.reconstruction.intake.checks import CheckOptions, check_photo, thumbnail
-from arview.reconstruction.intake.photos import LEAST_PHOTOS, Intake, Seen, assess
+from arview.reconstruction.intake.photos import LEAST_PHOTOS, Intake, Seen, assess, look_at
 from arview.reconstruction.intake.reading import GLANCE_PX, Pixels
 from arview.video import Frame, FrameSource, open_source
 
@@ -91,6 +91,33 @@ def intake_video(
         cut_short = source.ended_reason
     intake = assess(str(path), seen, {}, camera, options.checks)
     return replace(intake, warnings=(*intake.warnings, cut_short)) if cut_short else intake
+
+
+def intake_frames(
+    path: str | Path,
+    folder: str | Path,
+    options: VideoIntakeOptions | None = None,
+    camera: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Intake:
+    """The intake of frames that ``intake_video`` has written into ``folder`` before.
+
+    The video is opened only to learn how it was turned, which a calibrated camera needs. Raises as ``intake_video``.
+    """
+    options = options or VideoIntakeOptions()
+    frames = sorted(Path(folder).glob("frame_*.png"))
+    with open_source(path) as source:
+        turns = source.quarter_turns_clockwise
+    seen, rejected = [], {}
+    for done, frame in enumerate(frames, 1):
+        result = look_at(frame, frame.name)
+        if isinstance(result, Seen):
+            seen.append(replace(result, exif=replace(result.exif, quarter_turns_clockwise=turns)))
+        else:
+            rejected[frame.name] = result
+        if progress:
+            progress(done, len(frames))
+    return assess(str(path), seen, rejected, camera, options.checks)
 
 
 def choose_frames(
