@@ -267,23 +267,19 @@ def target_scene() -> tuple[list[Array], list[NDArray[np.uint8]]]:
 def test_boards_tags_and_bars_through_a_lens() -> None:
     poses, pictures = target_scene()
     sparse = sparse_of(poses, LENS)
-    specs = {
-        "board": ScaleSources(boards=(parse_board("charuco:6x5:24:17:DICT_5X5_100"),)),
-        "tag": ScaleSources(tags=(parse_tags("apriltag36h11:24"),)),
-        "scale_bar": ScaleSources(bars=(parse_scale_bar("3:7:150"),)),
-    }
-    for kind, sources in specs.items():
-        result = find_scale(sparse, None, sources, read=reader(pictures))
-        assert result.scale is not None and result.scale_std is not None and not result.warnings
-        assert [e.kind for e in result.evidence] == [kind]
-        off = result.scale / TRUTH.scale - 1.0
-        assert abs(off) < {"board": 2e-4, "tag": 2e-3, "scale_bar": 3e-4}[kind], (kind, off)
-        assert abs(off) < 3.5 * result.scale_std and result.scale_std < 4e-3
-        assert result.model_from_scan is None and result.why_no_frame == "no part was given"
-    everything = ScaleSources(specs["board"].boards, specs["tag"].tags, specs["scale_bar"].bars)
+    everything = ScaleSources(
+        boards=(parse_board("charuco:6x5:24:17:DICT_5X5_100"),),
+        tags=(parse_tags("apriltag36h11:24"),),
+        bars=(parse_scale_bar("3:7:150"),),
+    )
     result = find_scale(sparse, None, everything, read=reader(pictures))
     assert [e.kind for e in result.evidence] == ["board", "tag", "scale_bar"] and not result.warnings
+    for evidence, percent in zip(result.evidence, (0.02, 0.1, 0.03), strict=True):
+        off = evidence.mm_per_unit / TRUTH.scale - 1.0
+        assert abs(off) < percent / 100 and abs(off) < 3.5 * evidence.std < 2e-2, (evidence, off)
     assert result.scale == pytest.approx(TRUTH.scale, rel=2e-4)
+    assert result.scale_std is not None and 1e-4 < result.scale_std < 4e-4
+    assert result.model_from_scan is None and result.why_no_frame == "no part was given"
     assert json.loads(json.dumps(result.provenance()))["evidence"][0]["kind"] == "board"
 
 
@@ -337,6 +333,16 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Mon
     monkeypatch.setenv("ARVIEW_CACHE", str(tmp_path_factory.getbasetemp() / "arview-cache"))
 
 
+FEW = CadOptions(subdivisions=2, first_detections=3)
+"""Fewer guide views and tries than usual, for time."""
+
+
+def find(
+    sparse: SparseModel, part: Part, sources: ScaleSources | None = None, *, pictures: list[NDArray[np.uint8]]
+) -> ScaleResult:
+    return find_scale(sparse, part, sources, FEW, reader(pictures))
+
+
 def part_of(model: Model, base: str) -> Part:
     settings = tuple(ComponentSettings(c.name, "base" if c.name == base else "inspect") for c in model.components)
     return Part(model.name, Path(), Path(), model, settings, ViewRange((300.0, 900.0), (25.0, 70.0)))
@@ -386,10 +392,17 @@ def surface_points(model: Model, seed: int = 0) -> Array:
     return points + rng.normal(size=points.shape) * 0.1
 
 
-def test_cad_gives_scale_and_frame_though_components_are_displaced() -> None:
+@cache
+def usual_result() -> tuple[SparseModel, ScaleResult]:
+    """The assembly's photos with exact poses and points of its surface."""
     poses, pictures = assembly_photos()
     sparse = sparse_of(poses, PLAIN, surface_points(assembly()))
-    result = find_scale(sparse, part_of(assembly(), "plate"), read=reader(pictures))
+    return sparse, find(sparse, part_of(assembly(), "plate"), pictures=pictures)
+
+
+def test_cad_gives_scale_and_frame_though_components_are_displaced() -> None:
+    poses, _ = assembly_photos()
+    sparse, result = usual_result()
     assert result.why_no_frame == "" and [e.kind for e in result.evidence] == ["cad"]
     scale_percent, middle_mm, angle_deg = frame_error(result, assembly())
     assert scale_percent < 0.05 and middle_mm < 0.15 and angle_deg < 0.05
@@ -406,8 +419,8 @@ def test_noise_of_the_poses_is_in_the_uncertainty() -> None:
     poses, pictures = assembly_photos()
     rng = np.random.default_rng(6)
     noisy = [exp_se3(rng.normal(size=6) * [4e-4, 4e-4, 4e-4, 0.2, 0.2, 0.2]) @ pose for pose in poses]
-    exact = find_scale(sparse_of(poses, PLAIN), part_of(assembly(), "plate"), read=reader(pictures))
-    result = find_scale(sparse_of(noisy, PLAIN), part_of(assembly(), "plate"), read=reader(pictures))
+    _, exact = usual_result()
+    result = find(sparse_of(noisy, PLAIN), part_of(assembly(), "plate"), pictures=pictures)
     scale_percent, middle_mm, _ = frame_error(result, assembly())
     assert result.scale_std is not None and exact.scale_std is not None and result.covariance is not None
     assert result.scale_std > exact.scale_std
@@ -419,12 +432,12 @@ def test_scale_of_a_rig_moves_the_frame_with_it() -> None:
     poses, pictures = assembly_photos()
     sparse = sparse_of(poses, PLAIN)
     centres = {p.name: TRUTH.points_in_model(p.centre_in_scan) for p in sparse.photos}
-    result = find_scale(sparse, part_of(assembly(), "plate"), ScaleSources(rig=Rig(centres)), read=reader(pictures))
+    result = find(sparse, part_of(assembly(), "plate"), ScaleSources(rig=Rig(centres)), pictures=pictures)
     assert [e.kind for e in result.evidence] == ["rig", "cad"] and all(e.is_used for e in result.evidence)
     scale_percent, middle_mm, angle_deg = frame_error(result, assembly())
     assert scale_percent < 1e-3 and middle_mm < 0.15 and angle_deg < 0.05
     wrong = {name: 1.01 * centre for name, centre in centres.items()}
-    result = find_scale(sparse, part_of(assembly(), "plate"), ScaleSources(rig=Rig(wrong)), read=reader(pictures))
+    result = find(sparse, part_of(assembly(), "plate"), ScaleSources(rig=Rig(wrong)), pictures=pictures)
     assert result.scale == pytest.approx(1.01 * TRUTH.scale, rel=1e-5)
     assert not result.consistency.is_consistent and "another size" in result.consistency.reason
     assert any("CAD edges" in w and "camera rig" in w for w in result.warnings)
@@ -433,7 +446,7 @@ def test_scale_of_a_rig_moves_the_frame_with_it() -> None:
 def test_absent_part_gives_no_frame_and_no_scale() -> None:
     poses, _ = assembly_photos()
     empty = [picture(None, assembly(), PLAIN, seed=i, scene=i) for i in range(len(poses))]
-    result = find_scale(sparse_of(poses, PLAIN), part_of(assembly(), "plate"), read=reader(empty))
+    result = find(sparse_of(poses, PLAIN), part_of(assembly(), "plate"), pictures=empty)
     assert result.scale is None and result.scale_std is None and result.model_from_scan is None
     assert result.evidence == () and result.why_no_frame and result.provenance()["mm_per_unit"] is None
 
@@ -443,7 +456,7 @@ def test_bent_reconstruction_is_noticed() -> None:
     about = rigid(np.eye(3), assembly().center_in_model)
     bend = about @ rigid(exp_so3([0, 0, np.deg2rad(3.0)]), [5.0, 0, 0]) @ invert(about)
     bent = [pose @ bend if i in (1, 2, 3) else pose for i, pose in enumerate(poses)]
-    result = find_scale(sparse_of(bent, PLAIN), part_of(assembly(), "plate"), read=reader(pictures))
+    result = find(sparse_of(bent, PLAIN), part_of(assembly(), "plate"), pictures=pictures)
     assert not result.consistency.is_consistent and result.warnings
     if result.model_from_scan is not None:
         assert set(result.consistency.misfits) == {"01.png", "02.png", "03.png"}
@@ -452,7 +465,7 @@ def test_bent_reconstruction_is_noticed() -> None:
 def test_points_off_the_surface_are_noticed() -> None:
     poses, pictures = assembly_photos()
     points = surface_points(assembly()) - [0, 0, 6.0]
-    result = find_scale(sparse_of(poses, PLAIN, points), part_of(assembly(), "plate"), read=reader(pictures))
+    result = find(sparse_of(poses, PLAIN, points), part_of(assembly(), "plate"), pictures=pictures)
     assert not result.consistency.is_consistent and "behind" in result.consistency.reason
     assert result.consistency.points_behind is not None and result.consistency.points_behind > 0.9
 
@@ -471,7 +484,7 @@ def test_components_decide_between_twins() -> None:
     model = nearly_symmetric()
     poses = ring(model, 6)
     pictures = [picture(pose, model, PLAIN, seed=i, scene=i + 20) for i, pose in enumerate(poses)]
-    result = find_scale(sparse_of(poses, PLAIN), part_of(model, "plate"), read=reader(pictures))
+    result = find(sparse_of(poses, PLAIN), part_of(model, "plate"), pictures=pictures)
     scale_percent, middle_mm, angle_deg = frame_error(result, model)
     assert scale_percent < 0.06 and middle_mm < 0.2 and angle_deg < 0.06
     assert not any("twin" in w for w in result.warnings)

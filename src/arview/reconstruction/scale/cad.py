@@ -22,6 +22,7 @@ from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.vote import Sighting, Vote, vote
 from arview.reconstruction.types import PosedPhoto
 from arview.tracking import Detector
+from arview.tracking.threads import pool
 
 Pixels = NDArray[np.uint8]
 Progress = Callable[[str, int, int], None]
@@ -128,9 +129,10 @@ def shrunk(camera: Camera, image: Pixels, max_side_px: int) -> tuple[Camera, Pix
 
 
 def search_ranges(part: Part, cameras: Sequence[Camera], spans: tuple[float, float]) -> list[ViewRange]:
-    """Where to look for the part, likelier first: from above, then from below, unless its file says from where.
+    """From where the part may be seen, likelier first: above, then below, as far as its file declares either.
 
-    Distances follow from the lenses, in steps of the root of two so that guide views can be kept.
+    Photos are taken from all around, whatever sides are declared for tracking. Distances follow from the lenses, in
+    steps of the root of two so that guide views can be kept.
     """
     longer = np.array([camera.fx / max(camera.width, camera.height) for camera in cameras])
     diameter = part.model.diameter_mm
@@ -138,10 +140,11 @@ def search_ranges(part: Part, cameras: Sequence[Camera], spans: tuple[float, flo
     low = max(0.75, 2.0 ** (np.floor(2.0 * np.log2(longer.min() / spans[1])) / 2.0)) * diameter
     high = max(1.5 * low, 2.0 ** (np.ceil(2.0 * np.log2(longer.max() / spans[0])) / 2.0) * diameter)
     distances = (float(low), float(high))
-    declared = part.view_range
-    if declared is not None:
-        return [ViewRange(distances, declared.elevation_deg, declared.azimuth_deg)]
-    return [ViewRange(distances, (0.0, 90.0)), ViewRange(distances, (-90.0, 0.0))]
+    above, below = ViewRange(distances, (0.0, 90.0)), ViewRange(distances, (-90.0, 0.0))
+    if part.view_range is None:
+        return [above, below]
+    low_deg, high_deg = part.view_range.elevation_deg
+    return [half for half, is_seen in ((above, high_deg > 5.0), (below, low_deg < -5.0)) if is_seen] or [above]
 
 
 def find_cad(
@@ -236,24 +239,19 @@ def _refined(
 ) -> CadFind | NotFound:
     """The vote, or a twin of it, that the edges of several photos bear out best, refined in all; or why none is."""
     chosen = list(order[: options.max_views])
-    done = 0
-
-    def load(index: int) -> View:
-        nonlocal done
-        done += 1
+    views: list[View] = []
+    for view in pool().map(lambda i: make_view(photos[i], read(photos[i]), options.max_side_px), chosen):
+        views.append(view)
         if progress:
-            progress("reading photos", done, len(chosen))
-        return make_view(photos[index], read(photos[index]), options.max_side_px)
-
-    views = [load(index) for index in chosen]
+            progress("reading photos", len(views), len(chosen))
     base, model = base_names(part), part.model
     judge = JointRefiner(model, base, views[: options.rival_views], options.refine)
     starts = [v.similarity for v in votes[:3] if v.score >= 0.4 * votes[0].score]
     starts += [_turned(votes[0].similarity, turn, model) for turn in turns]
     judged = []
     for start in starts:
-        rough = judge.refine(start, options.refine.reaches_px[:4])
-        judged.append((judge.support(rough.similarity, rough.samples).score, rough.similarity))
+        rough, borne_out = judge.rough(start)
+        judged.append((borne_out.score, rough))
     judged.sort(key=lambda pair: -pair[0])
     warnings = []
     rivals = [score for score, other in judged[1:] if _is_other(judged[0][1], other)]
@@ -264,7 +262,7 @@ def _refined(
     refiner = JointRefiner(model, base, views, options.refine)
     fit = refiner.refine(judged[0][1])
     support = refiner.support(fit.similarity, fit.samples)
-    if not support.score >= options.least_support:
+    if max(support.score, support.base_score) < options.least_support:
         reason = (
             f"the part was found in {len(votes[0].sightings)} photos, but with the photos' poses only "
             f"{100 * support.share:.0f} % of its edges are where they should be "

@@ -19,6 +19,8 @@ NEAR_SHARE = 0.006
 """Points this near to the CAD's surface lie on it, in diameters of the part: rough surfaces, displaced components."""
 RIM_PX = 3
 """Points this near to an outline, in px drawn, may belong to what is behind it."""
+MIN_PHOTOS = 3
+"""Points seen by fewer photos are often wrong matches."""
 LEAST_POINTS = 60
 LEAST_NEAR, MOST_BEHIND = 0.6, 0.15
 LEAST_EDGES, LEAST_OF_OTHERS = 0.25, 0.45
@@ -106,7 +108,7 @@ def points_before_surface(sparse: SparseModel, model: Model, similarity: Similar
     which, before = np.concatenate([s[0] for s in seen]), np.concatenate([s[1] for s in seen])
     is_on = np.isfinite(before)
     on, total = np.bincount(which[is_on], minlength=len(points)), np.bincount(which, minlength=len(points))
-    kept = is_on & (on >= 2)[which] & (2 * on >= total)[which]
+    kept = is_on & (on >= 2)[which] & (total >= MIN_PHOTOS)[which] & (2 * on >= total)[which]
     order = np.lexsort((before[kept], which[kept]))
     values, owners = before[kept][order], which[kept][order]
     starts = np.flatnonzero(np.r_[True, owners[1:] != owners[:-1]]) if len(owners) else np.zeros(0, dtype=np.intp)

@@ -46,7 +46,7 @@ class RefineOptions:
     """Options of the joint refinement.
 
     Attributes:
-        reaches_px: how far edges are looked for, round by round, in px of the views.
+        rough_reaches_px, reaches_px: how far edges are looked for, round by round, in px of the views; first in a few.
         spacing_px: between samples along an edge, in px of the views.
         drawn_width_px: longer side at which hidden edges are found out; finer shows little more.
         half_width_px: profiles are averaged so far along the edge.
@@ -61,7 +61,8 @@ class RefineOptions:
         systematic_px: what all edges may be off together (chamfers, tone curve), for the uncertainty.
     """
 
-    reaches_px: tuple[float, ...] = (12.0, 10.0, 7.0, 5.0, 3.5, 3.0, 3.0, 3.0)
+    rough_reaches_px: tuple[float, ...] = (12.0, 10.0, 7.0, 5.0)
+    reaches_px: tuple[float, ...] = (7.0, 5.0, 3.5, 3.0, 3.0, 3.0)
     spacing_px: float = 6.0
     drawn_width_px: int = 800
     half_width_px: float = 3.0
@@ -73,7 +74,7 @@ class RefineOptions:
     beside_px: float = 9.0
     dark_shift_px: float = 0.1
     least_displacement_mm: float = 0.05
-    base_sigma_mm: float = 0.1
+    base_sigma_mm: float = 0.05
     systematic_px: float = 0.05
 
 
@@ -105,17 +106,24 @@ class Support:
         by_view, by_component: share of edge points with a step of brightness where predicted, less what chance gives:
             0 = as much as beside the edges, 1 = all; NaN where nothing was looked at.
         share, chance: of all points: with a step at the edge, and beside it.
+        is_base: (C,) which components define the frame.
     """
 
     by_view: Array
     by_component: Array
     share: float
     chance: float
+    is_base: NDArray[np.bool_]
 
     @property
     def score(self) -> float:
         """Mean of the components' shares: for comparing similarities of the same photos."""
-        return float(np.nanmean(self.by_component)) if np.isfinite(self.by_component).any() else 0.0
+        return _mean(self.by_component)
+
+    @property
+    def base_score(self) -> float:
+        """The same of the base: the others may be displaced."""
+        return _mean(self.by_component[self.is_base])
 
 
 @dataclass(frozen=True)
@@ -182,15 +190,30 @@ class JointRefiner:
         )  # fmt: skip
         return Samples(points, tangents, component, self._features(points, tangents, component))
 
-    def refine(self, start: Similarity, reaches_px: Sequence[float] | None = None) -> Fit:
-        """The similarity that the edges of all views agree on, from a rough one."""
+    def rough(self, start: Similarity) -> tuple[Similarity, Support]:
+        """A similarity refined from far, by all components or by the base alone, whichever finds the base better."""
+        tried = []
+        for components in (np.ones_like(self._is_base), self._is_base):
+            fit = self.refine(start, self.options.rough_reaches_px, components)
+            tried.append((fit.similarity, self.support(fit.similarity)))
+            if self._is_base.all():
+                break
+        return max(tried, key=lambda pair: pair[1].base_score)
+
+    def refine(
+        self,
+        start: Similarity,
+        reaches_px: Sequence[float] | None = None,
+        components: NDArray[np.bool_] | None = None,
+    ) -> Fit:
+        """The similarity that the edges of all views agree on, from a near one; of some ``components`` (C,) only."""
         o = self.options
         reaches = reaches_px or o.reaches_px
-        similarity, samples = start, self.sample_all(start)
+        similarity, samples = start, self.sample_all(start, components)
         displacements = np.zeros((len(self._is_base), 3))
         for index, reach_px in enumerate(reaches):
-            if index in (2, len(reaches) - 2):
-                samples = self.sample_all(similarity)
+            if index == len(reaches) - 2:
+                samples = self.sample_all(similarity, components)
             measured = self.measure_all(similarity, samples, reach_px)
             system = _System(measured, displacements, self._is_base, o)
             step, displacements = system.solve()
@@ -208,7 +231,8 @@ class JointRefiner:
             apply(similarity.cam_from_model(view.cam_from_scan), self.center)[2] / view.camera.fx for view in self.views
         ]
         sigma_mm = self.options.systematic_px * float(np.median(pixels))
-        return np.diag(np.repeat([sigma_mm / radius_mm, sigma_mm, sigma_mm / radius_mm], [3, 3, 1]) ** 2)
+        shift_mm = float(np.hypot(sigma_mm, self.options.base_sigma_mm))
+        return np.diag(np.repeat([sigma_mm / radius_mm, shift_mm, sigma_mm / radius_mm], [3, 3, 1]) ** 2)
 
     def support(self, similarity: Similarity, samples: Sequence[Samples] | None = None) -> Support:
         """How many predicted edges the views show, against how many they show beside them."""
@@ -227,7 +251,9 @@ class JointRefiner:
                 return np.asarray((share - chance) / (1.0 - np.minimum(chance, 0.95)))
 
         chance = (by_left + by_right).sum() / max(1, (left + right).sum())
-        return Support(contrast(1), contrast(0), float(found.sum() / max(1, looked.sum())), float(chance))
+        return Support(
+            contrast(1), contrast(0), float(found.sum() / max(1, looked.sum())), float(chance), self._is_base
+        )
 
     def measure(
         self, view: View, samples: Samples, cam_from_model: Array, reach_px: float, shift_px: float = 0.0
@@ -273,9 +299,17 @@ class JointRefiner:
 
         return list(pool().map(one, zip(self.views, samples, strict=True)))
 
-    def sample_all(self, start: Similarity) -> list[Samples]:
-        """`samples` of every view."""
-        return list(pool().map(lambda view: self.samples(view, start.cam_from_model(view.cam_from_scan)), self.views))
+    def sample_all(self, start: Similarity, components: NDArray[np.bool_] | None = None) -> list[Samples]:
+        """`samples` of every view, of some ``components`` (C,) only."""
+
+        def one(view: View) -> Samples:
+            found = self.samples(view, start.cam_from_model(view.cam_from_scan))
+            if components is None:
+                return found
+            of = components[found.component]
+            return Samples(found.points[of], found.tangents[of], found.component[of], found.feature[of])
+
+        return list(pool().map(one, self.views))
 
     @staticmethod
     def _normals(camera: Camera, cam_from_model: Array, points: Array, tangents: Array) -> Array:
@@ -295,6 +329,11 @@ class JointRefiner:
         place = np.round(foot / (0.02 * self.model.diameter_mm)).astype(np.int64)
         key = np.concatenate([component[:, None], direction, place], axis=1)
         return np.asarray(key @ np.array([1, 7, 67, 641, 6113, 1000003, 160005571], dtype=np.int64))
+
+
+def _mean(values: Array) -> float:
+    """Of those that are numbers; 0 without any."""
+    return float(np.nanmean(values)) if np.isfinite(values).any() else 0.0
 
 
 class _System:
