@@ -14,7 +14,9 @@ from arview.geometry import apply
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.pose import TrackingState
 from arview.tracking import Detector, DetectorOptions, TrackingSession
-from arview.tracking.ambiguity import find_symmetries
+from arview.tracking.ambiguity import TELLING, EdgeSteps, find_symmetries, telling
+from arview.tracking.detector import Hypothesis
+from arview.tracking.quality import Evidence
 from cad_files import box
 from synthetic import CAMERA, RANGE, assembly, assembly_views, block, component, error, picture, pose_from, post, wrong
 
@@ -122,6 +124,47 @@ def test_a_key_decides_between_twins_and_where_it_cannot_be_seen_the_view_is_amb
             wrong_by = [error(pose, truth, model)[2] for pose in poses]
             right += wrong_by[0] < 3.0 and len(poses) == 1 if is_told else len(poses) > 1 and min(wrong_by) < 3.0
     assert right >= 4
+
+
+def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
+    rng = np.random.default_rng(4)
+    shared, only_a, only_b = (
+        np.array([x, 0.0]) + rng.uniform(0, 90, (n, 2)) for x, n in ((0, 200), (200, 30), (400, 30))
+    )
+    normals = np.tile([1.0, 0.0], (230, 1))
+    noise = rng.normal(0.0, 0.3, 230)
+
+    def steps(own: np.ndarray, support: float) -> EdgeSteps:
+        jitter = rng.normal(0.0, 0.5, (230, 2))
+        return EdgeSteps(
+            np.concatenate([shared, own]) + jitter, normals, np.r_[np.full(200, 0.6), np.full(30, support)] + noise
+        )
+
+    assert telling(steps(only_a, 0.6), steps(only_b, 0.0)) > TELLING
+    assert telling(steps(only_b, 0.0), steps(only_a, 0.6)) < -TELLING
+    assert abs(telling(steps(only_a, 0.6), steps(only_b, 0.55))) < TELLING
+    # Nothing tells them apart where all edges are shared.
+    assert telling(steps(shared[:30], 0.6), steps(shared[:30], 0.0)) == 0.0
+
+
+def test_a_small_part_and_a_close_rival_are_doubted_and_a_pose_a_little_aside_is_no_rival() -> None:
+    evidence = Evidence(0.6, 0.6, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
+    weaker = Evidence(0.58, 0.58, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
+
+    def quality(distance_mm: float, rival_aside_mm: float | None, turn_deg: float) -> float:
+        pose = pose_from(30, 40, distance_mm)
+        hypotheses = [Hypothesis(pose, evidence, 8.0)]
+        if rival_aside_mm is not None:
+            other = pose_from(30 + turn_deg, 40, distance_mm)
+            other[0, 3] += rival_aside_mm
+            hypotheses.append(Hypothesis(other, weaker, 8.0))
+        return detector().qualities(hypotheses)[0]
+
+    alone = quality(500.0, None, 0.0)
+    assert alone > 0.5
+    assert quality(500.0, 5.0, 8.0) == alone
+    assert quality(500.0, 5.0, 60.0) < 0.5 * alone and quality(500.0, 300.0, 8.0) < 0.5 * alone
+    assert quality(2000.0, None, 0.0) < 0.3 * alone
 
 
 def test_the_poses_of_an_ambiguous_view_say_which_others_fit() -> None:

@@ -21,12 +21,12 @@ from arview.errors import InputError
 from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
-from arview.tracking.ambiguity import LEAD, find_symmetries
+from arview.tracking.ambiguity import LEAD, TELLING, find_symmetries, telling
 from arview.tracking.climb import climb
 from arview.tracking.components import ComponentCheck
 from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch, weighed
 from arview.tracking.picture import Picture
-from arview.tracking.quality import RIGHT_WORTH, Evidence, found_logit, found_probability
+from arview.tracking.quality import RIGHT_WORTH, Evidence, Leads, found_logit, found_probability
 from arview.tracking.templates import choose_apart
 from arview.tracking.threads import pool
 from arview.tracking.tracker import Stage, Tracker, TrackerOptions
@@ -48,6 +48,10 @@ HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
 SURE_QUALITY = 0.8
 """A pose of this quality ends the search."""
+ALIKE_ASIDE, ALIKE_ALONG, ALIKE_DEG = 0.12, 0.15, 20.0
+"""Hypotheses this near, across in diameters and along as a share of the distance, are no rivals of each other."""
+HERE_ASIDE, HERE_ALONG = 0.35, 0.25
+"""Rivals this near are at the same place."""
 COARSE_TOLERANCE_PX, FINE_TOLERANCE_PX = 3.5, 1.5
 """After the coarse and the fine stages edges are looked for this near."""
 FINE_STAGES = (
@@ -238,12 +242,33 @@ class Detector:
 
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
-        result = []
-        for k, hypothesis in enumerate(hypotheses):
-            rivals = (h.logit for h in hypotheses[k + 1 :] if not self._is_equal(hypothesis, h, self._turns))
-            margin = hypothesis.logit - max(rivals, default=-math.inf)
-            result.append(found_probability(hypothesis.evidence, hypothesis.lines, margin))
-        return result
+        return [
+            found_probability(
+                hypothesis.evidence,
+                hypothesis.lines,
+                self.tracker.radius_px(hypothesis.cam_from_body),
+                self._leads(hypothesis, hypotheses[k + 1 :]),
+            )
+            for k, hypothesis in enumerate(hypotheses)
+        ]
+
+    def _leads(self, best: Hypothesis, others: list[Hypothesis]) -> Leads:
+        """Leads of a hypothesis over others for other poses; one a little aside of it is the same, badly settled."""
+        here = elsewhere = -math.inf
+        place = best.cam_from_body[:3, 3]
+        distance_mm = float(np.linalg.norm(place))
+        for other in others:
+            offset = other.cam_from_body[:3, 3] - place
+            along_mm = abs(float(offset @ place)) / distance_mm
+            aside = math.sqrt(max(float(offset @ offset) - along_mm**2, 0.0)) / self.views.diameter_mm
+            is_alike = self._is_turned(best, other, self._turns, ALIKE_DEG)
+            if aside < ALIKE_ASIDE and along_mm < ALIKE_ALONG * distance_mm and is_alike:
+                continue
+            if aside < HERE_ASIDE and along_mm < HERE_ALONG * distance_mm:
+                here = max(here, other.logit)
+            else:
+                elsewhere = max(elsewhere, other.logit)
+        return Leads(best.logit - here, best.logit - elsewhere)
 
     def _in_model(self, hypothesis: Hypothesis) -> Array:
         return np.asarray(hypothesis.cam_from_body @ self.tracker.part.body_from_model)
@@ -253,27 +278,33 @@ class Detector:
     ) -> tuple[Hypothesis, list[Hypothesis]]:
         """The pose that is borne out best among the near symmetries of one found, and those that do as well.
 
-        Hypotheses at the same place whose evidence is as good are alternatives too, unless an exact symmetry makes
-        them the same pose.
+        What tells is the edges that only one of two poses has. Hypotheses at the same place from which these do not
+        part the best one are alternatives too, unless an exact symmetry makes them the same pose.
         """
         pose = best.cam_from_body
         starts = [rigid(pose[:3, :3] @ turn, pose[:3, 3]) for turn in self.symmetries.near]
         reach_mm = 0.25 * self.views.diameter_mm
         rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
         rivals = self._ordered([best, *self._finished(picture, starts), *rivals], 5.0)
-        rivals.sort(key=lambda h: -h.evidence.worth)
-        if best.evidence.worth < rivals[0].evidence.worth - LEAD:
-            best = rivals[0]
-        twins = [h for h in rivals if h is not best and h.evidence.worth > best.evidence.worth - LEAD]
-        return best, [h for h in twins if not self._is_equal(h, best, self.symmetries.exact)]
+        rivals = [h for h in rivals if h.evidence.worth > max(r.evidence.worth for r in rivals) - LEAD]
+        steps = {id(h): self.tracker.edge_steps(picture.gray, h.cam_from_body) for h in rivals}
+        best = rivals[0]
+        for rival in rivals[1:]:
+            if telling(steps[id(rival)], steps[id(best)]) > 0.0:
+                best = rival
+        twins = [h for h in rivals if h is not best and telling(steps[id(best)], steps[id(h)]) < TELLING]
+        return best, [h for h in twins if not self._is_turned(h, best, self.symmetries.exact, ALIKE_DEG)]
 
     def _is_equal(self, a: Hypothesis, b: Hypothesis, turns: Array, reach: float = 0.08) -> bool:
         """Whether two are the same pose, if need be by one of some turns (N,3,3); ``reach`` is in diameters."""
-        if np.linalg.norm(a.cam_from_body[:3, 3] - b.cam_from_body[:3, 3]) > reach * self.views.diameter_mm:
-            return False
+        apart_mm = np.linalg.norm(a.cam_from_body[:3, 3] - b.cam_from_body[:3, 3])
+        return bool(apart_mm <= reach * self.views.diameter_mm) and self._is_turned(a, b, turns, 8.0)
+
+    def _is_turned(self, a: Hypothesis, b: Hypothesis, turns: Array, angle_deg: float) -> bool:
+        """Whether two rotations are nearer than an angle, if need be by one of some turns (N,3,3)."""
         turned = b.cam_from_body[:3, :3] @ np.concatenate([np.eye(3)[None], turns])
         cosine = 0.5 * (np.einsum("ij,nij->n", a.cam_from_body[:3, :3], turned) - 1.0)
-        return bool(cosine.max() > np.cos(np.deg2rad(8.0)))
+        return bool(cosine.max() > np.cos(np.deg2rad(angle_deg)))
 
     def _picture(self, image: NDArray[np.uint8]) -> Picture:
         o = self.options

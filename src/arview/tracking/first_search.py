@@ -56,7 +56,7 @@ class Effort:
 
 
 QUICK = Effort(1500, 0, 500, 40, (12, 5))
-WIDE = Effort(20000, QUICK.matches, 6000, 200, (24, 8))
+WIDE = Effort(20000, QUICK.matches, 6000, 1000, (60, 10))
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 

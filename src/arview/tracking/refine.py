@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.tracking.edge import add_edges, measure_edges
 from arview.tracking.feature import add_features
 from arview.tracking.quality import edge_evidence, region_evidence
@@ -127,7 +128,7 @@ def run_evidence(  # type: ignore[no-untyped-def]
     image, gray, bin_of, odds, has_colours, edge_function, part, cam_from_body, intrinsics, step_mm,
     edge_threshold, tolerance_px
 ):  # fmt: skip
-    """The seven numbers of `Evidence` at a pose."""
+    """The numbers of `Evidence` at a pose."""
     directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
     view = nearest_view(directions, cam_from_body)
     first, last = e_start[view], e_start[view + 1]
@@ -135,7 +136,7 @@ def run_evidence(  # type: ignore[no-untyped-def]
         e_points[first:last], e_tangents[first:last], True, cam_from_body, intrinsics, step_mm
     )
     positions, strengths, seen = measure_edges(gray, pixels, normals, depths, 10, 1.0, edge_threshold)
-    contour, inner, share, sharpness, inside = edge_evidence(
+    contour, inner, share, sharpness, inside, scatter = edge_evidence(
         positions, strengths, seen, e_kinds[first:last], 10.0, tolerance_px
     )
     region, region_information = -1.0, 0.0
@@ -148,7 +149,30 @@ def run_evidence(  # type: ignore[no-untyped-def]
             image, bin_of, pixels, normals, depths, c_runs[first:last], intrinsics[0], odds, edge_function, 2
         )
         region, region_information = region_evidence(mean, information, agreement, 2.0)
-    return contour, inner, share, sharpness, region, region_information, inside
+    return contour, inner, share, sharpness, region, region_information, inside, scatter
+
+
+@njit(cache=True, nogil=True)
+def run_edge_steps(gray, part, cam_from_body, intrinsics, step_mm, edge_threshold, tolerance_px):  # type: ignore[no-untyped-def]
+    """Outline and design edges at a pose: pixels (N,2), normals (N,2), and support (N,) beyond chance, -1 to 1."""
+    directions, _, _, _, _, e_start, e_points, e_tangents, e_kinds = part
+    view = nearest_view(directions, cam_from_body)
+    first, last = e_start[view], e_start[view + 1]
+    pixels, normals, depths = project_lines(
+        e_points[first:last], e_tangents[first:last], True, cam_from_body, intrinsics, step_mm
+    )
+    positions, strengths, seen = measure_edges(gray, pixels, normals, depths, 10, 1.0, edge_threshold)
+    chosen = seen & ((e_kinds[first:last] & (EDGE_CONTOUR | EDGE_SHARP)) > 0)
+    support = np.zeros(last - first)
+    for i in range(last - first):
+        steps = 0
+        for j in range(positions.shape[1]):
+            if strengths[i, j] != 0.0 and abs(positions[i, j]) <= 10.0:
+                steps += 1
+                if abs(positions[i, j]) <= tolerance_px:
+                    support[i] = 1.0
+        support[i] -= 1.0 - (1.0 - tolerance_px / 10.0) ** steps
+    return pixels[chosen], normals[chosen], support[chosen]
 
 
 @njit(cache=True, nogil=True)

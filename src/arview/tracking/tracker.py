@@ -19,11 +19,12 @@ from arview.errors import InputError
 from arview.geometry import Array, invert, rigid, rotation_angle_rad
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.tracking.ambiguity import EdgeSteps
 from arview.tracking.feature import FeatureModality, Matches
 from arview.tracking.nonlocal_search import NonlocalSearch
 from arview.tracking.patch import Pyramid
 from arview.tracking.quality import Evidence, quality_of
-from arview.tracking.refine import count_colours, median_brightness_ratio, run_evidence, run_stages
+from arview.tracking.refine import count_colours, median_brightness_ratio, run_edge_steps, run_evidence, run_stages
 from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
 from arview.tracking.solver import apply_twist, relative_twist
 
@@ -338,6 +339,14 @@ class Tracker:
                 image, gray, self._bin_of, look.odds, look.is_known, EDGE_FUNCTION,
                 self.part.arrays, cam_from_body, self._intrinsics, self._step_mm, self.options.edge_threshold,
                 tolerance_px,
+            )
+        )  # fmt: skip
+
+    def edge_steps(self, gray: NDArray[np.uint8], cam_from_body: Array) -> EdgeSteps:
+        """The edges at a pose, and which of them the picture bears out."""
+        return EdgeSteps(
+            *run_edge_steps(
+                gray, self.part.arrays, cam_from_body, self._intrinsics, self._step_mm, self.options.edge_threshold, 1.5
             )
         )  # fmt: skip
 
