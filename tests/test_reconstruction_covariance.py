@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from arview.camera import Camera
-from arview.geometry import invert, log_se3, rigid
+from arview.geometry import invert, log_se3
 from arview.reconstruction.colmap import import_pycolmap, sparse_model_of
 from arview.reconstruction.covariance import free_frame_projection, pose_covariance
+from arview.reconstruction.scale.similarity import fit_points
 from arview.reconstruction.sparse import adjust
 from arview.reconstruction.types import Photo, SparseModel
 
@@ -48,11 +49,8 @@ def twists(found: SparseModel, truth: SparseModel) -> np.ndarray[Any, Any]:
     """(6M,) left twists from the true poses to the found ones, after a similarity fit of the centres."""
     a = np.array([photo.centre_in_scan for photo in found.photos])
     b = np.array([photo.centre_in_scan for photo in truth.photos])
-    u, s, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
-    sign = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
-    scale = float(np.trace(np.diag(s) @ sign) / ((a - a.mean(0)) ** 2).sum())
-    rotation = u @ sign @ vt
-    aligned = found.transformed(scale, rigid(rotation, b.mean(0) - scale * rotation @ a.mean(0)))
+    fit = fit_points(a, b).similarity
+    aligned = found.transformed(fit.scale, fit.model_from_scan)
     pairs = zip(aligned.photos, truth.photos, strict=True)
     return np.concatenate([log_se3(one.cam_from_scan @ invert(other.cam_from_scan)) for one, other in pairs])
 

@@ -14,6 +14,7 @@ from arview.geometry import Array, invert, skew
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of
 from arview.reconstruction.features import FeatureOptions, Features, find_features
 from arview.reconstruction.matching import match_along_lines, match_descriptors
+from arview.reconstruction.scale.similarity import fit_points
 from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
 from arview.reconstruction.types import Photo, SparseModel
 from photo_scene import CAMERA, Picture, bench, photograph, ring, write_photos
@@ -30,13 +31,8 @@ def aligned(sparse: SparseModel, truth: dict[str, Array]) -> tuple[SparseModel, 
     """The model moved onto the true camera centres by a similarity, and what is left at each centre, mm."""
     a = np.array([photo.centre_in_scan for photo in sparse.photos])
     b = np.array([invert(truth[photo.name])[:3, 3] for photo in sparse.photos])
-    u, s, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
-    sign = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
-    scale = float(np.trace(np.diag(s) @ sign) / ((a - a.mean(0)) ** 2).sum())
-    motion = np.eye(4)
-    motion[:3, :3] = u @ sign @ vt
-    motion[:3, 3] = b.mean(0) - scale * motion[:3, :3] @ a.mean(0)
-    moved = sparse.transformed(scale, motion)
+    fit = fit_points(a, b).similarity
+    moved = sparse.transformed(fit.scale, fit.model_from_scan)
     centres = np.array([photo.centre_in_scan for photo in moved.photos])
     return moved, np.linalg.norm(centres - b, axis=1)
 

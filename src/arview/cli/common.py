@@ -97,8 +97,12 @@ def stage_bar() -> Iterator[Callable[[str, int, int], None]]:
 
     with tqdm(disable=None, leave=False, unit="") as bar:
 
+        shown = ""
+
         def update(stage: str, done: int, in_all: int) -> None:
-            if bar.desc != f"{stage}: ":
+            nonlocal shown
+            if stage != shown:
+                shown = stage
                 bar.reset(in_all or None)
                 bar.set_description(stage)
             bar.total = in_all or None

@@ -32,7 +32,7 @@ from arview.geometry import Array
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of, write_model
 from arview.reconstruction.coverage import Coverage, coverage
 from arview.reconstruction.dense import Cad, DenseOptions, read_ply, reconstruct_dense, write_ply
-from arview.reconstruction.intake import Intake, VideoIntakeOptions, intake_photos, intake_video
+from arview.reconstruction.intake import Intake, VideoIntakeOptions, intake_frames, intake_photos, intake_video
 from arview.reconstruction.quality import Quality, quality_of
 from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
 from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
@@ -169,7 +169,7 @@ class _Run:
         frames = self.folder / "frames"
         key = key_of(content_key([video]), self.options.video)
         if self.stages.is_finished("frames", key) and frames.is_dir():
-            return intake_photos(frames, camera, self.options.video.checks, lambda i, n: self.tell("photos", i, n))
+            return intake_frames(video, frames, self.options.video, camera, lambda i, n: self.tell("photos", i, n))
         self.stages.restart("frames")
         for old in frames.glob("frame_*.png"):
             old.unlink()
