@@ -451,6 +451,12 @@ def test_absent_part_gives_no_frame_and_no_scale() -> None:
     assert result.evidence == () and result.why_no_frame and result.provenance()["mm_per_unit"] is None
 
 
+def test_one_photo_is_too_few() -> None:
+    poses, pictures = assembly_photos()
+    result = find(sparse_of(poses[:1], PLAIN), part_of(assembly(), "plate"), pictures=pictures)
+    assert result.scale is None and "fewer than two photos" in result.why_no_frame
+
+
 def test_bent_reconstruction_is_noticed() -> None:
     poses, pictures = assembly_photos()
     about = rigid(np.eye(3), assembly().center_in_model)

@@ -163,6 +163,8 @@ def find_cad(
         options: see CadOptions.
         progress: see Progress.
     """
+    if len(photos) < 2:
+        return NotFound("fewer than two photos were placed")
     order = spread_order(photos)
     reasons: list[NotFound] = []
     for view_range in search_ranges(part, [photo.camera for photo in photos], options.spans):
