@@ -34,11 +34,13 @@ focus as they are, texture around the part (a patterned mat, printed sheets). JP
 
 \b
 Millimetres come from what is known, in this order of trust, combined where there are several:
-  --board charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY   or  aruco:…, lengths in mm
-  --tag FAMILY:SIDE                   every tag of the family has this side in mm, as apriltag36h11:20
-  --scale-bar ID1:ID2:LENGTH          distance in mm of the middles of two tags
-  --scale-file FILE, --rig FILE       the same in a TOML file; known poses of the cameras
-  --part PART                         the CAD, found in the photos; it also gives the frame
+  --board charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY, or grid:COLUMNSxROWS:MARKER:GAP:DICTIONARY (mm)
+  --tag DICTIONARY:SIDE               every tag of the dictionary has this side in mm, as apriltag36h11:20
+  --scale-bar [DICTIONARY:]ID1:ID2:LENGTH   distance of the middles of two tags, known to 0.02 mm
+  --scale-file FILE                   the same in a TOML file: [[board]] spec = "...", [[tag]], [[scale_bar]], [rig]
+  --rig FILE.json                     centres_mm, cam_from_rig_mm or distances_mm of the cameras
+  --part PART                         the CAD, found in the photos; it also gives the frame. The base component
+                                      is taken to be as drawn: only something measured shows that it is not
 
 \b
 OUT holds the files of every stage: photos.json, sparse/ (COLMAP model, points.ply), scale.json, metric/

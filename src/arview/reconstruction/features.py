@@ -21,7 +21,7 @@ Progress = Callable[[int, int], None]
 class FeatureOptions:
     """How features are found."""
 
-    max_features: int = 8000  # a photo; more cost time in matching and add little but short tracks
+    max_features: int = 6000  # a photo; more cost time and add little but short tracks
     max_side_px: int = 2000  # larger photos are reduced to this: SIFT's time grows with the area
     contrast_threshold: float = 0.02  # OpenCV's default 0.04 leaves little on mill scale and brushed metal
 

@@ -241,7 +241,7 @@ def _cameras_and_poses(model: Any, photos: Sequence[Photo]) -> tuple[dict[int, C
     return cameras, {place[photo.name]: photo.cam_from_scan for photo in sparse.photos}
 
 
-MAX_PAIR_ANGLE_DEG = 60.0
+MAX_PAIR_ANGLE_DEG = 45.0
 """Between the viewing directions of a pair: SIFT finds nothing in common beyond."""
 
 
