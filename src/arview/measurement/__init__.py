@@ -1,0 +1,1 @@
+"""Measurement: datum alignment, deviation of each component with its uncertainty, verdicts."""
