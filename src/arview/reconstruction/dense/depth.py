@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import cv2
@@ -24,7 +25,6 @@ from arview.reconstruction.types import SparseModel
 
 STEPS = (4, 2)
 """Pixels of the working size per pixel of each PatchMatch stage; the depth maps have the last one's grid."""
-POLISH_STEP = 1
 SWEEPS = (3, 2)
 RANDOMS = 6
 POLISH_ITERATIONS = 3
@@ -54,37 +54,16 @@ class DepthMap:
 
 
 def depth_maps(
-    views: list[View], sparse: SparseModel, order: list[int], cad: Cad | None, options: DenseOptions,
-    threads: int, progress: Progress,
-) -> list[DepthMap]:  # fmt: skip
-    """Depth maps of all views; ``order`` holds the index in the sparse model of each view."""
+    views: list[View], sparse: SparseModel, cad: Cad | None, options: DenseOptions, threads: int, progress: Progress
+) -> list[DepthMap]:
+    """Depth maps of all views, whose sources are indices into the list."""
     greys = [cv2.cvtColor(view.color, cv2.COLOR_RGB2GRAY).astype(np.float32) for view in views]
     maps: list[Planes] = []
     with ThreadPoolExecutor(threads) as pool:
         for stage, step in enumerate(STEPS):
-            scaled = [_shrunk(grey, step) for grey in greys]
-
-            def search(i: int, stage: int = stage, step: int = step, scaled: list[Floats] = scaled) -> Planes:
-                view = views[i]
-                camera = view.camera.scaled(scaled[i].shape[1], scaled[i].shape[0])
-                hypotheses = []
-                if stage > 0:
-                    hypotheses.append(_grown(maps[i], STEPS[stage - 1] // step))
-                if cad is not None and options.cad_hypotheses:
-                    hypotheses.append(cad_planes(cad, view.cam_from_scan, camera))
-                if stage == 0:
-                    hypotheses.append(sparse_planes(sparse, order[i], camera))
-                problem = _problem(views, i, scaled, maps, step, options)
-                return _search(problem, view, np.stack(hypotheses), stage, cad, options, i)
-
-            maps = _each(pool, search, len(views), f"depth maps {stage + 1}/{len(STEPS)}", progress)
-        coarsest_first, maps = maps, []
-
-        def finish(i: int) -> DepthMap:
-            problem = _problem(views, i, [_shrunk(grey, POLISH_STEP) for grey in greys], [], POLISH_STEP, options)
-            return _polished(problem, views[i], coarsest_first[i])
-
-        return _each(pool, finish, len(views), "polishing", progress)
+            search = partial(_search, views, [_shrunk(grey, step) for grey in greys], maps, sparse, cad, options, stage)
+            maps = _each(pool, search, len(views), f"depth maps {stage + 1} of {len(STEPS)}", progress)
+        return _each(pool, partial(_polished, views, greys, maps, options), len(views), "polishing", progress)
 
 
 def _each(pool: ThreadPoolExecutor, job: Callable[[int], T], count: int, name: str, progress: Progress) -> list[T]:
@@ -141,14 +120,18 @@ def _problem(
         pixels=np.concatenate([greys[k].ravel() for k in sources]),
         maps=np.concatenate([there.reshape(-1, 3) for there in maps_there]) if maps else np.empty((0, 3), np.float32),
         sizes=np.concatenate(
-            [_layout([greys[k] for k in sources]), _layout(maps_there or [np.empty((0, 0, 3))] * len(sources))], axis=1
+            [
+                _layout([greys[k] for k in sources]),
+                _layout(maps_there or [np.empty((0, 0, 3), np.float32)] * len(sources)),
+            ],
+            axis=1,
         ),
         warps=np.array(warps, dtype=np.float32),
         numbers=np.array([*numbers, camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32),
     )
 
 
-def _layout(images: list[Floats]) -> NDArray[np.int32]:
+def _layout(images: list[NDArray[np.float32]]) -> NDArray[np.int32]:
     """(S,3) first pixel, width and height of images that lie one after another."""
     sizes = np.array([image.shape[:2] for image in images])
     first = np.concatenate([[0], np.cumsum(sizes[:, 0] * sizes[:, 1])[:-1]])
@@ -156,18 +139,25 @@ def _layout(images: list[Floats]) -> NDArray[np.int32]:
 
 
 def _search(
-    problem: Problem, view: View, hypotheses: Planes, stage: int, cad: Cad | None, options: DenseOptions, number: int
-) -> Planes:
-    """PatchMatch of one view at one level."""
-    height, width = problem.grey.shape
+    views: list[View], greys: list[Floats], maps: list[Planes], sparse: SparseModel, cad: Cad | None,
+    options: DenseOptions, stage: int, index: int,
+) -> Planes:  # fmt: skip
+    """PatchMatch of one view at one level; ``maps`` are those of the level before, or empty."""
+    view, step = views[index], STEPS[stage]
+    height, width = greys[index].shape
+    camera = view.camera.scaled(width, height)
+    given = [_grown(maps[index], STEPS[stage - 1] // step)] if maps else [sparse_planes(sparse, view.index, camera)]
+    if cad is not None and options.cad_hypotheses:
+        given.insert(0 if stage == 0 else 1, cad_planes(cad, view.cam_from_scan, camera))
+    problem = _problem(views, index, greys, maps, step, options)
     planes, costs = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
-    scratch, index = make_scratch()
-    seed = (options.seed * 0x9E3779B1 + number * 0x85EBCA6B + stage * 0xC2B2AE35) & 0x7FFFFFFF
+    scratch, indices = make_scratch()
+    seed = (options.seed * 0x9E3779B1 + view.index * 0x85EBCA6B + stage * 0xC2B2AE35) & 0x7FFFFFFF
     low, high = 1.0 / view.farthest, 1.0 / view.nearest
     depth = 2.0 / (low + high)
     spread = options.band_mm / depth**2 if cad is not None else 0.25 * (high - low)
     try_hypotheses(
-        problem, scratch, index, planes, costs, hypotheses, np.float32(spread), RANDOMS if stage == 0 else 0,
+        problem, scratch, indices, planes, costs, np.stack(given), np.float32(spread), RANDOMS if stage == 0 else 0,
         np.float32(low), np.float32(high), seed,
     )  # fmt: skip
     unit_w = 1.0 / float(np.mean(problem.warps[:, PARALLAX]))
@@ -175,17 +165,21 @@ def _search(
         fine = 0.5 ** (turn + stage)
         for color in (0, 1):
             sweep(
-                problem, scratch, index, planes, costs, NEIGHBOURS, color,
+                problem, scratch, indices, planes, costs, NEIGHBOURS, color,
                 np.float32(fine * unit_w), np.float32(0.5 * fine), seed + 101 * (turn + 1),
             )  # fmt: skip
     return planes
 
 
-def _polished(problem: Problem, view: View, planes: Planes) -> DepthMap:
+def _polished(
+    views: list[View], greys: list[Floats], maps: list[Planes], options: DenseOptions, index: int
+) -> DepthMap:
+    planes = maps[index].copy()
     height, width = planes.shape[:2]
-    step = STEPS[-1] // POLISH_STEP
-    scores, sigmas = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    problem = _problem(views, index, greys, [], 1, options)
     unit_w = 1.0 / float(np.mean(problem.warps[:, PARALLAX]))
-    scratch, index = make_scratch(0.5 * (step - 1))
-    polish(problem, scratch, index, planes, scores, sigmas, step, POLISH_ITERATIONS, unit_w)
-    return DepthMap(view.camera.scaled(width, height), view.cam_from_scan, planes, scores, sigmas, unit_w * step)
+    scores, sigmas = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    scratch, indices = make_scratch(0.5 * (STEPS[-1] - 1))
+    polish(problem, scratch, indices, planes, scores, sigmas, STEPS[-1], POLISH_ITERATIONS, unit_w)
+    camera = views[index].camera.scaled(width, height)
+    return DepthMap(camera, views[index].cam_from_scan, planes, scores, sigmas, unit_w * STEPS[-1])

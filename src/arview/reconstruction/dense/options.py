@@ -29,6 +29,7 @@ class DenseOptions:
         agreement_px: depth maps agree when the point moves by less than this in the photo.
         normal_angle_deg: and when their normals differ by less than this.
         grazing_deg: surfaces seen at a larger angle from their normal are not used.
+        threads: photos worked on at a time; 0 for one per core.
         seed: of the random hypotheses; the same seed gives the same cloud.
     """
 
@@ -47,6 +48,7 @@ class DenseOptions:
     agreement_px: float = 1.0
     normal_angle_deg: float = 35.0
     grazing_deg: float = 72.0
+    threads: int = 0
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -134,7 +134,8 @@ def _solve(q):  # type: ignore[no-untyped-def]
 def polish(p, s, index, planes, scores, sigmas, step_px, iterations, unit_w):  # type: ignore[no-untyped-def]
     """Refine the planes (H,W,3) in place; mean correlation (H,W) and standard deviation of w (H,W) out.
 
-    The problem is ``step_px`` (1 or 2) times as fine as the planes. ``unit_w`` is the change of w that moves a pixel by one in the sources. A pixel that no two sources see, or that
+    The problem is ``step_px`` (1 or 2) times as fine as the planes.
+    ``unit_w`` is the change of w that moves a pixel by one in the sources. A pixel that no two sources see, or that
     moves by more than two pixels, gets score 0.
     """
     grey, region, pixels, _, sizes, warps, numbers = p

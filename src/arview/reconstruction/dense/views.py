@@ -45,15 +45,16 @@ class View:
     """One photo, undistorted and cropped.
 
     Attributes:
-        name: of the photo.
+        index: of the photo in the sparse model. name: of the photo.
         camera: ideal camera of the window (its size, no distortion).
         cam_from_scan: (4,4).
         color: (H,W,3) uint8 RGB.
         region: (H,W) bool, pixels to reconstruct.
         nearest, farthest: depths between which the region's surfaces are.
-        sources: indices of the views to compare with, best first.
+        sources: indices of the photos, later of the views, to compare with, best first.
     """
 
+    index: int
     name: str
     camera: Camera
     cam_from_scan: Array
@@ -91,7 +92,8 @@ def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int
             apart[i, j] = apart[j, i] = np.median(angle)
     chosen: list[tuple[int, ...]] = []
     for i in range(count):
-        left, order = score[i].copy(), []
+        left = score[i].copy()
+        order: list[int] = []
         while len(order) < options.sources and left.max() > 0.02 * score[i].max() > 0:
             best = int(np.argmax(left))
             order.append(best)
@@ -139,7 +141,7 @@ def make_view(
     part = region[max(v0, 0) : v0 + height, max(u0, 0) : u0 + width]
     inside[max(-v0, 0) :, max(-u0, 0) :][: part.shape[0], : part.shape[1]] = part
     color, is_seen = _undistorted(image, photo.camera, camera)
-    return View(photo.name, camera, photo.cam_from_scan, color, inside & is_seen, nearest, farthest, sources)
+    return View(index, photo.name, camera, photo.cam_from_scan, color, inside & is_seen, nearest, farthest, sources)
 
 
 def _window(region: NDArray[np.bool_]) -> tuple[int, int, int, int]:
