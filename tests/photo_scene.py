@@ -65,7 +65,9 @@ def photograph(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     light = 0.65 + 0.35 * normals @ (0.3, -0.4, 0.87)
     grey = np.full(face.shape, 30.0)
-    grey[hit] = _texture(points, seed) * light[face[hit]]
+    tones = {"bench": 0.45, "plate": 1.25}
+    tone = np.concatenate([np.full(len(one.faces), tones.get(one.name, 0.8)) for one in model.components])
+    grey[hit] = _texture(points, seed) * (light * tone)[face[hit]]
     small = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     through = _through_lens(small, camera)
     through += np.random.default_rng(int(abs(cam_from_model[:3].sum()) * 1e3) + seed).normal(0.0, noise, through.shape)

@@ -61,8 +61,6 @@ reconstruction.json. A run that was interrupted goes on where it was; --force st
               help="How far components may be from their place, for the dense stage.")  # fmt: skip
 @click.option("--max-frames", type=click.IntRange(min=3), default=60, show_default=True, metavar="N",
               help="Of a video: frames to take.")  # fmt: skip
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
-              help="What computes depth maps.")  # fmt: skip
 @click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same cloud.")
 @click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Default: all cores.")
 @click.option("--force", is_flag=True, help="Start over, though an earlier run left finished stages in OUT.")
@@ -80,7 +78,6 @@ def reconstruct(
     until: str,
     band: float,
     max_frames: int,
-    device: str,
     seed: int,
     threads: int,
     force: bool,
@@ -106,7 +103,7 @@ def reconstruct(
         video=VideoIntakeOptions(max_frames=max_frames),
         sparse=SparseOptions(seed=seed, threads=threads),
         sources=_sources(boards, tags, bars, scale_file, rig),
-        dense=DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
+        dense=DenseOptions(seed=seed, band_mm=band, threads=threads),
         last_stage=get_args(run.Stage)[STAGES.index(until)],
         starts_over=force,
     )
