@@ -1,17 +1,46 @@
-"""The recorded sequences and the sample clip that bench and evaluate run on."""
+"""The recorded sequences, photo sets and the sample clip that bench and evaluate run on."""
 
 from __future__ import annotations
 
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 from arview.evaluation import Scene, load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLE = ROOT / "samples" / "bracket_plate"
-DATA = Path(os.environ.get("ARVIEW_DATA", ROOT.parent / "shared" / "data")) / "sequences"
+SHARED = Path(os.environ.get("ARVIEW_DATA", ROOT.parent / "shared" / "data"))
+DATA = SHARED / "sequences"
 SEQUENCES = ("castle", "cube", "teabox", "dragon", "plate")
+
+
+@dataclass(frozen=True)
+class PhotoSet:
+    """Photos of a part with exact truth; ``as_built`` is the mesh that was photographed, where it is known."""
+
+    name: str
+    folder: Path
+    part: Path
+    truth: Path
+    as_built: Path
+
+
+def photo_sets() -> list[PhotoSet]:
+    """The sets that are here; the others are named on stderr."""
+    found = []
+    for name, folder, part in (
+        ("plate", SHARED / "plate", "plate.glb"),
+        ("sample", ROOT / "samples" / "plate", "part.toml"),
+    ):
+        if (folder / "photos").is_dir():
+            found.append(
+                PhotoSet(name, folder / "photos", folder / part, folder / "truth.json", folder / "as_built.ply")
+            )
+        else:
+            skip(name, f"{folder / 'photos'} is not here")
+    return found
 
 
 def scenes(names: tuple[str, ...] = SEQUENCES) -> dict[str, Scene]:
