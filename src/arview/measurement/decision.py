@@ -1,0 +1,46 @@
+"""The decision rule: pass, fail or undecided for a distance with its uncertainty (ISO 14253-1)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from arview.errors import InputError
+from arview.inspection import Verdict
+
+
+@dataclass(frozen=True)
+class DecisionOptions:
+    """The rule's guard band."""
+
+    guard: float = 1.0  # share of U kept from the limit on both sides; 1 is ISO 14253-1's default, 0 simple acceptance
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.guard <= 3.0:
+            raise InputError(f"guard factor {self.guard}: expected a number from 0 to 3")
+
+
+def decide(value: float | None, uncertainty: float | None, tolerance: float | None, guard: float = 1.0) -> Verdict:
+    """Verdict on a value with its expanded uncertainty U, in the unit of the tolerance.
+
+    It passes when even ``value + guard · U`` is allowed, fails when ``value − guard · U`` is not, and is undecided
+    between, or without a tolerance; without a value it is not measured.
+    """
+    if value is None or uncertainty is None:
+        return Verdict.NOT_MEASURED
+    if tolerance is None:
+        return Verdict.UNDECIDED
+    if value + guard * uncertainty <= tolerance:
+        return Verdict.PASS
+    return Verdict.FAIL if value - guard * uncertainty > tolerance else Verdict.UNDECIDED
+
+
+def worst(verdicts: Iterable[Verdict]) -> Verdict:
+    """The verdict on several characteristics of a component: one that fails fails it, one undecided leaves it so."""
+    order = (Verdict.PASS, Verdict.NOT_MEASURED, Verdict.UNDECIDED, Verdict.FAIL)
+    return max(verdicts, key=order.index, default=Verdict.NOT_MEASURED)
+
+
+def zone_diameter_mm(distance_mm: float) -> float:
+    """Diameter of the smallest position tolerance zone (ISO 1101) that holds a component at this distance."""
+    return 2.0 * distance_mm
