@@ -1,0 +1,175 @@
+"""The rigid move that measurements along single directions agree on, what it leaves open, and how sure it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from arview.geometry import Array
+
+TUKEY = 4.685
+
+
+@dataclass(frozen=True)
+class RigidFit:
+    """Result of `fit_rigid`.
+
+    Attributes:
+        twist: (6,) rad and mm about the centre.
+        covariance: (6,6), zero along ``undetermined``.
+        undetermined: (K,6), see ``Move``.
+        weights: (N,) robust weights 0–1.
+        residual_mm: robust standard deviation of the inliers' residuals.
+        gain: (6,N) change of the twist by a change of each measurement.
+    """
+
+    twist: Array
+    covariance: Array
+    undetermined: Array
+    weights: Array
+    residual_mm: float
+    gain: Array
+
+
+def move_rows(points: Array, directions: Array, center: Array) -> Array:
+    """(N,6) how far points go along unit directions by a small move (rad, mm) about a centre."""
+    return np.concatenate([np.cross(points - center, directions), directions], axis=1)
+
+
+def fit_rigid(
+    rows: Array,
+    offsets: Array,
+    sigmas: Array,
+    free: Array,
+    radius_mm: float,
+    undetermined_mm: float,
+    places: Array,
+    least_sigma: float,
+    unit_mm: float | Array = 1.0,
+) -> RigidFit:
+    """Weighted least squares with Tukey's biweight (Holland & Welsch 1977) on ``offsets ≈ rows @ twist``.
+
+    Directions that leave less than the data can tell are left out: those of the shape's symmetry (``free``) and those
+    whose standard deviation would exceed ``undetermined_mm``. The covariance takes residuals of neighbours to be as
+    alike as they are found to be.
+
+    Args:
+        rows: (N,6) of `move_rows`.
+        offsets, sigmas: (N,) measured, and its predicted standard deviation.
+        free: (K,6) orthonormal, rotations times ``radius_mm``.
+        radius_mm: length that rotations are weighed with.
+        undetermined_mm: limit of a direction's standard deviation.
+        places: (N,D) coordinates in which neighbours are near each other, in correlation lengths or so.
+        least_sigma: robust standard deviation of normalised residuals is not taken to be less.
+        unit_mm: size of a unit of offset in mm, for ``residual_mm``.
+    """
+    scale = np.repeat([1.0 / radius_mm, 1.0], 3)
+    scaled = rows * scale
+    white = scaled / sigmas[:, None]
+    target = offsets / sigmas
+    basis = _complement(free)
+    weights = np.ones(len(rows))
+    spread = 1.0
+    # A direction is open when the data cannot hold it; neighbours are alike, so that few are independent.
+    information = basis.T @ white.T @ white @ basis
+    values, vectors = np.linalg.eigh(information)
+    is_held = values > max(4.0 / undetermined_mm**2, 1e-7 * values[-1] if len(values) else 0.0)
+    basis = basis @ vectors[:, is_held]
+    solution = np.zeros(6)
+    for _ in range(20):
+        weighted = white @ basis * weights[:, None]
+        normal = weighted.T @ (white @ basis)
+        solution, last = basis @ np.linalg.pinv(normal, hermitian=True) @ (weighted.T @ target), solution
+        left = target - white @ solution
+        spread = max(least_sigma, 1.4826 * float(np.median(np.abs(left))))
+        weights = np.clip(1.0 - (left / (TUKEY * spread)) ** 2, 0.0, None) ** 2
+        if np.abs(solution - last).max() < 1e-6:
+            break
+    weighted = white @ basis * weights[:, None]
+    inverse = np.linalg.pinv(weighted.T @ (white @ basis), hermitian=True)
+    gain = (basis @ inverse @ weighted.T) / sigmas  # scaled twist by offset
+    is_in = weights > 0.0
+    middle = _correlated(np.ascontiguousarray(weighted[is_in]), left[is_in], places[is_in])
+    covariance = basis @ inverse @ middle @ inverse @ basis.T
+    # What the covariance shows to be too poor to state is open as well.
+    values, vectors = np.linalg.eigh(basis.T @ covariance @ basis)
+    is_open = values > undetermined_mm**2
+    held = basis @ vectors[:, ~is_open]
+    project = held @ held.T
+    robust = left[is_in] * sigmas[is_in] * (unit_mm[is_in] if isinstance(unit_mm, np.ndarray) else unit_mm)
+    return RigidFit(
+        twist=project @ solution * scale,
+        covariance=project @ covariance @ project * np.outer(scale, scale),
+        undetermined=_complement(held.T).T,
+        weights=weights,
+        residual_mm=1.4826 * float(np.median(np.abs(robust))) if is_in.any() else float("inf"),
+        gain=scale[:, None] * (project @ gain),
+    )
+
+
+def _complement(directions: Array) -> Array:
+    """(6,6-K) orthonormal columns across K orthonormal rows."""
+    if not len(directions):
+        return np.eye(6)
+    return np.asarray(np.linalg.svd(directions)[2][len(directions) :].T)
+
+
+def _correlated(rows: Array, residuals: Array, places: Array) -> Array:
+    """(B,B) covariance of ``rows.T @ errors`` when errors are as alike as residuals at the same distance are."""
+    edges = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0])
+    if len(residuals) < 2:
+        return rows.T @ rows
+    bins = _distance_bins(np.ascontiguousarray(places), edges)
+    products, counts = _binned_products(bins, residuals, len(edges) + 1)
+    variance = float(np.mean(residuals**2)) * len(residuals) / max(len(residuals) - rows.shape[1], 1)
+    alike = np.where(counts > 50, products / np.maximum(counts, 1) / max(variance, 1e-300), 0.0)
+    alike = np.clip(alike, 0.0, 1.0)
+    # Once they are unlike they stay so: what a few pairs far apart show is chance.
+    alike = np.minimum.accumulate(alike)
+    alike[-1] = 0.0
+    return np.asarray(variance * (rows.T @ rows + _spread(bins, alike, rows)))
+
+
+@njit(cache=True, nogil=True)
+def _distance_bins(places, edges):  # type: ignore[no-untyped-def]
+    n, d = places.shape
+    bins = np.empty((n, n), dtype=np.uint8)
+    for i in range(n):
+        bins[i, i] = len(edges)
+        for j in range(i):
+            square = 0.0
+            for k in range(d):
+                square += (places[i, k] - places[j, k]) ** 2
+            b = 0
+            while b < len(edges) and square > edges[b] * edges[b]:
+                b += 1
+            bins[i, j] = bins[j, i] = b
+    return bins
+
+
+@njit(cache=True, nogil=True)
+def _binned_products(bins, residuals, size):  # type: ignore[no-untyped-def]
+    products, counts = np.zeros(size), np.zeros(size)
+    for i in range(bins.shape[0]):
+        for j in range(i):
+            products[bins[i, j]] += residuals[i] * residuals[j]
+            counts[bins[i, j]] += 1
+    return products, counts
+
+
+@njit(cache=True, nogil=True)
+def _spread(bins, alike, rows):  # type: ignore[no-untyped-def]
+    n, b = rows.shape
+    result = np.zeros((b, b))
+    for i in range(n):
+        mixed = np.zeros(b)
+        for j in range(n):
+            if j != i and alike[bins[i, j]] > 0.0:
+                for k in range(b):
+                    mixed[k] += alike[bins[i, j]] * rows[j, k]
+        for a in range(b):
+            for k in range(b):
+                result[a, k] += rows[i, a] * mixed[k]
+    return result

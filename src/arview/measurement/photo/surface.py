@@ -1,0 +1,182 @@
+"""Samples of a component's CAD surface, patches that follow it, and what its shape leaves free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.cad.fitness import face_areas
+from arview.cad.model import Component, Model, make_model
+from arview.cad.part import Part
+from arview.cad.symmetry import Symmetry, find_symmetries
+from arview.geometry import Array
+from arview.guideviews.mesh_edges import mesh_edges
+from arview.tracking.raycast import RayCaster
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points (N,3) of a surface in the model frame, with unit normals (N,3)."""
+
+    points: Array
+    normals: Array
+
+    def of(self, which: NDArray[np.bool_]) -> Samples:
+        """Some of them."""
+        return Samples(self.points[which], self.normals[which])
+
+
+def sample_surface(component: Component, spacing_mm: float, most: int, seed: int = 0) -> Samples:
+    """Samples about ``spacing_mm`` apart, at most ``most``, evenly by area."""
+    corners = component.vertices_in_model[component.faces]
+    areas = face_areas(component.vertices_in_model, component.faces.astype(np.int64))
+    spacing_mm = max(spacing_mm, float(np.sqrt(areas.sum() / most)))
+    count = int(np.ceil(6.0 * areas.sum() / spacing_mm**2))
+    rng = np.random.default_rng(seed)
+    edges = np.cumsum(areas) / areas.sum()
+    owners = np.minimum(np.searchsorted(edges, (np.arange(count) + rng.random(count)) / count), len(areas) - 1)
+    u, v = np.sqrt(rng.random(count)), rng.random(count)
+    points = np.einsum("nc,ncx->nx", np.stack([1 - u, u * (1 - v), u * v], axis=1), corners[owners])
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[owners]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    # One a cell of space and of direction is even enough.
+    cells = np.concatenate([np.floor(points / spacing_mm), np.round(1.2 * normals)], axis=1).astype(np.int64)
+    first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+    if len(first) > most:
+        first = np.sort(rng.permutation(first)[:most])
+    return Samples(points[first], normals[first])
+
+
+def tangents_of(normals: Array) -> tuple[Array, Array]:
+    """Two unit vectors (N,3) each, across unit normals (N,3) and each other."""
+    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    first = np.cross(normals, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(normals, first)
+
+
+def cut_patches(
+    samples: Samples, surface: RayCaster | None, normals_of_faces: Array | None, width: int, spacing_mm: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Patches shaped like the surface: points (N,P,3), and which of them (N,P) are on it.
+
+    A grid across the normal is projected along the normal onto the surface; points that miss it, or hit it more
+    than half a patch away or beyond an edge (60°), are off. Without a surface the patches are flat.
+    """
+    first, second = tangents_of(samples.normals)
+    steps = (np.arange(width) - (width - 1) / 2) * spacing_mm
+    a, b = (grid.ravel() for grid in np.meshgrid(steps, steps))
+    flat = samples.points[:, None] + a[None, :, None] * first[:, None] + b[None, :, None] * second[:, None]
+    if surface is None or normals_of_faces is None:
+        return flat, np.ones(flat.shape[:2], dtype=bool)
+    lift_mm = 0.75 * width * spacing_mm
+    toward = np.broadcast_to(-samples.normals[:, None], flat.shape).reshape(-1, 3)
+    distances, faces = surface.cast((flat + lift_mm * samples.normals[:, None]).reshape(-1, 3), toward)
+    depth = distances.reshape(flat.shape[:2]) - lift_mm
+    cosine = np.einsum("nx,npx->np", samples.normals, normals_of_faces[faces].reshape(flat.shape))
+    is_on = (np.abs(depth) < lift_mm / 1.5) & (cosine > 0.5)
+    return flat - np.where(is_on, depth, 0.0)[..., None] * samples.normals[:, None], is_on
+
+
+def shades_of(is_on: NDArray[np.bool_]) -> Array:
+    """(N,P,3) what plain shading may add to patches: constant and slopes, orthonormal over the points that are on."""
+    width = int(np.sqrt(is_on.shape[1]))
+    a, b = (grid.ravel() for grid in np.meshgrid(*2 * [np.linspace(-1.0, 1.0, width)]))
+    plain = np.stack([np.ones_like(a), a, b], axis=1)[None] * is_on[..., None]
+    return np.asarray(np.linalg.qr(plain)[0])
+
+
+def face_normals(component: Component) -> Array:
+    """(F,3) unit normals."""
+    corners = component.vertices_in_model[component.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300))
+
+
+def near_others(points: Array, model: Model, component: int, reach_mm: float) -> NDArray[np.bool_]:
+    """(N,) which points (N,3) are within ``reach_mm`` of the surface of another component."""
+    vertices, faces, owner = model.mesh
+    corners = vertices[faces[owner != component]]
+    low, high = points.min(axis=0) - reach_mm, points.max(axis=0) + reach_mm
+    corners = corners[((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)).all(axis=1)]
+    return np.asarray(_nearer_than(points, np.ascontiguousarray(corners), reach_mm))
+
+
+def near_edges(points: Array, component: Component, reach_mm: float) -> NDArray[np.bool_]:
+    """(N,) which points (N,3) are within ``reach_mm`` of a sharp edge of the component."""
+    from scipy.spatial import cKDTree
+
+    edges = mesh_edges(make_model(component.name, (component,)))
+    start, end = (edges.vertices_in_model[edges.ends[edges.is_crease, k]] for k in (0, 1))
+    count = np.maximum(1, np.ceil(np.linalg.norm(end - start, axis=1) / (0.25 * reach_mm))).astype(int)
+    which = np.repeat(np.arange(len(count)), count)
+    along = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[which]
+    if not len(which):
+        return np.zeros(len(points), dtype=bool)
+    tree = cKDTree(start[which] + along[:, None] * (end - start)[which])
+    return np.asarray(np.isfinite(tree.query(points, distance_upper_bound=reach_mm)[0]))
+
+
+def free_directions(component: Component, part: Part | None, center: Array, radius_mm: float) -> Array:
+    """(K,6) orthonormal moves (turn times ``radius_mm``, shift of the centre) that leave the shape as it is."""
+    found = find_symmetries(component.vertices_in_model, component.faces.astype(np.int64), near_share=0.0)
+    symmetries: list[Symmetry] = [item.symmetry for item in found if item.is_exact]
+    if part is not None:
+        declared = part.component_settings(component.name).symmetry
+        symmetries += [declared] if declared is not None else []
+    moves = []
+    for symmetry in symmetries:
+        if symmetry.order is None:
+            axis = np.array(symmetry.axis_in_model)
+            shift = np.cross(axis, center - np.array(symmetry.through_in_model))
+            moves.append(np.concatenate([axis * radius_mm, np.where(np.abs(shift) < 1e-3 * radius_mm, 0.0, shift)]))
+    if not moves:
+        return np.zeros((0, 6))
+    _, size, basis = np.linalg.svd(np.array(moves))
+    return np.asarray(basis[: np.count_nonzero(size > 1e-6 * radius_mm)])
+
+
+@njit(cache=True, nogil=True)
+def _nearer_than(points, corners, reach):  # type: ignore[no-untyped-def]
+    """Whether each point is nearer than ``reach`` to any triangle (T,3,3), to its plane or its edges."""
+    count = corners.shape[0]
+    boxes = np.empty((count, 6))
+    planes = np.empty((count, 3))
+    for k in range(count):
+        a, b, c = corners[k, 0], corners[k, 1], corners[k, 2]
+        for x in range(3):
+            boxes[k, x] = min(a[x], b[x], c[x]) - reach
+            boxes[k, 3 + x] = max(a[x], b[x], c[x]) + reach
+        planes[k] = np.cross(b - a, c - a)
+        planes[k] /= max(np.sqrt(np.sum(planes[k] * planes[k])), 1e-300)
+    result = np.zeros(points.shape[0], dtype=np.bool_)
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        for k in range(count):
+            if (
+                x < boxes[k, 0] or y < boxes[k, 1] or z < boxes[k, 2]
+                or x > boxes[k, 3] or y > boxes[k, 4] or z > boxes[k, 5]
+            ):  # fmt: skip
+                continue
+            n0, n1, n2 = planes[k, 0], planes[k, 1], planes[k, 2]
+            is_inside, nearest = True, 1e300
+            for e in range(3):
+                s, t = corners[k, e], corners[k, (e + 1) % 3]
+                e0, e1, e2 = t[0] - s[0], t[1] - s[1], t[2] - s[2]
+                d0, d1, d2 = x - s[0], y - s[1], z - s[2]
+                turn = n0 * (e1 * d2 - e2 * d1) + n1 * (e2 * d0 - e0 * d2) + n2 * (e0 * d1 - e1 * d0)
+                is_inside = is_inside and turn >= 0.0
+                along = (d0 * e0 + d1 * e1 + d2 * e2) / max(e0 * e0 + e1 * e1 + e2 * e2, 1e-300)
+                along = min(max(along, 0.0), 1.0)
+                square = (d0 - along * e0) ** 2 + (d1 - along * e1) ** 2 + (d2 - along * e2) ** 2
+                nearest = min(nearest, square)
+            if is_inside:
+                a = corners[k, 0]
+                nearest = ((x - a[0]) * n0 + (y - a[1]) * n1 + (z - a[2]) * n2) ** 2
+            if nearest < reach * reach:
+                result[i] = True
+                break
+    return result

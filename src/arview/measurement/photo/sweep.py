@@ -1,0 +1,338 @@
+"""Object-space sweep: where along its normal a surface looks alike in the photos.
+
+Plane sweeping (Collins, CVPR 1996; Gallup et al., CVPR 2007) with a plane for every sample, and in its place a patch
+of the CAD surface. Samples say how far they are off along their normals; together they say how the component moved,
+as in point-to-plane registration (Chen & Medioni 1992).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.part import Part
+from arview.geometry import Array, apply, exp_so3, log_so3, rigid
+from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
+from arview.measurement.photo.kernels import choose_views, sweep_scores, vote_shifts
+from arview.measurement.photo.options import PhotoOptions, SweepOptions
+from arview.measurement.photo.surface import (
+    Samples,
+    cut_patches,
+    face_normals,
+    free_directions,
+    near_edges,
+    near_others,
+    sample_surface,
+    shades_of,
+    tangents_of,
+)
+from arview.measurement.photo.views import PhotoViews
+from arview.measurement.types import Move, NotMeasured
+from arview.tracking.raycast import RayCaster
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """What a sweep says of each sample.
+
+    Attributes:
+        offsets_mm: (N,) along the normal, from the sample to the surface that the photos show.
+        variances_mm2: (N,) by image noise alone; neighbours share pixels, so their errors are alike.
+        is_ok: (N,) which say something; the others hold nothing.
+        scores: (N,) mean correlation of the views at the peak.
+        views: (N,V) photos that were compared, -1 for none.
+    """
+
+    offsets_mm: Array
+    variances_mm2: Array
+    is_ok: NDArray[np.bool_]
+    scores: Array
+    views: Indices
+
+
+def sweep_offsets(
+    samples_in_model: Array,
+    normals: Array,
+    views: PhotoViews,
+    reach_mm: float,
+    options: SweepOptions | None = None,
+    component: int | None = None,
+) -> Offsets:
+    """Distance along the normal of any samples of nearly flat surfaces, e.g. of a datum plane.
+
+    Args:
+        samples_in_model: (N,3) mm.
+        normals: (N,3) unit, outwards.
+        views: the photos; what hides samples is taken from the model at its nominal place.
+        reach_mm: how far is looked to either side.
+        component: index of the component the samples are on: patches follow its surface. Else they are flat.
+    """
+    o = options or SweepOptions()
+    samples = Samples(np.ascontiguousarray(samples_in_model), np.ascontiguousarray(normals))
+    px_mm = views.mm_per_px(samples.points.mean(axis=0))
+    caster, faces = None, None
+    if component is not None:
+        part = views.model.components[component]
+        caster, faces = RayCaster(part.vertices_in_model, part.faces), face_normals(part)
+    patches, is_on = cut_patches(samples, caster, faces, o.patch_points, o.patch_px / o.patch_points * px_mm)
+    chosen = pick_views(views, samples, -1 if component is None else component, np.eye(4), o, 0.5 * o.patch_px * px_mm)
+    steps = _steps(reach_mm, 0.4 * px_mm)
+    scores, count, alike = sweep_scores(
+        patches, is_on, shades_of(is_on), samples.normals, steps, chosen, views.levels[0], 1.5
+    )
+    chosen = without_outliers(chosen, scores, alike)
+    scores, count, _ = sweep_scores(
+        patches, is_on, shades_of(is_on), samples.normals, steps, chosen, views.levels[0], 1.5
+    )
+    return _peaks(scores, count, steps, is_on.sum(axis=1), chosen, o)
+
+
+def pick_views(
+    views: PhotoViews, samples: Samples, component: int, place: Array, o: SweepOptions, half_mm: float
+) -> Indices:
+    """(N,V) photos in which all of a sample's patch is seen; of ``component``, moved to ``place``, when not -1."""
+    first, second = tangents_of(samples.normals)
+    lift = samples.points + 0.05 * samples.normals
+    # Corners of half a patch: patches at an edge reach beyond it, and only what is on it is compared.
+    groups = np.stack([lift, *(lift + 0.5 * half_mm * (a * first + b * second) for a, b in _CORNERS)], axis=1)
+    toward = views.centres[None] - samples.points[:, None]
+    toward /= np.linalg.norm(toward, axis=2, keepdims=True)
+    cosines = np.einsum("nmx,nx->nm", toward, samples.normals)
+    visible = np.zeros(cosines.shape, dtype=bool)
+    hidden_by = component if component >= 0 else None
+    for view in range(len(views.cameras)):
+        facing = np.flatnonzero(cosines[:, view] > o.least_cosine)
+        if len(facing):
+            window = views.window(view, hidden_by, place, groups[facing].reshape(-1, 3))
+            # The middle must show the component itself; the corners must not be hidden.
+            seen = views.visible(view, window, groups[facing, :1], component)
+            visible[facing, view] = seen & views.visible(view, window, groups[facing])
+    middle = toward.mean(axis=0)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    return np.asarray(choose_views(visible, cosines, middle, o.max_views))
+
+
+_CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
+
+
+def without_outliers(chosen: Indices, scores: Array, alike: Array, least: float = 0.35) -> Indices:
+    """The views without those unlike the others at the peak (highlights, something in front), where 3 remain."""
+    best = np.argmax(scores, axis=1)
+    own = alike[np.arange(len(best)), best]
+    kept = np.where(own >= least, chosen, -1)
+    enough = np.count_nonzero(kept >= 0, axis=1) >= 3
+    return np.where(enough[:, None], kept, chosen)
+
+
+def _steps(reach_mm: float, step_mm: float) -> Array:
+    count = max(2, int(np.ceil(reach_mm / step_mm)))
+    return np.asarray(np.arange(-count, count + 1) * step_mm, dtype=np.float64)
+
+
+def _peaks(scores: Array, count: Array, steps: Array, on: Array, chosen: Indices, o: SweepOptions) -> Offsets:
+    """Sub-pixel place of the best score by a parabola, its variance by the curvature and what is left of the views.
+
+    The sum of squared differences of m views from their mean is (m - 1)(1 - score); its second derivative and the
+    variance of a pixel that its least value shows give the variance of the place.
+    """
+    n, pitch = len(scores), steps[1] - steps[0]
+    best = np.clip(np.argmax(scores, axis=1), 1, len(steps) - 2)
+    rows = np.arange(n)
+    a, b, c = (scores[rows, best + k].astype(np.float64) for k in (-1, 0, 1))
+    bend = a - 2.0 * b + c
+    is_peak = (b >= a) & (b >= c) & (bend < 0) & (a > -1.0) & (c > -1.0)
+    bend = np.where(is_peak, bend, -1.0)
+    offsets = steps[best] + 0.5 * pitch * (a - c) / bend
+    views = count[rows, best].astype(np.float64)
+    freedom = np.maximum(views - 1.0, 1.0) * np.maximum(on - 4.0, 1.0)  # pixels of a patch share what they saw
+    variances = 2.0 * (1.0 - np.minimum(b, 0.999)) / freedom / (-bend / pitch**2)
+    is_ok = is_peak & (b > o.least_score) & (views >= o.least_views) & (variances < o.largest_sigma_mm**2)
+    is_ok &= on >= 0.4 * o.patch_points**2
+    return Offsets(np.where(is_peak, offsets, 0.0), variances, is_ok, b, chosen)
+
+
+def pose_rows(views: PhotoViews, samples: Samples, chosen: Indices) -> Array:
+    """(N,6M) how much a sample's offset changes with the poses' twists: that of a point triangulated in its views."""
+    count = len(views.cameras)
+    moment = np.zeros((len(samples.points), 3, 3))
+    parts = []
+    for view in range(count):
+        of = np.flatnonzero((chosen == view).any(axis=1))
+        if not len(of):
+            continue
+        pose, camera = views.cam_from_model[view], views.cameras[view]
+        x, y, z = apply(pose, samples.points[of]).T
+        zero = np.zeros_like(x)
+        by_cam = camera.fx * np.stack(
+            [np.stack([1 / z, zero, -x / z**2], axis=1), np.stack([zero, 1 / z, -y / z**2], axis=1)], axis=1
+        )
+        by_model = by_cam @ pose[:3, :3]
+        moment[of] += np.swapaxes(by_model, 1, 2) @ by_model
+        # A left twist (turn w, shift t) moves a point in the camera by w × x + t.
+        turned = np.stack([
+            np.stack([zero, z, -y], axis=1), np.stack([-z, zero, x], axis=1), np.stack([y, -x, zero], axis=1)
+        ], axis=1)  # fmt: skip
+        by_twist = np.concatenate([by_cam @ turned, by_cam], axis=2)
+        parts.append((view, of, np.swapaxes(by_model, 1, 2) @ by_twist))
+    inverse = np.linalg.pinv(moment)
+    result = np.zeros((len(samples.points), 6 * count))
+    for view, of, mixed in parts:
+        result[of, 6 * view : 6 * view + 6] = -np.einsum("nx,nxy,nyk->nk", samples.normals[of], inverse[of], mixed)
+    return result
+
+
+class ComponentSweep:
+    """The sweep of one component: samples and patches in its nominal place, moved along as it is found elsewhere."""
+
+    def __init__(self, views: PhotoViews, component: int, part: Part | None, options: PhotoOptions) -> None:
+        self.views, self.component, self.options = views, component, options
+        self.shape = views.model.components[component]
+        self.center = self.shape.bounds_in_model.mean(axis=0)
+        self.radius_mm = 0.5 * float(np.linalg.norm(np.ptp(self.shape.bounds_in_model, axis=0)))
+        self.px_mm = views.mm_per_px(self.center)
+        self.free = free_directions(self.shape, part, self.center, self.radius_mm)
+        o = options.sweep
+        samples = sample_surface(self.shape, o.sample_spacing_px * self.px_mm, o.samples)
+        apart = ~near_others(samples.points, views.model, component, options.joint_mm)
+        apart &= ~near_edges(samples.points, self.shape, o.edge_px * self.px_mm)
+        self.samples = samples.of(apart)
+        self.patch_mm = o.patch_px * self.px_mm
+        self._caster = RayCaster(self.shape.vertices_in_model, self.shape.faces)
+        self._faces = face_normals(self.shape)
+
+    def measure(self, start: Array | None = None) -> Move | NotMeasured:
+        """The component's move; ``start`` (4,4, measured_from_nominal) where it is roughly known already."""
+        o = self.options.sweep
+        chosen = self._pick(np.eye(4) if start is None else start)
+        seen = np.count_nonzero(chosen >= 0, axis=1) >= o.least_views
+        if np.count_nonzero(seen) < o.least_samples:
+            return self._not(f"seen in fewer than {o.least_views} photos from near enough; take more of it")
+        place = self._coarse(chosen, seen) if start is None else start
+        patches, is_on = self._cut(o.patch_points, o.patch_px / o.patch_points * self.px_mm)
+        shades = shades_of(is_on)
+        fit: RigidFit | None = None
+        range_px = o.fine_range_px
+        for turn in range(o.rounds):
+            chosen = self._pick(place)
+            steps = _steps(range_px * self.px_mm, 0.4 * self.px_mm)
+            moved = Samples(apply(place, self.samples.points), self.samples.normals @ place[:3, :3].T)
+            shaped = apply(place, patches)
+            scores, count, alike = sweep_scores(
+                shaped, is_on, shades, moved.normals, steps, chosen, self.views.levels[0], o.least_contrast
+            )
+            chosen = without_outliers(chosen, scores, alike)
+            scores, count, alike = sweep_scores(
+                shaped, is_on, shades, moved.normals, steps, chosen, self.views.levels[0], o.least_contrast
+            )
+            found = _peaks(scores, count, steps, is_on.sum(axis=1), chosen, o)
+            ok = found.is_ok
+            seen = np.count_nonzero(chosen >= 0, axis=1) >= o.least_views
+            if np.count_nonzero(ok) < o.least_samples:
+                return self._not(
+                    f"weak texture: only {np.count_nonzero(ok)} of {np.count_nonzero(seen)} samples of its surface "
+                    "look alike in the photos"
+                )
+            fit = self._fit(moved.of(ok), found.offsets_mm[ok], found.variances_mm2[ok], place)
+            place = self._moved(place, fit.twist)
+            step = float(np.abs(fit.twist * np.repeat([self.radius_mm, 1.0], 3)).max())
+            if turn >= 1 and step < o.settled_mm:
+                break
+            range_px = max(1.6, min(range_px, 0.6 * range_px + 2.0 * step / self.px_mm))
+        assert fit is not None
+        used = int(np.count_nonzero(fit.weights > 0.1))
+        support = used / max(1, int(np.count_nonzero(seen)))
+        if support < o.least_support or used < o.least_samples:
+            return self._not(f"weak texture or not there: {100 * support:.0f} % of its surface agrees on a place")
+        return self._move(fit, moved.of(ok), found.views[ok], place, support)
+
+    def _pick(self, place: Array) -> Indices:
+        moved = Samples(apply(place, self.samples.points), self.samples.normals @ place[:3, :3].T)
+        return pick_views(self.views, moved, self.component, place, self.options.sweep, 0.5 * self.patch_mm)
+
+    def _cut(self, width: int, spacing_mm: float) -> tuple[Array, NDArray[np.bool_]]:
+        o = self.options.sweep
+        patches, is_on = cut_patches(self.samples, self._caster, self._faces, width, spacing_mm)
+        points = patches[is_on]
+        apart = ~near_others(points, self.views.model, self.component, self.options.joint_mm)
+        is_on[is_on] = apart & ~near_edges(points, self.shape, o.edge_px * self.px_mm)
+        return patches, is_on
+
+    def _coarse(self, chosen: Indices, seen: NDArray[np.bool_]) -> Array:
+        """Where most samples look alike, within the capture range: votes of shifts, then a fit to the near peaks."""
+        o = self.options.sweep
+        # Coarse enough that the range takes some forty steps, with patches to match.
+        level = int(np.clip(np.round(np.log2(0.4 / self.px_mm)) + 1, 1, 2))
+        coarse_mm = self.px_mm * 2**level
+        patches, is_on = self._cut(7, coarse_mm)
+        steps = _steps(o.capture_mm + coarse_mm, 0.6 * coarse_mm)
+        normals = self.samples.normals
+        scores, _, _ = sweep_scores(
+            patches, is_on, shades_of(is_on), normals, steps, chosen, self.views.levels[level], 1.0
+        )
+        axis = np.arange(-o.capture_mm, o.capture_mm + 1e-9, max(0.5, o.capture_mm / 12))
+        shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+        shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")]
+        votes = vote_shifts(scores[seen], steps, normals[seen], shifts, 0.3)
+        # The nearest of equals: a shift that only slides a surface in itself wins nothing.
+        best = shifts[np.flatnonzero(votes > votes.max() - 0.005 * abs(votes.max()) - 1e-9)[0]]
+        twist = np.concatenate([np.zeros(3), best])
+        rows = move_rows(self.samples.points, normals, self.center)
+        for reach_mm in (3.0 * coarse_mm, 2.0 * coarse_mm, 2.0 * coarse_mm):
+            near = np.where(np.abs(steps[None] - (rows @ twist)[:, None]) < reach_mm, scores, -1.0)
+            found = _peaks(near, np.full(near.shape, 3), steps, is_on.sum(axis=1), chosen, o)
+            ok = seen & (found.scores > 0.5) & (found.variances_mm2 < 1.0)
+            if np.count_nonzero(ok) < o.least_samples:
+                break
+            sigmas = np.full(np.count_nonzero(ok), 0.3 * coarse_mm)
+            twist = fit_rigid(
+                rows[ok], found.offsets_mm[ok], sigmas, self.free, self.radius_mm,
+                self.options.undetermined_mm, self._places(self.samples.of(ok)), 0.3,
+            ).twist  # fmt: skip
+        return self._moved(np.eye(4), twist)
+
+    def _fit(self, moved: Samples, offsets: Array, variances: Array, place: Array) -> RigidFit:
+        o = self.options.sweep
+        return fit_rigid(
+            move_rows(moved.points, moved.normals, apply(place, self.center)), offsets,
+            np.sqrt(variances + o.least_sigma_mm**2), self._free_at(place), self.radius_mm,
+            self.options.undetermined_mm, self._places(moved), 0.3,
+        )  # fmt: skip
+
+    def _free_at(self, place: Array) -> Array:
+        """The free directions turned along with the component."""
+        if not len(self.free):
+            return self.free
+        return np.concatenate([self.free[:, :3] @ place[:3, :3].T, self.free[:, 3:] @ place[:3, :3].T], axis=1)
+
+    def _places(self, samples: Samples) -> Array:
+        """Where samples are, in patch widths; faces of other directions are far."""
+        return np.concatenate([samples.points / self.patch_mm, 8.0 * samples.normals], axis=1)
+
+    def _moved(self, place: Array, twist: Array) -> Array:
+        """A place after a further move about where it takes the centre."""
+        rotation = exp_so3(twist[:3])
+        center = apply(place, self.center)
+        return rigid(rotation, center - rotation @ center + twist[3:]) @ place
+
+    def _move(self, fit: RigidFit, moved: Samples, chosen: Indices, place: Array, support: float) -> Move:
+        o = self.options.sweep
+        twist = np.concatenate([log_so3(place[:3, :3]), apply(place, self.center) - self.center])
+        covariance = fit.covariance
+        project = np.eye(6) - fit.undetermined.T @ fit.undetermined
+        scale = np.repeat([1.0 / self.radius_mm, 1.0], 3)
+        covariance = covariance + o.systematic_mm**2 * project * np.outer(scale, scale)
+        if self.views.pose_covariance is not None:
+            by_poses = fit.gain @ pose_rows(self.views, moved, chosen)
+            covariance = covariance + by_poses @ self.views.pose_covariance @ by_poses.T
+        twist = scale * (project @ (twist / scale))
+        return Move(
+            self.shape.name, "sweep", self.center, twist, 0.5 * (covariance + covariance.T), fit.undetermined,
+            self.radius_mm, int(np.count_nonzero(fit.weights > 0.1)), fit.residual_mm, support,
+        )  # fmt: skip
+
+    def _not(self, reason: str) -> NotMeasured:
+        return NotMeasured(self.shape.name, "sweep", reason)

@@ -1,0 +1,217 @@
+"""The photos and the model as the two ways of measuring see them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.cad.model import Model
+from arview.camera import Camera
+from arview.errors import InputError
+from arview.geometry import Array, apply
+from arview.raster import rasterise
+from arview.reconstruction.types import SparseModel
+from arview.tracking.threads import pool
+
+
+class Stack(NamedTuple):
+    """All photos at one size, for the kernels.
+
+    Attributes:
+        pixels: all pictures' grey levels one after the other, uint8.
+        starts: (M,) where each begins.
+        sizes: (M,2) width, height.
+        lenses: (M,9) fx fy cx cy k1 k2 p1 p2 k3.
+        poses: (M,3,4) cam_from_model.
+    """
+
+    pixels: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    lenses: Array
+    poses: Array
+
+
+class Window(NamedTuple):
+    """What an ideal camera sees of the model in part of a photo: 1/depth (0 = nothing) and component (-1)."""
+
+    lens: tuple[float, float, float, float]
+    origin: tuple[int, int]
+    inverse_depth: Array
+    ids: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class PhotoViews:
+    """Photos in grey with their poses in the model frame, and the model.
+
+    Attributes:
+        model: the nominal CAD.
+        names: of the photos.
+        cameras: of the photos, with distortion.
+        cam_from_model: (M,4,4).
+        levels: the photos at full, half and quarter size.
+        pose_covariance: see ``SparseModel``; None when it is not known.
+    """
+
+    model: Model
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    cam_from_model: Array
+    levels: tuple[Stack, ...]
+    pose_covariance: Array | None = None
+
+    @property
+    def centres(self) -> Array:
+        """(M,3) camera centres in the model frame."""
+        return -np.einsum("mji,mj->mi", self.cam_from_model[:, :3, :3], self.cam_from_model[:, :3, 3])
+
+    def gray(self, view: int) -> NDArray[np.uint8]:
+        """(H,W) uint8 picture of a photo."""
+        stack = self.levels[0]
+        width, height = stack.sizes[view]
+        return stack.pixels[stack.starts[view] : stack.starts[view] + width * height].reshape(height, width)
+
+    def mm_per_px(self, point: Array) -> float:
+        """Size of a pixel at a point (3,): median over the photos that look at it."""
+        depths = apply_all(self.cam_from_model, point)[:, 2]
+        ahead = depths > 0
+        if not ahead.any():
+            raise InputError("photos: no camera looks at the part; the poses are not in the frame of the CAD")
+        return float(np.median(depths[ahead] / np.array([camera.fx for camera in self.cameras])[ahead]))
+
+    def window(self, view: int, component: int | None, place: Array, around: Array, margin_px: int = 12) -> Window:
+        """The model around some points (N,3) as a photo without distortion shows it.
+
+        ``component`` stands at ``place`` (4,4, measured_from_nominal); None leaves all at nominal. A component of
+        -1 - i leaves component i out.
+        """
+        camera, pose = self.cameras[view], self.cam_from_model[view]
+        vertices, faces, owner = self.model.mesh
+        if component is not None and component >= 0:
+            mine = np.unique(faces[owner == component])
+            vertices = vertices.copy()
+            vertices[mine] = apply(place, vertices[mine])
+        elif component is not None:
+            faces, owner = faces[owner != -1 - component], owner[owner != -1 - component]
+        pixels = camera.without_distortion().project(apply(pose, around))
+        if not np.isfinite(pixels).all():
+            return Window((1.0, 1.0, 0.0, 0.0), (0, 0), np.zeros((1, 1)), np.full((1, 1), -1, dtype=np.int32))
+        spare = 0.15 * max(camera.width, camera.height)  # lenses may see beyond the ideal picture
+        largest = np.array([camera.width, camera.height]) + spare
+        low = np.floor(np.clip(pixels.min(axis=0) - margin_px, -spare, largest)).astype(int)
+        high = np.ceil(np.clip(pixels.max(axis=0) + margin_px, -spare, largest)).astype(int)
+        width, height = (int(v) for v in np.maximum(high - low, 1))
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        origin = (int(low[0]), int(low[1]))
+        inverse_depth, face = rasterise(apply(pose, vertices), faces, *lens, width, height, origin=origin)
+        return Window(lens, origin, inverse_depth, np.where(face >= 0, owner[np.maximum(face, 0)], -1))
+
+    def visible(self, view: int, window: Window, groups: Array, component: int = -1) -> NDArray[np.bool_]:
+        """(N,) whether all points of each group (N,Q,3) are inside the photo and not hidden in the window.
+
+        With ``component`` the window must show that component there.
+        """
+        stack = self.levels[0]
+        return _all_visible(
+            groups, stack.poses[view], stack.lenses[view], stack.sizes[view], np.array(window.lens),
+            np.array(window.origin), window.inverse_depth, window.ids, component,
+        )  # fmt: skip
+
+
+def load_views(sparse: SparseModel, model: Model) -> PhotoViews:
+    """Read the photos of a reconstruction whose poses are in mm and in the frame of the model.
+
+    Raises:
+        InputError: fewer than three photos; a photo cannot be read, or its size is not its camera's.
+    """
+    from arview.reconstruction.intake import read_photo
+
+    if len(sparse.photos) < 3:
+        raise InputError(f"photos: {len(sparse.photos)} placed photos; at least 3 are needed to measure in them")
+
+    def read(index: int) -> NDArray[np.uint8]:
+        photo = sparse.photos[index]
+        gray = np.asarray(cv2.cvtColor(read_photo(photo.path), cv2.COLOR_RGB2GRAY))
+        if gray.shape != (photo.camera.height, photo.camera.width):
+            raise InputError(
+                f"{photo.path}: the photo has {gray.shape[1]}×{gray.shape[0]} px, its camera "
+                f"{photo.camera.width}×{photo.camera.height}; reconstruct again from the photos as they are now"
+            )
+        return gray
+
+    grays = list(pool().map(read, range(len(sparse.photos))))
+    cameras = tuple(photo.camera for photo in sparse.photos)
+    poses = np.stack([photo.cam_from_scan for photo in sparse.photos])
+    return views_of(grays, cameras, poses, model, tuple(p.name for p in sparse.photos), sparse.pose_covariance)
+
+
+def views_of(
+    grays: list[NDArray[np.uint8]],
+    cameras: tuple[Camera, ...],
+    cam_from_model: Array,
+    model: Model,
+    names: tuple[str, ...],
+    pose_covariance: Array | None = None,
+) -> PhotoViews:
+    """Views of grey pictures (H,W) that are already read."""
+    levels = []
+    for level in range(3):
+        if level:
+            grays = [
+                np.asarray(cv2.resize(g, (g.shape[1] // 2, g.shape[0] // 2), interpolation=cv2.INTER_AREA))
+                for g in grays
+            ]
+        sizes = np.array([[g.shape[1], g.shape[0]] for g in grays], dtype=np.int64)
+        starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]])
+        small = [c.scaled(int(w), int(h)) for c, (w, h) in zip(cameras, sizes, strict=True)]
+        lenses = np.array([[c.fx, c.fy, c.cx, c.cy, *c.dist] for c in small], dtype=np.float64)
+        pixels = np.concatenate([g.ravel() for g in grays])
+        levels.append(Stack(pixels, starts, sizes, lenses, np.ascontiguousarray(cam_from_model[:, :3])))
+    return PhotoViews(model, names, cameras, cam_from_model, tuple(levels), pose_covariance)
+
+
+def apply_all(cam_from_model: Array, point: Array) -> Array:
+    """(M,3) one point (3,) in the frame of each of M cameras."""
+    return np.asarray(cam_from_model[:, :3, :3] @ point + cam_from_model[:, :3, 3])
+
+
+@njit(cache=True, nogil=True)
+def _all_visible(groups, pose, lens, size, ideal, origin, inverse_depth, ids, component):  # type: ignore[no-untyped-def]
+    margin = 2.0
+    height, width = inverse_depth.shape
+    result = np.zeros(groups.shape[0], dtype=np.bool_)
+    for i in range(groups.shape[0]):
+        good = True
+        for j in range(groups.shape[1]):
+            point = groups[i, j]
+            x = pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2] * point[2] + pose[0, 3]
+            y = pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2] * point[2] + pose[1, 3]
+            z = pose[2, 0] * point[0] + pose[2, 1] * point[1] + pose[2, 2] * point[2] + pose[2, 3]
+            if z <= 1.0:
+                good = False
+                break
+            x, y = x / z, y / z
+            r2 = x * x + y * y
+            radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
+            u = lens[0] * (x * radial + 2 * lens[6] * x * y + lens[7] * (r2 + 2 * x * x)) + lens[2]
+            v = lens[1] * (y * radial + lens[6] * (r2 + 2 * y * y) + 2 * lens[7] * x * y) + lens[3]
+            if not (margin < u < size[0] - 1 - margin and margin < v < size[1] - 1 - margin):
+                good = False
+                break
+            iu = int(np.round(ideal[0] * x + ideal[2])) - origin[0]
+            iv = int(np.round(ideal[1] * y + ideal[3])) - origin[1]
+            if iu < 0 or iv < 0 or iu >= width or iv >= height:
+                good = False
+                break
+            # A surface seen at up to 70° changes by some pixels' worth of depth within a pixel.
+            if (component >= 0 and ids[iv, iu] != component) or z * inverse_depth[iv, iu] > 1.0 + 4.0 / ideal[0]:
+                good = False
+                break
+        result[i] = good
+    return result
