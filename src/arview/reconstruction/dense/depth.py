@@ -25,7 +25,7 @@ from arview.reconstruction.types import SparseModel
 
 STEPS = (4, 2)
 """Pixels of the working size per pixel of each PatchMatch stage; the depth maps have the last one's grid."""
-SWEEPS = (3, 2)
+SWEEPS = (3, 1)
 RANDOMS = 6
 POLISH_ITERATIONS = 3
 T = TypeVar("T")
@@ -151,7 +151,7 @@ def _search(
         given.insert(0 if stage == 0 else 1, cad_planes(cad, view.cam_from_scan, camera))
     problem = _problem(views, index, greys, maps, step, options)
     planes, costs = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
-    scratch, indices = make_scratch()
+    scratch, indices = make_scratch(is_dense=stage > 0)
     seed = (options.seed * 0x9E3779B1 + view.index * 0x85EBCA6B + stage * 0xC2B2AE35) & 0x7FFFFFFF
     low, high = 1.0 / view.farthest, 1.0 / view.nearest
     depth = 2.0 / (low + high)

@@ -56,18 +56,21 @@ class Problem(NamedTuple):
     numbers: NDArray[np.float32]
 
 
-def make_scratch(shift: float = 0.0) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def make_scratch(shift: float = 0.0, is_dense: bool = False) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Working memory of one thread: (14,SAMPLES) with the samples' offsets and fall-off set, and (SAMPLES,) indices.
 
-    Samples lie on every other pixel of a disc. ``shift`` is where the pixels are from the middle: 0, or 0.5 for a
+    Samples lie on every other pixel of a disc, or on every pixel of a smaller one (``is_dense``). ``shift`` is where the pixels are from the middle: 0, or 0.5 for a
     middle between four pixels.
     """
     v, u = np.mgrid[-RADIUS - 1 : RADIUS + 2, -RADIUS - 1 : RADIUS + 2]
-    u, v = u[(u + v) % 2 == 0] + shift, v[(u + v) % 2 == 0] + shift
+    is_sample = ((u + v) % 2 == 0) | is_dense
+    u, v = u[is_sample] + shift, v[is_sample] + shift
     nearest = np.lexsort((u, v, u * u + v * v))[:SAMPLES]
     scratch = np.zeros((14, SAMPLES), dtype=np.float32)
     scratch[DX], scratch[DY] = u[nearest], v[nearest]
-    scratch[FALLOFF] = np.exp(-(scratch[DX] ** 2 + scratch[DY] ** 2) / (2.0 * 0.6**2 * RADIUS**2))
+    scratch[FALLOFF] = np.exp(
+        -(scratch[DX] ** 2 + scratch[DY] ** 2) / (2.0 * (0.4 if is_dense else 0.6) ** 2 * RADIUS**2)
+    )
     return scratch, np.zeros(SAMPLES, dtype=np.int32)
 
 
@@ -196,11 +199,15 @@ def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def element_cost(pixels, maps, sizes, warps, numbers, s, index, x, y, w, du, dv, variance):  # type: ignore[no-untyped-def]
-    """Mean of the best sources' 1 - ZNCC, plus their disagreement with its depth: 0 (best) to 2."""
+def element_cost(pixels, maps, sizes, warps, numbers, s, index, x, y, w, du, dv, variance, limit):  # type: ignore[no-untyped-def]
+    """Mean of the best sources' 1 - ZNCC, plus their disagreement with its depth: 0 (best) to 2.
+
+    Sources are left out, and 2 returned, as soon as the mean cannot get below ``limit``.
+    """
     if not is_facing(numbers, x, y, w, du, dv):
         return _WORST
     count = sizes.shape[0]
+    best = min(int(numbers[BEST]), count)
     for k in range(count):
         h = warp(warps, k, x, y, w, du, dv)
         cost = _WORST
@@ -213,7 +220,12 @@ def element_cost(pixels, maps, sizes, warps, numbers, s, index, x, y, w, du, dv,
             s[COSTS, j] = s[COSTS, j - 1]
             j -= 1
         s[COSTS, j] = cost
-    best = min(int(numbers[BEST]), count)
+        # The sources to come can cost nothing at best.
+        surest = _ZERO
+        for i in range(best - (count - 1 - k)):
+            surest += s[COSTS, i]
+        if surest > limit * float32(best):
+            return _WORST
     total = _ZERO
     for k in range(best):
         total += s[COSTS, k]

@@ -76,7 +76,9 @@ def try_hypotheses(p, s, index, planes, costs, hypotheses, spread, randoms, lowe
                         w = lowest + (highest - lowest) * share
                         du = w / fx * draw(seed, x, y, turn + 1)
                         dv = w / fy * draw(seed, x, y, turn + 2)
-                cost = element_cost(pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, w, du, dv, variance)
+                cost = element_cost(
+                    pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, w, du, dv, variance, costs[y, x]
+                )  # fmt: skip
                 if cost < costs[y, x]:
                     costs[y, x] = cost
                     planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, du, dv
@@ -114,7 +116,7 @@ def sweep(p, s, index, planes, costs, regions, color, step_w, step_tilt, seed): 
                 if abs(new_w - w) < same_w and tilt < float32(0.1) * step_tilt * w:
                     continue
                 new = element_cost(
-                    pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, new_w, new_u, new_v, variance
+                    pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, new_w, new_u, new_v, variance, cost
                 )
                 if new < cost:
                     cost, w, du, dv = new, new_w, new_u, new_v
@@ -127,7 +129,7 @@ def sweep(p, s, index, planes, costs, regions, color, step_w, step_tilt, seed): 
                         new_u += w / fx * step_tilt * draw(seed, x, y, 3 * turn + 1)
                         new_v += w / fy * step_tilt * draw(seed, x, y, 3 * turn + 2)
                     new = element_cost(
-                        pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, new_w, new_u, new_v, variance
+                        pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, new_w, new_u, new_v, variance, cost
                     )
                     if new < cost:
                         cost, w, du, dv = new, new_w, new_u, new_v
