@@ -22,7 +22,9 @@ Role = Literal["base", "inspect", "ignore"]
 Vector = tuple[float, float, float]
 
 ROLES = ("base", "inspect", "ignore")
-DATUM_FEATURES = ("plane", "hole", "pin")
+DatumFeature = Literal["plane", "hole", "pin", "point", "fit"]
+DATUM_FEATURES = ("plane", "hole", "pin", "point", "fit")
+DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 PART_FILE_EXAMPLE = """\
 # A part file. Lengths in mm, angles in degrees, positions in the frame of the CAD file.
@@ -77,9 +79,11 @@ symmetry = { axis = [0.0, 0.0, 1.0], through_mm = [60.0, 40.0, 0.0], order = "co
 # axis = [0.0, 0.0, 1.0]
 # order = 2
 
-# The features of the base that define the frame in which deviations are stated, in order of precedence.
+# The features of the base that define the frame in which deviations are stated, in order of precedence: each
+# locks what it determines and those before it have left free (ISO 5459). What all leave free, here the
+# rotation about B, the best fit of the base decides; so it does without any datums.
 [datums.A]
-feature = "plane"
+feature = "plane"              # plane, hole, pin, point (where its normal meets the surface), or fit (of a component)
 component = "base_plate"
 point_mm = [0.0, 0.0, 0.0]
 normal = [0.0, 0.0, 1.0]
@@ -87,9 +91,10 @@ normal = [0.0, 0.0, 1.0]
 [datums.B]
 feature = "hole"               # or "pin"
 component = "base_plate"
-point_mm = [-97.0, -67.0, 0.0]
+point_mm = [-97.0, -67.0, 0.0] # on the axis, at the end that the camera sees
 axis = [0.0, 0.0, 1.0]
 diameter_mm = 12.0
+locks = ["tx", "ty"]           # default: all that it determines; of rx ry rz tx ty tz, axes of the model
 """
 """A complete part file with comments; what `arview check --help` shows."""
 
@@ -117,16 +122,19 @@ class ComponentSettings:
 class Datum:
     """A feature that defines the frame of measurement.
 
-    ``direction_in_model`` is the unit normal of a plane or the unit axis of a hole or pin;
-    ``point_in_model`` lies on it, mm; ``diameter_mm`` belongs to holes and pins only.
+    ``direction_in_model`` is the unit normal of a plane or point, or the unit axis of a hole or pin;
+    ``point_in_model`` lies on it, mm; ``diameter_mm`` belongs to holes and pins only. Of a ``fit``, the best fit of
+    the whole component, they are the middle of its bounding box and +Z. ``locks`` are the degrees of freedom that
+    it may lock.
     """
 
     label: str
-    feature: Literal["plane", "hole", "pin"]
+    feature: DatumFeature
     component: str
     point_in_model: Vector
     direction_in_model: Vector
     diameter_mm: float | None = None
+    locks: tuple[str, ...] = DOF_NAMES
 
 
 @dataclass(frozen=True)
@@ -262,7 +270,7 @@ def _read_part(root: _Table, path: Path, unit: str | None) -> Part:
     symmetries = tuple(
         _read_symmetry(table, tuple(model.center_in_model.tolist())) for table in root.tables("symmetry")
     )
-    datums = _read_datums(root.table("datums"), names)
+    datums = _read_datums(root.table("datums"), cad.model)
     return Part(
         name=name,
         path=path,
@@ -339,19 +347,25 @@ def _read_symmetry(table: _Table, default_through: Vector) -> Symmetry:
     return Symmetry(axis, through, order)
 
 
-def _read_datums(tables: _Table, names: list[str]) -> tuple[Datum, ...]:
+def _read_datums(tables: _Table, model: Model) -> tuple[Datum, ...]:
     datums = []
+    names = [component.name for component in model.components]
     for label in tables.content:
         table = tables.table(label)
-        feature = cast(Literal["plane", "hole", "pin"], table.choice("feature", DATUM_FEATURES, required=True))
+        feature = cast(DatumFeature, table.choice("feature", DATUM_FEATURES, required=True))
         component = table.text("component")
         if component not in names:
             raise InputError(f"{table.path}: [{table.name}] {_unknown_component(component, names)}")
-        point = table.vector("point_mm")
-        direction = table.direction("normal" if feature == "plane" else "axis")
-        diameter_mm = None if feature == "plane" else table.positive("diameter_mm", required=True)
+        x, y, z = model.component(component).bounds_in_model.mean(axis=0).tolist()
+        point, direction, diameter_mm = (x, y, z), (0.0, 0.0, 1.0), None
+        if feature != "fit":
+            point = table.vector("point_mm")
+            direction = table.direction("normal" if feature in ("plane", "point") else "axis")
+        if feature in ("hole", "pin"):
+            diameter_mm = table.positive("diameter_mm", required=True)
+        locks = table.choices("locks", DOF_NAMES)
         table.finish()
-        datums.append(Datum(label, feature, component, point, direction, diameter_mm))
+        datums.append(Datum(label, feature, component, point, direction, diameter_mm, locks))
     tables.finish()
     return tuple(datums)
 
@@ -423,6 +437,13 @@ class _Table:
         if value not in options:
             self.fail(key, value, "one of " + ", ".join(f'"{option}"' for option in options))
         return str(value)
+
+    def choices(self, key: str, options: tuple[str, ...]) -> tuple[str, ...]:
+        """A list of some of the options; all of them by default."""
+        value = self.content[key] if self.known(key) else list(options)
+        if not isinstance(value, list) or not value or any(item not in options for item in value):
+            self.fail(key, value, "a list of some of " + ", ".join(f'"{option}"' for option in options))
+        return tuple(option for option in options if option in value)
 
     def positive(self, key: str, default: float | None = None, required: bool = False) -> float | None:
         if not required and not self.known(key):
