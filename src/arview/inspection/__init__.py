@@ -1,5 +1,13 @@
 """Inspection: the measured deviations of one built part, and the file ``inspection.json`` that holds them."""
 
+from arview.inspection.details import (
+    BudgetLine,
+    DatumReport,
+    DatumSystem,
+    Details,
+    MethodAgreement,
+    MethodResult,
+)
 from arview.inspection.files import load_inspection, save_inspection
 from arview.inspection.record import (
     SCHEMA_VERSION,
@@ -12,9 +20,15 @@ from arview.inspection.record import (
 
 __all__ = [
     "SCHEMA_VERSION",
+    "BudgetLine",
     "ComponentDeviation",
+    "DatumReport",
+    "DatumSystem",
+    "Details",
     "Finding",
     "Inspection",
+    "MethodAgreement",
+    "MethodResult",
     "Provenance",
     "Verdict",
     "load_inspection",

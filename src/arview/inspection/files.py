@@ -16,7 +16,9 @@ import jsonschema
 from arview.atomic import replacing
 from arview.cad.model import Model
 from arview.errors import InputError, MismatchError, OutputError
+from arview.inspection.details import DatumSystem, Details, from_json, to_json
 from arview.inspection.record import (
+    READABLE_VERSIONS,
     SCHEMA_VERSION,
     ComponentDeviation,
     Finding,
@@ -121,7 +123,7 @@ def _check_version(document: Any) -> None:
     if not isinstance(document, dict) or "schema_version" not in document:
         raise InputError("schema_version: is missing; this does not look like an arview inspection")
     version = document["schema_version"]
-    if version == SCHEMA_VERSION:
+    if version in READABLE_VERSIONS:
         return
     try:
         numbers = tuple(int(part) for part in str(version).split("."))
@@ -135,13 +137,13 @@ def _check_version(document: Any) -> None:
 
 
 @cache
-def _validator() -> Any:
-    file = resources.files("arview.inspection") / "schema" / f"inspection-{SCHEMA_VERSION}.json"
+def _validator(version: str) -> Any:
+    file = resources.files("arview.inspection") / "schema" / f"inspection-{version}.json"
     return jsonschema.Draft202012Validator(json.loads(file.read_text(encoding="utf-8")))
 
 
 def _check_schema(document: Any) -> None:
-    errors = sorted(_validator().iter_errors(document), key=lambda error: error.json_path)
+    errors = sorted(_validator(document["schema_version"]).iter_errors(document), key=lambda error: error.json_path)
     if not errors:
         return
     first = errors[0]
@@ -165,13 +167,26 @@ def _from_document(document: dict[str, Any]) -> Inspection:
         except InputError as error:
             raise InputError(f"components[{index}].{error} (component {entry['name']!r})") from None
     source = document["provenance"]
+    datums = document.get("datum_system")
     return Inspection(
         part=document["part"],
         serial=document["serial"],
         model_hash=document["model_hash"],
         created=created,
         components=tuple(components),
-        provenance=Provenance(source["tool"], source["version"], source["method"], source.get("note", "")),
+        provenance=Provenance(
+            source["tool"],
+            source["version"],
+            source["method"],
+            source.get("note", ""),
+            source.get("photos_hash", ""),
+            source.get("photos", 0),
+            tuple(source.get("software", {}).items()),
+            tuple(source.get("options", {}).items()),
+            source.get("cpu_s"),
+        ),
+        datum_system=None if datums is None else from_json(DatumSystem, datums),
+        warnings=tuple(document.get("warnings", ())),
     )
 
 
@@ -190,11 +205,18 @@ def _component(entry: dict[str, Any]) -> ComponentDeviation:
         tilt_deg=rotation.get("tilt_deg"),
         twist_deg=rotation.get("twist_deg"),
         finding=None if finding is None else Finding(finding),
+        details=None if entry.get("details") is None else from_json(Details, entry["details"]),
     )
 
 
 def _to_document(inspection: Inspection) -> dict[str, Any]:
-    return {
+    source = inspection.provenance
+    software, options = dict(source.software), dict(source.options)
+    more: dict[str, Any] = {
+        "photos_hash": source.photos_hash, "photos": source.photos, "software": software, "options": options,
+        "cpu_s": source.cpu_s,
+    }  # fmt: skip
+    document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "part": inspection.part,
         "serial": inspection.serial,
@@ -202,12 +224,18 @@ def _to_document(inspection: Inspection) -> dict[str, Any]:
         "created": inspection.created.replace(tzinfo=None).isoformat() + "Z",
         "components": [_to_entry(component) for component in inspection.components],
         "provenance": {
-            "tool": inspection.provenance.tool,
-            "version": inspection.provenance.version,
-            "method": inspection.provenance.method,
-            "note": inspection.provenance.note,
+            "tool": source.tool,
+            "version": source.version,
+            "method": source.method,
+            "note": source.note,
+            **{key: value for key, value in more.items() if value},
         },
     }
+    if inspection.datum_system is not None:
+        document["datum_system"] = to_json(inspection.datum_system)
+    if inspection.warnings:
+        document["warnings"] = list(inspection.warnings)
+    return document
 
 
 def _to_entry(component: ComponentDeviation) -> dict[str, Any]:
@@ -226,4 +254,6 @@ def _to_entry(component: ComponentDeviation) -> dict[str, Any]:
     }
     if component.finding is not None:
         entry["finding"] = component.finding.value
+    if component.details is not None:
+        entry["details"] = to_json(component.details)
     return entry

@@ -9,8 +9,10 @@ from enum import StrEnum
 
 from arview.cad.model import Model
 from arview.errors import InputError, MismatchError
+from arview.inspection.details import DatumSystem, Details
 
-SCHEMA_VERSION = "1.0"
+SCHEMA_VERSION = "1.1"
+READABLE_VERSIONS = ("1.0", "1.1")
 
 _DISTANCE_SLACK_MM = 0.006
 """Distance and displacement may each be rounded to 0.01 mm in a file; more than that is an inconsistency."""
@@ -47,6 +49,7 @@ class ComponentDeviation:
         tilt_deg: angle between measured and design axis of the component; None where undetermined.
         twist_deg: turn about that axis; None where undetermined.
         finding: ``missing`` when the component is not there.
+        details: the measurement in full; None in files of version 1.0.
 
     Raises:
         InputError: when the fields contradict each other; the message starts with the field's name.
@@ -62,6 +65,7 @@ class ComponentDeviation:
     tilt_deg: float | None = None
     twist_deg: float | None = None
     finding: Finding | None = None
+    details: Details | None = None
 
     def __post_init__(self) -> None:
         self._check_numbers()
@@ -135,12 +139,28 @@ class ComponentDeviation:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where the numbers come from; ``note`` is shown on the picture (e.g. "example, written by hand")."""
+    """Where the numbers come from.
+
+    Attributes:
+        tool, version: what measured.
+        method: how the numbers came about.
+        note: shown on the picture, e.g. "example, written by hand".
+        photos_hash: SHA-256 (hexadecimal) of the photos measured in; empty when there are none.
+        photos: number of them.
+        software: names and versions of the libraries that did the work.
+        options: what was asked for, by name.
+        cpu_s: processor time it took.
+    """
 
     tool: str
     version: str
     method: str
     note: str = ""
+    photos_hash: str = ""
+    photos: int = 0
+    software: tuple[tuple[str, str], ...] = ()
+    options: tuple[tuple[str, str], ...] = ()
+    cpu_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -153,7 +173,9 @@ class Inspection:
         model_hash: ``Model.source_hash`` of the CAD model measured against.
         created: when it was measured, UTC.
         components: one entry per inspected component; components of the model may be left out.
-        provenance: tool, version, method and note.
+        provenance: where the numbers come from.
+        datum_system: the frame of the deviations; None in files of version 1.0.
+        warnings: in words, what speaks against the whole.
 
     Raises:
         InputError: a component appears twice, or ``created`` has no time zone.
@@ -165,6 +187,8 @@ class Inspection:
     created: datetime
     components: tuple[ComponentDeviation, ...]
     provenance: Provenance
+    datum_system: DatumSystem | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.created.utcoffset() != timedelta(0):
