@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from arview.camera import Camera
 from arview.errors import InputError
@@ -95,9 +96,10 @@ def _match_by_appearance(
         matches = match_descriptors(one.descriptors[:count], other.descriptors[:count])
         return epipolar_inliers(one, other, matches, options.max_epipolar_px)
 
-    chosen = _pairs_worth_matching(features, options, threads)
     found: dict[Pair, Matches] = {}
-    with ThreadPoolExecutor(threads) as pool:
+    # Products of descriptors run one a thread: threads of the BLAS library below them would only wait for each other.
+    with ThreadPoolExecutor(threads) as pool, threadpool_limits(1, "blas"):
+        chosen = _pairs_worth_matching(features, options, pool)
         for done, (pair, matches) in enumerate(zip(chosen, pool.map(match, chosen), strict=True)):
             if len(matches) >= options.min_matches:
                 found[pair] = matches
@@ -105,7 +107,7 @@ def _match_by_appearance(
     return found
 
 
-def _pairs_worth_matching(features: Sequence[Features], options: SparseOptions, threads: int) -> list[Pair]:
+def _pairs_worth_matching(features: Sequence[Features], options: SparseOptions, pool: ThreadPoolExecutor) -> list[Pair]:
     """Pairs of photos whose largest features match often enough (preemptive matching, Wu 2013)."""
     pairs = list(itertools.combinations(range(len(features)), 2))
     if len(features) <= options.all_pairs_up_to:
@@ -120,8 +122,7 @@ def _pairs_worth_matching(features: Sequence[Features], options: SparseOptions, 
             return True
         return len(match_descriptors(largest[pair[0]], largest[pair[1]])) >= options.preview_matches
 
-    with ThreadPoolExecutor(threads) as pool:
-        return [pair for pair, worth in zip(pairs, pool.map(is_worth, pairs), strict=True) if worth]
+    return [pair for pair, worth in zip(pairs, pool.map(is_worth, pairs), strict=True) if worth]
 
 
 def _write_database(
