@@ -73,7 +73,7 @@ class Move:
     @property
     def observable(self) -> NDArray[np.bool_]:
         """(6,) which of rx ry rz tx ty tz, in model axes, no undetermined direction touches."""
-        return ~(np.abs(self.undetermined) > 0.05).any(axis=0) if len(self.undetermined) else np.ones(6, dtype=bool)
+        return np.asarray(~(np.abs(self.undetermined) > 0.05).any(axis=0))
 
 
 @dataclass(frozen=True)
