@@ -34,18 +34,18 @@ class SweepOptions:
 class EdgeOptions:
     """Options of the measurement by edges; ``px`` are those of the photos."""
 
-    reaches_px: tuple[float, ...] = (12.0, 8.0, 5.0, 3.5, 3.0, 3.0, 3.0)  # how far edges are looked for, by round
-    capture_mm: float = 5.0  # first reach, where photos are finer than 0.4 mm a px
+    capture_mm: float = 5.0  # displacement that the first round finds
+    reaches_px: tuple[float, ...] = (6.0, 4.5, 3.5, 3.0, 3.0, 3.0)  # how far steps are looked for, by round
     spacing_px: float = 3.0  # between samples along an edge
+    most_points: int = 3000  # edge points of one component in all photos; more say the same
     half_width_px: float = 2.0  # profiles are averaged so far along the edge
     threshold: float = 1.0  # weakest step, grey levels of 255 per px in linear light
     half_slope: float = 6.0  # a step of this slope counts half
     least_sigma_px: float = 0.05  # residuals are never taken to be better: lens, tessellation, pixel response
     dark_shift_px: float = 0.1  # how far all edges may be shifted towards the dark side (1 σ): tone curve, glare
-    rival_px: float = 3.0  # an edge with another predicted edge so near, across it, is not looked at
     least_points: int = 40  # fewer are no measurement
     least_support: float = 0.25  # share of predicted points with a step where the fit says, above chance
-    systematic_px: float = 0.03  # what all edges of a component may be off together: chamfers, light
+    systematic_px: float = 0.02  # what all edges of a component may be off together: chamfers, light
 
 
 @dataclass(frozen=True)

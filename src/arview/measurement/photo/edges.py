@@ -1,0 +1,323 @@
+"""A component's CAD edges and silhouettes, fitted to steps of brightness in all photos at once.
+
+Needs no texture. One-dimensional search along the normals of predicted edges (Harris, RAPID 1990; robust and with
+several hypotheses: Drummond & Cipolla 2002; Vacchetti, Lepetit & Fua 2004), hidden ones left out by the z-buffer, and
+a rigid move of the component in space that all of them agree on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.cad.model import make_model
+from arview.cad.part import Part
+from arview.camera import Camera
+from arview.geometry import Array, apply, exp_so3, log_so3, rigid
+from arview.guideviews.mesh_edges import EDGE_CREASE, EDGE_SILHOUETTE, mesh_edges, sample_visible_edges
+from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
+from arview.measurement.photo.options import EdgeOptions, PhotoOptions
+from arview.measurement.photo.surface import free_directions, near_others
+from arview.measurement.photo.views import PhotoViews
+from arview.measurement.types import Move, NotMeasured
+from arview.reconstruction.scale.edges import choose_steps, find_steps, linear_light
+
+
+@dataclass(frozen=True)
+class EdgePoints:
+    """Predicted edge points in the photos that see them: (N,3) points and unit tangents in the model, photo (N,)."""
+
+    points: Array
+    tangents: Array
+    view: NDArray[np.int64]
+
+    def of(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> EdgePoints:
+        """Some of them."""
+        return EdgePoints(self.points[which], self.tangents[which], self.view[which])
+
+
+@dataclass(frozen=True)
+class EdgeOffsets:
+    """Steps of brightness near predicted edge points.
+
+    Attributes:
+        directions: (N,3) unit, across the edge and the line of sight, in the model: what a photo can say.
+        offsets_mm: (N,) how far along it the step is; 0 where there is none.
+        mm_per_px: (N,) size of a pixel in that direction.
+        slopes: (N,) grey levels per px in linear light, brighter along the direction is positive; 0 where no step.
+        seen: (N,) inside the photo.
+        hypotheses_mm, strengths: (N,K) all steps that were found, 0 = none.
+        pose_rows: (N,6) change of the offset with the twist of its photo's pose.
+    """
+
+    directions: Array
+    offsets_mm: Array
+    mm_per_px: Array
+    slopes: Array
+    seen: NDArray[np.bool_]
+    hypotheses_mm: Array
+    strengths: Array
+    pose_rows: Array
+
+
+def edge_offsets(
+    edges: EdgePoints, center: Array, views: PhotoViews, reach_px: float, options: EdgeOptions, level: int = 0,
+    shift_px: float = 0.0,
+) -> EdgeOffsets:  # fmt: skip
+    """Look for a step of brightness across each predicted edge point.
+
+    Args:
+        edges: the points, in photos that are known to see them.
+        center: (3,) directions point away from it.
+        views: the photos.
+        reach_px: how far is looked to either side, px of the level.
+        level: of the photos, 0 is full size, each further one half of it.
+        shift_px: look so far beside: what is found there is chance.
+    """
+    n = len(edges.points)
+    directions, mm_per_px, twists = np.zeros((n, 3)), np.ones(n), np.zeros((n, 6))
+    hypotheses, strengths, seen = np.zeros((n, 4)), np.zeros((n, 4)), np.zeros(n, dtype=bool)
+    for view in np.unique(edges.view):
+        of = np.flatnonzero(edges.view == view)
+        camera, pose = views.cameras[view], views.cam_from_model[view]
+        width, height = views.levels[level].sizes[view]
+        camera = camera.scaled(int(width), int(height)) if level else camera
+        in_cam = apply(pose, edges.points[of])
+        pixels = camera.project(in_cam)
+        normals, by_cam = _across(camera, in_cam, pixels, edges.tangents[of] @ pose[:3, :3].T)
+        by_model = by_cam @ pose[:3, :3]
+        outward = np.where(np.sum(by_model * (edges.points[of] - center), axis=1) < 0, -1.0, 1.0)[:, None]
+        normals, by_cam, by_model = normals * outward, by_cam * outward, by_model * outward
+        bad = ~np.isfinite(normals).all(axis=1) | ~np.isfinite(pixels).all(axis=1)
+        normals[bad], pixels[bad], by_cam[bad], by_model[bad] = 0.0, -1e6, 0.0, [1.0, 0.0, 0.0]
+        gray, corner = _crop(views, int(view), level, pixels[~bad], reach_px + abs(shift_px))
+        offsets, slopes, inside = find_steps(
+            gray, pixels - corner + shift_px * normals, normals, reach_px, options.half_width_px, options.threshold
+        )
+        size = np.linalg.norm(by_model, axis=1)
+        mm_per_px[of], seen[of] = 1.0 / size, inside
+        directions[of] = by_model / size[:, None]
+        hypotheses[of], strengths[of] = offsets / size[:, None], slopes
+        twists[of] = np.concatenate([np.cross(in_cam, by_cam), by_cam], axis=1) / size[:, None]
+    chosen, slope = choose_steps(
+        hypotheses / mm_per_px[:, None], strengths, 0.4 * reach_px, options.half_slope
+    )  # in px, whatever the distance
+    return EdgeOffsets(directions, chosen * mm_per_px, mm_per_px, slope, seen, hypotheses, strengths, twists)
+
+
+def _across(camera: Camera, in_cam: Array, pixels: Array, tangents: Array) -> tuple[Array, Array]:
+    """(N,2) unit normals of edges in the picture, and (N,3) px along them by mm in the camera frame."""
+    # Through the lens by differences, of one micrometre per mm of depth.
+    delta = 1e-6 * in_cam[:, 2:]
+    by_cam = np.stack([(camera.project(in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)], axis=2)
+    along = np.einsum("nij,nj->ni", by_cam, tangents)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    return normals, np.einsum("ni,nij->nj", normals, by_cam)
+
+
+def _crop(
+    views: PhotoViews, view: int, level: int, pixels: Array, reach_px: float
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Part of a photo in linear light around some pixels, and its first pixel (u, v)."""
+    stack = views.levels[level]
+    width, height = stack.sizes[view]
+    gray = stack.pixels[stack.starts[view] : stack.starts[view] + width * height].reshape(height, width)
+    margin = reach_px + 12.0
+    low = np.clip(np.floor(pixels.min(axis=0, initial=0.0 if not len(pixels) else np.inf) - margin), 0, [width, height])
+    high = np.clip(np.ceil(pixels.max(axis=0, initial=0.0) + margin), 0, [width, height])
+    first, last = low.astype(np.int64), np.maximum(high, low + 4).astype(np.int64)
+    part = gray[first[1] : last[1], first[0] : last[0]]
+    if part.size == 0:
+        return np.zeros((4, 4), dtype=np.float32), np.zeros(2, dtype=np.int64)
+    return linear_light(np.ascontiguousarray(part)), first
+
+
+class ComponentEdges:
+    """The measurement of one component by its edges."""
+
+    def __init__(self, views: PhotoViews, component: int, part: Part | None, options: PhotoOptions) -> None:
+        self.views, self.component, self.options = views, component, options
+        self.shape = views.model.components[component]
+        self.center = self.shape.bounds_in_model.mean(axis=0)
+        self.radius_mm = 0.5 * float(np.linalg.norm(np.ptp(self.shape.bounds_in_model, axis=0)))
+        self.px_mm = views.mm_per_px(self.center)
+        self.free = free_directions(self.shape, part, self.center, self.radius_mm)
+        self._edges = mesh_edges(make_model(self.shape.name, (self.shape,)), 35.0)
+        self._center_of_place = apply(np.eye(4), self.center)
+
+    def measure(self, start: Array | None = None) -> Move | NotMeasured:
+        """The component's move; ``start`` (4,4, measured_from_nominal) where it is roughly known already."""
+        o = self.options.edges
+        place = np.eye(4) if start is None else start
+        edges = self.predicted(place)
+        if len(edges.points) < o.least_points or len(np.unique(edges.view)) < 3:
+            return self._not("fewer than 3 photos show enough of its edges; take more of it")
+        # Coarse pictures first where a pixel is much finer than what is looked for.
+        levels = [k for k in (2, 1) if self.px_mm * 2.0**k < 0.6]
+        rounds = [(k, 6.0) for k in levels] + [(0, reach) for reach in o.reaches_px]
+        if start is None:
+            place = self._capture(edges, levels[0] if levels else 0)
+        fit: RigidFit | None = None
+        dark_mm = 0.0
+        for turn, (level, reach_px) in enumerate(rounds):
+            edges = self.predicted(place)
+            found = edge_offsets(edges, apply(place, self.center), self.views, reach_px, o, level)
+            ok = found.seen & (found.slopes != 0.0)
+            if np.count_nonzero(ok) < o.least_points:
+                return self._not(f"only {np.count_nonzero(ok)} of {len(ok)} points of its edges are seen in the photos")
+            fit, dark_mm = self._fit(edges, found, ok, place, dark_mm)
+            place = self._moved(place, fit.twist)
+            step = float(np.abs(fit.twist * np.repeat([self.radius_mm, 1.0], 3)).max())
+            if turn >= len(rounds) - 3 and step < 0.002:
+                break
+        assert fit is not None
+        support = self._support(edges, place, fit)
+        used = int(np.count_nonzero(fit.weights > 0.1))
+        if support < o.least_support or used < o.least_points:
+            return self._not(f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance")
+        return self._move(fit, edges.of(ok), found, ok, place, support)
+
+    def predicted(self, place: Array) -> EdgePoints:
+        """Edge points that the photos should show with the component at a place, joints left out."""
+        o = self.options.edges
+        corners = apply(place, _box_corners(self.shape.bounds_in_model))
+        points, tangents, views = [], [], []
+        for view in range(len(self.views.cameras)):
+            window = self.views.window(view, self.component, place, corners)
+            if window.inverse_depth.size < 9 or not (window.ids == self.component).any():
+                continue
+            depth = np.zeros(window.inverse_depth.shape, dtype=np.float32)
+            np.divide(1.0, window.inverse_depth, out=depth, where=window.inverse_depth > 0)
+            fx, fy, cx, cy = window.lens
+            lens = (fx, fy, cx - window.origin[0], cy - window.origin[1])
+            found = sample_visible_edges(
+                self._edges, self.views.cam_from_model[view] @ place, lens, depth, o.spacing_px
+            )
+            good = (found.kinds & (EDGE_CREASE | EDGE_SILHOUETTE)) > 0
+            points.append(found.points_in_model[good])
+            tangents.append(found.tangents_in_model[good])
+            views.append(np.full(np.count_nonzero(good), view))
+        if not points:
+            return EdgePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
+        all_points = np.concatenate(points)
+        apart = ~near_others(all_points, self.views.model, self.component, self.options.joint_mm)
+        kept = np.flatnonzero(apart)
+        if len(kept) > o.most_points:
+            kept = kept[:: int(np.ceil(len(kept) / o.most_points))]
+        return EdgePoints(
+            apply(place, all_points[kept]), np.concatenate(tangents)[kept] @ place[:3, :3].T, np.concatenate(views)[kept]
+        )
+
+    def _capture(self, edges: EdgePoints, level: int) -> Array:
+        """Where most edges have a step, within the capture range: votes of shifts by all steps that were found."""
+        o = self.options.edges
+        some = edges.of(np.arange(0, len(edges.points), max(1, len(edges.points) // 800)))
+        px_mm = self.px_mm * 2.0**level
+        found = edge_offsets(some, self.center, self.views, o.capture_mm / px_mm + 2.0, o, level)
+        axis = np.arange(-o.capture_mm, o.capture_mm + 1e-9, max(0.5, o.capture_mm / 12))
+        shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+        shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")]
+        worth = np.abs(found.strengths) / (np.abs(found.strengths) + o.half_slope)
+        votes = _vote(found.hypotheses_mm, worth, found.directions, shifts, max(0.4, 1.2 * px_mm))
+        best = shifts[np.flatnonzero(votes > 0.99 * votes.max())[0]]
+        return rigid(np.eye(3), best)
+
+    def _fit(
+        self, edges: EdgePoints, found: EdgeOffsets, ok: NDArray[np.bool_], place: Array, dark_mm: float
+    ) -> tuple[RigidFit, float]:
+        """Fit, with all edges shifted alike to the dark side as the round before showed; and that shift anew."""
+        o = self.options.edges
+        size, slope = found.mm_per_px[ok], found.slopes[ok]
+        sigmas = _SIGMA_PX * size * np.sqrt((np.abs(slope) + o.half_slope) / np.abs(slope))
+        center = apply(place, self.center)
+        rows = move_rows(edges.points[ok], found.directions[ok], center)
+        dark = np.sign(slope)
+        fit = fit_rigid(
+            rows, found.offsets_mm[ok] - dark * dark_mm, sigmas, self._free_at(place), self.radius_mm,
+            self.options.undetermined_mm, edges.points[ok] / (4.0 * self.px_mm), o.least_sigma_px / _SIGMA_PX,
+        )  # fmt: skip
+        left = found.offsets_mm[ok] - rows @ fit.twist
+        prior = (0.05 * float(np.sum(fit.weights))) + 1.0
+        limit = o.dark_shift_px * 2.0 * self.px_mm
+        shift = float(np.sum(fit.weights * dark * left) / (np.sum(fit.weights) + prior))
+        return fit, float(np.clip(shift, -limit, limit))
+
+    def _support(self, edges: EdgePoints, place: Array, fit: RigidFit) -> float:
+        """Share of the predicted points with a step within a pixel, less what is found beside them."""
+        o = self.options.edges
+        shares = []
+        for shift_px in (0.0, -7.0, 7.0):
+            found = edge_offsets(edges, apply(place, self.center), self.views, 3.0, o, 0, shift_px)
+            near = found.seen & (found.slopes != 0.0) & (np.abs(found.offsets_mm) < found.mm_per_px)
+            shares.append(np.count_nonzero(near) / max(1, np.count_nonzero(found.seen)))
+        chance = min(0.5 * (shares[1] + shares[2]), 0.9)
+        return max(0.0, (shares[0] - chance) / (1.0 - chance))
+
+    def _free_at(self, place: Array) -> Array:
+        """The free directions turned along with the component."""
+        if not len(self.free):
+            return self.free
+        return np.concatenate([self.free[:, :3] @ place[:3, :3].T, self.free[:, 3:] @ place[:3, :3].T], axis=1)
+
+    def _moved(self, place: Array, twist: Array) -> Array:
+        """A place after a further move about where it takes the centre."""
+        rotation = exp_so3(twist[:3])
+        center = apply(place, self.center)
+        return rigid(rotation, center - rotation @ center + twist[3:]) @ place
+
+    def _move(
+        self, fit: RigidFit, edges: EdgePoints, found: EdgeOffsets, ok: NDArray[np.bool_], place: Array, support: float
+    ) -> Move:
+        o = self.options.edges
+        twist = np.concatenate([log_so3(place[:3, :3]), apply(place, self.center) - self.center])
+        project = np.eye(6) - fit.undetermined.T @ fit.undetermined
+        scale = np.repeat([1.0 / self.radius_mm, 1.0], 3)
+        systematic = o.systematic_px * self.px_mm
+        covariance = fit.covariance + systematic**2 * project * np.outer(scale, scale)
+        if self.views.pose_covariance is not None:
+            by_poses = np.zeros((6, 6 * len(self.views.cameras)))
+            for view in np.unique(edges.view):
+                of = edges.view == view
+                by_poses[:, 6 * view : 6 * view + 6] = fit.gain[:, of] @ found.pose_rows[ok][of]
+            covariance = covariance + by_poses @ self.views.pose_covariance @ by_poses.T
+        twist = scale * (project @ (twist / scale))
+        return Move(
+            self.shape.name, "edges", self.center, twist, 0.5 * (covariance + covariance.T), fit.undetermined,
+            self.radius_mm, int(np.count_nonzero(fit.weights > 0.1)), fit.residual_mm, support,
+        )  # fmt: skip
+
+    def _not(self, reason: str) -> NotMeasured:
+        return NotMeasured(self.shape.name, "edges", reason)
+
+
+_SIGMA_PX = 0.3
+"""Of a strong step; what residuals show replaces it."""
+
+
+def _box_corners(bounds: Array) -> Array:
+    return np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+
+@njit(cache=True, nogil=True)
+def _vote(hypotheses, worth, directions, shifts, width):  # type: ignore[no-untyped-def]
+    """(T,) sum over points of the best step near where shifts (T,3) put it."""
+    votes = np.zeros(shifts.shape[0])
+    for t in range(shifts.shape[0]):
+        total = 0.0
+        for i in range(hypotheses.shape[0]):
+            along = 0.0
+            for k in range(3):
+                along += directions[i, k] * shifts[t, k]
+            best = 0.0
+            for k in range(hypotheses.shape[1]):
+                off = (hypotheses[i, k] - along) / width
+                if worth[i, k] > 0.0 and abs(off) < 1.0:
+                    best = max(best, worth[i, k] * (1.0 - off * off))
+            total += best
+        votes[t] = total
+    return votes
