@@ -375,7 +375,8 @@ def _unplaced(
         elif not partners:
             reason = "nothing in common with the other photos: another part, or a view too far from the others"
         elif not partners & placed:
-            reason = f"has something in common only with {_some((group or partners) - {photo.name})}, not with the other {len(placed)}"
+            company = _some((group or partners) - {photo.name})
+            reason = f"has something in common only with {company}, not with the other {len(placed)}"
         else:
             reason = "too little in common with the placed photos: take more photos between this view and theirs"
         reasons.append((photo.name, reason))
