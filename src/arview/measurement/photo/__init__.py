@@ -1,1 +1,21 @@
 """Where components stand, measured in the photos themselves: by their surfaces and by their edges."""
+
+from arview.measurement.photo.edges import EdgeOffsets, EdgePoints, edge_offsets
+from arview.measurement.photo.measure import measure_components_in_photos
+from arview.measurement.photo.options import EdgeOptions, PhotoOptions, SweepOptions
+from arview.measurement.photo.sweep import Offsets, sweep_offsets
+from arview.measurement.photo.views import PhotoViews, load_views
+
+__all__ = [
+    "EdgeOffsets",
+    "EdgeOptions",
+    "EdgePoints",
+    "Offsets",
+    "PhotoOptions",
+    "PhotoViews",
+    "SweepOptions",
+    "edge_offsets",
+    "load_views",
+    "measure_components_in_photos",
+    "sweep_offsets",
+]

@@ -14,13 +14,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from arview.cad.model import make_model
-from arview.cad.part import Part
 from arview.camera import Camera
-from arview.geometry import Array, apply, exp_so3, log_so3, rigid
+from arview.geometry import Array, apply, rigid
 from arview.guideviews.mesh_edges import EDGE_CREASE, EDGE_SILHOUETTE, mesh_edges, sample_visible_edges
+from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
-from arview.measurement.photo.options import EdgeOptions, PhotoOptions
-from arview.measurement.photo.surface import free_directions, near_others
+from arview.measurement.photo.options import EdgeOptions
+from arview.measurement.photo.surface import near_others
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
 from arview.reconstruction.scale.edges import choose_steps, find_steps, linear_light
@@ -140,15 +140,9 @@ def _crop(
 class ComponentEdges:
     """The measurement of one component by its edges."""
 
-    def __init__(self, views: PhotoViews, component: int, part: Part | None, options: PhotoOptions) -> None:
-        self.views, self.component, self.options = views, component, options
-        self.shape = views.model.components[component]
-        self.center = self.shape.bounds_in_model.mean(axis=0)
-        self.radius_mm = 0.5 * float(np.linalg.norm(np.ptp(self.shape.bounds_in_model, axis=0)))
-        self.px_mm = views.mm_per_px(self.center)
-        self.free = free_directions(self.shape, part, self.center, self.radius_mm)
-        self._edges = mesh_edges(make_model(self.shape.name, (self.shape,)), 35.0)
-        self._center_of_place = apply(np.eye(4), self.center)
+    def __init__(self, body: MeasuredComponent) -> None:
+        self.body, self.views, self.options = body, body.views, body.options
+        self._edges = mesh_edges(make_model(body.shape.name, (body.shape,)), CREASE_DEG)
 
     def measure(self, start: Array | None = None) -> Move | NotMeasured:
         """The component's move; ``start`` (4,4, measured_from_nominal) where it is roughly known already."""
@@ -158,7 +152,7 @@ class ComponentEdges:
         if len(edges.points) < o.least_points or len(np.unique(edges.view)) < 3:
             return self._not("fewer than 3 photos show enough of its edges; take more of it")
         # Coarse pictures first where a pixel is much finer than what is looked for.
-        levels = [k for k in (2, 1) if self.px_mm * 2.0**k < 0.6]
+        levels = [k for k in (2, 1) if self.body.px_mm * 2.0**k < 0.6]
         rounds = [(k, 6.0) for k in levels] + [(0, reach) for reach in o.reaches_px]
         if start is None:
             place = self._capture(edges, levels[0] if levels else 0)
@@ -166,13 +160,13 @@ class ComponentEdges:
         dark_mm = 0.0
         for turn, (level, reach_px) in enumerate(rounds):
             edges = self.predicted(place)
-            found = edge_offsets(edges, apply(place, self.center), self.views, reach_px, o, level)
+            found = edge_offsets(edges, apply(place, self.body.center), self.views, reach_px, o, level)
             ok = found.seen & (found.slopes != 0.0)
             if np.count_nonzero(ok) < o.least_points:
                 return self._not(f"only {np.count_nonzero(ok)} of {len(ok)} points of its edges are seen in the photos")
             fit, dark_mm = self._fit(edges, found, ok, place, dark_mm)
-            place = self._moved(place, fit.twist)
-            step = float(np.abs(fit.twist * np.repeat([self.radius_mm, 1.0], 3)).max())
+            place = self.body.moved(place, fit.twist)
+            step = self.body.size_mm(fit.twist)
             if turn >= len(rounds) - 3 and step < 0.002:
                 break
         assert fit is not None
@@ -180,16 +174,17 @@ class ComponentEdges:
         used = int(np.count_nonzero(fit.weights > 0.1))
         if support < o.least_support or used < o.least_points:
             return self._not(f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance")
-        return self._move(fit, edges.of(ok), found, ok, place, support)
+        by_poses = self._by_poses(fit, edges.view[ok], found.pose_rows[ok])
+        return self.body.move("edges", fit, by_poses, place, o.systematic_px * self.body.px_mm, support)
 
     def predicted(self, place: Array) -> EdgePoints:
         """Edge points that the photos should show with the component at a place, joints left out."""
         o = self.options.edges
-        corners = apply(place, _box_corners(self.shape.bounds_in_model))
+        corners = apply(place, _box_corners(self.body.shape.bounds_in_model))
         points, tangents, views = [], [], []
         for view in range(len(self.views.cameras)):
-            window = self.views.window(view, self.component, place, corners)
-            if window.inverse_depth.size < 9 or not (window.ids == self.component).any():
+            window = self.views.window(view, self.body.index, place, corners)
+            if window.inverse_depth.size < 9 or not (window.ids == self.body.index).any():
                 continue
             depth = np.zeros(window.inverse_depth.shape, dtype=np.float32)
             np.divide(1.0, window.inverse_depth, out=depth, where=window.inverse_depth > 0)
@@ -205,23 +200,23 @@ class ComponentEdges:
         if not points:
             return EdgePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
         all_points = np.concatenate(points)
-        apart = ~near_others(all_points, self.views.model, self.component, self.options.joint_mm)
+        apart = ~near_others(all_points, self.views.model, self.body.index, self.options.joint_mm)
         kept = np.flatnonzero(apart)
         if len(kept) > o.most_points:
             kept = kept[:: int(np.ceil(len(kept) / o.most_points))]
         return EdgePoints(
-            apply(place, all_points[kept]), np.concatenate(tangents)[kept] @ place[:3, :3].T, np.concatenate(views)[kept]
+            apply(place, all_points[kept]),
+            np.concatenate(tangents)[kept] @ place[:3, :3].T,
+            np.concatenate(views)[kept],
         )
 
     def _capture(self, edges: EdgePoints, level: int) -> Array:
         """Where most edges have a step, within the capture range: votes of shifts by all steps that were found."""
         o = self.options.edges
         some = edges.of(np.arange(0, len(edges.points), max(1, len(edges.points) // 800)))
-        px_mm = self.px_mm * 2.0**level
-        found = edge_offsets(some, self.center, self.views, o.capture_mm / px_mm + 2.0, o, level)
-        axis = np.arange(-o.capture_mm, o.capture_mm + 1e-9, max(0.5, o.capture_mm / 12))
-        shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")]
+        px_mm = self.body.px_mm * 2.0**level
+        found = edge_offsets(some, self.body.center, self.views, o.capture_mm / px_mm + 2.0, o, level)
+        shifts = self.body.shifts(o.capture_mm)
         worth = np.abs(found.strengths) / (np.abs(found.strengths) + o.half_slope)
         votes = _vote(found.hypotheses_mm, worth, found.directions, shifts, max(0.4, 1.2 * px_mm))
         best = shifts[np.flatnonzero(votes > 0.99 * votes.max())[0]]
@@ -234,16 +229,16 @@ class ComponentEdges:
         o = self.options.edges
         size, slope = found.mm_per_px[ok], found.slopes[ok]
         sigmas = _SIGMA_PX * size * np.sqrt((np.abs(slope) + o.half_slope) / np.abs(slope))
-        center = apply(place, self.center)
+        center = apply(place, self.body.center)
         rows = move_rows(edges.points[ok], found.directions[ok], center)
         dark = np.sign(slope)
         fit = fit_rigid(
-            rows, found.offsets_mm[ok] - dark * dark_mm, sigmas, self._free_at(place), self.radius_mm,
-            self.options.undetermined_mm, edges.points[ok] / (4.0 * self.px_mm), o.least_sigma_px / _SIGMA_PX,
+            rows, found.offsets_mm[ok] - dark * dark_mm, sigmas, self.body.free_at(place), self.body.radius_mm,
+            self.options.undetermined_mm, edges.points[ok] / (4.0 * self.body.px_mm), o.least_sigma_px / _SIGMA_PX,
         )  # fmt: skip
         left = found.offsets_mm[ok] - rows @ fit.twist
         prior = (0.05 * float(np.sum(fit.weights))) + 1.0
-        limit = o.dark_shift_px * 2.0 * self.px_mm
+        limit = o.dark_shift_px * 2.0 * self.body.px_mm
         shift = float(np.sum(fit.weights * dark * left) / (np.sum(fit.weights) + prior))
         return fit, float(np.clip(shift, -limit, limit))
 
@@ -252,49 +247,26 @@ class ComponentEdges:
         o = self.options.edges
         shares = []
         for shift_px in (0.0, -7.0, 7.0):
-            found = edge_offsets(edges, apply(place, self.center), self.views, 3.0, o, 0, shift_px)
+            found = edge_offsets(edges, apply(place, self.body.center), self.views, 3.0, o, 0, shift_px)
             near = found.seen & (found.slopes != 0.0) & (np.abs(found.offsets_mm) < found.mm_per_px)
-            shares.append(np.count_nonzero(near) / max(1, np.count_nonzero(found.seen)))
+            shares.append(int(np.count_nonzero(near)) / max(1, int(np.count_nonzero(found.seen))))
         chance = min(0.5 * (shares[1] + shares[2]), 0.9)
         return max(0.0, (shares[0] - chance) / (1.0 - chance))
 
-    def _free_at(self, place: Array) -> Array:
-        """The free directions turned along with the component."""
-        if not len(self.free):
-            return self.free
-        return np.concatenate([self.free[:, :3] @ place[:3, :3].T, self.free[:, 3:] @ place[:3, :3].T], axis=1)
-
-    def _moved(self, place: Array, twist: Array) -> Array:
-        """A place after a further move about where it takes the centre."""
-        rotation = exp_so3(twist[:3])
-        center = apply(place, self.center)
-        return rigid(rotation, center - rotation @ center + twist[3:]) @ place
-
-    def _move(
-        self, fit: RigidFit, edges: EdgePoints, found: EdgeOffsets, ok: NDArray[np.bool_], place: Array, support: float
-    ) -> Move:
-        o = self.options.edges
-        twist = np.concatenate([log_so3(place[:3, :3]), apply(place, self.center) - self.center])
-        project = np.eye(6) - fit.undetermined.T @ fit.undetermined
-        scale = np.repeat([1.0 / self.radius_mm, 1.0], 3)
-        systematic = o.systematic_px * self.px_mm
-        covariance = fit.covariance + systematic**2 * project * np.outer(scale, scale)
-        if self.views.pose_covariance is not None:
-            by_poses = np.zeros((6, 6 * len(self.views.cameras)))
-            for view in np.unique(edges.view):
-                of = edges.view == view
-                by_poses[:, 6 * view : 6 * view + 6] = fit.gain[:, of] @ found.pose_rows[ok][of]
-            covariance = covariance + by_poses @ self.views.pose_covariance @ by_poses.T
-        twist = scale * (project @ (twist / scale))
-        return Move(
-            self.shape.name, "edges", self.center, twist, 0.5 * (covariance + covariance.T), fit.undetermined,
-            self.radius_mm, int(np.count_nonzero(fit.weights > 0.1)), fit.residual_mm, support,
-        )  # fmt: skip
+    def _by_poses(self, fit: RigidFit, view: NDArray[np.int64], rows: Array) -> Array:
+        """(6,6M) how the fitted twist changes with the poses: ``rows`` (N,6) of each point with its own photo's."""
+        result = np.zeros((6, 6 * len(self.views.cameras)))
+        for v in np.unique(view):
+            of = view == v
+            result[:, 6 * v : 6 * v + 6] = fit.gain[:, of] @ rows[of]
+        return result
 
     def _not(self, reason: str) -> NotMeasured:
-        return NotMeasured(self.shape.name, "edges", reason)
+        return NotMeasured(self.body.shape.name, "edges", reason)
 
 
+CREASE_DEG = 35.0
+"""Faces that meet at more are an edge; less are facets of a curved surface, more or less coarse."""
 _SIGMA_PX = 0.3
 """Of a strong step; what residuals show replaces it."""
 

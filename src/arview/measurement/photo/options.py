@@ -28,6 +28,7 @@ class SweepOptions:
     least_samples: int = 25  # fewer that agree are no measurement
     least_support: float = 0.15  # share of the visible samples that must agree
     systematic_mm: float = 0.004  # of the whole component, any direction: what residuals do not show
+    systematic_share: float = 0.25  # of the residuals that is alike all over: reflections, shadows, blur at edges
 
 
 @dataclass(frozen=True)

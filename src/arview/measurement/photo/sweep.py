@@ -12,16 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.part import Part
-from arview.geometry import Array, apply, exp_so3, log_so3, rigid
+from arview.geometry import Array, apply
+from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.kernels import choose_views, sweep_scores, vote_shifts
-from arview.measurement.photo.options import PhotoOptions, SweepOptions
+from arview.measurement.photo.options import SweepOptions
 from arview.measurement.photo.surface import (
     Samples,
     cut_patches,
     face_normals,
-    free_directions,
     near_edges,
     near_others,
     sample_surface,
@@ -61,6 +60,7 @@ def sweep_offsets(
     reach_mm: float,
     options: SweepOptions | None = None,
     component: int | None = None,
+    removed: int | None = None,
 ) -> Offsets:
     """Distance along the normal of any samples of nearly flat surfaces, e.g. of a datum plane.
 
@@ -70,6 +70,7 @@ def sweep_offsets(
         views: the photos; what hides samples is taken from the model at its nominal place.
         reach_mm: how far is looked to either side.
         component: index of the component the samples are on: patches follow its surface. Else they are flat.
+        removed: index of a component that is taken not to be there.
     """
     o = options or SweepOptions()
     samples = Samples(np.ascontiguousarray(samples_in_model), np.ascontiguousarray(normals))
@@ -79,7 +80,7 @@ def sweep_offsets(
         part = views.model.components[component]
         caster, faces = RayCaster(part.vertices_in_model, part.faces), face_normals(part)
     patches, is_on = cut_patches(samples, caster, faces, o.patch_points, o.patch_px / o.patch_points * px_mm)
-    chosen = pick_views(views, samples, -1 if component is None else component, np.eye(4), o, 0.5 * o.patch_px * px_mm)
+    chosen = pick_views(views, samples, o, component, removed=removed)
     steps = _steps(reach_mm, 0.4 * px_mm)
     scores, count, alike = sweep_scores(
         patches, is_on, shades_of(is_on), samples.normals, steps, chosen, views.levels[0], 1.5
@@ -92,25 +93,37 @@ def sweep_offsets(
 
 
 def pick_views(
-    views: PhotoViews, samples: Samples, component: int, place: Array, o: SweepOptions, half_mm: float
+    views: PhotoViews,
+    samples: Samples,
+    o: SweepOptions,
+    component: int | None = None,
+    place: Array | None = None,
+    removed: int | None = None,
 ) -> Indices:
-    """(N,V) photos in which all of a sample's patch is seen; of ``component``, moved to ``place``, when not -1."""
+    """(N,V) photos in which most of a sample's patch is seen.
+
+    Samples are of ``component``, which stands at ``place`` (4,4, default nominal), or of any (None); the component
+    ``removed`` hides nothing.
+    """
+    if not len(samples.points):
+        return np.full((0, o.max_views), -1, dtype=np.int64)
     first, second = tangents_of(samples.normals)
     lift = samples.points + 0.05 * samples.normals
-    # Corners of half a patch: patches at an edge reach beyond it, and only what is on it is compared.
-    groups = np.stack([lift, *(lift + 0.5 * half_mm * (a * first + b * second) for a, b in _CORNERS)], axis=1)
+    # Corners at half the way to those of the patch: at an edge patches reach beyond it, but only what is on it counts.
+    half_mm = 0.25 * o.patch_px * views.mm_per_px(samples.points.mean(axis=0))
+    groups = np.stack([lift, *(lift + half_mm * (a * first + b * second) for a, b in _CORNERS)], axis=1)
     toward = views.centres[None] - samples.points[:, None]
     toward /= np.linalg.norm(toward, axis=2, keepdims=True)
     cosines = np.einsum("nmx,nx->nm", toward, samples.normals)
     visible = np.zeros(cosines.shape, dtype=bool)
-    hidden_by = component if component >= 0 else None
+    scene = component if removed is None else -1 - removed
     for view in range(len(views.cameras)):
         facing = np.flatnonzero(cosines[:, view] > o.least_cosine)
         if len(facing):
-            window = views.window(view, hidden_by, place, groups[facing].reshape(-1, 3))
+            window = views.window(view, scene, np.eye(4) if place is None else place, groups[facing].reshape(-1, 3))
             # The middle must show the component itself; the corners must not be hidden.
-            seen = views.visible(view, window, groups[facing, :1], component)
-            visible[facing, view] = seen & views.visible(view, window, groups[facing])
+            own = views.visible(view, window, groups[facing, :1], -1 if component is None else component)
+            visible[facing, view] = own & views.visible(view, window, groups[facing])
     middle = toward.mean(axis=0)
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
     return np.asarray(choose_views(visible, cosines, middle, o.max_views))
@@ -188,21 +201,16 @@ def pose_rows(views: PhotoViews, samples: Samples, chosen: Indices) -> Array:
 class ComponentSweep:
     """The sweep of one component: samples and patches in its nominal place, moved along as it is found elsewhere."""
 
-    def __init__(self, views: PhotoViews, component: int, part: Part | None, options: PhotoOptions) -> None:
-        self.views, self.component, self.options = views, component, options
-        self.shape = views.model.components[component]
-        self.center = self.shape.bounds_in_model.mean(axis=0)
-        self.radius_mm = 0.5 * float(np.linalg.norm(np.ptp(self.shape.bounds_in_model, axis=0)))
-        self.px_mm = views.mm_per_px(self.center)
-        self.free = free_directions(self.shape, part, self.center, self.radius_mm)
-        o = options.sweep
-        samples = sample_surface(self.shape, o.sample_spacing_px * self.px_mm, o.samples)
-        apart = ~near_others(samples.points, views.model, component, options.joint_mm)
-        apart &= ~near_edges(samples.points, self.shape, o.edge_px * self.px_mm)
+    def __init__(self, body: MeasuredComponent) -> None:
+        self.body, self.views, self.options = body, body.views, body.options
+        o = self.options.sweep
+        samples = sample_surface(body.shape, o.sample_spacing_px * body.px_mm, o.samples)
+        apart = ~near_others(samples.points, self.views.model, body.index, self.options.joint_mm)
+        apart &= ~near_edges(samples.points, body.shape, o.edge_px * body.px_mm)
         self.samples = samples.of(apart)
-        self.patch_mm = o.patch_px * self.px_mm
-        self._caster = RayCaster(self.shape.vertices_in_model, self.shape.faces)
-        self._faces = face_normals(self.shape)
+        self.patch_mm = o.patch_px * body.px_mm
+        self._caster = RayCaster(body.shape.vertices_in_model, body.shape.faces)
+        self._faces = face_normals(body.shape)
 
     def measure(self, start: Array | None = None) -> Move | NotMeasured:
         """The component's move; ``start`` (4,4, measured_from_nominal) where it is roughly known already."""
@@ -212,13 +220,13 @@ class ComponentSweep:
         if np.count_nonzero(seen) < o.least_samples:
             return self._not(f"seen in fewer than {o.least_views} photos from near enough; take more of it")
         place = self._coarse(chosen, seen) if start is None else start
-        patches, is_on = self._cut(o.patch_points, o.patch_px / o.patch_points * self.px_mm)
+        patches, is_on = self._cut(o.patch_points, o.patch_px / o.patch_points * self.body.px_mm)
         shades = shades_of(is_on)
         fit: RigidFit | None = None
         range_px = o.fine_range_px
         for turn in range(o.rounds):
             chosen = self._pick(place)
-            steps = _steps(range_px * self.px_mm, 0.4 * self.px_mm)
+            steps = _steps(range_px * self.body.px_mm, 0.4 * self.body.px_mm)
             moved = Samples(apply(place, self.samples.points), self.samples.normals @ place[:3, :3].T)
             shaped = apply(place, patches)
             scores, count, alike = sweep_scores(
@@ -237,50 +245,50 @@ class ComponentSweep:
                     "look alike in the photos"
                 )
             fit = self._fit(moved.of(ok), found.offsets_mm[ok], found.variances_mm2[ok], place)
-            place = self._moved(place, fit.twist)
-            step = float(np.abs(fit.twist * np.repeat([self.radius_mm, 1.0], 3)).max())
+            place = self.body.moved(place, fit.twist)
+            step = self.body.size_mm(fit.twist)
             if turn >= 1 and step < o.settled_mm:
                 break
-            range_px = max(1.6, min(range_px, 0.6 * range_px + 2.0 * step / self.px_mm))
+            range_px = max(1.6, min(range_px, 0.6 * range_px + 2.0 * step / self.body.px_mm))
         assert fit is not None
         used = int(np.count_nonzero(fit.weights > 0.1))
         support = used / max(1, int(np.count_nonzero(seen)))
         if support < o.least_support or used < o.least_samples:
             return self._not(f"weak texture or not there: {100 * support:.0f} % of its surface agrees on a place")
-        return self._move(fit, moved.of(ok), found.views[ok], place, support)
+        by_poses = fit.gain @ pose_rows(self.views, moved.of(ok), found.views[ok])
+        systematic_mm = float(np.hypot(o.systematic_mm, o.systematic_share * fit.residual_mm))
+        return self.body.move("sweep", fit, by_poses, place, systematic_mm, support)
 
     def _pick(self, place: Array) -> Indices:
         moved = Samples(apply(place, self.samples.points), self.samples.normals @ place[:3, :3].T)
-        return pick_views(self.views, moved, self.component, place, self.options.sweep, 0.5 * self.patch_mm)
+        return pick_views(self.views, moved, self.options.sweep, self.body.index, place)
 
     def _cut(self, width: int, spacing_mm: float) -> tuple[Array, NDArray[np.bool_]]:
         o = self.options.sweep
         patches, is_on = cut_patches(self.samples, self._caster, self._faces, width, spacing_mm)
         points = patches[is_on]
-        apart = ~near_others(points, self.views.model, self.component, self.options.joint_mm)
-        is_on[is_on] = apart & ~near_edges(points, self.shape, o.edge_px * self.px_mm)
+        apart = ~near_others(points, self.views.model, self.body.index, self.options.joint_mm)
+        is_on[is_on] = apart & ~near_edges(points, self.body.shape, o.edge_px * self.body.px_mm)
         return patches, is_on
 
     def _coarse(self, chosen: Indices, seen: NDArray[np.bool_]) -> Array:
         """Where most samples look alike, within the capture range: votes of shifts, then a fit to the near peaks."""
         o = self.options.sweep
         # Coarse enough that the range takes some forty steps, with patches to match.
-        level = int(np.clip(np.round(np.log2(0.4 / self.px_mm)) + 1, 1, 2))
-        coarse_mm = self.px_mm * 2**level
+        level = int(np.clip(np.round(np.log2(0.4 / self.body.px_mm)) + 1, 1, 2))
+        coarse_mm = self.body.px_mm * 2**level
         patches, is_on = self._cut(7, coarse_mm)
         steps = _steps(o.capture_mm + coarse_mm, 0.6 * coarse_mm)
         normals = self.samples.normals
         scores, _, _ = sweep_scores(
             patches, is_on, shades_of(is_on), normals, steps, chosen, self.views.levels[level], 1.0
         )
-        axis = np.arange(-o.capture_mm, o.capture_mm + 1e-9, max(0.5, o.capture_mm / 12))
-        shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")]
+        shifts = self.body.shifts(o.capture_mm)
         votes = vote_shifts(scores[seen], steps, normals[seen], shifts, 0.3)
         # The nearest of equals: a shift that only slides a surface in itself wins nothing.
         best = shifts[np.flatnonzero(votes > votes.max() - 0.005 * abs(votes.max()) - 1e-9)[0]]
         twist = np.concatenate([np.zeros(3), best])
-        rows = move_rows(self.samples.points, normals, self.center)
+        rows = move_rows(self.samples.points, normals, self.body.center)
         for reach_mm in (3.0 * coarse_mm, 2.0 * coarse_mm, 2.0 * coarse_mm):
             near = np.where(np.abs(steps[None] - (rows @ twist)[:, None]) < reach_mm, scores, -1.0)
             found = _peaks(near, np.full(near.shape, 3), steps, is_on.sum(axis=1), chosen, o)
@@ -289,50 +297,22 @@ class ComponentSweep:
                 break
             sigmas = np.full(np.count_nonzero(ok), 0.3 * coarse_mm)
             twist = fit_rigid(
-                rows[ok], found.offsets_mm[ok], sigmas, self.free, self.radius_mm,
+                rows[ok], found.offsets_mm[ok], sigmas, self.body.free, self.body.radius_mm,
                 self.options.undetermined_mm, self._places(self.samples.of(ok)), 0.3,
             ).twist  # fmt: skip
-        return self._moved(np.eye(4), twist)
+        return self.body.moved(np.eye(4), twist)
 
     def _fit(self, moved: Samples, offsets: Array, variances: Array, place: Array) -> RigidFit:
         o = self.options.sweep
         return fit_rigid(
-            move_rows(moved.points, moved.normals, apply(place, self.center)), offsets,
-            np.sqrt(variances + o.least_sigma_mm**2), self._free_at(place), self.radius_mm,
+            move_rows(moved.points, moved.normals, apply(place, self.body.center)), offsets,
+            np.sqrt(variances + o.least_sigma_mm**2), self.body.free_at(place), self.body.radius_mm,
             self.options.undetermined_mm, self._places(moved), 0.3,
         )  # fmt: skip
-
-    def _free_at(self, place: Array) -> Array:
-        """The free directions turned along with the component."""
-        if not len(self.free):
-            return self.free
-        return np.concatenate([self.free[:, :3] @ place[:3, :3].T, self.free[:, 3:] @ place[:3, :3].T], axis=1)
 
     def _places(self, samples: Samples) -> Array:
         """Where samples are, in patch widths; faces of other directions are far."""
         return np.concatenate([samples.points / self.patch_mm, 8.0 * samples.normals], axis=1)
 
-    def _moved(self, place: Array, twist: Array) -> Array:
-        """A place after a further move about where it takes the centre."""
-        rotation = exp_so3(twist[:3])
-        center = apply(place, self.center)
-        return rigid(rotation, center - rotation @ center + twist[3:]) @ place
-
-    def _move(self, fit: RigidFit, moved: Samples, chosen: Indices, place: Array, support: float) -> Move:
-        o = self.options.sweep
-        twist = np.concatenate([log_so3(place[:3, :3]), apply(place, self.center) - self.center])
-        covariance = fit.covariance
-        project = np.eye(6) - fit.undetermined.T @ fit.undetermined
-        scale = np.repeat([1.0 / self.radius_mm, 1.0], 3)
-        covariance = covariance + o.systematic_mm**2 * project * np.outer(scale, scale)
-        if self.views.pose_covariance is not None:
-            by_poses = fit.gain @ pose_rows(self.views, moved, chosen)
-            covariance = covariance + by_poses @ self.views.pose_covariance @ by_poses.T
-        twist = scale * (project @ (twist / scale))
-        return Move(
-            self.shape.name, "sweep", self.center, twist, 0.5 * (covariance + covariance.T), fit.undetermined,
-            self.radius_mm, int(np.count_nonzero(fit.weights > 0.1)), fit.residual_mm, support,
-        )  # fmt: skip
-
     def _not(self, reason: str) -> NotMeasured:
-        return NotMeasured(self.shape.name, "sweep", reason)
+        return NotMeasured(self.body.shape.name, "sweep", reason)
