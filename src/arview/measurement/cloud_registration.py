@@ -7,7 +7,7 @@ Point to point (Besl & McKay 1992), point to plane (Chen & Medioni 1992) and gen
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -68,7 +68,7 @@ class TargetCloud:
         self.normals = estimate_normals(self.points, self.tree, neighbours) if normals is None else normals
 
 
-def estimate_normals(points: Array, tree: object | None = None, neighbours: int = 12) -> Array:
+def estimate_normals(points: Array, tree: Any = None, neighbours: int = 12) -> Array:
     """(N,3) unit normals of planes through the nearest points of each; their side is arbitrary."""
     from scipy.spatial import cKDTree
 
@@ -93,7 +93,9 @@ def register_clouds(
     center = apply(pose, source).mean(axis=0)
     own_normals = estimate_normals(source, None, o.neighbours) if o.method == "generalized" else source
     limit, converged = o.first_distance_mm, False
-    for iterations in range(1, o.most_iterations + 1):
+    iterations = 0
+    while iterations < o.most_iterations:
+        iterations += 1
         moved = apply(pose, source)
         distance, index = target.tree.query(moved, distance_upper_bound=limit)
         pairs = np.flatnonzero(np.isfinite(distance))

@@ -18,6 +18,8 @@ from arview.geometry import Array
 
 _SHARES = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 0.95])
 _LENGTHS = 6
+_DOUBT = 2.0
+"""What the log-likelihood must gain by the two numbers of the shared part (Akaike 1974)."""
 _NEIGHBOURS = 4
 """Points of the sample come in groups of this size, near each other, so that short ranges are seen too."""
 _SUM_POINTS = 1000
@@ -61,6 +63,7 @@ def estimate_noise(points: Array, normals: Array, residuals: Array, rows: Array,
         variances = _SHARES * values[:, None] + (1.0 - _SHARES)
         scales = np.mean((vectors.T @ seen)[:, None] ** 2 / variances, axis=0)
         likelihoods = -0.5 * (len(seen) * np.log(scales) + np.log(variances).sum(axis=0))
+        likelihoods -= _DOUBT * (_SHARES > 0)
         k = int(np.argmax(likelihoods))
         if likelihoods[k] > likelihood:
             likelihood = float(likelihoods[k])

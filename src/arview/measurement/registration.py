@@ -45,6 +45,8 @@ class RegistrationOptions:
         least_information: moves with less information per point, in the unit of the best one's possible, are not
             determined; turns are weighed with the size of the points' cloud.
         least_points: fewer cannot tell a place from noise.
+        least_width_mm: of the kernel: a surface that is off by less is never left out as an outlier, however well the
+            rest fits.
         noise_points: points that the noise is estimated from; 0 takes the points to err independently, which makes
             the covariance far too small on real clouds.
         seed: of the choice of those.
@@ -63,6 +65,7 @@ class RegistrationOptions:
     least_normal_cosine: float = 0.5
     least_information: float = 1e-4
     least_points: int = 50
+    least_width_mm: float = 0.0
     noise_points: int = 240
     seed: int = 0
 
@@ -181,7 +184,7 @@ def register_to_surface(
         free: (K,6) moves (rotation vector, shift) that are allowed, see `degrees_of_freedom`; default: all.
             Finite turns about two axes leave their subspace in second order.
         radius_mm: that rotations are weighed with; default: root mean square distance of the points to the centre.
-        point_weights: (N,) e.g. inverse variances; only their ratios count.
+        point_weights: (N,) inverse variances; only their ratios count. Residuals are judged in units of these.
         normals: (N,3) of the points, to keep them to faces that look the same way; zeros where unknown.
         usable_faces: (F,) False for faces that cannot have been seen: points nearest to those do not count.
         options: see RegistrationOptions.
@@ -197,24 +200,28 @@ def register_to_surface(
         bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
         raise InputError(f"registration: {bad} of {len(points)} points are NaN or infinite; leave them out first")
     pose = np.eye(4) if start is None else np.asarray(start, dtype=np.float64)
-    base = np.ones(len(points)) if point_weights is None else point_weights / np.median(point_weights)
+    base = (
+        np.ones(len(points)) if point_weights is None else np.clip(point_weights / np.median(point_weights), 0.04, 25.0)
+    )
     center = apply(pose, points).mean(axis=0) if center is None else np.asarray(center, dtype=np.float64)
     radius = radius_mm or float(np.sqrt(np.mean(np.sum((apply(pose, points) - center) ** 2, axis=1)))) or 1.0
     scales = _scales(radius)
     basis = np.eye(6) if free is None else _orthonormal(free / scales)
     width, hint, converged = o.first_distance_mm / o.distance_sigmas, None, False
-    for iterations in range(1, o.most_iterations + 1):
+    iterations = 0
+    while iterations < o.most_iterations:
+        iterations += 1
         system = _measure(points, normals, base, surface, usable_faces, pose, center, radius, basis, width, hint, o)
         step = -(system.vectors / system.values) @ (system.vectors.T @ (basis @ system.gradient))
         twist = (basis.T @ step) * scales
         pose = move_about(center, twist) @ pose
         hint = system.faces
         turned_deg = float(np.rad2deg(np.linalg.norm(twist[:3])))
-        is_narrow = width <= max(system.sigma, o.last_distance_mm / o.distance_sigmas)
+        is_narrow = width <= max(system.sigma, o.least_width_mm, o.last_distance_mm / o.distance_sigmas)
         if is_narrow and np.linalg.norm(twist[3:]) < o.threshold_mm and turned_deg < o.threshold_deg:
             converged = True
             break
-        width = max(system.sigma, o.shrink * width)
+        width = max(system.sigma, o.least_width_mm, o.shrink * width)
     system = _measure(points, normals, base, surface, usable_faces, pose, center, radius, basis, width, hint, o)
     return _result(system, pose, center, radius, basis, base, iterations, converged, o)
 
@@ -223,7 +230,7 @@ def register_from_starts(
     points: Array,
     surface: Surface,
     starts: Sequence[Array],
-    coarse_points: int = 1500,
+    coarse_points: int = 800,
     apart_mm: float = 0.2,
     normals: Array | None = None,
     point_weights: Array | None = None,
@@ -242,10 +249,10 @@ def register_from_starts(
         apart_mm: minima whose points differ less on average are one.
     """
     o = options or RegistrationOptions()
-    few = slice(None, None, max(1, len(points) // coarse_points))
+    few = slice(None, None, -(-len(points) // coarse_points))
     some = {"normals": normals[few] if normals is not None else None,
             "point_weights": point_weights[few] if point_weights is not None else None}  # fmt: skip
-    quick = replace(o, noise_points=0, threshold_mm=1e-3, threshold_deg=1e-3, most_iterations=30)
+    quick = replace(o, noise_points=0, threshold_mm=0.01, threshold_deg=0.01, most_iterations=15)
     found: list[Registration] = []
     failure: InputError | None = None
     for start in starts:
@@ -313,11 +320,11 @@ def _measure(
         raise InputError(
             f"registration: {np.count_nonzero(counts)} of {len(points)} points are within {reach:.2f} mm of the surface"
         )
-    size = np.abs(np.where(counts, residuals, 0.0))
+    size = np.abs(np.where(counts, residuals, 0.0)) * np.sqrt(base)
     if o.trim > 0.0:
         counts &= size <= np.quantile(size[counts], 1.0 - o.trim)
     sigma = max(1.4826 * float(np.median(size[counts])), 1e-9)
-    weights = np.where(counts, _kernel(size / max(sigma, width), o.kernel), 0.0) * base
+    weights = np.where(counts, _kernel(size / max(sigma, width, o.least_width_mm), o.kernel), 0.0) * base
     normals = np.where(counts[:, None], closest.normals, 0.0)
     rows = np.hstack([np.cross(moved - center, normals) / radius, normals])
     weighted = rows * weights[:, None]
@@ -348,11 +355,17 @@ def _result(
     scales = _scales(radius)
     used = np.flatnonzero(system.weights > 0.1 * base)
     residuals, weights = system.residuals[used], system.weights[used]
+    own = np.sqrt(base[used])  # residuals × own all have one variance
     noise = estimate_noise(
-        system.moved[used], system.normals[used], residuals, system.rows[used] @ determined.T, o.noise_points, o.seed
+        system.moved[used],
+        system.normals[used],
+        residuals * own,
+        (system.rows[used] * own[:, None]) @ determined.T,
+        o.noise_points,
+        o.seed,
     )
     # Each residual moves the result by H⁻¹ Jᵀ w: what such a sum of correlated errors scatters by.
-    pull = (determined.T / system.values) @ (determined @ (system.rows[used] * weights[:, None]).T)
+    pull = (determined.T / system.values) @ (determined @ (system.rows[used] * (weights / own)[:, None]).T)
     scatter = spread_of_sum(system.moved[used], system.normals[used], pull, noise, o.seed)
     undetermined = _complement(basis, determined)
     return Registration(
