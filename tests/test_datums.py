@@ -48,7 +48,9 @@ def hole(
     points = HOLES[label] + 6.5 * normals
     offsets = moved(points, normals, move, HOLES["B"]) + radius_mm + rng.normal(0, sigma, count)
     offsets[: count // 12] += 0.6  # a burr
-    return surface_equations(label, "hole", points, normals, offsets, np.full(count, sigma**2), has_radius=True)
+    return surface_equations(
+        label, "hole", points, normals, offsets, np.full(count, sigma**2), by_radius=np.ones(count)
+    )
 
 
 def three(seed: int, move: Array = TRUE, **kwargs: float | bool) -> Alignment:

@@ -51,7 +51,8 @@ class Equations:
         variances: (N,) mm², of independent noise.
         points: (N,3) where, model frame, mm.
         of: how many should have been seen.
-        has_radius: a common offset (hole larger, edge rounded) says nothing about the place.
+        by_radius: (N,) derivative of the offsets by the radius of a hole or pin, which says nothing about its place
+            (worn, edge rounded); None of others.
         locks: which of rx ry rz tx ty tz it may lock.
     """
 
@@ -62,7 +63,7 @@ class Equations:
     variances: Array
     points: Array
     of: int
-    has_radius: bool = False
+    by_radius: Array | None = None
     locks: tuple[str, ...] = DOF_NAMES
 
 
@@ -143,12 +144,12 @@ def point_from_move(arms: Array) -> Array:
 
 def surface_equations(
     label: str, feature: str, points: Array, normals: Array, offsets_mm: Array, variances: Array,
-    of: int | None = None, has_radius: bool = False, locks: tuple[str, ...] = DOF_NAMES,
+    of: int | None = None, by_radius: Array | None = None, locks: tuple[str, ...] = DOF_NAMES,
 ) -> Equations:  # fmt: skip
     """Equations of offsets (N,) along normals (N,3) at points (N,3) of the model."""
     rows = np.einsum("ni,nij->nj", normals, point_from_move(points))
     count = len(points) if of is None else of
-    return Equations(label, feature, rows, offsets_mm, variances, points, count, has_radius, locks)
+    return Equations(label, feature, rows, offsets_mm, variances, points, count, by_radius, locks)
 
 
 def move_equations(label: str, move: Move, locks: tuple[str, ...] = DOF_NAMES) -> tuple[Equations, Array]:
@@ -258,7 +259,9 @@ def _result(
             common = part @ (rows / np.array([reach] * 3 + [1.0] * 3))
             share = share + options.form_mm**2 * common @ common.T
         rows = one.rows - one.rows[:, 3:6] @ _about(origin)
-        rest = one.offsets_mm - rows @ move - (fit.radius_mm or 0.0)
+        rest = one.offsets_mm - rows @ move
+        if one.by_radius is not None and fit.radius_mm is not None:
+            rest = rest - one.by_radius * fit.radius_mm
         rest_mm = float(np.sqrt(np.average(rest**2, weights=fit.weights)))
         used = int((fit.weights > 0.1 * fit.weights.max()).sum())
         results.append(
@@ -296,8 +299,8 @@ def _fit_alone(one: Equations, is_exact: bool) -> _Fit:
         return _Fit(1.0 / one.variances, one.variances, sigma, 1.0, None, np.ones(count, dtype=bool))
     center = one.points.mean(axis=0)
     local = one.rows[:, :6] - one.rows[:, 3:6] @ _about(center)[:, :6]
-    if one.has_radius:
-        local = np.concatenate([local, np.ones((count, 1))], axis=1)
+    if one.by_radius is not None:
+        local = np.concatenate([local, one.by_radius[:, None]], axis=1)
     share, residuals = robust_weights(local, one.offsets_mm, one.variances)
     inliers = share > 0.1
     noise = residuals / np.sqrt(one.variances)
@@ -308,7 +311,7 @@ def _fit_alone(one: Equations, is_exact: bool) -> _Fit:
     correlation = correlation_factor(one.points[inliers], noise[inliers])
     weights = share / one.variances
     radius = None
-    if one.has_radius:
+    if one.by_radius is not None:
         weighted = local * weights[:, None]
         normal = np.linalg.pinv(weighted.T @ local, rcond=1e-12, hermitian=True)
         radius = float((normal @ (weighted.T @ one.offsets_mm))[6])
@@ -381,8 +384,8 @@ def _check_covered(one: Equations, fit: _Fit, options: AlignmentOptions) -> None
             f"{name}: only {used} of {one.of} points on it could be measured; photograph it from more sides, in better"
             " light, or name another feature in the part file"
         )
-    if one.has_radius:  # where the middle of the circle is; a short arc does not tell it
-        local, watched = np.concatenate([one.rows[:, 3:6], np.ones((len(one.rows), 1))], axis=1), np.eye(3, 4)
+    if one.by_radius is not None:  # where the middle of the circle is; a short arc does not tell it
+        local, watched = np.concatenate([one.rows[:, 3:6], one.by_radius[:, None]], axis=1), np.eye(3, 4)
     else:
         local = one.rows[:, :6] - one.rows[:, 3:6] @ _about(one.points.mean(axis=0))[:, :6]
         watched = local[fit.inliers]
@@ -400,8 +403,8 @@ def _solver(design: Array, one: Equations, fit: _Fit, scale_std: float | None) -
     """(K, N or N+1) that makes of offsets (and of the scale known before) the least-squares directions."""
     columns = design.shape[1]
     weights = fit.weights / fit.weights.max()
-    if one.has_radius:
-        design = np.concatenate([design, np.ones((len(design), 1))], axis=1)
+    if one.by_radius is not None:
+        design = np.concatenate([design, one.by_radius[:, None]], axis=1)
     if scale_std is not None:
         known = np.zeros(design.shape[1])
         known[columns - 1] = 1.0
