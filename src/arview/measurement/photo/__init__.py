@@ -3,6 +3,7 @@
 from arview.measurement.photo.edges import EdgeOffsets, EdgePoints, edge_offsets
 from arview.measurement.photo.measure import measure_components_in_photos
 from arview.measurement.photo.options import EdgeOptions, PhotoOptions, SweepOptions
+from arview.measurement.photo.rims import RimFit, fit_rim
 from arview.measurement.photo.sweep import Offsets, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
 
@@ -13,8 +14,10 @@ __all__ = [
     "Offsets",
     "PhotoOptions",
     "PhotoViews",
+    "RimFit",
     "SweepOptions",
     "edge_offsets",
+    "fit_rim",
     "load_views",
     "measure_components_in_photos",
     "sweep_offsets",

@@ -71,7 +71,9 @@ class MeasuredComponent:
         """
         scale = np.repeat([1.0 / self.radius_mm, 1.0], 3)
         project = np.eye(6) - fit.undetermined.T @ fit.undetermined
-        covariance = fit.covariance + systematic_mm**2 * project * np.outer(scale, scale)
+        # What shifts a face by this turns a component by more: faces do not reach out to its rim.
+        systematic = np.diag(np.repeat([4.0, 1.0], 3)) * systematic_mm**2
+        covariance = fit.covariance + project @ systematic @ project * np.outer(scale, scale)
         if self.views.pose_covariance is not None:
             covariance = covariance + by_poses @ self.views.pose_covariance @ by_poses.T
         twist = np.concatenate([log_so3(place[:3, :3]), apply(place, self.center) - self.center])

@@ -137,6 +137,15 @@ def _crop(
     return linear_light(np.ascontiguousarray(part)), first
 
 
+def pose_gain(views: PhotoViews, fit: RigidFit, view: NDArray[np.int64], rows: Array) -> Array:
+    """(6,6M) how a fitted twist changes with the poses, from ``rows`` (N,6) of each point with its own photo's."""
+    result = np.zeros((6, 6 * len(views.cameras)))
+    for v in np.unique(view):
+        of = view == v
+        result[:, 6 * v : 6 * v + 6] = fit.gain[:, of] @ rows[of]
+    return result
+
+
 class ComponentEdges:
     """The measurement of one component by its edges."""
 
@@ -174,7 +183,7 @@ class ComponentEdges:
         used = int(np.count_nonzero(fit.weights > 0.1))
         if support < o.least_support or used < o.least_points:
             return self._not(f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance")
-        by_poses = self._by_poses(fit, edges.view[ok], found.pose_rows[ok])
+        by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
         return self.body.move("edges", fit, by_poses, place, o.systematic_px * self.body.px_mm, support)
 
     def predicted(self, place: Array) -> EdgePoints:
@@ -252,14 +261,6 @@ class ComponentEdges:
             shares.append(int(np.count_nonzero(near)) / max(1, int(np.count_nonzero(found.seen))))
         chance = min(0.5 * (shares[1] + shares[2]), 0.9)
         return max(0.0, (shares[0] - chance) / (1.0 - chance))
-
-    def _by_poses(self, fit: RigidFit, view: NDArray[np.int64], rows: Array) -> Array:
-        """(6,6M) how the fitted twist changes with the poses: ``rows`` (N,6) of each point with its own photo's."""
-        result = np.zeros((6, 6 * len(self.views.cameras)))
-        for v in np.unique(view):
-            of = view == v
-            result[:, 6 * v : 6 * v + 6] = fit.gain[:, of] @ rows[of]
-        return result
 
     def _not(self, reason: str) -> NotMeasured:
         return NotMeasured(self.body.shape.name, "edges", reason)

@@ -46,7 +46,7 @@ class EdgeOptions:
     dark_shift_px: float = 0.1  # how far all edges may be shifted towards the dark side (1 σ): tone curve, glare
     least_points: int = 40  # fewer are no measurement
     least_support: float = 0.25  # share of predicted points with a step where the fit says, above chance
-    systematic_px: float = 0.02  # what all edges of a component may be off together: chamfers, light
+    systematic_px: float = 0.03  # what all edges of a component may be off together: chamfers, light
 
 
 @dataclass(frozen=True)

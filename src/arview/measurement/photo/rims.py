@@ -1,0 +1,114 @@
+"""Circular edges measured in the photos: the rim of a hole or pin, for datums."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from arview.errors import InputError
+from arview.geometry import Array
+from arview.measurement.photo.edges import EdgeOffsets, EdgePoints, edge_offsets, pose_gain
+from arview.measurement.photo.fit import fit_rigid
+from arview.measurement.photo.options import EdgeOptions
+from arview.measurement.photo.surface import tangents_of
+from arview.measurement.photo.views import PhotoViews
+
+
+@dataclass(frozen=True)
+class RimFit:
+    """Where a circular edge lies in its plane.
+
+    Attributes:
+        shift_mm: (3,) of its centre from nominal, across the axis, model axes.
+        covariance: (3,3) of it, zero along the axis.
+        radius_shift_mm: found minus nominal radius, with what light and chamfers do to the edge: no measure of a bore.
+        used: number of edge points that agree.
+        residual_mm: robust standard deviation of their residuals.
+        support: 0–1, share of the points looked at that agree.
+    """
+
+    shift_mm: Array
+    covariance: Array
+    radius_shift_mm: float
+    used: int
+    residual_mm: float
+    support: float
+
+
+def fit_rim(
+    center_in_model: Array,
+    axis: Array,
+    diameter_mm: float,
+    views: PhotoViews,
+    reach_mm: float = 3.0,
+    options: EdgeOptions | None = None,
+) -> RimFit:
+    """The shift, across its axis, of a circular edge that stands out in the photos; its plane is taken to be known.
+
+    ``center_in_model`` (3,) is the middle of the edge to look for: of a hole in a plate that of the rim on the
+    cameras' side. A chamfer has two such edges: give the outer one, which the plate's face ends at, and its diameter.
+
+    Raises:
+        InputError: the edge is not found in at least three photos.
+    """
+    o = options or EdgeOptions()
+    axis = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    center = np.asarray(center_in_model, dtype=np.float64)
+    first, second = (vectors[0] for vectors in tangents_of(axis[None]))
+    px_mm = views.mm_per_px(center)
+    count = int(np.clip(np.pi * diameter_mm / (o.spacing_px * px_mm), 24, 180))
+    angle = 2.0 * np.pi * (np.arange(count) + 0.5) / count
+    radial = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    around = np.cross(axis, radial)
+    # Turns and shifts along the axis are not asked for; the place of the first turn is taken by the radius.
+    locked = [*np.eye(6)[1:3].tolist(), [0.0, 0.0, 0.0, *axis.tolist()]]
+    shift, radius_mm = np.zeros(3), 0.5 * diameter_mm
+    reaches_px = [max(reach_mm / px_mm, 4.0), 5.0, 3.0, 3.0, 3.0]
+    for reach_px in reaches_px:
+        rim = center + shift + radius_mm * radial
+        edges, outward = _seen(views, rim, radial, around, axis)
+        # More than a radius away is the other side.
+        found = edge_offsets(edges, center + shift, views, min(reach_px, 0.8 * radius_mm / px_mm), o)
+        ok = found.seen & (found.slopes != 0.0)
+        if np.count_nonzero(ok) < o.least_points or len(np.unique(edges.view[ok])) < 3:
+            raise InputError(
+                f"rim of ⌀{diameter_mm:g} mm at ({', '.join(f'{x:.1f}' for x in center)}): its edge is found in "
+                f"{len(np.unique(edges.view[ok]))} photos at {np.count_nonzero(ok)} points; take photos that show it"
+            )
+        fit = fit_rigid(
+            _rows(found, outward)[ok], found.offsets_mm[ok], 0.3 * found.mm_per_px[ok], np.array(locked), 1.0,
+            reach_mm, edges.points[ok] / (4.0 * px_mm), o.least_sigma_px / 0.3,
+        )  # fmt: skip
+        shift = shift + fit.twist[3:]
+        radius_mm += float(fit.twist[0])
+    systematic_mm = o.systematic_px * px_mm
+    covariance = fit.covariance[3:, 3:] + systematic_mm**2 * (np.eye(3) - np.outer(axis, axis))
+    if views.pose_covariance is not None:
+        by_poses = pose_gain(views, fit, edges.view[ok], found.pose_rows[ok])[3:]
+        covariance = covariance + by_poses @ views.pose_covariance @ by_poses.T
+    used = int(np.count_nonzero(fit.weights > 0.1))
+    return RimFit(
+        shift, covariance, radius_mm - 0.5 * diameter_mm, used, fit.residual_mm, used / max(1, len(edges.points))
+    )
+
+
+def _rows(found: EdgeOffsets, outward: Array) -> Array:
+    """(N,6): growth of the radius, two that stand for nothing, shift."""
+    grown = np.sum(found.directions * outward, axis=1)
+    return np.concatenate([grown[:, None], np.zeros((len(grown), 2)), found.directions], axis=1)
+
+
+def _seen(views: PhotoViews, rim: Array, radial: Array, around: Array, axis: Array) -> tuple[EdgePoints, Array]:
+    """The points of the rim that each photo sees, just above it, and their outward directions."""
+    points, tangents, outward, owner = [], [], [], []
+    groups = (rim + 0.1 * axis)[:, None]
+    for view in range(len(views.cameras)):
+        window = views.window(view, None, np.eye(4), groups.reshape(-1, 3))
+        seen = views.visible(view, window, groups) & ((views.centres[view] - rim) @ axis > 0)
+        points.append(rim[seen])
+        tangents.append(around[seen])
+        outward.append(radial[seen])
+        owner.append(np.full(np.count_nonzero(seen), view))
+    edges = EdgePoints(np.concatenate(points), np.concatenate(tangents), np.concatenate(owner))
+    return edges, np.concatenate(outward)
