@@ -2,7 +2,7 @@
 
 Each pixel's element is looked up in the maps of the views around (forward-backward check: Schönberger 2016,
 Galliani 2015); those that agree are merged along the pixel's own ray, weighted by how well each is known. Views are
-independent in this, so threads take one each; a last pass leaves each surface point out in all views but one.
+independent in this, so threads take one each; of all points in a small cell the best known one stays.
 """
 
 from __future__ import annotations
@@ -26,6 +26,10 @@ FELLOWS = 8
 """Other views that a view is checked against."""
 _RELATIVE_DEPTH = 0.01
 """Depths differ by more than this share: another surface, whatever the pixels say."""
+_CELL_PX = 0.5
+"""Side of the cells, of which each holds one point, in pixels of the maps (as wide as they are on the surface)."""
+_CELL_LENGTH = 5.0
+"""Length of the cells along the normal, in their sides: what is less well known than the surface there goes."""
 _ISOLATED = 3
 """A pixel with fewer neighbours (of 8) on its surface is a crumb."""
 
@@ -34,8 +38,9 @@ _ISOLATED = 3
 class _Stack:
     """All maps one after another: elements in the scan frame for numba.
 
-    ``elements`` (P,5) float32: normal form n·X = 1 in the camera (n divided by the plane's distance), variance of w,
-    and w at the pixel (0: none). ``layout`` (V,3): first pixel, width, height. ``cameras`` (V,4): fx fy cx cy.
+    ``elements`` (P,6) float32: normal form n·X = 1 in the camera (n divided by the plane's distance), variance of w,
+    w at the pixel (0: none), and 1 where it may become a point, not only bear out others.
+    ``layout`` (V,3): first pixel, width, height. ``cameras`` (V,4): fx fy cx cy.
     ``poses`` (V,3,4): cam_from_scan.
     """
 
@@ -60,7 +65,13 @@ def fuse(
     """
     stack = _stacked(maps, options)
     limits = np.array(
-        [options.agreement_px, _RELATIVE_DEPTH, np.cos(np.deg2rad(options.normal_angle_deg)), options.least_views]
+        [
+            options.agreement_px,
+            _RELATIVE_DEPTH,
+            np.cos(np.deg2rad(options.normal_angle_deg)),
+            options.least_views,
+            options.largest_spread_px,
+        ]
     )
     fellows = [_fellows(maps, i) for i in range(len(maps))]
     merged = np.zeros((len(stack.elements), 3), dtype=np.float32)
@@ -73,12 +84,28 @@ def fuse(
             progress("fusion", done, len(maps))
     for first, width, height in stack.layout:
         _drop_crumbs(merged[first : first + width * height].reshape(height, width, 3))
-    is_used = np.zeros(len(merged), dtype=np.uint8)
-    parts = []
-    for i in range(len(maps)):
-        chosen = _thin(i, fellows[i], stack.layout, stack.cameras, stack.poses, limits, merged, is_used)
-        parts.append(_points(maps[i], images[i], stack, merged, chosen, i))
-    return DenseCloud(*(np.concatenate([part[k] for part in parts]) for k in range(5)))
+    parts = [_points(m, image, stack, merged, i) for i, (m, image) in enumerate(zip(maps, images, strict=True))]
+    points, normals, colors, sigma, views = (np.concatenate([part[k] for part in parts]) for k in range(5))
+    known = merged[:, 0] > 0
+    footprint = float(np.median(merged[known, 0])) / maps[0].camera.fx if known.any() else 1.0
+    best = _best_of_cells(points, normals, sigma, _CELL_PX * footprint)
+    return DenseCloud(points[best], normals[best], colors[best], sigma[best], views[best])
+
+
+def _best_of_cells(
+    points: Array, normals: NDArray[np.float32], sigma: NDArray[np.float32], side: float
+) -> NDArray[np.int64]:
+    """Indices of the best known point of each cell; cells are longer along the axis nearest to the normal."""
+    if len(points) == 0:
+        return np.empty(0, dtype=np.int64)
+    axis = np.argmax(np.abs(normals), axis=1)
+    facing = 2 * axis + (normals[np.arange(len(points)), axis] > 0)
+    sides = side * np.where(np.arange(3) == axis[:, None], _CELL_LENGTH, 1.0)
+    cell = np.floor((points - points.min(axis=0)) / sides).astype(np.int64)
+    counts = cell.max(axis=0) + 1
+    key = ((facing * counts[0] + cell[:, 0]) * counts[1] + cell[:, 1]) * counts[2] + cell[:, 2]
+    order = np.lexsort((sigma, key))
+    return order[np.flatnonzero(np.diff(key[order], prepend=-1))]
 
 
 def _stacked(maps: Sequence[DepthMap], options: DenseOptions) -> _Stack:
@@ -90,10 +117,10 @@ def _stacked(maps: Sequence[DepthMap], options: DenseOptions) -> _Stack:
         a, b, w = planes[..., 1] * camera.fx, planes[..., 2] * camera.fy, planes[..., 0]
         c = w - a * x - b * y
         cosine = w / np.maximum(np.sqrt((a * a + b * b + c * c) * (x * x + y * y + 1.0)), 1e-30)
-        is_good = (w > 0) & (m.scores >= options.least_zncc) & (m.sigmas <= options.largest_sigma_px * m.unit_w)
-        is_good &= cosine >= np.cos(np.deg2rad(options.grazing_deg))
-        element = np.stack([a, b, c, m.sigmas**2, np.where(is_good, w, 0.0)], axis=-1)
-        elements.append(element.reshape(-1, 5).astype(np.float32))
+        is_known = (w > 0) & (m.scores > 0) & (m.sigmas <= options.largest_sigma_px * m.unit_w)
+        is_good = is_known & (m.scores >= options.least_zncc) & (cosine >= np.cos(np.deg2rad(options.grazing_deg)))
+        element = np.stack([a, b, c, m.sigmas**2, np.where(is_known, w, 0.0), is_good], axis=-1)
+        elements.append(element.reshape(-1, 6).astype(np.float32))
     sizes = np.array([(m.camera.width, m.camera.height) for m in maps])
     first = np.concatenate([[0], np.cumsum(sizes[:, 0] * sizes[:, 1])[:-1]])
     return _Stack(
@@ -132,7 +159,7 @@ def _seen_at(j, p0, p1, p2, layout, cameras, poses):  # type: ignore[no-untyped-
 def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # type: ignore[no-untyped-def]
     """Merged depth, its standard deviation and the number of views of each pixel of view i that enough agree on."""
     first, width, height = layout[i]
-    agreement, relative, least_cosine, least_views = limits[0], limits[1], limits[2], limits[3]
+    agreement, relative, least_cosine, least_views, spread_px = limits
     fx, fy, cx, cy = cameras[i]
     count = fellows.shape[0]
     depths, weights = np.empty(count + 1), np.empty(count + 1)
@@ -140,7 +167,7 @@ def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # typ
     centre = -(r.T @ t)
     for at in range(first, first + width * height):
         w = elements[at, 4]
-        if not w > 0.0:
+        if not (w > 0.0 and elements[at, 5] > 0.0):
             continue
         column, row = (at - first) % width, (at - first) // width
         xn, yn = (column - cx) / fx, (row - cy) / fy
@@ -207,10 +234,12 @@ def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # typ
         spread = 0.0
         for k in range(views):
             spread += weights[k] * (depths[k] - mean) ** 2
-        variance = max(1.0 / total, spread / total / (views - 1))
+        # Two maps share a photo on average: they count as half as many independent ones.
+        variance = 2.0 * max(1.0 / total, spread / total / (views - 1))
         # Along the normal, which the ray meets at an angle.
-        lean = abs(n0 * ray0 + n1 * ray1 + n2 * ray2) / length
-        merged[at, 0], merged[at, 1], merged[at, 2] = mean, np.sqrt(variance) * lean, views
+        sigma = np.sqrt(variance) * abs(n0 * ray0 + n1 * ray1 + n2 * ray2) / length
+        if sigma <= spread_px * z / fx:
+            merged[at, 0], merged[at, 1], merged[at, 2] = mean, sigma, views
 
 
 @njit(cache=True, nogil=True)
@@ -230,37 +259,13 @@ def _drop_crumbs(merged):  # type: ignore[no-untyped-def]
                 merged[y, x] = 0.0
 
 
-@njit(cache=True, nogil=True)
-def _thin(i, fellows, layout, cameras, poses, limits, merged, is_used):  # type: ignore[no-untyped-def]
-    """Pixels of view i that no earlier view has given a point to; their places in the later views are marked."""
-    first, width, height = layout[i]
-    fx, fy, cx, cy = cameras[i]
-    r, t = poses[i, :, :3].copy(), poses[i, :, 3].copy()
-    chosen = np.zeros(width * height, np.bool_)
-    for at in range(first, first + width * height):
-        if not merged[at, 0] > 0.0 or is_used[at]:
-            continue
-        chosen[at - first] = True
-        z = merged[at, 0]
-        x = ((at - first) % width - cx) / fx * z - t[0]
-        y = ((at - first) // width - cy) / fy * z - t[1]
-        z -= t[2]
-        p0 = r[0, 0] * x + r[1, 0] * y + r[2, 0] * z
-        p1 = r[0, 1] * x + r[1, 1] * y + r[2, 1] * z
-        p2 = r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
-        for f in range(fellows.shape[0]):
-            q, _, _, depth = _seen_at(fellows[f], p0, p1, p2, layout, cameras, poses)
-            if q >= 0 and abs(merged[q, 0] - depth) < limits[1] * depth:
-                is_used[q] = 1
-    return chosen
-
-
 def _points(
-    m: DepthMap, image: Image, stack: _Stack, merged: NDArray[np.float32], chosen: NDArray[np.bool_], index: int
+    m: DepthMap, image: Image, stack: _Stack, merged: NDArray[np.float32], index: int
 ) -> tuple[Array, NDArray[np.float32], Image, NDArray[np.float32], NDArray[np.uint8]]:
-    """Points, normals, colours, deviations and view counts of the chosen pixels of one view."""
+    """Points, normals, colours, deviations and view counts of the merged pixels of one view."""
     first, width, height = stack.layout[index]
     here = slice(first, first + width * height)
+    chosen = merged[here, 0] > 0
     rows, columns = np.divmod(np.flatnonzero(chosen), width)
     depth, sigma, views = merged[here][chosen].T
     rays = m.camera.unproject(np.stack([columns, rows], axis=-1))

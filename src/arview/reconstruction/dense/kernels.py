@@ -59,7 +59,8 @@ class Problem(NamedTuple):
 def make_scratch(shift: float = 0.0, is_dense: bool = False) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Working memory of one thread: (14,SAMPLES) with the samples' offsets and fall-off set, and (SAMPLES,) indices.
 
-    Samples lie on every other pixel of a disc, or on every pixel of a smaller one (``is_dense``). ``shift`` is where the pixels are from the middle: 0, or 0.5 for a
+    Samples lie on every other pixel of a disc, or on every pixel of a smaller one (``is_dense``).
+    ``shift`` is where the pixels are from the middle: 0, or 0.5 for a
     middle between four pixels.
     """
     v, u = np.mgrid[-RADIUS - 1 : RADIUS + 2, -RADIUS - 1 : RADIUS + 2]

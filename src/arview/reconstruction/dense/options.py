@@ -25,8 +25,11 @@ class DenseOptions:
         geometric_weight: cost of one pixel of disagreement with the depth map of a source.
         least_zncc: mean correlation with the sources below which a pixel is not used.
         largest_sigma_px: standard deviation in pixels of parallax above which a pixel is not used: no texture.
+        largest_spread_px: standard deviation of a merged point along its normal, in pixels of the maps as wide as
+            they are there, above which it is dropped.
         least_views: photos that must agree on a point of the cloud, its own included.
-        agreement_px: depth maps agree when the point moves by less than this in the photo.
+        agreement_px: depth maps agree when the point moves by less than this in the photo, in pixels of the maps
+            (half the working size).
         normal_angle_deg: and when their normals differ by less than this.
         grazing_deg: surfaces seen at a larger angle from their normal are not used.
         threads: photos worked on at a time; 0 for one per core.
@@ -42,12 +45,13 @@ class DenseOptions:
     cad_hypotheses: bool = True
     noise: float = 1.5
     geometric_weight: float = 0.1
-    least_zncc: float = 0.6
+    least_zncc: float = 0.5
     largest_sigma_px: float = 0.25
+    largest_spread_px: float = 0.35
     least_views: int = 3
-    agreement_px: float = 1.0
+    agreement_px: float = 1.5
     normal_angle_deg: float = 35.0
-    grazing_deg: float = 72.0
+    grazing_deg: float = 75.0
     threads: int = 0
     seed: int = 0
 
@@ -60,6 +64,9 @@ class DenseOptions:
             )
         if not self.least_views >= 2:
             raise InputError(f"dense: least_views is {self.least_views}, expected at least 2")
-        for name in ("band_mm", "noise", "agreement_px", "largest_sigma_px", "normal_angle_deg", "grazing_deg"):
+        for name in ("band_mm", "noise", "agreement_px", "largest_sigma_px", "largest_spread_px"):
             if not getattr(self, name) > 0:
                 raise InputError(f"dense: {name} is {getattr(self, name)}, expected a positive number")
+        for name in ("normal_angle_deg", "grazing_deg"):
+            if not 0.0 < getattr(self, name) < 90.0:
+                raise InputError(f"dense: {name} is {getattr(self, name)}, expected between 0 and 90")
