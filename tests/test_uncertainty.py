@@ -120,10 +120,15 @@ def test_contradiction_widens_what_both_claim() -> None:
     far = move(np.zeros(6), fine), move(np.array([0, 0, 0, 0.4, 0, 0.0]), coarse, "edges")
     found = combine(far)
     assert agreements(far)[0].ratio > 4
-    # Neither is believed: between the two, and both within two standard deviations.
+    # The better method on paper is followed, not believed: σ is six times what it claims.
+    std = np.sqrt(np.diag(sum(found.covariances.values()) + found.disagreement))
+    assert found.twist[3] < 0.015
+    assert 0.06 < std[3] < 0.12
+    assert 0.015 < std[4] < 0.06  # wrong along x may be wrong along y too
+    even = move(np.zeros(6), fine), move(np.array([0, 0, 0, 0.4, 0, 0.0]), fine, "edges")
+    found = combine(even)
     std = np.sqrt((sum(found.covariances.values()) + found.disagreement)[3, 3])
-    assert 0.1 < found.twist[3] < 0.3
-    assert abs(found.twist[3] - 0.4) < 2 * std and found.twist[3] < 2 * std
+    assert found.twist[3] == pytest.approx(0.2) and 0.2 < std < 0.35
     assert np.allclose(found.disagreement[:3, :3], 0.0)  # the rotations do agree
 
 
@@ -181,7 +186,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(monte_carlo: bool) -> Non
             at_zero.append(inside[-1])
     assert 0.92 <= np.mean(inside) <= 0.99
     assert 0.91 <= np.mean(at_zero) <= 0.99
-    assert 0.93 <= np.mean(per_axis) <= 0.98
+    assert 0.93 <= np.mean(per_axis) <= 0.99
 
 
 def test_the_budget_sums_and_names_the_largest() -> None:

@@ -308,7 +308,10 @@ def _fit_alone(one: Equations, is_exact: bool) -> _Fit:
     freedom = max(1.0, share.sum() - rank)
     # The residuals say how large the noise is; what the method says only how it differs from offset to offset.
     factor = float((share * noise**2).sum() / freedom) if freedom > 20 else max(1.0, float(np.mean(noise**2)))
-    correlation = correlation_factor(one.points[inliers], noise[inliers])
+    correlation = max(
+        correlation_factor(one.points[inliers], noise[inliers]),
+        block_factor(one.points[inliers], noise[inliers], rank),
+    )
     weights = share / one.variances
     radius = None
     if one.by_radius is not None:
@@ -372,6 +375,34 @@ def correlation_factor(points: Array, residuals: Array, most: int = 600) -> floa
             break
         factor += correlation * 2.0 * len(of_bin) / len(points) * step
     return factor
+
+
+def check_covered(one: Equations, options: AlignmentOptions) -> None:
+    """Raises InputError, naming the datum, when too little of it was measured to lock anything."""
+    _check_covered(one, _fit_alone(one, is_exact=False), options)
+
+
+def block_factor(points: Array, residuals: Array, rank: int, blocks: int = 12) -> float:
+    """The same from the means of residuals (N,) in blocks of neighbours, less what a fit of ``rank`` has taken up.
+
+    It sees errors that are alike over a large part of a feature, which the fit has mostly made its own. Blocks are of
+    equal numbers: around a rim by angle, on a face in strips of strips.
+    """
+    count = len(points)
+    if count < 8 * blocks or rank >= blocks - 2:
+        return 1.0
+    from_middle = points - points.mean(axis=0)
+    _, vectors = np.linalg.eigh(from_middle.T @ from_middle)
+    x, y = from_middle @ vectors[:, 2], from_middle @ vectors[:, 1]
+    if np.std(np.hypot(x, y)) < 0.1 * np.mean(np.hypot(x, y)):
+        order = np.argsort(np.arctan2(y, x))
+    else:
+        strip = np.digitize(x, np.quantile(x, [0.25, 0.5, 0.75]))
+        order = np.lexsort((y, strip))
+    parts = np.array_split(residuals[order], blocks)
+    means = np.array([part.mean() for part in parts])
+    between = float(np.sum(means**2)) / (blocks - rank)
+    return max(1.0, between * count / blocks / float(np.mean(residuals**2)))
 
 
 def _check_covered(one: Equations, fit: _Fit, options: AlignmentOptions) -> None:

@@ -60,9 +60,9 @@ class Combined:
 def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> Combined:
     """Weighted mean of moves of one component by independent methods.
 
-    Methods that differ by more than their covariances allow have an error that neither knows: a variance common to
-    both is added, of rotations and of shifts for themselves, just large enough to explain the difference (Mandel &
-    Paule 1970, where Birge 1932 inflates both alike: the better method on paper does not win by its own word alone).
+    Methods that differ by more than their covariances allow have an error that neither knows. Rotations and shifts for
+    themselves, the covariance is then inflated until the difference is explained (Birge 1932), and the scatter of the
+    methods about the mean is added along the difference: who claims little gets a small weight, and still a say.
     What only one determines is its alone.
 
     Args:
@@ -76,27 +76,49 @@ def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> Combined:
         raise InputError("combine: expected at least one move, and all of one component")
     radius = moves[0].radius_mm
     unit = np.array([radius] * 3 + [1.0] * 3)
+    scaled = np.outer(unit, unit)
     twists = [move.twist * unit for move in moves]
     bases = [_determined(move.undetermined) for move in moves]
-    noise = [move.covariance * np.outer(unit, unit) for move in moves]
-    extra = np.zeros(6)
-    for part in _PARTS:
-        extra[part] = _between(twists, noise, bases, part)
+    noise = [move.covariance * scaled for move in moves]
     weights = []
     for covariance, basis in zip(noise, bases, strict=True):
-        inside = basis.T @ (covariance + np.diag(extra)) @ basis
+        inside = basis.T @ covariance @ basis
         weights.append(basis @ np.linalg.pinv(inside, rcond=1e-12, hermitian=True) @ basis.T)
     values, vectors = np.linalg.eigh(np.sum(weights, axis=0))
     known = values > 1.0 / undetermined_mm**2
     inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
     gains = [inverse @ weight for weight in weights]
     twist = np.sum([gain @ one for gain, one in zip(gains, twists, strict=True)], axis=0)
-    shares = [gain @ one @ gain.T / np.outer(unit, unit) for gain, one in zip(gains, noise, strict=True)]
-    disagreement = np.sum([gain @ np.diag(extra) @ gain.T for gain in gains], axis=0) / np.outer(unit, unit)
+    disagreement = np.zeros((6, 6))
+    for i, j in combinations(range(len(moves)), 2):
+        for part in _PARTS:
+            axes = _common(_common(bases[i], bases[j]), np.eye(6)[:, part])
+            disagreement += _beyond_chance(
+                twists[i] - twists[j], noise[i] + noise[j], gains[i], gains[j], inverse, axes
+            )
+    shares = [gain @ one @ gain.T / scaled for gain, one in zip(gains, noise, strict=True)]
     return Combined(
-        twist / unit, {move.method: share for move, share in zip(moves, shares, strict=True)}, disagreement,
-        vectors[:, ~known].T, radius, moves[0].center_in_model,
+        twist / unit, {move.method: share for move, share in zip(moves, shares, strict=True)},
+        disagreement / scaled, vectors[:, ~known].T, radius, moves[0].center_in_model,
     )  # fmt: skip
+
+
+def _beyond_chance(
+    difference: Array, joint: Array, gain: Array, other_gain: Array, combined: Array, axes: Array
+) -> Array:
+    """(6,6) variance to add along axes (6,K) for a difference that its covariance does not explain."""
+    if axes.shape[1] == 0:
+        return np.zeros((6, 6))
+    seen = axes.T @ difference
+    squares = float(seen @ np.linalg.pinv(axes.T @ joint @ axes, hermitian=True) @ seen) / len(seen)
+    if squares <= 1.0:
+        return np.zeros((6, 6))
+    along = axes @ seen
+    unit = along / np.linalg.norm(along)
+    shares = np.clip([unit @ gain @ unit, unit @ other_gain @ unit], 0.0, 1.0)
+    scatter = float(shares.prod()) * (1.0 - 1.0 / squares) * np.outer(along, along)
+    project = axes @ axes.T
+    return np.asarray(scatter + (squares - 1.0) * project @ combined @ project)
 
 
 def agreements(moves: Sequence[Move]) -> tuple[Agreement, ...]:
@@ -121,27 +143,6 @@ def quantile_of_length(covariance: Array, probability: float = 0.95) -> float:
     if trace <= 0 or square <= 0:
         return 0.0
     return float(np.sqrt(square / trace * chi2.ppf(probability, trace**2 / square)))
-
-
-def _between(twists: Sequence[Array], noise: Sequence[Array], bases: Sequence[Array], part: slice) -> float:
-    """Common variance that explains the largest contradiction of two methods in rotations or in shifts."""
-    largest = 0.0
-    for i, j in combinations(range(len(twists)), 2):
-        axes = _common(_common(bases[i], bases[j]), np.eye(6)[:, part])
-        if axes.shape[1] == 0:
-            continue
-        difference = axes.T @ (twists[i] - twists[j])
-        values, vectors = np.linalg.eigh(axes.T @ (noise[i] + noise[j]) @ axes)
-        squares, values = (vectors.T @ difference) ** 2, np.maximum(values, 1e-12)
-        low, high = 0.0, float(squares.sum())
-        if float((squares / values).sum()) <= len(squares):
-            continue
-        for _ in range(60):  # the excess falls steadily with the variance
-            middle = 0.5 * (low + high)
-            is_low = float((squares / (values + 2.0 * middle)).sum()) > len(squares)
-            low, high = (middle, high) if is_low else (low, middle)
-        largest = max(largest, high)
-    return largest
 
 
 def _determined(undetermined: Array) -> Array:

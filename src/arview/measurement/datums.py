@@ -81,6 +81,28 @@ def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move], o: Datu
     )
 
 
+def base_plane(component: Component, toward: Array) -> Datum | None:
+    """The largest flat face of a component that looks towards (3,), as a datum; None when it is no large part of it."""
+    corners = component.vertices_in_model[component.faces]
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(doubled, axis=1)
+    normals = doubled / np.maximum(areas, 1e-12)[:, None]
+    heights = np.einsum("nx,nx->n", normals, corners.mean(axis=1))
+    ahead = normals @ (toward / np.linalg.norm(toward)) > 0.5
+    if not ahead.any():
+        return None
+    keys = np.round(np.concatenate([normals * 500.0, heights[:, None] * 20.0], axis=1)[ahead])
+    groups, owner = np.unique(keys, axis=0, return_inverse=True)
+    of_group = np.bincount(owner.ravel(), weights=areas[ahead], minlength=len(groups))
+    if of_group.max() < 0.2 * areas.sum():
+        return None
+    face = np.flatnonzero(ahead)[np.flatnonzero(owner.ravel() == np.argmax(of_group))[0]]
+    point, normal = corners[face].mean(axis=0), normals[face]
+    x, y, z = point.tolist()
+    a, b, c = normal.tolist()
+    return Datum("plane", "plane", component.name, (x, y, z), (a, b, c))
+
+
 # --- planes ----------------------------------------------------------------------------------------------
 
 

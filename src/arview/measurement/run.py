@@ -30,9 +30,9 @@ from arview.inspection import (
     Provenance,
     Verdict,
 )
-from arview.measurement.alignment import Alignment, AlignmentOptions, align, move_equations
+from arview.measurement.alignment import Alignment, AlignmentOptions, Equations, align, check_covered, move_equations
 from arview.measurement.combine import Agreement, Combined, agreements, combine
-from arview.measurement.datums import DatumOptions, measure_datums
+from arview.measurement.datums import DatumOptions, base_plane, measure_datums
 from arview.measurement.decision import DecisionOptions, decide, worst, zone_diameter_mm
 from arview.measurement.folder import MetricReconstruction
 from arview.measurement.photo import PhotoOptions, PhotoViews, load_views, measure_components_in_photos
@@ -188,6 +188,8 @@ def align_to_datums(
         if together is not None:
             fitted[name] = _as_move(name, together)
     equations = measure_datums(part.datums, views, fitted, options.datums)
+    if not part.datums:
+        equations = _plane_of_base(views, part.model, base, options)
     rest = next((move_equations(name, fitted[name])[0] for name in base if name in fitted), None)
     if rest is None and not equations:
         reasons = "; ".join(f.reason for name in base for f in results[name].failures)
@@ -201,6 +203,20 @@ def align_to_datums(
     kinds = {evidence.kind for evidence in reconstruction.scale.evidence if evidence.is_used}
     scale_std = reconstruction.scale.scale_std or 0.0
     return align(equations, origin, size_mm, rest, scale_std, kinds <= {"cad"}, options.alignment)
+
+
+def _plane_of_base(views: PhotoViews, model: Model, base: Sequence[str], options: MeasureOptions) -> list[Equations]:
+    """The base's large flat face, which is known better than the height of its edges; nothing where there is none."""
+    component = model.component(base[0])
+    plane = base_plane(component, views.centres.mean(axis=0) - component.bounds_in_model.mean(axis=0))
+    if plane is None:
+        return []
+    try:
+        equations = measure_datums((plane,), views, {}, options.datums)
+        check_covered(equations[0], options.alignment)
+    except InputError:
+        return []
+    return equations
 
 
 def _as_move(name: str, together: Combined) -> Move:
@@ -386,7 +402,7 @@ def _datum_system(
     components = {datum.label: datum.component for datum in part.datums}
     reports = tuple(
         DatumReport(
-            one.label, one.feature, components.get(one.label, one.label), one.locked, one.used, one.of,
+            one.label, one.feature, components.get(one.label, base[0]), one.locked, one.used, one.of,
             one.residual_mm, one.rest_mm, one.radius_mm,
             {"plane": "sweep", "point": "sweep", "hole": "edges", "pin": "edges"}.get(one.feature, "sweep and edges"),
         )
@@ -394,7 +410,7 @@ def _datum_system(
     )  # fmt: skip
     notes = alignment.notes
     if not part.datums:
-        notes = (f"no datums in the part file: best fit of {', '.join(base)}",)
+        notes = (f"no datums in the part file: best fit of {', '.join(base)}", *notes)
     scale = reconstruction.scale
     used = [evidence.detail for evidence in scale.evidence if evidence.is_used]
     return DatumSystem(

@@ -1,0 +1,165 @@
+"""The command measure: reconstruction → displacement of every component, with U and verdict."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from arview.cli.common import UNIT, main, output_path, say, stage_bar
+
+if TYPE_CHECKING:
+    from arview.inspection import ComponentDeviation, Inspection
+    from arview.measurement.types import Method
+
+METHODS = ("sweep", "edges", "cloud")
+EXIT_FAIL, EXIT_UNDECIDED = 3, 4
+
+
+def _parse_methods(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[Method, ...]:
+    names = [name.strip() for name in value.split(",") if name.strip()]
+    chosen = tuple(name for name in METHODS if name in names)
+    if not chosen or any(name not in METHODS for name in names):
+        raise click.BadParameter(f"{value!r}: expected some of {','.join(METHODS)}")
+    return chosen  # type: ignore[return-value]
+
+
+@main.command(
+    short_help="Measure where components stand, with uncertainty and verdict.",
+    epilog="""\b
+Examples:
+  arview measure out/ --part part.toml
+  arview measure out/ --part part.toml -o inspection.json --tolerance 0.5
+  arview measure out/ --part plate.step --photos photos/ --methods edges --guard 0
+
+\b
+OUT is the folder of `arview reconstruct --part`. Components of the role 'inspect' are measured, in the photos twice
+(sweep: their surface; edges: their edges) and in the cloud where there is one; sweep and edges together are the
+result, the cloud is for comparison. Displacements are in the frame of the part file's datums; what they leave free,
+or all without datums, the best fit of the base decides. dx dy dz are those of the middle of a component's bounding
+box; ? is undetermined. U is the expanded uncertainty (k = 2; near zero as much as makes its interval hold the true
+distance 95 times of 100).
+
+\b
+A component passes when distance + guard * U is within its tolerance, fails when distance - guard * U is not, and is
+undecided between (ISO 14253-1). Tolerances come from the part file, else from --tolerance; they are radii: position
+tolerance zones of drawings (ISO 1101) are diameters, twice as large. INSPECTION holds all: covariance, methods,
+budget, datums; `arview annotate --inspection` draws it.
+
+\b
+Exit codes: 0 every component passes, 3 one fails or is missing, 4 none fails but one is undecided or was not
+measured, 2 bad input, 130 interrupted.""",
+)
+@click.argument("folder", metavar="OUT")
+@click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
+@click.option("-o", "--output", metavar="INSPECTION", help="File to write; default: inspection.json in OUT.")
+@click.option("--photos", metavar="FOLDER", help="Where the photos are, if not where they were.")
+@click.option("--tolerance", type=click.FloatRange(min=0, min_open=True), metavar="MM",
+              help="Largest distance allowed, for components without one in the part file.")  # fmt: skip
+@click.option("--guard", type=click.FloatRange(0, 3), default=1.0, show_default=True, metavar="G",
+              help="Share of U kept from the tolerance; 0 is simple acceptance.")  # fmt: skip
+@click.option("--methods", callback=_parse_methods, default=",".join(METHODS), show_default=True, metavar="LIST",
+              help="Ways of measuring, separated by commas.")  # fmt: skip
+@click.option(
+    "--correct-bias", is_flag=True, help="Judge the most likely true distance: noise makes small ones larger."
+)
+@click.option("--no-monte-carlo", is_flag=True, help="Combine uncertainties by their sum of squares alone.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the Monte Carlo.")
+@click.option("--anyway", is_flag=True, help="Measure though the reconstruction does not have the CAD's shape.")
+@UNIT
+def measure(
+    folder: str,
+    part_path: str,
+    output: str | None,
+    photos: str | None,
+    tolerance: float | None,
+    guard: float,
+    methods: tuple[Method, ...],
+    correct_bias: bool,
+    no_monte_carlo: bool,
+    seed: int,
+    anyway: bool,
+    unit: str | None,
+) -> None:
+    """Measure where the components of PART stand in the reconstruction OUT: displacement, U, verdict."""
+    from arview.cad import load_part
+    from arview.inspection import save_inspection
+    from arview.measurement import run
+    from arview.measurement.decision import DecisionOptions
+    from arview.measurement.folder import read_folder
+    from arview.measurement.uncertainty import UncertaintyOptions
+
+    target = output_path(output or str(Path(folder) / "inspection.json"), [part_path])
+    part = load_part(part_path, unit)
+    options = run.MeasureOptions(
+        methods=methods,
+        tolerance_mm=tolerance,
+        corrects_bias=correct_bias,
+        uses_inconsistent=anyway,
+        uncertainty=UncertaintyOptions(monte_carlo=not no_monte_carlo, seed=seed),
+        decision=DecisionOptions(guard),
+    )
+    reconstruction = read_folder(folder, photos, "cloud" in methods)
+    with stage_bar() as progress:
+        inspection = run.measure(reconstruction, part, options, progress)
+    save_inspection(inspection, target)
+    _print(inspection, target)
+    code = exit_code(inspection)
+    if code:
+        click.get_current_context().exit(code)
+
+
+def exit_code(inspection: Inspection) -> int:
+    """0 when all pass, 3 when one fails, 4 when one is undecided or not measured."""
+    verdicts = {component.verdict.value for component in inspection.components}
+    if "fail" in verdicts:
+        return EXIT_FAIL
+    return EXIT_UNDECIDED if verdicts - {"pass"} else 0
+
+
+def _print(inspection: Inspection, target: Path) -> None:
+    """Datums, a line for each component, and a summary; doubts go to stderr."""
+    for warning in inspection.warnings:
+        say(f"warning: {warning}")
+    system = inspection.datum_system
+    if system is not None:
+        for datum in system.datums:
+            radius = "" if datum.radius_mm is None else f", radius {datum.radius_mm:+.3f} mm"
+            count = "best fit" if datum.feature == "fit" else f"{datum.used} of {datum.of} points"
+            click.echo(
+                f"datum {datum.label} ({datum.feature} of {datum.component}) locks {datum.locked}: {count}, residual "
+                f"{datum.residual_mm:.3f} mm{radius}"
+            )
+        for note in system.notes:
+            click.echo(f"datums: {note}")
+    width = max(len(component.name) for component in inspection.components)
+    head = ("dx", "dy", "dz", "distance", "U", "tilt")
+    click.echo(
+        f"{'component':{width}}" + "".join(f"{title:>9}" for title in head) + "  verdict       largest term of U"
+    )
+    for component in inspection.components:
+        click.echo(f"{component.name:{width}}{_row(component)}")
+    for component in inspection.components:
+        for note in component.details.notes if component.details else ():
+            say(f"{component.name}: {note}")
+    counts = [f"{sum(c.verdict.value == v for c in inspection.components)} {v.replace('_', ' ')}" for v in
+              ("pass", "fail", "undecided", "not_measured")]  # fmt: skip
+    missing = [c.name for c in inspection.components if c.finding is not None]
+    click.echo(", ".join(counts) + (f"; missing: {', '.join(missing)}" if missing else ""))
+    click.echo(f"wrote {target}")
+
+
+def _row(component: ComponentDeviation) -> str:
+    """Numbers in mm and degrees, ``?`` for what is undetermined."""
+    values = [*component.displacement_mm, component.distance_mm, component.uncertainty_mm]
+    signs = ("+", "+", "+", "", "")
+    cells = [f"{'?' if v is None else format(v, f'{sign}.3f'):>9}" for v, sign in zip(values, signs, strict=True)]
+    tilt = component.tilt_deg
+    cells.append(f"{'?' if tilt is None or math.isnan(tilt) else format(tilt, '.2f') + '°':>9}")
+    verdict = "missing" if component.finding is not None else component.verdict.value.replace("_", " ")
+    details = component.details
+    budget = details.budget if details is not None else ()
+    largest = f"{budget[0].name} {budget[0].std_mm:.3f}" if budget else ""
+    return "".join(cells) + f"  {verdict:<13} {largest}".rstrip()
