@@ -30,7 +30,7 @@ from arview.measurement.registration import (
 )
 from arview.measurement.surface import Surface
 from arview.measurement.types import Move, NotMeasured
-from arview.measurement.visibility import seen_by
+from arview.measurement.visibility import Views
 from arview.reconstruction.types import DenseCloud, PosedPhoto
 
 
@@ -133,8 +133,9 @@ def measure_components_in_cloud(
     box = model.bounds_in_model + np.array([[-o.band_mm], [o.band_mm]])
     points = prepare_cloud(cloud, box, o.grid_mm, o.least_points)
     check_belongs(points, model, o.band_mm)
+    views = Views(model, photos) if photos else None
     with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
-        candidates = list(threads.map(lambda name: _candidate(name, model, part, photos, {}, o), part.inspected))
+        candidates = list(threads.map(lambda name: _candidate(name, model, part, views, o), part.inspected))
         first = list(threads.map(lambda c: _measure(c, points, None, o), candidates))
         places = {m.component: m.measured_from_nominal for m in first if isinstance(m, Move)}
 
@@ -143,7 +144,7 @@ def measure_components_in_cloud(
             if not isinstance(found, Move):
                 return found
             moved = replace(c, others=_around(c.component, model, places, o))
-            return _measure(moved, points, found, o)
+            return _measure(moved, points, found.nominal_from_measured, o)
 
         second = list(threads.map(again, range(len(candidates))))
         return list(threads.map(lambda i: _named(second[i], candidates[i], candidates, points, o), range(len(second))))
@@ -201,12 +202,11 @@ def spin_moves(component: Component, surface: Surface, part: Part | None, least_
 
 
 def _candidate(
-    name: str, model: Model, part: Part, photos: Sequence[PosedPhoto], places: dict[str, Array],
-    o: CloudDeviationOptions,
+    name: str, model: Model, part: Part | None, views: Views | None, o: CloudDeviationOptions
 ) -> Candidate:  # fmt: skip
     component = model.component(name)
     surface = Surface(component.vertices_in_model, component.faces)
-    others = _around(component, model, places, o)
+    others = _around(component, model, {}, o)
     spacing = max(o.grid_mm, 0.3, float(np.sqrt(surface.areas.sum() / 4000.0)))
     spread, of_face = surface.sample(spacing)
     tried = np.concatenate([spread, surface.triangles.mean(axis=1)])
@@ -217,8 +217,8 @@ def _candidate(
         to_others = np.where(closest.faces >= 0, np.abs(closest.distances), np.inf)
     touches = to_others < 0.2
     seen = ~touches
-    if photos:
-        seen &= seen_by(tried, surface.face_normals[faces], model, photos) >= o.least_photos
+    if views is not None:
+        seen &= views.count(tried, surface.face_normals[faces]) >= o.least_photos
     height = float(np.max(to_others[np.isfinite(to_others)], initial=0.0)) if others is not None else np.inf
     joint = min(o.joint_mm, 0.25 * height)
     usable = np.zeros(len(surface.faces), dtype=bool)
@@ -251,8 +251,8 @@ def _around(component: Component, model: Model, places: dict[str, Array], o: Clo
     return Surface(np.concatenate(vertices), np.concatenate(faces), np.concatenate(groups))
 
 
-def _measure(c: Candidate, cloud: CloudPoints, start: Move | None, o: CloudDeviationOptions) -> Move | NotMeasured:
-    """Move of one component, or why there is none."""
+def _measure(c: Candidate, cloud: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Move | NotMeasured:
+    """Move of one component, or why there is none; ``start`` is nominal_from_measured (4,4), None tries several."""
     name = c.component.name
     if len(c.samples) == 0:
         return NotMeasured(name, "cloud", "none of its surface can be seen in the photos")
@@ -316,13 +316,13 @@ def _covered(samples: Array, points: Array, reach_mm: float, fit: Registration |
     return float(np.mean(np.isfinite(distance)))
 
 
-def _register(c: Candidate, own: CloudPoints, start: Move | None, o: CloudDeviationOptions) -> Registration:
+def _register(c: Candidate, own: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Registration:
     """The component's points on its surface: undetermined moves are left out one after the other."""
     radius, scales = c.radius_mm, np.array([c.radius_mm] * 3 + [1.0] * 3)
     options = replace(o.registration, first_distance_mm=o.band_mm, least_points=min(o.least_points, 50))
     given: dict[str, Any] = {"center": c.center, "radius_mm": radius, "usable_faces": c.usable_faces}
     fixed = c.spins
-    starts = _starts(c.center, radius, o.band_mm) if start is None else [start.nominal_from_measured]
+    starts = _starts(c.center, radius, o.band_mm) if start is None else [start]
     for _ in range(6):
         free = _rest(fixed) / scales
         fit = register_from_starts(
@@ -401,19 +401,19 @@ def _named(
     if isinstance(found, Move) or found.is_missing or "shape" not in found.reason or c.others is None:
         return found
     foot = c.others.closest(c.center[None]).points[0]
+    tried = [c]
     for other in all_of_them:
-        if other.component.name == c.component.name or other.others is None or _same_shape(c, other):
+        if other.others is None or any(_same_shape(other, done) for done in tried):
             continue
-        shift = foot - other.others.closest(other.center[None]).points[0]
-        there = rigid(np.eye(3), shift)
+        tried.append(other)
+        there = rigid(np.eye(3), foot - other.others.closest(other.center[None]).points[0])
         vertices = apply(there, other.component.vertices_in_model)
-        stand_in = Component(c.component.name, vertices, other.component.faces)
-        spins = other.spins.copy()
-        trial = Candidate(
-            stand_in, Surface(vertices, stand_in.faces), c.others, apply(there, other.samples),
-            apply(there, other.contact), other.usable_faces, spins, other.joint_mm,
+        trial = replace(
+            other, component=Component(c.component.name, vertices, other.component.faces), others=c.others,
+            surface=Surface(vertices, other.component.faces), samples=apply(there, other.samples),
+            contact=apply(there, other.contact),
         )  # fmt: skip
-        if isinstance(_measure(trial, cloud, None, o), Move):
+        if isinstance(_measure(trial, cloud, np.eye(4), o), Move):
             return replace(found, reason=f"{found.reason}; it has the shape of {other.component.name}: swapped?")
     return found
 
