@@ -5,8 +5,11 @@ COLMAP puts the centre of the first pixel at (0.5, 0.5), arview at (0, 0).
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import zlib
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +35,16 @@ def import_pycolmap() -> Any:
     except ImportError as error:
         raise MissingDependencyError(f"pycolmap cannot be loaded ({error}); pip install pycolmap") from error
     pycolmap.logging.minloglevel = 3
+    _take_back_signals()
     return pycolmap
+
+
+@lru_cache(maxsize=1)
+def _take_back_signals() -> None:
+    """Undo the handlers that pycolmap's logging sets when loaded: they print a stack trace when a run is ended."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        with contextlib.suppress(ValueError):  # not in the main thread: left as they are
+            signal.signal(number, signal.getsignal(number) or signal.SIG_DFL)
 
 
 def colmap_camera(camera: Camera, is_calibrated: bool) -> Any:
