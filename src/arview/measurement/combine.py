@@ -116,7 +116,8 @@ def _beyond_chance(
     along = axes @ seen
     unit = along / np.linalg.norm(along)
     shares = np.clip([unit @ gain @ unit, unit @ other_gain @ unit], 0.0, 1.0)
-    scatter = float(shares.prod()) * (1.0 - 1.0 / squares) * np.outer(along, along)
+    # Axis by axis: that two methods differ along an oblique direction ties no axes to each other.
+    scatter = float(shares.prod()) * (1.0 - 1.0 / squares) * np.diag(along**2)
     project = axes @ axes.T
     return np.asarray(scatter + (squares - 1.0) * project @ combined @ project)
 

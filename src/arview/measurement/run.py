@@ -190,7 +190,7 @@ def align_to_datums(
     equations = measure_datums(part.datums, views, fitted, options.datums)
     if not part.datums:
         equations = _plane_of_base(views, part.model, base, options)
-    rest = next((move_equations(name, fitted[name])[0] for name in base if name in fitted), None)
+    rest = next((_rest_of_base(results[name], fitted[name], equations) for name in base if name in fitted), None)
     if rest is None and not equations:
         reasons = "; ".join(f.reason for name in base for f in results[name].failures)
         raise InputError(f"{', '.join(base)}: could not be measured, there is no frame: {reasons}")
@@ -217,6 +217,13 @@ def _plane_of_base(views: PhotoViews, model: Model, base: Sequence[str], options
     except InputError:
         return []
     return equations
+
+
+def _rest_of_base(measured: Measured, fitted: Move, datums: Sequence[Equations]) -> Equations:
+    """The base's best fit; within a plane that is already known by its edges, as its narrow sides tell little."""
+    edges = [move for move in measured.moves if move.method == "edges"]
+    is_flat = any(datum.feature == "plane" for datum in datums)
+    return move_equations(fitted.component, edges[0] if edges and is_flat else fitted)[0]
 
 
 def _as_move(name: str, together: Combined) -> Move:
