@@ -275,7 +275,7 @@ def _measure(c: Candidate, cloud: CloudPoints, start: Array | None, o: CloudDevi
         )
         return NotMeasured(name, "cloud", f"{reason} ({found}, residuals {fit.sigma_mm:.2f} mm)")
     if support < o.least_support:
-        return NotMeasured(name, "cloud", f"too little of it is in the cloud ({found})")
+        return NotMeasured(name, "cloud", f"too little of it is where it should be: fallen over, or hidden ({found})")
     return _move(c, fit, support, o)
 
 
