@@ -275,7 +275,13 @@ def intake_summary(intake: Intake) -> dict[str, Any]:
     """Intake for ``photos.json``."""
     return {
         "photos": [
-            {"name": photo.name, "lens": photo.lens, "width": photo.width, "height": photo.height}
+            {
+                "name": photo.name,
+                "path": str(photo.path.resolve()),
+                "lens": photo.lens,
+                "width": photo.width,
+                "height": photo.height,
+            }
             for photo in intake.photos
         ],
         "rejected": dict(intake.rejected),
