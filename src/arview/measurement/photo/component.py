@@ -76,6 +76,8 @@ class MeasuredComponent:
         covariance = fit.covariance + project @ systematic @ project * np.outer(scale, scale)
         if self.views.pose_covariance is not None:
             covariance = covariance + by_poses @ self.views.pose_covariance @ by_poses.T
+        open_too = len(fit.undetermined) - len(self.free)
+        notes = (f"in {open_too} more directions than its shape leaves free it is not held",) if open_too > 0 else ()
         twist = np.concatenate([log_so3(place[:3, :3]), apply(place, self.center) - self.center])
         return Move(
             component=self.shape.name,
@@ -88,4 +90,5 @@ class MeasuredComponent:
             used=int(np.count_nonzero(fit.weights > 0.1)),
             residual_mm=fit.residual_mm,
             support=support,
+            notes=notes,
         )

@@ -181,7 +181,7 @@ class ComponentEdges:
         assert fit is not None
         support = self._support(edges, place, fit)
         used = int(np.count_nonzero(fit.weights > 0.1))
-        if support < o.least_support or used < o.least_points:
+        if support < o.least_support or used < o.least_points or len(fit.undetermined) == 6:
             return self._not(f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance")
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
         return self.body.move("edges", fit, by_poses, place, o.systematic_px * self.body.px_mm, support)
@@ -244,6 +244,7 @@ class ComponentEdges:
         fit = fit_rigid(
             rows, found.offsets_mm[ok] - dark * dark_mm, sigmas, self.body.free_at(place), self.body.radius_mm,
             self.options.undetermined_mm, edges.points[ok] / (4.0 * self.body.px_mm), o.least_sigma_px / _SIGMA_PX,
+            move_rows(edges.points[found.seen], found.directions[found.seen], center), o.least_direction,
         )  # fmt: skip
         left = found.offsets_mm[ok] - rows @ fit.twist
         prior = (0.05 * float(np.sum(fit.weights))) + 1.0

@@ -47,7 +47,8 @@ def fit_rigid(
     undetermined_mm: float,
     places: Array,
     least_sigma: float,
-    unit_mm: float | Array = 1.0,
+    looked_rows: Array | None = None,
+    least_support: float = 0.0,
 ) -> RigidFit:
     """Weighted least squares with Tukey's biweight (Holland & Welsch 1977) on ``offsets ≈ rows @ twist``.
 
@@ -63,7 +64,9 @@ def fit_rigid(
         undetermined_mm: limit of a direction's standard deviation.
         places: (N,D) coordinates in which neighbours are near each other, in correlation lengths or so.
         least_sigma: robust standard deviation of normalised residuals is not taken to be less.
-        unit_mm: size of a unit of offset in mm, for ``residual_mm``.
+        looked_rows: (L,6) of all that was looked at, whether it gave an offset or not; default ``rows``.
+        least_support: share of the information of ``looked_rows`` that must agree for a direction to be stated; below
+            twice as much its uncertainty grows.
     """
     scale = np.repeat([1.0 / radius_mm, 1.0], 3)
     scaled = rows * scale
@@ -93,20 +96,49 @@ def fit_rigid(
     is_in = weights > 0.0
     middle = _correlated(np.ascontiguousarray(weighted[is_in]), left[is_in], places[is_in])
     covariance = basis @ inverse @ middle @ inverse @ basis.T
+    shares, modes = _support(scaled, weights, scaled if looked_rows is None else looked_rows * scale, basis)
+    # Few of many agreeing is a sign of a wrong place among them: worse than their scatter shows.
+    grown = np.maximum(2.0 * least_support / np.maximum(shares, 1e-9), 1.0)
+    own = np.linalg.pinv(modes)
+    inner = own @ covariance @ own.T
+    covariance = covariance + modes @ np.diag(np.diag(inner) * (grown**2 - 1.0)) @ modes.T
     # What the covariance shows to be too poor to state is open as well.
     values, vectors = np.linalg.eigh(basis.T @ covariance @ basis)
-    is_open = values > undetermined_mm**2
-    held = basis @ vectors[:, ~is_open]
+    is_open = np.concatenate([(basis @ vectors[:, values > undetermined_mm**2]).T, modes[:, shares < least_support].T])
+    held = basis @ _across(is_open @ basis)
     project = held @ held.T
-    robust = left[is_in] * sigmas[is_in] * (unit_mm[is_in] if isinstance(unit_mm, np.ndarray) else unit_mm)
     return RigidFit(
         twist=project @ solution * scale,
         covariance=project @ covariance @ project * np.outer(scale, scale),
         undetermined=_complement(held.T).T,
         weights=weights,
-        residual_mm=1.4826 * float(np.median(np.abs(robust))) if is_in.any() else float("inf"),
+        residual_mm=1.4826 * float(np.median(np.abs(left[is_in] * sigmas[is_in]))) if is_in.any() else float("inf"),
         gain=scale[:, None] * (project @ gain),
     )
+
+
+def _support(rows: Array, weights: Array, looked: Array, basis: Array) -> tuple[Array, Array]:
+    """Share of the information looked for that agrees, ascending, and the moves (6,B) it belongs to."""
+    from scipy.linalg import eigh
+
+    inner, outer = rows @ basis, looked @ basis
+    if not basis.shape[1]:
+        return np.zeros(0), basis
+    wanted = outer.T @ outer
+    wanted += 1e-9 * np.trace(wanted) * np.eye(len(wanted))
+    shares, modes = eigh((inner * weights[:, None]).T @ inner, wanted)
+    modes = basis @ modes
+    return shares, modes / np.linalg.norm(modes, axis=0)
+
+
+def _across(directions: Array) -> Array:
+    """Orthonormal columns across all rows, which may depend on each other."""
+    size = directions.shape[1]
+    if not len(directions):
+        return np.eye(size)
+    _, values, vectors = np.linalg.svd(directions)
+    rank = int(np.count_nonzero(values > 1e-9))
+    return np.asarray(vectors[rank:].T)
 
 
 def _complement(directions: Array) -> Array:

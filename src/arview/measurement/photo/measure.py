@@ -31,8 +31,8 @@ def measure_components_in_photos(
 ) -> dict[str, Result]:
     """Where components stand, by each of the two ways.
 
-    Both start from the nominal place, by themselves. The frame is that of the poses: measure the datums, or the base
-    by its name, to state moves relative to it.
+    Both look around the nominal place by themselves, and where the other found the component. The frame is that of
+    the poses: measure the datums, or the base by its name, to state moves relative to it.
 
     Args:
         sparse: placed photos, mm, within about 0.3 mm and 0.05° in the frame of the model; or views of it.
@@ -66,7 +66,10 @@ def measure_component(views: PhotoViews, index: int, part: Part | None, options:
     """One component by both ways; when a way fails, whether the component is there at all is looked at."""
     body = MeasuredComponent(views, index, part, options)
     edges = ComponentEdges(body).measure()
-    sweep = ComponentSweep(body).measure()
+    # Where edges found it is one more place to look at; what the surface says there is its own.
+    sweep = ComponentSweep(body).measure([edges.measured_from_nominal] if isinstance(edges, Move) else [])
+    if isinstance(edges, NotMeasured) and isinstance(sweep, Move):
+        edges = ComponentEdges(body).measure(sweep.measured_from_nominal)
     if isinstance(edges, NotMeasured) and is_gone(body):
         reason = "not there: the photos show the surface that it should stand on"
         return {

@@ -27,6 +27,7 @@ class SweepOptions:
     least_sigma_mm: float = 0.015  # samples are never taken to be better: form, lens, tessellation
     least_samples: int = 25  # fewer that agree are no measurement
     least_support: float = 0.15  # share of the visible samples that must agree
+    least_direction: float = 0.2  # share of what is seen of a direction that must agree, or it is undetermined
     systematic_mm: float = 0.004  # of the whole component, any direction: what residuals do not show
     systematic_share: float = 0.25  # of the residuals that is alike all over: reflections, shadows, blur at edges
 
@@ -45,6 +46,7 @@ class EdgeOptions:
     least_sigma_px: float = 0.05  # residuals are never taken to be better: lens, tessellation, pixel response
     dark_shift_px: float = 0.1  # how far all edges may be shifted towards the dark side (1 σ): tone curve, glare
     least_points: int = 40  # fewer are no measurement
+    least_direction: float = 0.2  # share of what is seen of a direction that must agree, or it is undetermined
     least_support: float = 0.25  # share of predicted points with a step where the fit says, above chance
     systematic_px: float = 0.03  # what all edges of a component may be off together: chamfers, light
 

@@ -7,6 +7,7 @@ as in point-to-plane registration (Chen & Medioni 1992).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -212,16 +213,17 @@ class ComponentSweep:
         self._caster = RayCaster(body.shape.vertices_in_model, body.shape.faces)
         self._faces = face_normals(body.shape)
 
-    def measure(self, start: Array | None = None) -> Move | NotMeasured:
-        """The component's move; ``start`` (4,4, measured_from_nominal) where it is roughly known already."""
+    def measure(self, starts: Sequence[Array] = ()) -> Move | NotMeasured:
+        """The component's move; ``starts`` (4,4, places) are tried beside what the coarse round finds."""
         o = self.options.sweep
-        chosen = self._pick(np.eye(4) if start is None else start)
+        chosen = self._pick(np.eye(4))
         seen = np.count_nonzero(chosen >= 0, axis=1) >= o.least_views
         if np.count_nonzero(seen) < o.least_samples:
             return self._not(f"seen in fewer than {o.least_views} photos from near enough; take more of it")
-        place = self._coarse(chosen, seen) if start is None else start
         patches, is_on = self._cut(o.patch_points, o.patch_px / o.patch_points * self.body.px_mm)
         shades = shades_of(is_on)
+        places = [self._coarse(chosen, seen), *starts]
+        place = max(places, key=lambda p: self._alike(p, patches, is_on, shades)) if starts else places[0]
         fit: RigidFit | None = None
         range_px = o.fine_range_px
         for turn in range(o.rounds):
@@ -244,7 +246,7 @@ class ComponentSweep:
                     f"weak texture: only {np.count_nonzero(ok)} of {np.count_nonzero(seen)} samples of its surface "
                     "look alike in the photos"
                 )
-            fit = self._fit(moved.of(ok), found.offsets_mm[ok], found.variances_mm2[ok], place)
+            fit = self._fit(moved, found, seen, place)
             place = self.body.moved(place, fit.twist)
             step = self.body.size_mm(fit.twist)
             if turn >= 1 and step < o.settled_mm:
@@ -255,9 +257,20 @@ class ComponentSweep:
         support = used / max(1, int(np.count_nonzero(seen)))
         if support < o.least_support or used < o.least_samples:
             return self._not(f"weak texture or not there: {100 * support:.0f} % of its surface agrees on a place")
+        if len(fit.undetermined) == 6:
+            return self._not("weak texture: in no direction does enough of its surface agree on a place")
         by_poses = fit.gain @ pose_rows(self.views, moved.of(ok), found.views[ok])
         systematic_mm = float(np.hypot(o.systematic_mm, o.systematic_share * fit.residual_mm))
         return self.body.move("sweep", fit, by_poses, place, systematic_mm, support)
+
+    def _alike(self, place: Array, patches: Array, is_on: NDArray[np.bool_], shades: Array) -> float:
+        """How much of the surface looks alike at a place, within a pixel along its normals."""
+        steps = 0.7 * self.body.px_mm * np.arange(-1.0, 2.0)
+        normals = self.samples.normals @ place[:3, :3].T
+        scores, _, _ = sweep_scores(
+            apply(place, patches), is_on, shades, normals, steps, self._pick(place), self.views.levels[0], 1.5
+        )
+        return float(np.maximum(scores.max(axis=1) - 0.3, 0.0).sum())
 
     def _pick(self, place: Array) -> Indices:
         moved = Samples(apply(place, self.samples.points), self.samples.normals @ place[:3, :3].T)
@@ -302,12 +315,13 @@ class ComponentSweep:
             ).twist  # fmt: skip
         return self.body.moved(np.eye(4), twist)
 
-    def _fit(self, moved: Samples, offsets: Array, variances: Array, place: Array) -> RigidFit:
-        o = self.options.sweep
+    def _fit(self, moved: Samples, found: Offsets, seen: NDArray[np.bool_], place: Array) -> RigidFit:
+        o, ok = self.options.sweep, found.is_ok
+        rows = move_rows(moved.points, moved.normals, apply(place, self.body.center))
         return fit_rigid(
-            move_rows(moved.points, moved.normals, apply(place, self.body.center)), offsets,
-            np.sqrt(variances + o.least_sigma_mm**2), self.body.free_at(place), self.body.radius_mm,
-            self.options.undetermined_mm, self._places(moved), 0.3,
+            rows[ok], found.offsets_mm[ok], np.sqrt(found.variances_mm2[ok] + o.least_sigma_mm**2),
+            self.body.free_at(place), self.body.radius_mm, self.options.undetermined_mm, self._places(moved.of(ok)),
+            0.3, rows[seen], o.least_direction,
         )  # fmt: skip
 
     def _places(self, samples: Samples) -> Array:
