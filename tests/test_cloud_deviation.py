@@ -1,5 +1,6 @@
 """Components measured in simulated clouds of a small assembly, and what is said where there is nothing to measure."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import trimesh
 
 from arview.cad.model import Component, make_model
-from arview.cad.part import ComponentSettings, Part
+from arview.cad.part import ComponentSettings, Part, load_part
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import apply, look_at
@@ -29,6 +30,7 @@ from arview.measurement.types import Move, NotMeasured
 from arview.measurement.visibility import Views
 from arview.reconstruction.types import DenseCloud, PosedPhoto
 
+PLATE = Path(__file__).parents[2] / "shared" / "data" / "plate"
 NOISE_MM = 0.08
 POST, TALL, BLOCK, NUT = "post", "tall_post", "block", "nut"
 
@@ -276,3 +278,25 @@ def test_full_width_at_half_maximum_of_known_distributions():
     assert full_width_at_half_maximum(narrow, 3.0) == pytest.approx(0.2355, rel=0.04)
     tails = np.concatenate([narrow, rng.uniform(-2, 2, 10_000)])
     assert full_width_at_half_maximum(tails, 3.0) == pytest.approx(0.2355, rel=0.08)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PLATE.is_dir(), reason="needs the plate photo set beside the checkout")
+def test_plate_as_built_with_weld_beads():
+    """Points of the surface that was really rendered, weld beads included: only post_1 was displaced."""
+    part = load_part(PLATE / "plate.glb")
+    settings = tuple(replace(s, role="base" if s.name == "base_plate" else "inspect") for s in part.settings)
+    truth = json.loads((PLATE / "truth.json").read_text())
+    k = np.array(truth["K"])
+    camera = Camera(1600, 1200, k[0, 0], k[1, 1], k[0, 2], k[1, 2], np.array([*truth["dist_k1_k2"], 0, 0, 0]))
+    photos = [PosedPhoto(n, PLATE / n, camera, np.array(pose)) for n, pose in truth["cam_from_model_mm"].items()]
+    mesh = trimesh.load(PLATE / "as_built.ply")
+    built = make_model("built", (Component("built", np.array(mesh.vertices), np.array(mesh.faces, np.int32)),))
+    cloud = make_cloud(built, photos, spacing_mm=0.7, noise_mm=0.1)
+    found = measure_components_in_cloud(cloud, part.model, replace(part, settings=settings), photos)
+    assert len(found) == 16
+    for move in found:
+        assert isinstance(move, Move), move
+        true = np.array(truth["truth"][move.component]["displacement_mm"])
+        assert np.abs(move.displacement_mm - true).max() < 0.025, move.component
+    assert find_foreign(cloud, part.model, found) == []

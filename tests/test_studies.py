@@ -40,8 +40,8 @@ def test_noise_study_is_unbiased_and_repeatable():
     assert study.tables == again.tables
     for row in table(study):
         # 2,000 points scatter by some 35 um per mm of noise; of six runs the mean, four times over.
-        assert abs(row["bias_um"]) < 4.0 * 35.0 * row["sigma_mm"] / np.sqrt(6.0) + 0.05, row
-        assert row["std_um"] <= 60.0 * row["sigma_mm"] + 0.01, row
+        assert abs(row["bias_um"]) < 4.0 * 35.0 * row["sigma_mm"] / np.sqrt(6.0) + 0.1, row
+        assert row["std_um"] <= 60.0 * row["sigma_mm"] + 0.1, row
     assert noise_study(is_quick=True, seed=1).tables != study.tables
 
 
