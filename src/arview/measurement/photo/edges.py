@@ -179,7 +179,7 @@ class ComponentEdges:
             if turn >= len(rounds) - 3 and step < 0.002:
                 break
         assert fit is not None
-        support = self._support(edges, place, fit)
+        support = self._support(edges, place)
         used = int(np.count_nonzero(fit.weights > 0.1))
         if support < o.least_support or used < o.least_points or len(fit.undetermined) == 6:
             return self._not(f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance")
@@ -247,12 +247,11 @@ class ComponentEdges:
             move_rows(edges.points[found.seen], found.directions[found.seen], center), o.least_direction,
         )  # fmt: skip
         left = found.offsets_mm[ok] - rows @ fit.twist
-        prior = (0.05 * float(np.sum(fit.weights))) + 1.0
-        limit = o.dark_shift_px * 2.0 * self.body.px_mm
-        shift = float(np.sum(fit.weights * dark * left) / (np.sum(fit.weights) + prior))
+        limit = o.most_dark_shift_px * self.body.px_mm
+        shift = float(np.sum(fit.weights * dark * left) / (1.05 * np.sum(fit.weights) + 1.0))  # a little held at none
         return fit, float(np.clip(shift, -limit, limit))
 
-    def _support(self, edges: EdgePoints, place: Array, fit: RigidFit) -> float:
+    def _support(self, edges: EdgePoints, place: Array) -> float:
         """Share of the predicted points with a step within a pixel, less what is found beside them."""
         o = self.options.edges
         shares = []

@@ -44,7 +44,7 @@ class EdgeOptions:
     threshold: float = 1.0  # weakest step, grey levels of 255 per px in linear light
     half_slope: float = 6.0  # a step of this slope counts half
     least_sigma_px: float = 0.05  # residuals are never taken to be better: lens, tessellation, pixel response
-    dark_shift_px: float = 0.1  # how far all edges may be shifted towards the dark side (1 σ): tone curve, glare
+    most_dark_shift_px: float = 0.2  # how far all edges may be shifted towards the dark side: tone curve, glare
     least_points: int = 40  # fewer are no measurement
     least_direction: float = 0.2  # share of what is seen of a direction that must agree, or it is undetermined
     least_support: float = 0.25  # share of predicted points with a step where the fit says, above chance
