@@ -14,8 +14,9 @@ from arview.cad.part import ComponentSettings, Part, load_part
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import apply, look_at
+from arview.measurement import cloud_points
 from arview.measurement.cloud_deviation import measure_components_in_cloud
-from arview.measurement.cloud_points import CloudPoints, grid_average
+from arview.measurement.cloud_points import CloudPoints, grid_average, prepare_cloud
 from arview.measurement.distance_map import (
     distance_map,
     full_width_at_half_maximum,
@@ -300,3 +301,15 @@ def test_plate_as_built_with_weld_beads():
         true = np.array(truth["truth"][move.component]["displacement_mm"])
         assert np.abs(move.displacement_mm - true).max() < 0.025, move.component
     assert find_foreign(cloud, part.model, found) == []
+
+
+def test_a_cloud_too_large_for_one_piece_gives_the_same(cloud, model, monkeypatch):
+    box = model.bounds_in_model
+    whole = prepare_cloud(cloud, box, 0.5, 60)
+    monkeypatch.setattr(cloud_points, "_CHUNK", 20_000)
+    pieces = prepare_cloud(cloud, box, 0.5, 60)
+    assert len(pieces) == pytest.approx(len(whole), rel=0.1)
+    vertices, faces, _ = model.mesh
+    surface = Surface(vertices, faces)
+    spread = [np.nanmedian(np.abs(surface.closest(p.points, 0.5).distances)) for p in (whole, pieces)]
+    assert spread[1] == pytest.approx(spread[0], rel=0.2)

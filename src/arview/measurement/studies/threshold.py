@@ -18,13 +18,13 @@ METHODS = ("exact surface", "point to plane", "point to point", "point to point,
 TRUE_MM = 1.0
 
 
-def threshold_study(is_quick: bool = False, seed: int = 0) -> Study:
+def threshold_study(is_quick: bool = False, seed: int = 0, runs: int = 20) -> Study:
     """A post moved by 1 mm, 24,099 points, no noise, registered with thresholds of 0.1 … 1e-5 mm and degrees.
 
     The reference of the clouds is another sample of the surface, or the measured points themselves before they were
     moved: then the partners are exact and only the threshold is left as an error.
     """
-    runs, count = (2, 2000) if is_quick else (20, 24_099)
+    runs, count = (2, 2000) if is_quick else (runs, 24_099)
     surface, center = post()
 
     def run(job: tuple[str, float, int]) -> tuple[Array, int]:
