@@ -37,7 +37,7 @@ class SparseOptions:
     """How photos are placed."""
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
-    first_features: int = 3000  # a photo, in the first pass: matching by appearance grows with the square
+    first_features: int = 2500  # a photo, in the first pass: matching by appearance grows with the square
     preview_features: int = 400  # a photo, to choose the pairs worth matching; Wu 2013
     preview_matches: int = 5  # of those, in a pair worth matching; chance gives 0 to 3
     all_pairs_up_to: int = 12  # photos; every pair is matched
@@ -298,7 +298,7 @@ def _adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> boo
     principal point by half a pixel on good photos, and the focal length with it, so a small move is no finding.
     """
     before = {key: np.array(camera.params[1:3]) for key, camera in model.cameras.items() if _is_refined(camera)}
-    adjust(model, threads, refines_centre=True, iterations=30)
+    adjust(model, threads, refines_centre=True, iterations=12)
     moved = [float(np.abs(model.cameras[key].params[1:3] - centre).max()) for key, centre in before.items()]
     sizes = [max(model.cameras[key].width, model.cameras[key].height) for key in before]
     if any(
@@ -323,7 +323,7 @@ def _is_refined(camera: Any) -> bool:
     return bool(camera.model.name != CALIBRATED_MODEL)
 
 
-def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 50) -> Any:
+def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25) -> Any:
     """Bundle adjustment in place: poses, points, and the intrinsics of lenses that are not calibrated.
 
     Returns the solved pycolmap adjuster, from which covariances can be computed.
