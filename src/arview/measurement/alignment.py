@@ -54,6 +54,7 @@ class Equations:
         by_radius: (N,) derivative of the offsets by the radius of a hole or pin, which says nothing about its place
             (worn, edge rounded); None of others.
         locks: which of rx ry rz tx ty tz it may lock.
+        form_mm: standard uncertainty of its place that residuals do not show, beside that of the options.
     """
 
     label: str
@@ -65,6 +66,7 @@ class Equations:
     of: int
     by_radius: Array | None = None
     locks: tuple[str, ...] = DOF_NAMES
+    form_mm: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -257,7 +259,7 @@ def _result(
             reach = max(1.0, float(np.sqrt(((one.points - center) ** 2).sum(axis=1).mean())))
             rows = one.rows[:, :6] - one.rows[:, 3:6] @ _about(center)[:, :6]
             common = part @ (rows / np.array([reach] * 3 + [1.0] * 3))
-            share = share + options.form_mm**2 * common @ common.T
+            share = share + (options.form_mm**2 + one.form_mm**2) * common @ common.T
         rows = one.rows - one.rows[:, 3:6] @ _about(origin)
         rest = one.offsets_mm - rows @ move
         if one.by_radius is not None and fit.radius_mm is not None:
@@ -299,8 +301,8 @@ def _fit_alone(one: Equations, is_exact: bool) -> _Fit:
         return _Fit(1.0 / one.variances, one.variances, sigma, 1.0, None, np.ones(count, dtype=bool))
     center = one.points.mean(axis=0)
     local = one.rows[:, :6] - one.rows[:, 3:6] @ _about(center)[:, :6]
-    if one.by_radius is not None:
-        local = np.concatenate([local, one.by_radius[:, None]], axis=1)
+    if one.by_radius is not None:  # a small circle's tilt is no more than texture
+        local = np.concatenate([one.rows[:, 3:6], one.by_radius[:, None]], axis=1)
     share, residuals = robust_weights(local, one.offsets_mm, one.variances)
     inliers = share > 0.1
     noise = residuals / np.sqrt(one.variances)
@@ -317,7 +319,7 @@ def _fit_alone(one: Equations, is_exact: bool) -> _Fit:
     if one.by_radius is not None:
         weighted = local * weights[:, None]
         normal = np.linalg.pinv(weighted.T @ local, rcond=1e-12, hermitian=True)
-        radius = float((normal @ (weighted.T @ one.offsets_mm))[6])
+        radius = float((normal @ (weighted.T @ one.offsets_mm))[-1])
     sigma = float(1.4826 * np.median(np.abs(residuals[inliers]))) if inliers.any() else float("inf")
     return _Fit(weights, one.variances * factor * correlation, sigma, correlation, radius, inliers)
 

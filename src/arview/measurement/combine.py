@@ -138,12 +138,12 @@ def agreements(moves: Sequence[Move]) -> tuple[Agreement, ...]:
 
 def quantile_of_length(covariance: Array, probability: float = 0.95) -> float:
     """Length that a normal vector of zero mean stays below; its square is taken as scaled χ² (Satterthwaite 1946)."""
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv
 
     trace, square = float(np.trace(covariance)), float(np.sum(covariance * covariance.T))
     if trace <= 0 or square <= 0:
         return 0.0
-    return float(np.sqrt(square / trace * chi2.ppf(probability, trace**2 / square)))
+    return float(np.sqrt(2.0 * square / trace * gammaincinv(0.5 * trace**2 / square, probability)))
 
 
 def _determined(undetermined: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,9 @@ class DatumOptions:
     reach_mm: float = 1.0  # how far a feature may be from its rough place
     rim_points: int = 120  # around a hole; about a px apart on small ones
     fine_reach_px: float = 3.0  # around the place that the first look at a rim has found
+    rim_px: float = (
+        0.07  # standard uncertainty of a rim's place by what is around it: rust, chalk, burrs; six rims rendered
+    )
     rival_px: float = 3.0  # a point of a rim with the other rim so near, in that photo, is not looked at
     sweep: SweepOptions = field(default_factory=SweepOptions)
     edges: EdgeOptions = field(default_factory=EdgeOptions)
@@ -263,10 +266,18 @@ def _measure_rim(datum: Datum, views: PhotoViews, o: DatumOptions) -> Equations:
         weighted = design * (share / variances)[:, None]
         solution = np.linalg.pinv(weighted.T @ design, hermitian=True) @ (weighted.T @ offsets)
         shift, radius_mm, reach_px = solution[:3], float(solution[3]), o.fine_reach_px
-    places = points[which[ok]]
-    return surface_equations(
-        datum.label, datum.feature, places, directions, offsets, variances, len(which), by_radius, datum.locks
+    equations = surface_equations(
+        datum.label,
+        datum.feature,
+        points[which[ok]],
+        directions,
+        offsets,
+        variances,
+        len(which),
+        by_radius,
+        datum.locks,
     )
+    return replace(equations, form_mm=o.rim_px * px_mm)
 
 
 def _rim_views(views: PhotoViews, rim: Rim, points: Array, radial: Array, o: DatumOptions) -> NDArray[np.bool_]:
