@@ -33,7 +33,7 @@ class DatumOptions:
     rim_points: int = 120  # around a hole; about a px apart on small ones
     fine_reach_px: float = 3.0  # around the place that the first look at a rim has found
     rim_px: float = (
-        0.07  # standard uncertainty of a rim's place by what is around it: rust, chalk, burrs; six rims rendered
+        0.07  # standard uncertainty of a rim's place by what is around it: rust, chalk, burrs: as of four rendered rims
     )
     rival_px: float = 3.0  # a point of a rim with the other rim so near, in that photo, is not looked at
     sweep: SweepOptions = field(default_factory=SweepOptions)
