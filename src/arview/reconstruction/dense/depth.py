@@ -25,7 +25,7 @@ from arview.reconstruction.types import SparseModel
 
 STEPS = (4, 2)
 """Pixels of the working size per pixel of each PatchMatch stage; the depth maps have the last one's grid."""
-SWEEPS = (3, 1)
+SWEEPS = (2, 1)
 RANDOMS = 6
 POLISH_ITERATIONS = 3
 T = TypeVar("T")

@@ -30,7 +30,7 @@ NOISE, GEOMETRIC, MAP_STEP, BEST, FX, FY, CX, CY = range(8)
 _MAX_ERROR_PX = float32(3.0)
 _WORST = float32(2.0)
 _ZERO, _HALF, _ONE = float32(0.0), float32(0.5), float32(1.0)
-_COLOR_SCALE = float32(1.0 / 40.0)
+_COLOR_SCALE = float32(1.0 / 25.0)
 """One by the difference in grey at which a pixel of the window counts half: it may be another surface's."""
 
 
