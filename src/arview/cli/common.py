@@ -96,7 +96,6 @@ def stage_bar() -> Iterator[Callable[[str, int, int], None]]:
     from tqdm import tqdm
 
     with tqdm(disable=None, leave=False, unit="") as bar:
-
         shown = ""
 
         def update(stage: str, done: int, in_all: int) -> None:
