@@ -231,9 +231,10 @@ def test_clouds_that_do_not_belong(cloud, model, part, photos):
 
 
 def test_foreign_object_is_found_and_only_that(cloud, results, model, photos, moved):
-    assert find_foreign(cloud, model, list(results.values())) == []
+    places = {name: move.measured_from_nominal for name, move in results.items()}
+    assert find_foreign(cloud, model, places) == []
     thing = _component("thing", trimesh.creation.box((14.0, 9.0, 7.0)), (60, -35, 9.5))
-    found = find_foreign(make_cloud(model, photos, moved, extra=(thing,)), model, list(results.values()))
+    found = find_foreign(make_cloud(model, photos, moved, extra=(thing,)), model, places)
     assert len(found) == 1
     assert np.abs(found[0].center_in_model - [60, -35, 10]).max() < 3.0
     assert found[0].nearest_component == "base"
@@ -300,7 +301,7 @@ def test_plate_as_built_with_weld_beads():
         assert isinstance(move, Move), move
         true = np.array(truth["truth"][move.component]["displacement_mm"])
         assert np.abs(move.displacement_mm - true).max() < 0.025, move.component
-    assert find_foreign(cloud, part.model, found) == []
+    assert find_foreign(cloud, part.model, {move.component: move.measured_from_nominal for move in found}) == []
 
 
 def test_a_cloud_too_large_for_one_piece_gives_the_same(cloud, model, monkeypatch):

@@ -22,7 +22,8 @@ from arview.measurement import folder as folder_module
 from arview.measurement import run
 from arview.measurement.datums import base_plane, find_rim, plane_samples
 from arview.measurement.folder import MetricReconstruction, read_folder
-from arview.measurement.run import MeasureOptions, measure
+from arview.measurement.options import MeasureOptions
+from arview.measurement.run import measure
 from arview.measurement.uncertainty import UncertaintyOptions
 from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import PosedPhoto, SparseModel

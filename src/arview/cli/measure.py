@@ -46,11 +46,13 @@ distance 95 times of 100).
 A component passes when distance + guard * U is within its tolerance, fails when distance - guard * U is not, and is
 undecided between (ISO 14253-1). Tolerances come from the part file, else from --tolerance; they are radii: position
 tolerance zones of drawings (ISO 1101) are diameters, twice as large. INSPECTION holds all: covariance, methods,
-budget, datums; `arview annotate --inspection` draws it.
+budget, datums; `arview annotate --inspection` draws it. Where there is a cloud, surfaces that belong to nothing in the
+CAD are foreign objects, and the signed distances of its points to the nominal CAD are written to the folder
+INSPECTION_distances: coloured PLY, a picture, histograms.
 
 \b
 Exit codes: 0 every component passes, 3 one fails or is missing, 4 none fails but one is undecided or was not
-measured, 2 bad input, 130 interrupted.""",
+measured, or there is a foreign object, 2 bad input, 130 interrupted.""",
 )
 @click.argument("folder", metavar="OUT")
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
@@ -66,6 +68,7 @@ measured, 2 bad input, 130 interrupted.""",
     "--correct-bias", is_flag=True, help="Judge the most likely true distance: noise makes small ones larger."
 )
 @click.option("--no-monte-carlo", is_flag=True, help="Combine uncertainties by their sum of squares alone.")
+@click.option("--no-maps", is_flag=True, help="Leave out the distance map's pictures and PLY.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the Monte Carlo.")
 @click.option("--anyway", is_flag=True, help="Measure though the reconstruction does not have the CAD's shape.")
 @UNIT
@@ -79,6 +82,7 @@ def measure(
     methods: tuple[Method, ...],
     correct_bias: bool,
     no_monte_carlo: bool,
+    no_maps: bool,
     seed: int,
     anyway: bool,
     unit: str | None,
@@ -89,15 +93,17 @@ def measure(
     from arview.measurement import run
     from arview.measurement.decision import DecisionOptions
     from arview.measurement.folder import read_folder
+    from arview.measurement.options import MeasureOptions
     from arview.measurement.uncertainty import UncertaintyOptions
 
     target = output_path(output or str(Path(folder) / "inspection.json"), [part_path])
     part = load_part(part_path, unit)
-    options = run.MeasureOptions(
+    options = MeasureOptions(
         methods=methods,
         tolerance_mm=tolerance,
         corrects_bias=correct_bias,
         uses_inconsistent=anyway,
+        maps_folder=None if no_maps else target.parent / f"{target.stem}_distances",
         uncertainty=UncertaintyOptions(monte_carlo=not no_monte_carlo, seed=seed),
         decision=DecisionOptions(guard),
     )
@@ -112,11 +118,11 @@ def measure(
 
 
 def exit_code(inspection: Inspection) -> int:
-    """0 when all pass, 3 when one fails, 4 when one is undecided or not measured."""
+    """0 when all pass, 3 when one fails, 4 when one is undecided or not measured, or something foreign is there."""
     verdicts = {component.verdict.value for component in inspection.components}
     if "fail" in verdicts:
         return EXIT_FAIL
-    return EXIT_UNDECIDED if verdicts - {"pass"} else 0
+    return EXIT_UNDECIDED if verdicts - {"pass"} or inspection.foreign_objects else 0
 
 
 def _print(inspection: Inspection, target: Path) -> None:
@@ -144,11 +150,24 @@ def _print(inspection: Inspection, target: Path) -> None:
     for component in inspection.components:
         for note in component.details.notes if component.details else ():
             say(f"{component.name}: {note}")
+    for one in inspection.foreign_objects:
+        click.echo(one.text)
+    if inspection.distance_map is not None:
+        whole = inspection.distance_map.statistics[0]
+        click.echo(
+            f"distances of the cloud to the CAD: {whole.count} points, mean {whole.mean_mm:+.3f}, sigma "
+            f"{whole.sigma_mm:.3f}, FWHM {whole.fwhm_mm:.3f} mm"
+        )
     counts = [f"{sum(c.verdict.value == v for c in inspection.components)} {v.replace('_', ' ')}" for v in
               ("pass", "fail", "undecided", "not_measured")]  # fmt: skip
     missing = [c.name for c in inspection.components if c.finding is not None]
+    if inspection.foreign_objects:
+        counts.append(f"{len(inspection.foreign_objects)} foreign")
     click.echo(", ".join(counts) + (f"; missing: {', '.join(missing)}" if missing else ""))
     click.echo(f"wrote {target}")
+    if inspection.distance_map is not None and inspection.distance_map.files:
+        cloud, *pictures = inspection.distance_map.files
+        click.echo(f"wrote {target.parent / cloud} and {len(pictures)} pictures")
 
 
 def _row(component: ComponentDeviation) -> str:

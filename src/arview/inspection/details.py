@@ -148,6 +148,39 @@ class DatumSystem:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class ForeignReport:
+    """A surface that belongs to nothing in the CAD: box in the datum frame, mm, area, how far from what, in words."""
+
+    center_mm: Vector3
+    size_mm: Vector3
+    area_mm2: float
+    nearest_component: str
+    distance_mm: float
+    text: str
+
+
+@dataclass(frozen=True)
+class DistanceRow:
+    """Signed distances of the cloud's points to a component's nominal surface, or to all (``all``), mm."""
+
+    name: str
+    count: int
+    mean_mm: float
+    sigma_mm: float
+    median_mm: float
+    fwhm_mm: float
+
+
+@dataclass(frozen=True)
+class DistanceReport:
+    """Distances of the aligned cloud to the CAD: points within ``reach_mm`` alone; files beside the inspection."""
+
+    reach_mm: float
+    statistics: tuple[DistanceRow, ...]
+    files: tuple[str, ...] = ()
+
+
 def to_json(value: Any) -> Any:
     """Dataclasses as objects, tuples as lists; fields that hold their default are left out."""
     if is_dataclass(value) and not isinstance(value, type):

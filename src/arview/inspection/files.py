@@ -16,7 +16,7 @@ import jsonschema
 from arview.atomic import replacing
 from arview.cad.model import Model
 from arview.errors import InputError, MismatchError, OutputError
-from arview.inspection.details import DatumSystem, Details, from_json, to_json
+from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport, from_json, to_json
 from arview.inspection.record import (
     READABLE_VERSIONS,
     SCHEMA_VERSION,
@@ -167,7 +167,7 @@ def _from_document(document: dict[str, Any]) -> Inspection:
         except InputError as error:
             raise InputError(f"components[{index}].{error} (component {entry['name']!r})") from None
     source = document["provenance"]
-    datums = document.get("datum_system")
+    datums, distances = document.get("datum_system"), document.get("distance_map")
     return Inspection(
         part=document["part"],
         serial=document["serial"],
@@ -187,6 +187,8 @@ def _from_document(document: dict[str, Any]) -> Inspection:
         ),
         datum_system=None if datums is None else from_json(DatumSystem, datums),
         warnings=tuple(document.get("warnings", ())),
+        foreign_objects=tuple(from_json(ForeignReport, one) for one in document.get("foreign_objects", ())),
+        distance_map=None if distances is None else from_json(DistanceReport, distances),
     )
 
 
@@ -235,6 +237,10 @@ def _to_document(inspection: Inspection) -> dict[str, Any]:
         document["datum_system"] = to_json(inspection.datum_system)
     if inspection.warnings:
         document["warnings"] = list(inspection.warnings)
+    if inspection.foreign_objects:
+        document["foreign_objects"] = to_json(inspection.foreign_objects)
+    if inspection.distance_map is not None:
+        document["distance_map"] = to_json(inspection.distance_map)
     return document
 
 

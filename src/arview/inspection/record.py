@@ -9,7 +9,7 @@ from enum import StrEnum
 
 from arview.cad.model import Model
 from arview.errors import InputError, MismatchError
-from arview.inspection.details import DatumSystem, Details
+from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport
 
 SCHEMA_VERSION = "1.1"
 READABLE_VERSIONS = ("1.0", "1.1")
@@ -176,6 +176,8 @@ class Inspection:
         provenance: where the numbers come from.
         datum_system: the frame of the deviations; None in files of version 1.0.
         warnings: in words, what speaks against the whole.
+        foreign_objects: what is there beside the components, the largest first.
+        distance_map: of the cloud, where there is one.
 
     Raises:
         InputError: a component appears twice, or ``created`` has no time zone.
@@ -189,6 +191,8 @@ class Inspection:
     provenance: Provenance
     datum_system: DatumSystem | None = None
     warnings: tuple[str, ...] = ()
+    foreign_objects: tuple[ForeignReport, ...] = ()
+    distance_map: DistanceReport | None = None
 
     def __post_init__(self) -> None:
         if self.created.utcoffset() != timedelta(0):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,6 @@ from arview.cad.model import Model
 from arview.geometry import Array, apply
 from arview.measurement.cloud_points import prepare_cloud
 from arview.measurement.surface import Surface
-from arview.measurement.types import Move, NotMeasured
 from arview.reconstruction.types import DenseCloud
 
 
@@ -53,15 +52,16 @@ class ForeignObject:
 
 
 def find_foreign(
-    cloud: DenseCloud, model: Model, moves: Sequence[Move | NotMeasured] = (), options: ForeignOptions | None = None
-) -> list[ForeignObject]:
+    cloud: DenseCloud, model: Model, places: Mapping[str, Array] | None = None, unknown: Sequence[str] = (),
+    options: ForeignOptions | None = None,
+) -> list[ForeignObject]:  # fmt: skip
     """Objects inside the model's box that are far from all of its surfaces, the largest first.
 
     Args:
         cloud: in the frame of the CAD, mm.
         model: nominal.
-        moves: of the components, so that displaced ones are no foreign objects. Around those that are not measured
-            and not missing nothing is said.
+        places: (4,4) ``measured_from_nominal`` by component, so that displaced ones are no foreign objects.
+        unknown: components that are there but could not be measured; around them nothing is said.
         options: see ForeignOptions.
 
     Raises:
@@ -72,13 +72,13 @@ def find_foreign(
     o = options or ForeignOptions()
     # What lies below the part and around it shows at the rim of its box.
     points = prepare_cloud(cloud, model.bounds_in_model + np.array([[o.far_mm], [-o.far_mm]]), o.grid_mm, 1).points
-    places = {m.component: m.measured_from_nominal for m in moves if isinstance(m, Move)}
-    vertices, faces, groups = model.mesh
+    places = places or {}
+    _, faces, groups = model.mesh
     parts = [apply(places.get(c.name, np.eye(4)), c.vertices_in_model) for c in model.components]
-    surface = Surface(np.concatenate(parts) if places else vertices, faces, groups)
+    surface = Surface(np.concatenate(parts), faces, groups)
     far = points[surface.closest(points, o.far_mm).faces < 0]
-    for unknown in (m for m in moves if isinstance(m, NotMeasured) and not m.is_missing):
-        low, high = model.component(unknown.component).bounds_in_model
+    for name in unknown:
+        low, high = model.component(name).bounds_in_model
         reach = float(np.linalg.norm(high - low))
         far = far[~np.all((far > low - reach) & (far < high + reach), axis=1)]
     if len(far) == 0:

@@ -1,0 +1,85 @@
+"""What an aligned cloud shows beside displacements: foreign objects, and its distances to the CAD."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from arview.cad.model import Model
+from arview.errors import InputError, OutputError
+from arview.geometry import apply, invert
+from arview.inspection import ComponentDeviation, DistanceReport, DistanceRow, ForeignReport, Verdict
+from arview.measurement.alignment import Alignment
+from arview.measurement.distance_map import (
+    DistanceMap,
+    distance_map,
+    histogram_picture,
+    map_picture,
+    write_distance_ply,
+)
+from arview.measurement.foreign import ForeignObject, find_foreign
+from arview.measurement.plot import save_picture
+from arview.reconstruction.types import DenseCloud
+
+
+def look_at_cloud(
+    cloud: DenseCloud, model: Model, alignment: Alignment, deviations: Sequence[ComponentDeviation],
+    folder: Path | None = None,
+) -> tuple[tuple[ForeignReport, ...], DistanceReport | None]:  # fmt: skip
+    """Foreign objects in a cloud of the rough frame, and its distances to the CAD in the datum frame.
+
+    Args:
+        cloud: mm, in the frame that ``alignment`` is of.
+        model: nominal.
+        alignment: datum frame.
+        deviations: of the components: foreign objects are looked for beside them where they were found.
+        folder: where ``distances.ply``, ``map.png`` and a histogram of each component are written; None: nowhere.
+
+    Raises:
+        OutputError: the folder cannot be written to.
+    """
+    datum_from_rough = invert(alignment.rough_from_datum)
+    aligned = replace(cloud, points=apply(datum_from_rough, np.asarray(cloud.points, dtype=np.float64)))
+    places = {d.name: np.array(d.details.measured_from_nominal) for d in deviations
+              if d.details is not None and d.details.measured_from_nominal is not None}  # fmt: skip
+    unknown = [d.name for d in deviations if d.verdict is Verdict.NOT_MEASURED]
+    try:
+        found = find_foreign(aligned, model, places, unknown)
+        distances = distance_map(aligned, model)
+    except InputError:  # nothing of the cloud is at the part: said of every component already
+        return (), None
+    files = () if folder is None else write_distance_map(distances, model, folder)
+    rows = tuple(
+        DistanceRow(row.name, row.count, row.mean_mm, row.sigma_mm, row.median_mm, row.fwhm_mm)
+        for row in distances.statistics
+    )
+    return tuple(_report(one) for one in found), DistanceReport(distances.reach_mm, rows, files)
+
+
+def write_distance_map(distances: DistanceMap, model: Model, folder: Path) -> tuple[str, ...]:
+    """Write the coloured cloud, its picture and the histograms; their names below the folder's parent.
+
+    Raises:
+        OutputError: the folder cannot be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made ({error.strerror or error})") from error
+    pictures = {"map.png": map_picture(distances), "histogram.png": histogram_picture(distances, model)}
+    for row in distances.statistics[1:]:
+        name = "".join(c if c.isalnum() or c in "-_" else "_" for c in row.name)
+        pictures[f"histogram_{name}.png"] = histogram_picture(distances, model, row.name)
+    write_distance_ply(distances, folder / "distances.ply")
+    for name, picture in pictures.items():
+        save_picture(picture, folder / name)
+    return tuple(f"{folder.name}/{name}" for name in ("distances.ply", *pictures))
+
+
+def _report(one: ForeignObject) -> ForeignReport:
+    x, y, z = one.center_in_model.tolist()
+    a, b, c = one.size_mm.tolist()
+    return ForeignReport((x, y, z), (a, b, c), one.area_mm2, one.nearest_component, one.distance_mm, one.describe())

@@ -1,0 +1,55 @@
+"""Options of a measurement, and what all methods found of a component."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from arview.errors import InputError
+from arview.measurement.alignment import AlignmentOptions
+from arview.measurement.combine import Combined, combine
+from arview.measurement.datums import DatumOptions
+from arview.measurement.decision import DecisionOptions
+from arview.measurement.photo import PhotoOptions
+from arview.measurement.types import Method, Move, NotMeasured
+from arview.measurement.uncertainty import UncertaintyOptions
+
+METHODS: tuple[Method, ...] = ("sweep", "edges", "cloud")
+
+
+@dataclass(frozen=True)
+class MeasureOptions:
+    """Options of a measurement: those of its parts, and what is asked for."""
+
+    methods: tuple[Method, ...] = METHODS  # the cloud only where there is one
+    tolerance_mm: float | None = None  # of components for which the part file says nothing; None: not judged
+    corrects_bias: bool = False  # decide on the most likely true distance instead of the measured one
+    uses_inconsistent: bool = False  # go on though the reconstruction does not have the CAD's shape
+    maps_folder: Path | None = None  # where pictures and PLY of the distance map are written; None: nowhere
+    photo: PhotoOptions = field(default_factory=PhotoOptions)
+    datums: DatumOptions = field(default_factory=DatumOptions)
+    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
+    uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
+    decision: DecisionOptions = field(default_factory=DecisionOptions)
+
+    def __post_init__(self) -> None:
+        unknown = [method for method in self.methods if method not in METHODS]
+        if unknown or not self.methods:
+            raise InputError(f"methods {', '.join(self.methods) or 'none'}: expected some of {', '.join(METHODS)}")
+        if self.tolerance_mm is not None and not self.tolerance_mm > 0:
+            raise InputError(f"tolerance {self.tolerance_mm} mm: expected more than 0")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A component's results by all methods, before the datum frame."""
+
+    moves: tuple[Move, ...]
+    failures: tuple[NotMeasured, ...]
+
+
+def combined_of(measured: Measured) -> Combined | None:
+    """The move that counts: sweep and edges together; the cloud's alone where neither could."""
+    direct = [move for move in measured.moves if move.method != "cloud"]
+    moves = direct or list(measured.moves)
+    return combine(moves) if moves else None
