@@ -45,6 +45,12 @@ class MeasuredComponent:
         """The largest part of a move, turns at the component's rim."""
         return float(np.abs(twist * np.repeat([self.radius_mm, 1.0], 3)).max())
 
+    def is_same(self, place: Array, other: Array) -> bool:
+        """Whether no corner of the component's box differs by a quarter of a pixel: too little to hide or show it."""
+        low, high = self.shape.bounds_in_model
+        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+        return float(np.linalg.norm(apply(place, corners) - apply(other, corners), axis=1).max()) < 0.25 * self.px_mm
+
     def free_at(self, place: Array) -> Array:
         """The free directions turned along with the component."""
         turn = place[:3, :3].T

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from arview.cad.model import make_model
 from arview.camera import Camera
-from arview.geometry import Array, apply, rigid
+from arview.geometry import Array, apply, invert, rigid
 from arview.guideviews.mesh_edges import EDGE_CREASE, EDGE_SILHOUETTE, mesh_edges, sample_visible_edges
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
@@ -152,6 +152,7 @@ class ComponentEdges:
     def __init__(self, body: MeasuredComponent) -> None:
         self.body, self.views, self.options = body, body.views, body.options
         self._edges = mesh_edges(make_model(body.shape.name, (body.shape,)), CREASE_DEG)
+        self._predicted: tuple[Array, EdgePoints] | None = None
 
     def measure(self, start: Array | None = None) -> Move | NotMeasured:
         """The component's move; ``start`` (4,4, measured_from_nominal) where it is roughly known already."""
@@ -165,7 +166,6 @@ class ComponentEdges:
         rounds = [(k, 6.0) for k in levels] + [(0, reach) for reach in o.reaches_px]
         if start is None:
             place = self._capture(edges, levels[0] if levels else 0)
-        fit: RigidFit | None = None
         dark_mm = 0.0
         for turn, (level, reach_px) in enumerate(rounds):
             edges = self.predicted(place)
@@ -173,12 +173,14 @@ class ComponentEdges:
             ok = found.seen & (found.slopes != 0.0)
             if np.count_nonzero(ok) < o.least_points:
                 return self._not(f"only {np.count_nonzero(ok)} of {len(ok)} points of its edges are seen in the photos")
-            fit, dark_mm = self._fit(edges, found, ok, place, dark_mm)
+            before, dark_before_mm = place, dark_mm
+            fit, dark_mm = self._fit(edges, found, ok, place, dark_mm, is_last=False)
             place = self.body.moved(place, fit.twist)
             step = self.body.size_mm(fit.twist)
             if turn >= len(rounds) - 3 and step < 0.002:
                 break
-        assert fit is not None
+        fit, _ = self._fit(edges, found, ok, before, dark_before_mm)
+        place = self.body.moved(before, fit.twist)
         support = self._support(edges, place)
         used = int(np.count_nonzero(fit.weights > 0.1))
         if support < o.least_support or used < o.least_points or len(fit.undetermined) == 6:
@@ -187,7 +189,14 @@ class ComponentEdges:
         return self.body.move("edges", fit, by_poses, place, o.systematic_px * self.body.px_mm, support)
 
     def predicted(self, place: Array) -> EdgePoints:
-        """Edge points that the photos should show with the component at a place, joints left out."""
+        """Edge points that the photos should show with the component at a place, joints left out.
+
+        A place as good as the same as the last one shows the same points, moved along.
+        """
+        if self._predicted is not None and self.body.is_same(self._predicted[0], place):
+            before, edges = self._predicted
+            step = place @ invert(before)
+            return EdgePoints(apply(step, edges.points), edges.tangents @ step[:3, :3].T, edges.view)
         o = self.options.edges
         corners = apply(place, _box_corners(self.body.shape.bounds_in_model))
         points, tangents, views = [], [], []
@@ -213,11 +222,13 @@ class ComponentEdges:
         kept = np.flatnonzero(apart)
         if len(kept) > o.most_points:
             kept = kept[:: int(np.ceil(len(kept) / o.most_points))]
-        return EdgePoints(
+        edges = EdgePoints(
             apply(place, all_points[kept]),
             np.concatenate(tangents)[kept] @ place[:3, :3].T,
             np.concatenate(views)[kept],
         )
+        self._predicted = (place, edges)
+        return edges
 
     def _capture(self, edges: EdgePoints, level: int) -> Array:
         """Where most edges have a step, within the capture range: votes of shifts by all steps that were found."""
@@ -227,13 +238,18 @@ class ComponentEdges:
         found = edge_offsets(some, self.body.center, self.views, o.capture_mm / px_mm + 2.0, o, level)
         shifts = self.body.shifts(o.capture_mm)
         worth = np.abs(found.strengths) / (np.abs(found.strengths) + o.half_slope)
-        votes = _vote(found.hypotheses_mm, worth, found.directions, shifts, max(0.4, 1.2 * px_mm))
+        order = np.argsort(-worth.max(axis=1), kind="stable")  # what weighs most first: losers are seen early
+        order = order[worth[order].max(axis=1) > 0.0]
+        votes = _vote(
+            found.hypotheses_mm[order], worth[order], found.directions[order], shifts, max(0.4, 1.2 * px_mm), 0.99
+        )
         best = shifts[np.flatnonzero(votes > 0.99 * votes.max())[0]]
         return rigid(np.eye(3), best)
 
     def _fit(
-        self, edges: EdgePoints, found: EdgeOffsets, ok: NDArray[np.bool_], place: Array, dark_mm: float
-    ) -> tuple[RigidFit, float]:
+        self, edges: EdgePoints, found: EdgeOffsets, ok: NDArray[np.bool_], place: Array, dark_mm: float,
+        is_last: bool = True,
+    ) -> tuple[RigidFit, float]:  # fmt: skip
         """Fit, with all edges shifted alike to the dark side as the round before showed; and that shift anew."""
         o = self.options.edges
         size, slope = found.mm_per_px[ok], found.slopes[ok]
@@ -245,6 +261,7 @@ class ComponentEdges:
             rows, found.offsets_mm[ok] - dark * dark_mm, sigmas, self.body.free_at(place), self.body.radius_mm,
             self.options.undetermined_mm, edges.points[ok] / (4.0 * self.body.px_mm), o.least_sigma_px / _SIGMA_PX,
             move_rows(edges.points[found.seen], found.directions[found.seen], center), o.least_direction,
+            most_pairs=len(ok) if is_last else _FEW_PAIRS,
         )  # fmt: skip
         left = found.offsets_mm[ok] - rows @ fit.twist
         limit = o.most_dark_shift_px * self.body.px_mm
@@ -268,6 +285,8 @@ class ComponentEdges:
 
 CREASE_DEG = 35.0
 """Faces that meet at more are an edge; less are facets of a curved surface, more or less coarse."""
+_FEW_PAIRS = 700
+"""Points whose pairs say how alike errors are, while the place is still being sought."""
 _SIGMA_PX = 0.3
 """Of a strong step; what residuals show replaces it."""
 
@@ -276,13 +295,22 @@ def _box_corners(bounds: Array) -> Array:
     return np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
-@njit(cache=True, nogil=True)
-def _vote(hypotheses, worth, directions, shifts, width):  # type: ignore[no-untyped-def]
-    """(T,) sum over points of the best step near where shifts (T,3) put it."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _vote(hypotheses, worth, directions, shifts, width, share):  # type: ignore[no-untyped-def]
+    """(T,) sum over points of the best step near where shifts (T,3) put it.
+
+    Shifts that cannot come to ``share`` of the best one's are given up, with what they have come to.
+    """
     votes = np.zeros(shifts.shape[0])
+    rest = np.zeros(hypotheses.shape[0] + 1)
+    for i in range(hypotheses.shape[0] - 1, -1, -1):
+        rest[i] = rest[i + 1] + worth[i].max()
+    highest = 0.0
     for t in range(shifts.shape[0]):
         total = 0.0
         for i in range(hypotheses.shape[0]):
+            if total + rest[i] < share * highest:
+                break
             along = 0.0
             for k in range(3):
                 along += directions[i, k] * shifts[t, k]
@@ -293,4 +321,5 @@ def _vote(hypotheses, worth, directions, shifts, width):  # type: ignore[no-unty
                     best = max(best, worth[i, k] * (1.0 - off * off))
             total += best
         votes[t] = total
+        highest = max(highest, total)
     return votes

@@ -49,6 +49,7 @@ def fit_rigid(
     least_sigma: float,
     looked_rows: Array | None = None,
     least_support: float = 0.0,
+    most_pairs: int = 1_000_000,
 ) -> RigidFit:
     """Weighted least squares with Tukey's biweight (Holland & Welsch 1977) on ``offsets ≈ rows @ twist``.
 
@@ -67,6 +68,7 @@ def fit_rigid(
         looked_rows: (L,6) of all that was looked at, whether it gave an offset or not; default ``rows``.
         least_support: share of the information of ``looked_rows`` that must agree for a direction to be stated; below
             twice as much its uncertainty grows.
+        most_pairs: points whose pairs say how alike residuals are; fewer take the covariance from every so manieth.
     """
     scale = np.repeat([1.0 / radius_mm, 1.0], 3)
     scaled = rows * scale
@@ -94,7 +96,10 @@ def fit_rigid(
     inverse = np.linalg.pinv(weighted.T @ (white @ basis), hermitian=True)
     gain = (basis @ inverse @ weighted.T) / sigmas  # scaled twist by offset
     is_in = weights > 0.0
-    middle = _correlated(np.ascontiguousarray(weighted[is_in]), left[is_in], places[is_in])
+    some = np.flatnonzero(is_in)
+    stride = max(1, -(-len(some) // most_pairs))
+    some = some[::stride]
+    middle = stride * _correlated(np.ascontiguousarray(weighted[some]), left[some], places[some], stride)
     covariance = basis @ inverse @ middle @ inverse @ basis.T
     shares, modes = _support(scaled, weights, scaled if looked_rows is None else looked_rows * scale, basis)
     # Few of many agreeing is a sign of a wrong place among them: worse than their scatter shows.
@@ -148,8 +153,11 @@ def _complement(directions: Array) -> Array:
     return np.asarray(np.linalg.svd(directions)[2][len(directions) :].T)
 
 
-def _correlated(rows: Array, residuals: Array, places: Array) -> Array:
-    """(B,B) covariance of ``rows.T @ errors`` when errors are as alike as residuals at the same distance are."""
+def _correlated(rows: Array, residuals: Array, places: Array, stride: int = 1) -> Array:
+    """(B,B) covariance of ``rows.T @ errors`` when errors are as alike as residuals at the same distance are.
+
+    Of every ``stride``-th row it is the share: each stands for so many neighbours.
+    """
     edges = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0])
     if len(residuals) < 2:
         return rows.T @ rows
@@ -161,7 +169,7 @@ def _correlated(rows: Array, residuals: Array, places: Array) -> Array:
     # Once they are unlike they stay so: what a few pairs far apart show is chance.
     alike = np.minimum.accumulate(alike)
     alike[-1] = 0.0
-    return np.asarray(variance * (rows.T @ rows + _spread(bins, alike, rows)))
+    return np.asarray(variance * (rows.T @ rows + stride * _spread(bins, alike, rows)))
 
 
 @njit(cache=True, nogil=True)

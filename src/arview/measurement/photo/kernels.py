@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+_FAST = {"reassoc", "contract", "arcp", "nsz"}
+"""Sums may be done in any order: four numbers at a time."""
 
-@njit(cache=True, nogil=True)
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def sweep_scores(patches, is_on, shades, normals, steps, views, stack, least_contrast):  # type: ignore[no-untyped-def]
     """Mean correlation (ZNCC) over all pairs of views of patches moved along their normals.
 
@@ -30,11 +33,12 @@ def sweep_scores(patches, is_on, shades, normals, steps, views, stack, least_con
     scores = np.full((n, s_all), -1.0, dtype=np.float32)
     count = np.zeros((n, s_all), dtype=np.int8)
     alike = np.full((n, s_all, v_all), -1.0, dtype=np.float32)
-    ahead = np.empty((v_all, p_all, 3))
+    ahead = np.empty((v_all, 3, p_all))
     toward = np.empty((v_all, 3))
     values = np.empty((v_all, p_all))
     total = np.empty(p_all)
-    shade = np.empty((p_all, 3))
+    shade = np.empty((3, p_all))
+    across, down = np.empty(p_all), np.empty(p_all)
     for i in range(n):
         used = 0
         for p in range(p_all):
@@ -44,12 +48,12 @@ def sweep_scores(patches, is_on, shades, normals, steps, views, stack, least_con
                     if m < 0:
                         continue
                     for k in range(3):
-                        ahead[v, used, k] = (
+                        ahead[v, k, used] = (
                             poses[m, k, 0] * patches[i, p, 0] + poses[m, k, 1] * patches[i, p, 1]
                             + poses[m, k, 2] * patches[i, p, 2] + poses[m, k, 3]
                         )  # fmt: skip
                 for k in range(3):
-                    shade[used, k] = shades[i, p, k]
+                    shade[k, used] = shades[i, p, k]
                 used += 1
         if used < 9:
             continue
@@ -73,33 +77,38 @@ def sweep_scores(patches, is_on, shades, normals, steps, views, stack, least_con
                 fx, fy, cx, cy = lenses[m, 0], lenses[m, 1], lenses[m, 2], lenses[m, 3]
                 k1, k2, p1, p2, k3 = lenses[m, 4], lenses[m, 5], lenses[m, 6], lenses[m, 7], lenses[m, 8]
                 mean, slope_a, slope_b = 0.0, 0.0, 0.0
-                is_inside = True
+                step_x, step_y, step_z = step * toward[v, 0], step * toward[v, 1], step * toward[v, 2]
                 for p in range(used):
-                    z = ahead[v, p, 2] + step * toward[v, 2]
-                    x = (ahead[v, p, 0] + step * toward[v, 0]) / z
-                    y = (ahead[v, p, 1] + step * toward[v, 1]) / z
+                    inverse = 1.0 / (ahead[v, 2, p] + step_z)
+                    x = (ahead[v, 0, p] + step_x) * inverse
+                    y = (ahead[v, 1, p] + step_y) * inverse
                     r2 = x * x + y * y
                     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-                    a = fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + cx
-                    b = fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + cy
+                    across[p] = fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + cx
+                    down[p] = fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + cy
+                is_inside = True
+                for p in range(used):
+                    a, b = across[p], down[p]
                     if not (a >= 0.0 and b >= 0.0 and a < width - 1 and b < height - 1):
                         is_inside = False
                         break
+                if not is_inside:
+                    continue
+                for p in range(used):
+                    a, b = across[p], down[p]
                     ia, ib = int(a), int(b)
                     fa, fb = a - ia, b - ib
                     at = start + ib * width + ia
                     top = pixels[at] * (1.0 - fa) + pixels[at + 1] * fa
                     bottom = pixels[at + width] * (1.0 - fa) + pixels[at + width + 1] * fa
-                    value = top * (1.0 - fb) + bottom * fb
-                    values[v, p] = value
-                    mean += value * shade[p, 0]
-                    slope_a += value * shade[p, 1]
-                    slope_b += value * shade[p, 2]
-                if not is_inside:
-                    continue
+                    values[v, p] = top * (1.0 - fb) + bottom * fb
+                for p in range(used):
+                    mean += values[v, p] * shade[0, p]
+                    slope_a += values[v, p] * shade[1, p]
+                    slope_b += values[v, p] * shade[2, p]
                 square = 0.0
                 for p in range(used):
-                    values[v, p] -= mean * shade[p, 0] + slope_a * shade[p, 1] + slope_b * shade[p, 2]
+                    values[v, p] -= mean * shade[0, p] + slope_a * shade[1, p] + slope_b * shade[2, p]
                     square += values[v, p] * values[v, p]
                 if square < used * least_contrast * least_contrast:
                     continue

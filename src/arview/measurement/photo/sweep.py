@@ -83,12 +83,8 @@ def sweep_offsets(
     patches, is_on = cut_patches(samples, caster, faces, o.patch_points, o.patch_px / o.patch_points * px_mm)
     chosen = pick_views(views, samples, o, component, removed=removed)
     steps = _steps(reach_mm, 0.4 * px_mm)
-    scores, count, alike = sweep_scores(
-        patches, is_on, shades_of(is_on), samples.normals, steps, chosen, views.levels[0], 1.5
-    )
-    chosen = without_outliers(chosen, scores, alike)
-    scores, count, _ = sweep_scores(
-        patches, is_on, shades_of(is_on), samples.normals, steps, chosen, views.levels[0], 1.5
+    scores, count, chosen = agreeing_scores(
+        patches, is_on, shades_of(is_on), samples.normals, steps, chosen, views, 1.5
     )
     return _peaks(scores, count, steps, is_on.sum(axis=1), chosen, o)
 
@@ -140,6 +136,21 @@ def without_outliers(chosen: Indices, scores: Array, alike: Array, least: float 
     kept = np.where(own >= least, chosen, -1)
     enough = np.count_nonzero(kept >= 0, axis=1) >= 3
     return np.where(enough[:, None], kept, chosen)
+
+
+def agreeing_scores(
+    patches: Array, is_on: NDArray[np.bool_], shades: Array, normals: Array, steps: Array, chosen: Indices,
+    views: PhotoViews, least_contrast: float,
+) -> tuple[Array, Array, Indices]:  # fmt: skip
+    """Scores (N,S) and numbers of views (N,S) of `sweep_scores` without the views unlike the others; those left."""
+    stack = views.levels[0]
+    scores, count, alike = sweep_scores(patches, is_on, shades, normals, steps, chosen, stack, least_contrast)
+    kept = without_outliers(chosen, scores, alike)
+    less = np.flatnonzero((kept != chosen).any(axis=1))
+    scores[less], count[less], _ = sweep_scores(
+        patches[less], is_on[less], shades[less], normals[less], steps, kept[less], stack, least_contrast
+    )
+    return scores, count, kept
 
 
 def _steps(reach_mm: float, step_mm: float) -> Array:
@@ -212,6 +223,7 @@ class ComponentSweep:
         self.patch_mm = o.patch_px * body.px_mm
         self._caster = RayCaster(body.shape.vertices_in_model, body.shape.faces)
         self._faces = face_normals(body.shape)
+        self._picked: list[tuple[Array, Indices]] = []
 
     def measure(self, starts: Sequence[Array] = ()) -> Move | NotMeasured:
         """The component's move; ``starts`` (4,4, places) are tried beside what the coarse round finds."""
@@ -231,12 +243,8 @@ class ComponentSweep:
             steps = _steps(range_px * self.body.px_mm, 0.4 * self.body.px_mm)
             moved = Samples(apply(place, self.samples.points), self.samples.normals @ place[:3, :3].T)
             shaped = apply(place, patches)
-            scores, count, alike = sweep_scores(
-                shaped, is_on, shades, moved.normals, steps, chosen, self.views.levels[0], o.least_contrast
-            )
-            chosen = without_outliers(chosen, scores, alike)
-            scores, count, alike = sweep_scores(
-                shaped, is_on, shades, moved.normals, steps, chosen, self.views.levels[0], o.least_contrast
+            scores, count, chosen = agreeing_scores(
+                shaped, is_on, shades, moved.normals, steps, chosen, self.views, o.least_contrast
             )
             found = _peaks(scores, count, steps, is_on.sum(axis=1), chosen, o)
             ok = found.is_ok
@@ -273,8 +281,14 @@ class ComponentSweep:
         return float(np.maximum(scores.max(axis=1) - 0.3, 0.0).sum())
 
     def _pick(self, place: Array) -> Indices:
+        """The photos to compare in; those of a place tried before, where that is as good as the same."""
+        for before, chosen in self._picked:
+            if self.body.is_same(before, place):
+                return chosen
         moved = Samples(apply(place, self.samples.points), self.samples.normals @ place[:3, :3].T)
-        return pick_views(self.views, moved, self.options.sweep, self.body.index, place)
+        chosen = pick_views(self.views, moved, self.options.sweep, self.body.index, place)
+        self._picked.append((place, chosen))
+        return chosen
 
     def _cut(self, width: int, spacing_mm: float) -> tuple[Array, NDArray[np.bool_]]:
         o = self.options.sweep
