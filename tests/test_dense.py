@@ -135,7 +135,7 @@ def test_cloud_lies_on_what_was_built(cloud: DenseCloud, scene: SparseModel) -> 
     assert score.far < 0.02  # the rim before a plain background
     assert score.complete > 0.85
     assert len(cloud.points) == len(cloud.normals) == len(cloud.colors) == len(cloud.sigma) == len(cloud.views)
-    assert cloud.views.min() >= 3
+    assert cloud.views.min() >= TINY.least_views
 
 
 def test_normals_colors_and_deviations_are_right(cloud: DenseCloud) -> None:

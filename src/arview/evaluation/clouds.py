@@ -140,7 +140,8 @@ def score_cloud(
         points: (N,3) of the cloud.
         vertices, faces: the true mesh.
         cameras: each photo's camera and true ``cam_from_mesh`` (4,4): what they see is what can be complete.
-        box: (2,3) lowest and highest corner; points outside are not judged (the table the part lies on).
+        box: (2,3) lowest and highest corner; what is outside is not judged, neither points (the table the part lies
+            on) nor surface.
         least_views: photos that must see a piece of the surface.
         near_mm: for completeness. far_mm: for ``far``.
 
@@ -149,12 +150,12 @@ def score_cloud(
     """
     from scipy.spatial import cKDTree
 
+    samples, _ = sample_mesh(vertices, faces, _SPACING_MM)
     if box is not None:
-        points = points[np.all((points >= box[0]) & (points <= box[1]), axis=1)]
+        points, samples = (p[np.all((p >= box[0]) & (p <= box[1]), axis=1)] for p in (points, samples))
     if len(points) == 0:
         raise InputError("cloud: has no points to judge")
     distance = distances_to_mesh(points, vertices, faces)
-    samples, _ = sample_mesh(vertices, faces, _SPACING_MM)
     visible = samples[views_of(samples, vertices, faces, cameras) >= least_views]
     if len(visible) == 0:
         raise InputError(f"cloud: no surface of the mesh is seen by {least_views} photos; do the poses belong to it?")

@@ -141,7 +141,7 @@ def measure_components_in_cloud(
 
         def again(index: int) -> Move | NotMeasured:
             c, found = candidates[index], first[index]
-            if not isinstance(found, Move):
+            if not isinstance(found, Move) or not _is_crowded(c, model, first, o):
                 return found
             moved = replace(c, others=_around(c.component, model, places, o))
             return _measure(moved, points, found.nominal_from_measured, o)
@@ -249,6 +249,20 @@ def _around(component: Component, model: Model, places: dict[str, Array], o: Clo
     if not vertices:
         return None
     return Surface(np.concatenate(vertices), np.concatenate(faces), np.concatenate(groups))
+
+
+def _is_crowded(c: Candidate, model: Model, found: Sequence[Move | NotMeasured], o: CloudDeviationOptions) -> bool:
+    """Whether a neighbour stands so far from nominal that other points are left out on its account."""
+    low, high = c.component.bounds_in_model
+    for one in found:
+        if not isinstance(one, Move) or one.component == c.component.name:
+            continue
+        corners = model.component(one.component).bounds_in_model
+        reach = 2.0 * o.band_mm + o.joint_mm
+        is_near = bool((corners[1] > low - reach).all() and (corners[0] < high + reach).all())
+        if is_near and np.linalg.norm(one.twist * ([one.radius_mm] * 3 + [1.0] * 3)) > 0.1 * o.joint_mm:
+            return True
+    return False
 
 
 def _measure(c: Candidate, cloud: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Move | NotMeasured:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -122,8 +123,12 @@ def near_edges(points: Array, component: Component, reach_mm: float) -> NDArray[
 
 def free_directions(component: Component, part: Part | None, center: Array, radius_mm: float) -> Array:
     """(K,6) orthonormal moves (turn times ``radius_mm``, shift of the centre) that leave the shape as it is."""
-    found = find_symmetries(component.vertices_in_model, component.faces.astype(np.int64), near_share=0.0)
-    symmetries: list[Symmetry] = [item.symmetry for item in found if item.is_exact]
+    # Components of one shape have the same ones about their centres: parts have many alike.
+    local = np.round(component.vertices_in_model - center, 6) + 0.0
+    symmetries = [
+        replace(one, through_in_model=tuple((np.array(one.through_in_model) + center).tolist()))
+        for one in _symmetries(local.tobytes(), component.faces.astype(np.int64).tobytes())
+    ]
     if part is not None:
         declared = part.component_settings(component.name).symmetry
         symmetries += [declared] if declared is not None else []
@@ -137,6 +142,14 @@ def free_directions(component: Component, part: Part | None, center: Array, radi
         return np.zeros((0, 6))
     _, size, basis = np.linalg.svd(np.array(moves))
     return np.asarray(basis[: np.count_nonzero(size > 1e-6 * radius_mm)])
+
+
+@lru_cache(maxsize=64)
+def _symmetries(vertices: bytes, faces: bytes) -> tuple[Symmetry, ...]:
+    """Exact symmetries of a mesh given as the bytes of (V,3) float64 and (F,3) int64."""
+    points, corners = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
+    found = find_symmetries(points, corners, near_share=0.0)
+    return tuple(item.symmetry for item in found if item.is_exact)
 
 
 @njit(cache=True, nogil=True)

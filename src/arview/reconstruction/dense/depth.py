@@ -27,7 +27,7 @@ STEPS = (4, 2)
 """Pixels of the working size per pixel of each PatchMatch stage; the depth maps have the last one's grid."""
 SWEEPS = (2, 1)
 RANDOMS = 6
-POLISH_ITERATIONS = 3
+POLISH_ITERATIONS = 5
 T = TypeVar("T")
 Progress = Callable[[str, int, int], None]
 """Called with the stage's name, views done and views in all."""

@@ -27,7 +27,7 @@ class DenseOptions:
         largest_sigma_px: standard deviation in pixels of parallax above which a pixel is not used: no texture.
         largest_spread_px: standard deviation of a merged point along its normal, in pixels of the maps as wide as
             they are there, above which it is dropped.
-        least_views: photos that must agree on a point of the cloud, its own included.
+        least_views: photos that must agree on a point of the cloud, its own included. Each was matched with several.
         agreement_px: depth maps agree when the point moves by less than this in the photo, in pixels of the maps
             (half the working size).
         normal_angle_deg: and when their normals differ by less than this.
@@ -47,10 +47,10 @@ class DenseOptions:
     geometric_weight: float = 0.1
     least_zncc: float = 0.5
     largest_sigma_px: float = 0.25
-    largest_spread_px: float = 0.35
-    least_views: int = 3
+    largest_spread_px: float = 0.2
+    least_views: int = 2
     agreement_px: float = 1.5
-    normal_angle_deg: float = 35.0
+    normal_angle_deg: float = 20.0
     grazing_deg: float = 75.0
     threads: int = 0
     seed: int = 0

@@ -35,6 +35,8 @@ from arview.reconstruction.dense.kernels import (
 _ZERO, _ONE = float32(0.0), float32(1.0)
 _SEES = float32(0.5)
 """Correlation from which a source is taken to see the element."""
+_SETTLED = 0.1
+"""Last step in px that an element may still make: what has not settled shows where it started, not what is there."""
 _SLOPE_PRIOR = 0.05
 """Weight of the slopes' start, as a share of the evidence for w: keeps them where texture is poor."""
 
@@ -157,7 +159,7 @@ def polish(p, s, index, planes, scores, sigmas, step_px, iterations, unit_w):  #
             for i in range(SAMPLES):
                 total += s[WEIGHT, i] * s[WEIGHT, i]
             samples = 1.0 / total
-            start, moved, lasting, sigma = w, 0.0, True, np.inf
+            start, step, lasting, sigma = w, 0.0, True, np.inf
             for _ in range(iterations):
                 system[:] = 0.0
                 for k in range(count):
@@ -175,12 +177,11 @@ def polish(p, s, index, planes, scores, sigmas, step_px, iterations, unit_w):  #
                 w += float32(limit * step)
                 du += float32(limit * step_u / RADIUS)
                 dv += float32(limit * step_v / RADIUS)
-                moved = abs(w - start)
-                if not (moved < 2.0 * unit_w and is_facing(numbers, at_x, at_y, w, du, dv)):
+                if not (abs(w - start) < 2.0 * unit_w and is_facing(numbers, at_x, at_y, w, du, dv)):
                     lasting = False
                     break
                 if abs(step) < 0.03 * unit_w:
                     break
-            if lasting:
+            if lasting and abs(step) < _SETTLED * unit_w:
                 planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, du * float32(step_px), dv * float32(step_px)
                 scores[y, x], sigmas[y, x] = float32(system[11] / system[10]), float32(sigma)
