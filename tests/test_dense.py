@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from arview.cad.model import Component, Model, make_model
 from arview.camera import Camera
@@ -268,3 +269,20 @@ def test_score_counts_what_is_missing_and_what_is_off(scene: SparseModel) -> Non
     assert _score(top, scene).median_mm == pytest.approx(0.2, abs=1e-3)
     with pytest.raises(InputError, match="no points"):
         _score(replace(everything, points=np.empty((0, 3))), scene)
+
+
+def test_torch_finds_the_same_surface(scene: SparseModel, nominal: Cad, cloud: DenseCloud, monkeypatch) -> None:
+    # What a GPU does, on the processor: the same pixels get the same elements, but for ties and rounding.
+    pytest.importorskip("torch")
+    monkeypatch.setattr("arview.reconstruction.dense.depth.torch_device", lambda device: "cpu")
+    other = reconstruct_dense(scene, TINY, nominal)
+    apart, _ = cKDTree(other.points).query(cloud.points)
+    assert abs(len(other.points) / len(cloud.points) - 1) < 0.01
+    assert np.mean(apart < 0.01) > 0.98
+    assert np.linalg.norm(_box_place(other) - _box_place(cloud)) < 0.02
+
+
+@pytest.mark.parametrize("device", ["cuda:7", "nonsense"])
+def test_a_device_that_is_not_there_is_refused(scene: SparseModel, device: str) -> None:
+    with pytest.raises(InputError, match="--device"):
+        reconstruct_dense(scene, replace(TINY, device=device))

@@ -63,6 +63,8 @@ reconstruction.json. A run that was interrupted goes on where it was; --force st
               help="Of a video: frames to take.")  # fmt: skip
 @click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same cloud.")
 @click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Default: all cores.")
+@click.option("--device", default="auto", show_default=True, metavar="auto|cpu|cuda[:N]",
+              help="Where dense matching runs; auto takes a CUDA GPU where torch (arview[gpu]) sees one.")  # fmt: skip
 @click.option("--force", is_flag=True, help="Start over, though an earlier run left finished stages in OUT.")
 @UNIT
 def reconstruct(
@@ -80,6 +82,7 @@ def reconstruct(
     max_frames: int,
     seed: int,
     threads: int,
+    device: str,
     force: bool,
     unit: str | None,
 ) -> None:
@@ -103,7 +106,7 @@ def reconstruct(
         video=VideoIntakeOptions(max_frames=max_frames),
         sparse=SparseOptions(seed=seed, threads=threads),
         sources=_sources(boards, tags, bars, scale_file, rig),
-        dense=DenseOptions(seed=seed, band_mm=band, threads=threads),
+        dense=DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
         last_stage=get_args(run.Stage)[STAGES.index(until)],
         starts_over=force,
     )

@@ -124,7 +124,7 @@ def near_edges(points: Array, component: Component, reach_mm: float) -> NDArray[
 def free_directions(component: Component, part: Part | None, center: Array, radius_mm: float) -> Array:
     """(K,6) orthonormal moves (turn times ``radius_mm``, shift of the centre) that leave the shape as it is."""
     # Components of one shape have the same ones about their centres: parts have many alike.
-    local = np.round(component.vertices_in_model - center, 3) + 0.0
+    local = np.round(component.vertices_in_model - center, 6) + 0.0
     symmetries = [
         replace(one, through_in_model=tuple((np.array(one.through_in_model) + center).tolist()))
         for one in _symmetries(local.tobytes(), component.faces.astype(np.int64).tobytes())

@@ -20,6 +20,7 @@ from arview.reconstruction.dense.kernels import PARALLAX, Problem, make_scratch
 from arview.reconstruction.dense.options import DenseOptions
 from arview.reconstruction.dense.patchmatch import NEIGHBOURS, sweep, try_hypotheses
 from arview.reconstruction.dense.polish import polish
+from arview.reconstruction.dense.torch_search import search_torch, torch_device
 from arview.reconstruction.dense.views import Cad, Floats, Planes, View, cad_planes, relative_pose, sparse_planes
 from arview.reconstruction.types import SparseModel
 
@@ -59,9 +60,11 @@ def depth_maps(
     """Depth maps of all views, whose sources are indices into the list."""
     greys = [cv2.cvtColor(view.color, cv2.COLOR_RGB2GRAY).astype(np.float32) for view in views]
     maps: list[Planes] = []
+    device = torch_device(options.device)
     with ThreadPoolExecutor(threads) as pool:
         for stage, step in enumerate(STEPS):
-            search = partial(_search, views, [_shrunk(grey, step) for grey in greys], maps, sparse, cad, options, stage)
+            small = [_shrunk(grey, step) for grey in greys]
+            search = partial(_search, views, small, maps, sparse, cad, options, stage, device)
             maps = _each(pool, search, len(views), f"depth maps {stage + 1} of {len(STEPS)}", progress)
         return _each(pool, partial(_polished, views, greys, maps, options), len(views), "polishing", progress)
 
@@ -140,7 +143,7 @@ def _layout(images: list[NDArray[np.float32]]) -> NDArray[np.int32]:
 
 def _search(
     views: list[View], greys: list[Floats], maps: list[Planes], sparse: SparseModel, cad: Cad | None,
-    options: DenseOptions, stage: int, index: int,
+    options: DenseOptions, stage: int, device: str | None, index: int,
 ) -> Planes:  # fmt: skip
     """PatchMatch of one view at one level; ``maps`` are those of the level before, or empty."""
     view, step = views[index], STEPS[stage]
@@ -150,23 +153,26 @@ def _search(
     if cad is not None and options.cad_hypotheses:
         given.insert(0 if stage == 0 else 1, cad_planes(cad, view.cam_from_scan, camera))
     problem = _problem(views, index, greys, maps, step, options)
-    planes, costs = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
-    scratch, indices = make_scratch(is_dense=stage > 0)
     seed = (options.seed * 0x9E3779B1 + view.index * 0x85EBCA6B + stage * 0xC2B2AE35) & 0x7FFFFFFF
     low, high = 1.0 / view.farthest, 1.0 / view.nearest
     depth = 2.0 / (low + high)
     spread = options.band_mm / depth**2 if cad is not None else 0.25 * (high - low)
+    unit_w = 1.0 / float(np.mean(problem.warps[:, PARALLAX]))
+    steps = [(0.5 ** (turn + stage) * unit_w, 0.5 * 0.5 ** (turn + stage)) for turn in range(SWEEPS[stage])]
+    randoms = RANDOMS if stage == 0 else 0
+    if device is not None:
+        return search_torch(problem, np.stack(given), spread, randoms, low, high, steps, stage > 0, seed, device)
+    planes, costs = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
+    scratch, indices = make_scratch(is_dense=stage > 0)
     try_hypotheses(
-        problem, scratch, indices, planes, costs, np.stack(given), np.float32(spread), RANDOMS if stage == 0 else 0,
+        problem, scratch, indices, planes, costs, np.stack(given), np.float32(spread), randoms,
         np.float32(low), np.float32(high), seed,
     )  # fmt: skip
-    unit_w = 1.0 / float(np.mean(problem.warps[:, PARALLAX]))
-    for turn in range(SWEEPS[stage]):
-        fine = 0.5 ** (turn + stage)
+    for turn, (step_w, step_tilt) in enumerate(steps):
         for color in (0, 1):
             sweep(
                 problem, scratch, indices, planes, costs, NEIGHBOURS, color,
-                np.float32(fine * unit_w), np.float32(0.5 * fine), seed + 101 * (turn + 1),
+                np.float32(step_w), np.float32(step_tilt), seed + 101 * (turn + 1),
             )  # fmt: skip
     return planes
 

@@ -27,10 +27,12 @@ PARALLAX = 12
 # Elements of `Problem.numbers`.
 NOISE, GEOMETRIC, MAP_STEP, BEST, FX, FY, CX, CY = range(8)
 
-_MAX_ERROR_PX = float32(3.0)
+MAX_ERROR_PX = float32(3.0)
+LEAST_SQUARED_COSINE = float32(0.025)
+"""Of the angle at which an element is seen: 81°."""
 _WORST = float32(2.0)
 _ZERO, _HALF, _ONE = float32(0.0), float32(0.5), float32(1.0)
-_COLOR_SCALE = float32(1.0 / 25.0)
+COLOR_SCALE = float32(1.0 / 25.0)
 """One by the difference in grey at which a pixel of the window counts half: it may be another surface's."""
 
 
@@ -88,7 +90,7 @@ def take_window(grey, s, x, y):  # type: ignore[no-untyped-def]
         s[CENTRED, i] = grey[min(max(row, 0), height - 1), min(max(column, 0), width - 1)]
     total, mean = _ZERO, _ZERO
     for i in range(SAMPLES):
-        unlike = (s[CENTRED, i] - middle) * _COLOR_SCALE
+        unlike = (s[CENTRED, i] - middle) * COLOR_SCALE
         weight = s[FALLOFF, i] / (_ONE + unlike * unlike)
         s[WEIGHT, i] = weight
         total += weight
@@ -180,12 +182,12 @@ def disagreement_px(maps, sizes, warps, step, k, h, w):  # type: ignore[no-untyp
     u, v = (h[0] / h[6] + _HALF) / step, (h[3] / h[6] + _HALF) / step
     column, row = int(u), int(v)
     if column < 0 or row < 0 or column >= sizes[k, MAP_WIDTH] or row >= sizes[k, MAP_HEIGHT]:
-        return _MAX_ERROR_PX
+        return MAX_ERROR_PX
     at = sizes[k, MAP_FIRST] + row * sizes[k, MAP_WIDTH] + column
     if maps[at, 0] <= _ZERO:
-        return _MAX_ERROR_PX
+        return MAX_ERROR_PX
     there = maps[at, 0] + maps[at, 1] * (u - _HALF - float32(column)) + maps[at, 2] * (v - _HALF - float32(row))
-    return min(abs(there - w / h[6]) * warps[k, PARALLAX], _MAX_ERROR_PX)
+    return min(abs(there - w / h[6]) * warps[k, PARALLAX], MAX_ERROR_PX)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -196,7 +198,7 @@ def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
     xn, yn = (x - numbers[CX]) / numbers[FX], (y - numbers[CY]) / numbers[FY]
     a, b = du * numbers[FX], dv * numbers[FY]
     c = w - a * xn - b * yn
-    return w * w > float32(0.025) * (a * a + b * b + c * c) * (xn * xn + yn * yn + _ONE)
+    return w * w > LEAST_SQUARED_COSINE * (a * a + b * b + c * c) * (xn * xn + yn * yn + _ONE)
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

@@ -33,6 +33,7 @@ class DenseOptions:
         normal_angle_deg: and when their normals differ by less than this.
         grazing_deg: surfaces seen at a larger angle from their normal are not used.
         threads: photos worked on at a time; 0 for one per core.
+        device: where the search is done: ``auto`` takes CUDA where torch sees it, ``cpu``, or a torch device.
         seed: of the random hypotheses; the same seed gives the same cloud.
     """
 
@@ -53,6 +54,7 @@ class DenseOptions:
     normal_angle_deg: float = 20.0
     grazing_deg: float = 75.0
     threads: int = 0
+    device: str = "auto"
     seed: int = 0
 
     def __post_init__(self) -> None:

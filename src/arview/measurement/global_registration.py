@@ -1,0 +1,231 @@
+"""Where the CAD is in a cloud of which nothing is known: its frame, and its scale if that is unknown too.
+
+Rotations are tried that turn a main direction of the cloud's normals onto one of the CAD's, all around it; for each
+the shift follows from a correlation of both as voxels (by FFT, as in Padfield, CVPR 2010). The best are refined on
+the exact surface, and how well all of the part then fits decides: symmetric wrong answers fit the base, but not the
+components.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from arview.cad.model import Model
+from arview.errors import InputError
+from arview.geometry import Array, apply, exp_so3, rigid
+from arview.measurement.cloud_registration import estimate_normals
+from arview.measurement.registration import TUKEY_SIGMAS
+from arview.measurement.surface import Surface
+from arview.reconstruction.scale.similarity import Similarity
+from arview.reconstruction.types import DenseCloud
+from arview.tracking.threads import pool
+
+
+@dataclass(frozen=True)
+class GlobalOptions:
+    """Options of the search. ``diameter`` is the model's."""
+
+    points: int = 4000  # of cloud and CAD each; a few to each voxel
+    voxels: int = 40  # across the diameter: components are some voxels wide
+    step_deg: float = 6.0  # of the turns about a main direction; refining takes half of it
+    kept: int = 12  # poses that are refined and compared
+    scale_step: float = 1.08  # between scales that are tried when it is unknown
+    scale_range: tuple[float, float] = (0.7, 2.5)  # the part's size over the cloud's; more than 1: part of it is seen
+    limit_share: float = 0.015  # distances count up to this share of the diameter: displaced, or not the part
+    least_lead: float = 1.08  # cost of the next best place over the best one's, or it is ambiguous
+    seed: int = 0
+
+
+def find_model(cloud: DenseCloud, model: Model, scale: float | None = 1.0, options: GlobalOptions | None = None) -> Similarity:
+    """The scale and rigid place ``model_from_scan`` of a cloud anywhere.
+
+    Args:
+        cloud: of the part and little else.
+        model: nominal.
+        scale: mm per unit of the cloud, None when it is unknown.
+        options: see GlobalOptions.
+
+    Raises:
+        InputError: too few points; two places that are no symmetry of the part fit alike; none fits.
+    """
+    o = options or GlobalOptions()
+    points, normals = _some_points(cloud, o)
+    vertices, faces, groups = model.mesh
+    surface = Surface(vertices, faces, groups)
+    samples, of_face = surface.spread(o.points, o.seed)
+    extent = float(np.linalg.norm(np.diff(np.quantile(points, [0.01, 0.99], axis=0), axis=0)))
+    scales = [scale] if scale else list(_ladder(model.diameter_mm / extent, o))
+    turns = _turns(normals, surface.face_normals[of_face], o)
+    places = [job for one in scales for job in pool().map(lambda r, s=one: _shifted(points * s, samples, r, model, s, o), turns)]
+    places.sort(key=lambda place: -place[0])
+    limit_mm = o.limit_share * model.diameter_mm
+    tried = [(s, pose) for _, s, pose in _distinct(places, model, o)]
+    fits = list(pool().map(lambda job: _refined(points, surface, samples, *job, scale is None, limit_mm), tried))
+    fits.sort(key=lambda fit: fit[0])
+    cost, found_scale, pose = fits[0]
+    if cost > 0.6 * limit_mm:
+        raise InputError("cloud: the part is not found in it: another part, or too little of it")
+    for rival_cost, _, rival in fits[1:]:
+        moved = apply(rival, samples_in_scan := apply(_inverse(pose), samples))
+        if rival_cost > o.least_lead * cost + 1e-3 * limit_mm or len(samples_in_scan) == 0:
+            break
+        other_mm = np.abs(surface.closest(moved).distances)
+        if np.mean(np.linalg.norm(moved - samples, axis=1)) > limit_mm and np.mean(other_mm) > 0.1 * limit_mm:
+            raise InputError(
+                "cloud: two places of the part in it fit alike; give a cloud that shows more of what tells its sides apart"
+            )
+    return Similarity(found_scale, pose)
+
+
+def _some_points(cloud: DenseCloud, o: GlobalOptions) -> tuple[Array, Array]:
+    """Points (N,3) spread evenly over a cloud, and normals, estimated where there are none; their side is not used."""
+    points = np.asarray(cloud.points, dtype=np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < 200:
+        raise InputError(f"cloud: {len(points)} points are too few to find the part in it; at least 200 are needed")
+    rng = np.random.default_rng(o.seed)
+    if len(points) > 40 * o.points:
+        points = points[rng.permutation(len(points))[: 40 * o.points]]
+    low, high = np.quantile(points, [0.002, 0.998], axis=0)
+    points = points[np.all((points >= low - 0.05 * (high - low)) & (points <= high + 0.05 * (high - low)), axis=1)]
+    # As many cells as are wanted points: halve the cell until there are.
+    cell = float(np.linalg.norm(high - low)) / 20.0
+    for _ in range(12):
+        _, first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)
+        if len(first) >= 0.7 * o.points or len(first) > 0.5 * len(points):
+            break
+        cell *= 0.8
+    tree = cKDTree(points)
+    chosen = points[first]
+    _, near = tree.query(chosen, k=min(16, len(points)))
+    around = points[near] - points[near].mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    return chosen, vectors[:, :, 0]
+
+
+def _ladder(middle: float, o: GlobalOptions) -> Array:
+    low, high = o.scale_range
+    return np.asarray(middle * np.geomspace(low, high, int(np.log(high / low) / np.log(o.scale_step)) + 2))
+
+
+def _main_axes(normals: Array, most: int) -> list[Array]:
+    """Directions, without sign, that most normals (N,3) have."""
+    left, found = normals[np.linalg.norm(normals, axis=1) > 0.5], []
+    for _ in range(most):
+        if len(left) < 0.03 * len(normals):
+            break
+        tried = left[:: max(1, len(left) // 400)]
+        close = np.abs(tried @ left.T) > np.cos(np.deg2rad(5.0))
+        best = close[np.argmax(close.sum(axis=1))]
+        if best.sum() < 0.04 * len(normals):
+            break
+        _, _, axes = np.linalg.svd(left[best], full_matrices=False)
+        found.append(axes[0])
+        left = left[np.abs(left @ axes[0]) < np.cos(np.deg2rad(15.0))]
+    return found or [np.array([0.0, 0.0, 1.0])]
+
+
+def _turns(of_cloud: Array, of_model: Array, o: GlobalOptions) -> list[Array]:
+    """Rotations (3,3) that turn the cloud's main direction onto one of the model's, all around it."""
+    turns = []
+    angles = np.arange(0.0, 360.0, o.step_deg)
+    for target in _main_axes(of_model, 2):
+        for sign in (1.0, -1.0):
+            first = _between(sign * _main_axes(of_cloud, 1)[0], target)
+            turns += [exp_so3(np.deg2rad(angle) * target) @ first for angle in angles]
+    return turns
+
+
+def _between(a: Array, b: Array) -> Array:
+    """(3,3) the smallest rotation of one unit vector onto another."""
+    axis, cosine = np.cross(a, b), float(a @ b)
+    if np.linalg.norm(axis) < 1e-9:
+        across = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        return np.eye(3) if cosine > 0 else exp_so3(np.pi * across / np.linalg.norm(across))
+    return exp_so3(axis / np.linalg.norm(axis) * np.arctan2(np.linalg.norm(axis), cosine))
+
+
+def _shifted(points: Array, samples: Array, turn: Array, model: Model, scale: float, o: GlobalOptions) -> tuple[float, float, Array]:
+    """How well turned points fit at their best shift: score, scale, pose (4,4) of the scaled points."""
+    from scipy import fft
+
+    turned = points @ turn.T
+    cell = max(model.diameter_mm / o.voxels, float(np.ptp(turned, axis=0).max()) / 90.0)
+    of_points, low = _voxels(turned, cell)
+    of_model, low_model = _voxels(samples, cell)
+    shape = [fft.next_fast_len(a + b, real=True) for a, b in zip(of_points.shape, of_model.shape, strict=True)]
+    spectrum = fft.rfftn(of_model, shape) * np.conj(fft.rfftn(of_points, shape))
+    score = fft.irfftn(spectrum, shape)
+    best = np.array(np.unravel_index(int(np.argmax(score)), score.shape))
+    best = np.where(best > np.array(of_model.shape), best - np.array(shape), best)
+    shift = low_model - low + best * cell
+    size = np.sqrt(float((of_points**2).sum()) * float((of_model**2).sum()))
+    return float(score.max()) / size, scale, rigid(turn, shift)
+
+
+def _voxels(points: Array, cell: float) -> tuple[Array, Array]:
+    """Occupied cells, blurred by one, and the corner of the first."""
+    from scipy.ndimage import gaussian_filter
+
+    low = points.min(axis=0) - 2.0 * cell
+    index = np.floor((points - low) / cell).astype(np.int64)
+    grid = np.zeros(index.max(axis=0) + 3)
+    grid[tuple(index.T)] = 1.0
+    return gaussian_filter(grid, 0.8), low
+
+
+def _distinct(places: list[tuple[float, float, Array]], model: Model, o: GlobalOptions) -> list[tuple[float, float, Array]]:
+    """The best places that are not nearly one that is better."""
+    kept: list[tuple[float, float, Array]] = []
+    for score, scale, pose in places:
+        turns = [np.trace(other[:3, :3].T @ pose[:3, :3]) for _, s, other in kept if abs(s / scale - 1.0) < 0.04]
+        if all(turn < 1.0 + 2.0 * np.cos(np.deg2rad(2.5 * o.step_deg)) for turn in turns):
+            kept.append((score, scale, pose))
+        if len(kept) == o.kept:
+            break
+    return kept
+
+
+def _refined(
+    points: Array, surface: Surface, samples: Array, scale: float, pose: Array, with_scale: bool, limit_mm: float
+) -> tuple[float, float, Array]:  # fmt: skip
+    """Cost, scale and pose (4,4) on the exact surface: Gauss–Newton on seven numbers with Tukey's weights."""
+    width, size = 4.0 * limit_mm, 0.25 * float(np.linalg.norm(np.ptp(samples, axis=0)))
+    for _ in range(40):
+        moved = apply(pose, points * scale)
+        closest = surface.closest(moved, TUKEY_SIGMAS * width)
+        near = closest.faces >= 0
+        if np.count_nonzero(near) < 50:
+            return np.inf, scale, pose
+        x, n, r = moved[near], closest.normals[near], closest.distances[near]
+        center = x.mean(axis=0)
+        rows = np.hstack([np.cross(x - center, n) / size, n, np.sum(n * (x - center), axis=1)[:, None] / size])
+        rows = rows if with_scale else rows[:, :6]
+        weights = (1.0 - np.minimum(np.abs(r) / (TUKEY_SIGMAS * width), 1.0) ** 2) ** 2
+        normal = (rows * weights[:, None]).T @ rows
+        step = -np.linalg.solve(normal + 1e-6 * np.trace(normal) * np.eye(len(normal)), (rows * weights[:, None]).T @ r)
+        grown = 1.0 + step[6] / size if with_scale else 1.0
+        turn = exp_so3(step[:3] / size)
+        pose = rigid(turn, center + step[3:6] - turn @ center) @ pose
+        if with_scale:
+            scale, about = scale * grown, pose[:3, :3].T @ (center - pose[:3, 3])
+            pose = rigid(pose[:3, :3], pose[:3, 3] + pose[:3, :3] @ about * (1.0 - grown))
+        if np.abs(step).max() < 1e-4 * size and width <= 0.05 * limit_mm:
+            break
+        width = max(0.6 * width, 0.05 * limit_mm)
+    # Both ways: points that have no surface, and surface that has no points where others of it have.
+    moved = apply(pose, points * scale)
+    low, high = samples.min(axis=0) - limit_mm, samples.max(axis=0) + limit_mm
+    inside = np.all((moved > low) & (moved < high), axis=1)
+    if np.count_nonzero(inside) < 0.3 * len(points):
+        return np.inf, scale, pose
+    of_points = np.minimum(np.abs(surface.closest(moved[inside]).distances), limit_mm)
+    to_points = np.minimum(cKDTree(moved).query(samples)[0], 3.0 * limit_mm) / 3.0
+    return float(of_points.mean() + 0.3 * to_points.mean()), scale, pose
+
+
+def _inverse(pose: Array) -> Array:
+    return np.linalg.inv(pose)
