@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from arview.geometry import Array, apply, invert, rotation_angle_rad
 from arview.reconstruction.dense import read_ply
 from arview.reconstruction.scale.similarity import Similarity, fit_points
 from lines import Line
-from recordings import PhotoSet, photo_sets
+from recordings import PhotoSet
 
 
 @dataclass(frozen=True)
@@ -47,10 +48,10 @@ class CameraErrors:
     true_from_found: Similarity
 
 
-def reconstruct_lines(details: dict[str, Any]) -> list[Line]:
+def reconstruct_lines(sets: Sequence[PhotoSet], details: dict[str, Any]) -> list[Line]:
     """Lines for every photo set."""
     lines = []
-    for photos in photo_sets():
+    for photos in sets:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder)
             seconds, memory_mb = timed_run(photos, out)

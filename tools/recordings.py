@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,8 +28,8 @@ class PhotoSet:
     as_built: Path
 
 
-def photo_sets() -> list[PhotoSet]:
-    """The sets that are here; the others are named on stderr."""
+def photo_sets(more: Sequence[Path] = ()) -> list[PhotoSet]:
+    """The sets that are here; the others are named on stderr. ``more``: folders that samples/plate/generate.py wrote."""
     found = []
     for name, folder, part in (
         ("plate", SHARED / "plate", "plate.glb"),
@@ -40,6 +41,9 @@ def photo_sets() -> list[PhotoSet]:
             )
         else:
             skip(name, f"{folder / 'photos'} is not here")
+    part = ROOT / "samples" / "plate" / "part.toml"
+    for folder in more:
+        found.append(PhotoSet(folder.name, folder / "photos", part, folder / "truth.json", folder / "as_built.ply"))
     return found
 
 
