@@ -29,7 +29,7 @@ class PhotoSet:
 
 
 def photo_sets(more: Sequence[Path] = ()) -> list[PhotoSet]:
-    """The sets that are here; the others are named on stderr. ``more``: folders that samples/plate/generate.py wrote."""
+    """The sets that are here, and folders that samples/plate/generate.py wrote; what is missing is named on stderr."""
     found = []
     for name, folder, part in (
         ("plate", SHARED / "plate", "plate.glb"),
