@@ -22,8 +22,8 @@ Role = Literal["base", "inspect", "ignore"]
 Vector = tuple[float, float, float]
 
 ROLES = ("base", "inspect", "ignore")
-DatumFeature = Literal["plane", "hole", "pin", "point", "fit"]
-DATUM_FEATURES = ("plane", "hole", "pin", "point", "fit")
+DatumFeature = Literal["plane", "hole", "pin", "cylinder", "edge", "point", "fit"]
+DATUM_FEATURES = ("plane", "hole", "pin", "cylinder", "edge", "point", "fit")
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 PART_FILE_EXAMPLE = """\
@@ -83,7 +83,8 @@ symmetry = { axis = [0.0, 0.0, 1.0], through_mm = [60.0, 40.0, 0.0], order = "co
 # locks what it determines and those before it have left free (ISO 5459). What all leave free, here the
 # rotation about B, the best fit of the base decides; so it does without any datums.
 [datums.A]
-feature = "plane"              # plane, hole, pin, point (where its normal meets the surface), or fit (of a component)
+feature = "plane"              # plane, hole, pin (their rim), cylinder (the axis of a round face), edge (straight, of
+                               # two flat faces), point (where its normal meets the surface), or fit (of a component)
 component = "base_plate"
 point_mm = [0.0, 0.0, 0.0]
 normal = [0.0, 0.0, 1.0]
@@ -122,8 +123,8 @@ class ComponentSettings:
 class Datum:
     """A feature that defines the frame of measurement.
 
-    ``direction_in_model`` is the unit normal of a plane or point, or the unit axis of a hole or pin;
-    ``point_in_model`` lies on it, mm; ``diameter_mm`` belongs to holes and pins only. Of a ``fit``, the best fit of
+    ``direction_in_model`` is the unit normal of a plane or point, or the unit axis of a hole, pin, cylinder or edge;
+    ``point_in_model`` lies on it, mm; ``diameter_mm`` belongs to round ones only. Of a ``fit``, the best fit of
     the whole component, they are the middle of its bounding box and +Z. ``locks`` are the degrees of freedom that
     it may lock.
     """
@@ -361,7 +362,7 @@ def _read_datums(tables: _Table, model: Model) -> tuple[Datum, ...]:
         if feature != "fit":
             point = table.vector("point_mm")
             direction = table.direction("normal" if feature in ("plane", "point") else "axis")
-        if feature in ("hole", "pin"):
+        if feature in ("hole", "pin", "cylinder"):
             diameter_mm = table.positive("diameter_mm", required=True)
         locks = table.choices("locks", DOF_NAMES)
         table.finish()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from arview.cli.common import UNIT, main, output_path, say, stage_bar
+from arview.errors import InputError
 
 if TYPE_CHECKING:
     from arview.inspection import ComponentDeviation, Inspection
@@ -33,6 +34,7 @@ Examples:
   arview measure out/ --part part.toml
   arview measure out/ --part part.toml -o inspection.json --tolerance 0.5
   arview measure out/ --part plate.step --photos photos/ --methods edges --guard 0
+  arview measure --cloud scan.ply --part part.toml
 
 \b
 OUT is the folder of `arview reconstruct --part`. Components of the role 'inspect' are measured, in the photos twice
@@ -54,7 +56,8 @@ INSPECTION_distances: coloured PLY, a picture, histograms.
 Exit codes: 0 every component passes, 3 one fails or is missing, 4 none fails but one is undecided or was not
 measured, or there is a foreign object, 2 bad input, 130 interrupted.""",
 )
-@click.argument("folder", metavar="OUT")
+@click.argument("folder", metavar="[OUT]", required=False)
+@click.option("--cloud", "cloud_path", metavar="FILE", help="Measure a cloud alone instead: PLY, in mm, any frame.")
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
 @click.option("-o", "--output", metavar="INSPECTION", help="File to write; default: inspection.json in OUT.")
 @click.option("--photos", metavar="FOLDER", help="Where the photos are, if not where they were.")
@@ -73,7 +76,8 @@ measured, or there is a foreign object, 2 bad input, 130 interrupted.""",
 @click.option("--anyway", is_flag=True, help="Measure though the reconstruction does not have the CAD's shape.")
 @UNIT
 def measure(
-    folder: str,
+    folder: str | None,
+    cloud_path: str | None,
     part_path: str,
     output: str | None,
     photos: str | None,
@@ -87,16 +91,19 @@ def measure(
     anyway: bool,
     unit: str | None,
 ) -> None:
-    """Measure where the components of PART stand in the reconstruction OUT: displacement, U, verdict."""
+    """Measure where the components of PART stand in the reconstruction OUT, or in a cloud: displacement, U, verdict."""
     from arview.cad import load_part
     from arview.inspection import save_inspection
     from arview.measurement import run
     from arview.measurement.decision import DecisionOptions
-    from arview.measurement.folder import read_folder
+    from arview.measurement.folder import read_cloud, read_folder
     from arview.measurement.options import MeasureOptions
     from arview.measurement.uncertainty import UncertaintyOptions
 
-    target = output_path(output or str(Path(folder) / "inspection.json"), [part_path])
+    if (folder is None) == (cloud_path is None):
+        raise InputError("give either OUT, the folder of `arview reconstruct`, or --cloud FILE")
+    place = Path(folder) if folder is not None else Path(cloud_path or "").parent
+    target = output_path(output or str(place / "inspection.json"), [part_path])
     part = load_part(part_path, unit)
     options = MeasureOptions(
         methods=methods,
@@ -107,7 +114,7 @@ def measure(
         uncertainty=UncertaintyOptions(monte_carlo=not no_monte_carlo, seed=seed),
         decision=DecisionOptions(guard),
     )
-    reconstruction = read_folder(folder, photos, "cloud" in methods)
+    reconstruction = read_cloud(cloud_path or "") if folder is None else read_folder(folder, photos, "cloud" in methods)
     with stage_bar() as progress:
         inspection = run.measure(reconstruction, part, options, progress)
     save_inspection(inspection, target)

@@ -45,7 +45,7 @@ class Equations:
 
     Attributes:
         label: of the datum, as ``B``.
-        feature: plane, hole, pin, point or fit.
+        feature: plane, hole, pin, cylinder, edge, point or fit.
         rows: (N,7) derivative of each offset by ω, t and s about the model's origin: p × n, n, n · p.
         offsets_mm: (N,) measured minus nominal.
         variances: (N,) mm², of independent noise.
@@ -214,8 +214,9 @@ def align(
         columns = _determined(rows[:, :6] * unit, allowed, trusted) * unit[:, None]
         if columns.shape[1] == 0:
             raise InputError(f"datum {one.label}: locks nothing that the datums before it have not locked already")
-        with_scale = finds_scale and one.feature in ("hole", "pin") and holes > 0
-        holes += one.feature in ("hole", "pin")
+        is_round = one.feature in ("hole", "pin", "cylinder")
+        with_scale = finds_scale and is_round and holes > 0
+        holes += is_round
         columns = np.concatenate([columns, np.zeros((1, columns.shape[1]))])
         if with_scale:
             columns = np.concatenate([columns, np.eye(7)[:, 6:]], axis=1)
@@ -301,8 +302,10 @@ def _fit_alone(one: Equations, is_exact: bool) -> _Fit:
         return _Fit(1.0 / one.variances, one.variances, sigma, 1.0, None, np.ones(count, dtype=bool))
     center = one.points.mean(axis=0)
     local = one.rows[:, :6] - one.rows[:, 3:6] @ _about(center)[:, :6]
-    if one.by_radius is not None:  # a small circle's tilt is no more than texture
-        local = np.concatenate([one.rows[:, 3:6], one.by_radius[:, None]], axis=1)
+    if one.feature in ("hole", "pin"):  # a small circle's tilt is no more than texture
+        local = one.rows[:, 3:6]
+    if one.by_radius is not None:
+        local = np.concatenate([local, one.by_radius[:, None]], axis=1)
     share, residuals = robust_weights(local, one.offsets_mm, one.variances)
     inliers = share > 0.1
     noise = residuals / np.sqrt(one.variances)
@@ -411,17 +414,20 @@ def _check_covered(one: Equations, fit: _Fit, options: AlignmentOptions) -> None
     used, name = int(fit.inliers.sum()), f"datum {one.label} ({one.feature})"
     if one.feature == "fit":
         return
-    least = 1 if one.feature == "point" else options.least_points
+    least = {"point": 1, "edge": 4}.get(one.feature, options.least_points)
     if used < max(least, round(options.least_share * one.of)):
         raise InputError(
             f"{name}: only {used} of {one.of} points on it could be measured; photograph it from more sides, in better"
             " light, or name another feature in the part file"
         )
-    if one.by_radius is not None:  # where the middle of the circle is; a short arc does not tell it
+    if one.feature in ("hole", "pin") and one.by_radius is not None:  # where its middle is; an arc does not tell it
         local, watched = np.concatenate([one.rows[:, 3:6], one.by_radius[:, None]], axis=1), np.eye(3, 4)
     else:
         local = one.rows[:, :6] - one.rows[:, 3:6] @ _about(one.points.mean(axis=0))[:, :6]
         watched = local[fit.inliers]
+        if one.by_radius is not None:
+            local = np.concatenate([local, one.by_radius[:, None]], axis=1)
+            watched = np.concatenate([watched, np.zeros((len(watched), 1))], axis=1)
     information = (local / fit.variances[:, None] * fit.inliers[:, None]).T @ local
     values, vectors = np.linalg.eigh(information)
     kept = values > 1e-9 * values[-1]

@@ -116,6 +116,7 @@ def measure_components_in_cloud(
     part: Part,
     photos: Sequence[PosedPhoto] = (),
     options: CloudDeviationOptions | None = None,
+    names: Sequence[str] | None = None,
 ) -> list[Move | NotMeasured]:
     """Moves of the components to be inspected, in the order of the model.
 
@@ -125,6 +126,7 @@ def measure_components_in_cloud(
         part: says what is inspected, and symmetries.
         photos: with ``cam_from_scan`` in the same frame, for what could be seen; none: all but what touches others.
         options: see CloudDeviationOptions.
+        names: of the components to measure; default: those to be inspected.
 
     Raises:
         InputError: the cloud is empty, far from the CAD, of another part, or mirrored.
@@ -135,7 +137,7 @@ def measure_components_in_cloud(
     check_belongs(points, model, o.band_mm)
     views = Views(model, photos) if photos else None
     with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
-        candidates = list(threads.map(lambda name: _candidate(name, model, part, views, o), part.inspected))
+        candidates = list(threads.map(lambda name: _candidate(name, model, part, views, o), names or part.inspected))
         first = list(threads.map(lambda c: _measure(c, points, None, o), candidates))
         places = {m.component: m.measured_from_nominal for m in first if isinstance(m, Move)}
 

@@ -13,9 +13,10 @@ from arview.cad.part import Datum
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.alignment import Equations, move_equations, robust_weights, surface_equations
+from arview.measurement.features import edge_line, round_faces
 from arview.measurement.photo.edges import EdgePoints, edge_offsets
 from arview.measurement.photo.options import EdgeOptions, SweepOptions
-from arview.measurement.photo.surface import near_others, tangents_of
+from arview.measurement.photo.surface import near_edges, near_others, sample_surface, tangents_of
 from arview.measurement.photo.sweep import sweep_offsets
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move
@@ -68,6 +69,10 @@ def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move], o: Datu
         return move_equations(datum.label, moves[datum.component], datum.locks)[0]
     if datum.feature in ("hole", "pin"):
         return _measure_rim(datum, views, o)
+    if datum.feature == "cylinder":
+        return _measure_cylinder(datum, views, o)
+    if datum.feature == "edge":
+        return _measure_edge(datum, views, o)
     component = views.model.component(datum.component)
     radius_mm = o.point_radius_mm if datum.feature == "point" else None
     points = plane_samples(component, datum, o.samples, radius_mm)
@@ -296,3 +301,69 @@ def _rim_views(views: PhotoViews, rim: Rim, points: Array, radial: Array, o: Dat
         apart = np.linalg.norm(pixels[:, None] - rivals[None], axis=2).min(axis=1)
         result[:, index] = visible & (apart > o.rival_px)
     return result
+
+
+# --- cylinders and edges ---------------------------------------------------------------------------------
+
+
+def _measure_cylinder(datum: Datum, views: PhotoViews, o: DatumOptions) -> Equations:
+    """The round faces by the sweep, with patches of their shape; how thick it is says nothing about its axis."""
+    component, index = views.model.component(datum.component), views.model.index(datum.component)
+    faces, side = round_faces(component, datum)
+    px_mm = views.mm_per_px(np.array(datum.point_in_model))
+    samples = sample_surface(replace(component, faces=component.faces[faces]), 3.0 * px_mm, o.samples)
+    apart = ~near_others(samples.points, views.model, index, o.least_clear_mm)
+    samples = samples.of(apart & ~near_edges(samples.points, component, o.sweep.edge_px * px_mm))
+    if len(samples.points) < o.sweep.least_samples:
+        raise InputError(f"datum {datum.label} (cylinder): too little of it is clear of edges and other components")
+    found = sweep_offsets(samples.points, samples.normals, views, o.reach_mm, o.sweep, index)
+    ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= o.sweep.least_views))
+    axis = np.array(datum.direction_in_model)
+    radial = samples.points - np.array(datum.point_in_model)
+    radial = side * (radial - (radial @ axis)[:, None] * axis)
+    radial /= np.linalg.norm(radial, axis=1, keepdims=True)
+    variances = found.variances_mm2 + o.sweep.least_sigma_mm**2
+    return surface_equations(
+        datum.label, "cylinder", samples.points[ok], radial[ok], found.offsets_mm[ok], variances[ok], seen,
+        np.full(np.count_nonzero(ok), side), datum.locks,
+    )  # fmt: skip
+
+
+def _measure_edge(datum: Datum, views: PhotoViews, o: DatumOptions) -> Equations:
+    """Steps of brightness across a straight edge, in all photos that show it: two looks, as at a rim."""
+    line = edge_line(views.model.component(datum.component), datum)
+    px_mm = views.mm_per_px(0.5 * (line.start + line.end))
+    points = line.points(o.rim_points, 6.0 * px_mm)
+    points = points[~near_others(points, views.model, views.model.index(datum.component), o.least_clear_mm)]
+    groups = (points + 0.05 * line.normals.sum(axis=0))[:, None]
+    seen = np.zeros((len(points), len(views.cameras)), dtype=bool)
+    for index in range(len(views.cameras)):
+        toward = views.centres[index] - points.mean(axis=0) if len(points) else np.zeros(3)
+        if (line.normals @ toward > 0.1 * np.linalg.norm(toward)).any() and len(points):
+            seen[:, index] = views.visible(index, views.window(index, None, np.eye(4), groups[:, 0]), groups)
+    which, view = np.nonzero(seen)
+    if len(np.unique(view)) < 3:
+        raise InputError(f"datum {datum.label} (edge): fewer than 3 photos show it; photograph it too")
+    # Offsets are looked for and fitted about the place that the look before has found.
+    project = np.eye(3) - np.outer(line.direction, line.direction)
+    inside = 0.5 * (line.start + line.end) - 10.0 * line.normals.sum(axis=0)
+    tangents = np.tile(line.direction, (len(which), 1))
+    shift, reach_px = np.zeros(3), o.reach_mm / px_mm + 2.0
+    for _ in range(3):
+        found = edge_offsets(EdgePoints(points[which] + shift, tangents, view), inside, views, reach_px, o.edges)
+        ok = found.seen & (found.slopes != 0.0)
+        if np.count_nonzero(ok) < o.edges.least_points:
+            raise InputError(
+                f"datum {datum.label} (edge): seen at {np.count_nonzero(ok)} of {len(ok)} places only; is it covered?"
+            )
+        directions, slope = found.directions[ok], np.abs(found.slopes[ok])
+        variances = (0.3 * found.mm_per_px[ok]) ** 2 * (slope + o.edges.half_slope) / slope
+        offsets = found.offsets_mm[ok] + directions @ shift
+        share, _ = robust_weights(directions @ project, offsets, variances)
+        weighted = (directions @ project) * (share / variances)[:, None]
+        shift = np.linalg.pinv(weighted.T @ directions @ project, rcond=1e-6) @ (weighted.T @ offsets)
+        reach_px = o.fine_reach_px
+    equations = surface_equations(
+        datum.label, "edge", points[which[ok]], directions, offsets, variances, len(which), None, datum.locks
+    )
+    return replace(equations, form_mm=o.rim_px * px_mm)

@@ -9,11 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from arview.cad.part import Part
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of
-from arview.reconstruction.scale.types import ScaleResult
+from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import DenseCloud, Photo, SparseModel
+
+_SCALE_STD = 1e-3
+"""Of a scale by the cloud's shape alone: it is off by 3e-4 where the scale is known; datums better it."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +44,10 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the one that `arview reconstruct` wrote")
     scale = ScaleResult.from_provenance(_read(folder / "scale.json"))
-    if scale.scale is None:
+    has_cloud = with_cloud and (folder / "cloud.ply").is_file()
+    if scale.scale is None and not has_cloud:
         raise InputError(f"{folder}: lengths are in an arbitrary unit; reconstruct with --part, --board or --tag")
-    if scale.model_from_scan is None:
+    if scale.model_from_scan is None and not has_cloud:
         raise InputError(f"{folder}: the part was not found in the photos, there is no CAD frame: {scale.why_no_frame}")
     listed = [_photo(entry, folder, photos) for entry in _read(folder / "photos.json")["photos"]]
     try:
@@ -55,11 +60,91 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
     if covariance.is_file():
         sparse = replace(sparse, pose_covariance=np.load(covariance))
     cloud = None
-    if with_cloud and (folder / "cloud.ply").is_file():
+    if has_cloud:
         from arview.reconstruction.dense import read_ply
 
         cloud = read_ply(folder / "cloud.ply")
-    return MetricReconstruction(sparse.transformed(scale.scale, scale.model_from_scan), scale, cloud)
+    frame = np.eye(4) if scale.model_from_scan is None else scale.model_from_scan
+    sparse = sparse if scale.scale is None else sparse.transformed(scale.scale, frame)
+    return MetricReconstruction(sparse, scale, cloud)
+
+
+def read_cloud(path: str | Path) -> MetricReconstruction:
+    """A cloud alone, in mm, in any frame: a PLY file with or without normals.
+
+    Raises:
+        InputError: no PLY file, or no points in it.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a cloud as PLY, in mm")
+    none = np.zeros(0)
+    empty = SparseModel(
+        (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none.astype(np.int32),
+        np.zeros((0, 2)),
+    )  # fmt: skip
+    scale = ScaleResult(1.0, None, None, None, (), (), "a cloud alone", Consistency(True, ""))
+    return MetricReconstruction(empty, scale, _any_ply(path))
+
+
+def _any_ply(path: Path) -> DenseCloud:
+    from arview.reconstruction.dense import read_ply
+
+    try:
+        return read_ply(path)
+    except InputError:
+        pass
+    import trimesh
+
+    try:
+        with path.open("rb") as file:
+            content = trimesh.exchange.ply.load_ply(file)
+        points = np.asarray(content["vertices"], dtype=np.float64).reshape(-1, 3)
+        rows = content.get("metadata", {}).get("_ply_raw", {}).get("vertex", {}).get("data")
+        names = getattr(getattr(rows, "dtype", None), "names", None) or ()
+    except Exception as error:  # whatever a broken file makes of the reader
+        raise InputError(f"{path}: is no PLY file with points ({error})") from error
+    has_normals = {"nx", "ny", "nz"} <= set(names)
+    normals = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], axis=1) if has_normals else 0.0 * points
+    count = len(points)
+    return DenseCloud(
+        points, normals.astype(np.float32), np.zeros((count, 3), np.uint8), np.full(count, np.nan, np.float32),
+        np.zeros(count, np.uint8),
+    )  # fmt: skip
+
+
+def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricReconstruction:
+    """The reconstruction where the cloud's shape says that the CAD is; as it is when its frame is known.
+
+    Raises:
+        InputError: the part is not found in the cloud; the scale is unknown, and no two datums have a distance.
+    """
+    from arview.measurement.global_registration import find_model
+
+    scale, cloud = reconstruction.scale, reconstruction.cloud
+    if scale.model_from_scan is not None or cloud is None:
+        return reconstruction
+    if scale.scale is None and sum(d.feature in ("hole", "pin", "cylinder") for d in part.datums) < 2:
+        raise InputError(
+            "cloud: lengths are in an arbitrary unit, and the part file has no two datums whose distance says the "
+            "scale; reconstruct with a board, a tag or a scale bar"
+        )
+    found = find_model(cloud, part.model, None if scale.scale is None else 1.0)
+    normals = np.asarray(cloud.normals @ found.model_from_scan[:3, :3].T, dtype=np.float32)
+    moved = replace(
+        cloud, points=found.points_in_model(np.asarray(cloud.points, dtype=np.float64)), normals=normals,
+        sigma=np.asarray(cloud.sigma * found.scale, dtype=np.float32),
+    )  # fmt: skip
+    evidence = scale.evidence
+    std = scale.scale_std
+    if scale.scale is None:
+        std = _SCALE_STD
+        evidence = (ScaleEvidence("cad", found.scale, std, "the cloud's shape"),)
+    scale = replace(
+        scale, scale=found.scale * (scale.scale or 1.0), scale_std=std, model_from_scan=found.model_from_scan,
+        evidence=evidence, warnings=(*scale.warnings, "the part was found by the shape of the cloud alone"),
+    )  # fmt: skip
+    return MetricReconstruction(reconstruction.sparse.transformed(found.scale, found.model_from_scan), scale, moved)
 
 
 def _read(path: Path) -> Any:

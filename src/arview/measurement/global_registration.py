@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 
 from arview.cad.model import Model
 from arview.errors import InputError
-from arview.geometry import Array, apply, exp_so3, rigid
-from arview.measurement.cloud_registration import estimate_normals
+from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.measurement.registration import TUKEY_SIGMAS
 from arview.measurement.surface import Surface
 from arview.reconstruction.scale.similarity import Similarity
@@ -39,7 +38,9 @@ class GlobalOptions:
     seed: int = 0
 
 
-def find_model(cloud: DenseCloud, model: Model, scale: float | None = 1.0, options: GlobalOptions | None = None) -> Similarity:
+def find_model(
+    cloud: DenseCloud, model: Model, scale: float | None = 1.0, options: GlobalOptions | None = None
+) -> Similarity:
     """The scale and rigid place ``model_from_scan`` of a cloud anywhere.
 
     Args:
@@ -52,45 +53,56 @@ def find_model(cloud: DenseCloud, model: Model, scale: float | None = 1.0, optio
         InputError: too few points; two places that are no symmetry of the part fit alike; none fits.
     """
     o = options or GlobalOptions()
-    points, normals = _some_points(cloud, o)
+    points, normals, is_oriented = _some_points(cloud, o)
     vertices, faces, groups = model.mesh
     surface = Surface(vertices, faces, groups)
     samples, of_face = surface.spread(o.points, o.seed)
     extent = float(np.linalg.norm(np.diff(np.quantile(points, [0.01, 0.99], axis=0), axis=0)))
     scales = [scale] if scale else list(_ladder(model.diameter_mm / extent, o))
     turns = _turns(normals, surface.face_normals[of_face], o)
-    places = [job for one in scales for job in pool().map(lambda r, s=one: _shifted(points * s, samples, r, model, s, o), turns)]
+    places = [
+        job
+        for one in scales
+        for job in pool().map(lambda r, s=one: _shifted(points * s, samples, r, model, s, o), turns)
+    ]
     places.sort(key=lambda place: -place[0])
     limit_mm = o.limit_share * model.diameter_mm
-    tried = [(s, pose) for _, s, pose in _distinct(places, model, o)]
-    fits = list(pool().map(lambda job: _refined(points, surface, samples, *job, scale is None, limit_mm), tried))
+    # A thin plate fits with its top at its bottom too: starts to both sides.
+    step = 0.8 * model.diameter_mm / o.voxels * _main_axes(surface.face_normals[of_face], 1)[0]
+    tried = [(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _distinct(places, o) for k in (-1.0, 0.0, 1.0)]
+    sides = normals if is_oriented else None
+    fits = list(pool().map(lambda job: _refined(points, sides, surface, samples, job, scale is None, limit_mm), tried))
     fits.sort(key=lambda fit: fit[0])
     cost, found_scale, pose = fits[0]
     if cost > 0.6 * limit_mm:
         raise InputError("cloud: the part is not found in it: another part, or too little of it")
     for rival_cost, _, rival in fits[1:]:
-        moved = apply(rival, samples_in_scan := apply(_inverse(pose), samples))
-        if rival_cost > o.least_lead * cost + 1e-3 * limit_mm or len(samples_in_scan) == 0:
+        if rival_cost > o.least_lead * cost + 1e-3 * limit_mm:
             break
+        moved = apply(rival @ invert(pose), samples)
         other_mm = np.abs(surface.closest(moved).distances)
         if np.mean(np.linalg.norm(moved - samples, axis=1)) > limit_mm and np.mean(other_mm) > 0.1 * limit_mm:
             raise InputError(
-                "cloud: two places of the part in it fit alike; give a cloud that shows more of what tells its sides apart"
+                "cloud: the part fits in two ways alike, and in none well: it is mirrored, another part, or shows too "
+                "little of what tells its sides apart"
             )
     return Similarity(found_scale, pose)
 
 
-def _some_points(cloud: DenseCloud, o: GlobalOptions) -> tuple[Array, Array]:
-    """Points (N,3) spread evenly over a cloud, and normals, estimated where there are none; their side is not used."""
-    points = np.asarray(cloud.points, dtype=np.float64)
-    points = points[np.isfinite(points).all(axis=1)]
+def _some_points(cloud: DenseCloud, o: GlobalOptions) -> tuple[Array, Array, bool]:
+    """Points (N,3) spread evenly over a cloud, normals, and whether their side is known: else they are estimated."""
+    points, own = np.asarray(cloud.points, dtype=np.float64), np.asarray(cloud.normals, dtype=np.float64)
+    sound = np.isfinite(points).all(axis=1)
+    points, own = points[sound], np.nan_to_num(own[sound])
     if len(points) < 200:
         raise InputError(f"cloud: {len(points)} points are too few to find the part in it; at least 200 are needed")
     rng = np.random.default_rng(o.seed)
     if len(points) > 40 * o.points:
-        points = points[rng.permutation(len(points))[: 40 * o.points]]
+        few = rng.permutation(len(points))[: 40 * o.points]
+        points, own = points[few], own[few]
     low, high = np.quantile(points, [0.002, 0.998], axis=0)
-    points = points[np.all((points >= low - 0.05 * (high - low)) & (points <= high + 0.05 * (high - low)), axis=1)]
+    core = np.all((points >= low - 0.05 * (high - low)) & (points <= high + 0.05 * (high - low)), axis=1)
+    points, own = points[core], own[core]
     # As many cells as are wanted points: halve the cell until there are.
     cell = float(np.linalg.norm(high - low)) / 20.0
     for _ in range(12):
@@ -98,12 +110,13 @@ def _some_points(cloud: DenseCloud, o: GlobalOptions) -> tuple[Array, Array]:
         if len(first) >= 0.7 * o.points or len(first) > 0.5 * len(points):
             break
         cell *= 0.8
-    tree = cKDTree(points)
     chosen = points[first]
-    _, near = tree.query(chosen, k=min(16, len(points)))
+    if np.mean(np.linalg.norm(own, axis=1) > 0.5) > 0.9:
+        return chosen, own[first], True
+    _, near = cKDTree(points).query(chosen, k=min(16, len(points)))
     around = points[near] - points[near].mean(axis=1, keepdims=True)
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
-    return chosen, vectors[:, :, 0]
+    return chosen, vectors[:, :, 0], False
 
 
 def _ladder(middle: float, o: GlobalOptions) -> Array:
@@ -112,7 +125,7 @@ def _ladder(middle: float, o: GlobalOptions) -> Array:
 
 
 def _main_axes(normals: Array, most: int) -> list[Array]:
-    """Directions, without sign, that most normals (N,3) have."""
+    """Directions that most normals (N,3) have, with the sign that most of them have."""
     left, found = normals[np.linalg.norm(normals, axis=1) > 0.5], []
     for _ in range(most):
         if len(left) < 0.03 * len(normals):
@@ -123,13 +136,13 @@ def _main_axes(normals: Array, most: int) -> list[Array]:
         if best.sum() < 0.04 * len(normals):
             break
         _, _, axes = np.linalg.svd(left[best], full_matrices=False)
-        found.append(axes[0])
+        found.append(axes[0] * (1.0 if np.mean(left[best] @ axes[0] > 0) >= 0.5 else -1.0))
         left = left[np.abs(left @ axes[0]) < np.cos(np.deg2rad(15.0))]
     return found or [np.array([0.0, 0.0, 1.0])]
 
 
 def _turns(of_cloud: Array, of_model: Array, o: GlobalOptions) -> list[Array]:
-    """Rotations (3,3) that turn the cloud's main direction onto one of the model's, all around it."""
+    """Rotations (3,3) that turn the cloud's main direction onto one of the model's, either side, all around it."""
     turns = []
     angles = np.arange(0.0, 360.0, o.step_deg)
     for target in _main_axes(of_model, 2):
@@ -148,7 +161,9 @@ def _between(a: Array, b: Array) -> Array:
     return exp_so3(axis / np.linalg.norm(axis) * np.arctan2(np.linalg.norm(axis), cosine))
 
 
-def _shifted(points: Array, samples: Array, turn: Array, model: Model, scale: float, o: GlobalOptions) -> tuple[float, float, Array]:
+def _shifted(
+    points: Array, samples: Array, turn: Array, model: Model, scale: float, o: GlobalOptions
+) -> tuple[float, float, Array]:
     """How well turned points fit at their best shift: score, scale, pose (4,4) of the scaled points."""
     from scipy import fft
 
@@ -177,7 +192,7 @@ def _voxels(points: Array, cell: float) -> tuple[Array, Array]:
     return gaussian_filter(grid, 0.8), low
 
 
-def _distinct(places: list[tuple[float, float, Array]], model: Model, o: GlobalOptions) -> list[tuple[float, float, Array]]:
+def _distinct(places: list[tuple[float, float, Array]], o: GlobalOptions) -> list[tuple[float, float, Array]]:
     """The best places that are not nearly one that is better."""
     kept: list[tuple[float, float, Array]] = []
     for score, scale, pose in places:
@@ -190,14 +205,18 @@ def _distinct(places: list[tuple[float, float, Array]], model: Model, o: GlobalO
 
 
 def _refined(
-    points: Array, surface: Surface, samples: Array, scale: float, pose: Array, with_scale: bool, limit_mm: float
+    points: Array, normals: Array | None, surface: Surface, samples: Array, start: tuple[float, Array],
+    with_scale: bool, limit_mm: float,
 ) -> tuple[float, float, Array]:  # fmt: skip
     """Cost, scale and pose (4,4) on the exact surface: Gauss–Newton on seven numbers with Tukey's weights."""
+    scale, pose = start
     width, size = 4.0 * limit_mm, 0.25 * float(np.linalg.norm(np.ptp(samples, axis=0)))
     for _ in range(40):
         moved = apply(pose, points * scale)
         closest = surface.closest(moved, TUKEY_SIGMAS * width)
         near = closest.faces >= 0
+        if normals is not None:
+            near &= np.sum(np.nan_to_num(closest.normals) * (normals @ pose[:3, :3].T), axis=1) > 0.3
         if np.count_nonzero(near) < 50:
             return np.inf, scale, pose
         x, n, r = moved[near], closest.normals[near], closest.distances[near]
@@ -222,10 +241,10 @@ def _refined(
     inside = np.all((moved > low) & (moved < high), axis=1)
     if np.count_nonzero(inside) < 0.3 * len(points):
         return np.inf, scale, pose
-    of_points = np.minimum(np.abs(surface.closest(moved[inside]).distances), limit_mm)
+    closest = surface.closest(moved[inside])
+    of_points = np.minimum(np.abs(closest.distances), limit_mm)
+    if normals is not None:
+        is_turned = np.sum(closest.normals * (normals[inside] @ pose[:3, :3].T), axis=1) < 0.0
+        of_points[is_turned] = limit_mm
     to_points = np.minimum(cKDTree(moved).query(samples)[0], 3.0 * limit_mm) / 3.0
     return float(of_points.mean() + 0.3 * to_points.mean()), scale, pose
-
-
-def _inverse(pose: Array) -> Array:
-    return np.linalg.inv(pose)

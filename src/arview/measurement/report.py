@@ -200,11 +200,12 @@ def datum_record(
 ) -> DatumSystem:
     """The frame of the deviations."""
     components = {datum.label: datum.component for datum in part.datums}
+    methods = dict.fromkeys(("plane", "point", "cylinder"), "sweep") | dict.fromkeys(("hole", "pin", "edge"), "edges")
     reports = tuple(
         DatumReport(
             one.label, one.feature, components.get(one.label, base[0]), one.locked, one.used, one.of,
             one.residual_mm, one.rest_mm, one.radius_mm,
-            {"plane": "sweep", "point": "sweep", "hole": "edges", "pin": "edges"}.get(one.feature, "sweep and edges"),
+            methods.get(one.feature, "sweep and edges") if reconstruction.sparse.photos else "cloud",
         )
         for one in alignment.datums
     )  # fmt: skip
@@ -221,6 +222,7 @@ def datum_record(
 
 def provenance_of(reconstruction: MetricReconstruction, options: MeasureOptions, cpu_s: float) -> Provenance:
     """What the numbers were made with."""
+    photos = reconstruction.sparse.photos
     used = [m for m in options.methods if m != "cloud" or reconstruction.cloud is not None]
     asked = {
         "methods": ",".join(options.methods),
@@ -235,9 +237,9 @@ def provenance_of(reconstruction: MetricReconstruction, options: MeasureOptions,
     return Provenance(
         tool="arview measure",
         version=__version__,
-        method=f"{', '.join(used)} in {len(reconstruction.sparse.photos)} photos",
-        photos_hash=content_key(photo.path for photo in reconstruction.sparse.photos),
-        photos=len(reconstruction.sparse.photos),
+        method=f"{', '.join(used)} in {len(photos)} photos" if photos else "cloud alone",
+        photos_hash=content_key(photo.path for photo in photos) if photos else "",
+        photos=len(photos),
         software=tuple((name, _version(name)) for name in _SOFTWARE),
         options=tuple(asked.items()),
         cpu_s=round(cpu_s, 2),

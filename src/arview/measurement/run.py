@@ -17,10 +17,11 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import DistanceReport, ForeignReport, Inspection
 from arview.measurement.alignment import Alignment, Equations, align, check_covered, move_equations
+from arview.measurement.cloud_datums import measure_datums_in_cloud
 from arview.measurement.combine import Combined
 from arview.measurement.datums import base_plane, measure_datums
 from arview.measurement.findings import look_at_cloud
-from arview.measurement.folder import MetricReconstruction
+from arview.measurement.folder import MetricReconstruction, in_model_frame
 from arview.measurement.options import Measured, MeasureOptions, combined_of
 from arview.measurement.photo import PhotoViews, load_views, measure_components_in_photos
 from arview.measurement.report import component_record, datum_doubts, datum_record, provenance_of
@@ -67,13 +68,19 @@ def _measure(
     if not names:
         raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
     # Without the covariance of the poses: it is carried to the components relative to the datums below.
-    views = load_views(replace(reconstruction.sparse, pose_covariance=None), part.model)
+    reconstruction = in_model_frame(reconstruction, part)
+    has_photos = bool(reconstruction.sparse.photos)
+    if not has_photos and "cloud" not in options.methods:
+        raise InputError("a cloud alone can only be measured by the method cloud")
+    views = load_views(replace(reconstruction.sparse, pose_covariance=None), part.model) if has_photos else None
     results = measure_all(reconstruction, views, part, [*base, *names], options, tell)
     tell("datums", 0, 1)
     alignment = align_to_datums(reconstruction, views, part, base, results, options)
     warnings += datum_doubts(alignment)
     poses = None
-    if reconstruction.sparse.pose_covariance is None:
+    if views is None:
+        warnings.append("a cloud alone: its scale and its bending are not known, they are not in U")
+    elif reconstruction.sparse.pose_covariance is None:
         warnings.append("the covariance of the camera poses is unknown: it is not in U")
     else:
         poses = PosePropagation(reconstruction.sparse, part.model, alignment, base)
@@ -101,12 +108,12 @@ def _measure(
 
 
 def measure_all(
-    reconstruction: MetricReconstruction, views: PhotoViews, part: Part, names: Sequence[str],
+    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, names: Sequence[str],
     options: MeasureOptions, tell: Progress,
 ) -> dict[str, Measured]:  # fmt: skip
     """Every component by every method asked for, in the rough frame."""
     found: dict[str, list[Move | NotMeasured]] = {name: [] for name in names}
-    if {"sweep", "edges"} & set(options.methods):
+    if views is not None and {"sweep", "edges"} & set(options.methods):
 
         def step(name: str, share: float) -> None:
             tell("components", round(share * len(names)), len(names))
@@ -119,8 +126,16 @@ def measure_all(
 
         tell("cloud", 0, 1)
         try:
-            measured = measure_components_in_cloud(reconstruction.cloud, part.model, part, reconstruction.sparse.photos)
+            measured = measure_components_in_cloud(
+                reconstruction.cloud,
+                part.model,
+                part,
+                reconstruction.sparse.photos,
+                names=names if views is None else None,
+            )
         except InputError as error:
+            if views is None:
+                raise
             measured = [NotMeasured(name, "cloud", str(error)) for name in names]
         for one in measured:
             if one.component in found:
@@ -135,7 +150,7 @@ def measure_all(
 
 
 def align_to_datums(
-    reconstruction: MetricReconstruction, views: PhotoViews, part: Part, base: Sequence[str],
+    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, base: Sequence[str],
     results: Mapping[str, Measured], options: MeasureOptions,
 ) -> Alignment:  # fmt: skip
     """The datum frame of the part file; where it leaves something free, or without datums, the base's best fit."""
@@ -144,14 +159,18 @@ def align_to_datums(
         together = combined_of(results[name]) if name in results else None
         if together is not None:
             fitted[name] = _as_move(name, together)
-    equations = measure_datums(part.datums, views, fitted, options.datums)
-    if not part.datums:
+    if views is None:
+        assert reconstruction.cloud is not None
+        equations = measure_datums_in_cloud(part.datums, part.model, reconstruction.cloud, fitted, options.datums)
+    else:
+        equations = measure_datums(part.datums, views, fitted, options.datums)
+    if not part.datums and views is not None:
         equations = _plane_of_base(views, part.model, base, options)
     rest = next((_rest_of_base(results[name], fitted[name], equations) for name in base if name in fitted), None)
     if rest is None and not equations:
         reasons = "; ".join(f.reason for name in base for f in results[name].failures)
         raise InputError(f"{', '.join(base)}: could not be measured, there is no frame: {reasons}")
-    holes = [datum for datum in part.datums if datum.feature in ("hole", "pin")]
+    holes = [datum for datum in part.datums if datum.feature in ("hole", "pin", "cylinder")]
     if part.datums:
         origin = np.array((holes or part.datums)[0].point_in_model)
     else:

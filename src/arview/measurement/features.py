@@ -1,0 +1,94 @@
+"""Datum features in the CAD: which faces of a component are a plane or a cylinder, where an edge runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.model import Component
+from arview.cad.part import Datum
+from arview.errors import InputError
+from arview.geometry import Array
+
+_OFF_MM = 0.05
+"""A vertex so far from a plane or line is not on it."""
+
+
+def _faces(component: Component) -> tuple[Array, Array]:
+    """Corners (F,3,3), and unit normals (F,3), zero where a face has no area."""
+    corners = component.vertices_in_model[component.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    return corners, np.where(size > 1e-9, normals / np.maximum(size, 1e-300), 0.0)
+
+
+def flat_faces(component: Component, datum: Datum) -> NDArray[np.bool_]:
+    """(F,) the faces in a datum plane. Raises InputError when there are none."""
+    corners, normals = _faces(component)
+    direction = np.array(datum.direction_in_model)
+    heights = (corners - np.array(datum.point_in_model)) @ direction
+    found = (normals @ direction > 0.999) & (np.abs(heights).max(axis=1) < _OFF_MM)
+    if not found.any():
+        raise InputError(f"datum {datum.label}: {datum.component!r} has no flat face at {list(datum.point_in_model)}")
+    return np.asarray(found)
+
+
+def round_faces(component: Component, datum: Datum) -> tuple[NDArray[np.bool_], float]:
+    """(F,) the faces of a cylinder about the datum's axis; 1 where they look outwards, -1 in a bore.
+
+    Raises InputError when there are none.
+    """
+    corners, normals = _faces(component)
+    axis, radius = np.array(datum.direction_in_model), 0.5 * float(datum.diameter_mm or 0.0)
+    arms = corners - np.array(datum.point_in_model)
+    radial = arms - (arms @ axis)[..., None] * axis
+    near = np.abs(np.linalg.norm(radial, axis=2) - radius).max(axis=1) < max(_OFF_MM, 0.02 * radius)
+    found = near & (np.abs(normals @ axis) < 0.05) & normals.any(axis=1)
+    if np.count_nonzero(found) < 6:
+        raise InputError(
+            f"datum {datum.label}: {datum.component!r} has no {datum.feature} of ⌀{2 * radius:g} mm about"
+            f" {list(datum.point_in_model)}"
+        )
+    outward = np.sum(normals[found] * radial[found].mean(axis=1), axis=1)
+    return np.asarray(found), 1.0 if np.mean(outward > 0) > 0.5 else -1.0
+
+
+@dataclass(frozen=True)
+class EdgeLine:
+    """A straight edge: its ends (3,), mm, and the unit normals (2,3) of the faces that meet there."""
+
+    start: Array
+    end: Array
+    normals: Array
+
+    @property
+    def direction(self) -> Array:
+        """(3,) unit."""
+        return np.asarray((self.end - self.start) / np.linalg.norm(self.end - self.start))
+
+    def points(self, count: int, margin_mm: float) -> Array:
+        """(N,3) along it, without its ends."""
+        length = float(np.linalg.norm(self.end - self.start))
+        share = np.linspace(min(margin_mm / length, 0.25), 1.0 - min(margin_mm / length, 0.25), count)
+        return np.asarray(self.start + share[:, None] * (self.end - self.start))
+
+
+def edge_line(component: Component, datum: Datum) -> EdgeLine:
+    """The edge of a component along the datum's line. Raises InputError when two flat faces do not meet there."""
+    corners, normals = _faces(component)
+    axis, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
+    arms = corners - point
+    along = arms @ axis
+    on = np.linalg.norm(arms - along[..., None] * axis, axis=2) < _OFF_MM
+    sides = np.flatnonzero((on.sum(axis=1) == 2) & normals.any(axis=1))
+    different = [normals[i] for i in sides if abs(normals[i] @ normals[sides[0]]) < 0.9]
+    if not different:
+        raise InputError(
+            f"datum {datum.label}: {datum.component!r} has no straight edge through {list(datum.point_in_model)}"
+        )
+    places = along[sides][on[sides]]
+    return EdgeLine(
+        point + places.min() * axis, point + places.max() * axis, np.stack([normals[sides[0]], different[0]])
+    )
