@@ -74,10 +74,12 @@ def find_model(
     fits = list(pool().map(lambda job: _refined(points, sides, surface, samples, job, scale is None, limit_mm), tried))
     fits.sort(key=lambda fit: fit[0])
     cost, found_scale, pose = fits[0]
-    if cost > 0.6 * limit_mm:
+    around = _around(apply(pose, points * found_scale), samples, limit_mm)
+    cost -= around * limit_mm
+    if around > 0.7 or cost > 0.6 * limit_mm * (1.0 - around):
         raise InputError("cloud: the part is not found in it: another part, or too little of it")
     for rival_cost, _, rival in fits[1:]:
-        if rival_cost > o.least_lead * cost + 1e-3 * limit_mm:
+        if rival_cost - around * limit_mm > o.least_lead * cost + 1e-3 * limit_mm:
             break
         moved = apply(rival @ invert(pose), samples)
         other_mm = np.abs(surface.closest(moved).distances)
@@ -235,16 +237,19 @@ def _refined(
         if np.abs(step).max() < 1e-4 * size and width <= 0.05 * limit_mm:
             break
         width = max(0.6 * width, 0.05 * limit_mm)
-    # Both ways: points that have no surface, and surface that has no points where others of it have.
+    # Both ways: points that have no surface, and surface that has no points. What lies around the part costs the same
+    # wherever it is.
     moved = apply(pose, points * scale)
-    low, high = samples.min(axis=0) - limit_mm, samples.max(axis=0) + limit_mm
-    inside = np.all((moved > low) & (moved < high), axis=1)
-    if np.count_nonzero(inside) < 0.3 * len(points):
-        return np.inf, scale, pose
-    closest = surface.closest(moved[inside])
+    closest = surface.closest(moved)
     of_points = np.minimum(np.abs(closest.distances), limit_mm)
     if normals is not None:
-        is_turned = np.sum(closest.normals * (normals[inside] @ pose[:3, :3].T), axis=1) < 0.0
-        of_points[is_turned] = limit_mm
-    to_points = np.minimum(cKDTree(moved).query(samples)[0], 3.0 * limit_mm) / 3.0
+        of_points[np.sum(closest.normals * (normals @ pose[:3, :3].T), axis=1) < 0.0] = limit_mm
+    apart = cKDTree(moved).query(samples)[0]
+    to_points = np.clip(apart - 2.0 * np.median(apart), 0.0, limit_mm)  # less what lies between the points
     return float(of_points.mean() + 0.3 * to_points.mean()), scale, pose
+
+
+def _around(points: Array, samples: Array, limit_mm: float) -> float:
+    """Share of points (N,3) outside the model's box: no part of it."""
+    low, high = samples.min(axis=0) - limit_mm, samples.max(axis=0) + limit_mm
+    return 1.0 - float(np.mean(np.all((points > low) & (points < high), axis=1)))

@@ -178,7 +178,8 @@ def align_to_datums(
     size_mm = 0.5 * float(np.linalg.norm(np.ptp(_bounds(part.model, base), axis=0)))
     kinds = {evidence.kind for evidence in reconstruction.scale.evidence if evidence.is_used}
     scale_std = reconstruction.scale.scale_std or 0.0
-    return align(equations, origin, size_mm, rest, scale_std, kinds <= {"cad"}, options.alignment)
+    finds_scale = bool(kinds) and kinds <= {"cad"}
+    return align(equations, origin, size_mm, rest, scale_std, finds_scale, options.alignment)
 
 
 def _plane_of_base(views: PhotoViews, model: Model, base: Sequence[str], options: MeasureOptions) -> list[Equations]:
