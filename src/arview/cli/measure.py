@@ -37,7 +37,8 @@ Examples:
   arview measure --cloud scan.ply --part part.toml
 
 \b
-OUT is the folder of `arview reconstruct --part`. Components of the role 'inspect' are measured, in the photos twice
+OUT is the folder of `arview reconstruct --part`; where that did not find the part, or with --cloud, the shape of the
+cloud says where it is. Components of the role 'inspect' are measured, in the photos twice
 (sweep: their surface; edges: their edges) and in the cloud where there is one; sweep and edges together are the
 result, the cloud is for comparison. Displacements are in the frame of the part file's datums; what they leave free,
 or all without datums, the best fit of the base decides. dx dy dz are those of the middle of a component's bounding

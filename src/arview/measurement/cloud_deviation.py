@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from arview.cad.model import Component, Model
 from arview.cad.part import Part
@@ -136,7 +137,8 @@ def measure_components_in_cloud(
     points = prepare_cloud(cloud, box, o.grid_mm, o.least_points)
     check_belongs(points, model, o.band_mm)
     views = Views(model, photos) if photos else None
-    with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
+    # Threads of BLAS would wait for each other on matrices as small as these.
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
         candidates = list(threads.map(lambda name: _candidate(name, model, part, views, o), names or part.inspected))
         first = list(threads.map(lambda c: _measure(c, points, None, o), candidates))
         places = {m.component: m.measured_from_nominal for m in first if isinstance(m, Move)}
