@@ -36,6 +36,10 @@ _ISOLATED = 3
 """A pixel with fewer neighbours (of 8) on its surface is a crumb."""
 
 
+_Points = tuple[Array, NDArray[np.float32], Image, NDArray[np.float32], NDArray[np.uint8]]
+"""Points (N,3), normals (N,3), colours (N,3), deviations (N,), view counts (N,)."""
+
+
 @dataclass(frozen=True)
 class _Stack:
     """All maps one after another: elements in the scan frame for numba.
@@ -81,12 +85,15 @@ def fuse(
     def merge(i: int) -> None:
         _merge(i, fellows[i], stack.elements, stack.layout, stack.cameras, stack.poses, limits, merged)
 
+    def points_of(i: int) -> _Points:
+        first, width, height = stack.layout[i]
+        _drop_crumbs(merged[first : first + width * height].reshape(height, width, 3))
+        return _points(maps[i], images[i], stack, merged, i)
+
     with ThreadPoolExecutor(threads) as pool:
         for done, _ in enumerate(pool.map(merge, range(len(maps))), start=1):
             progress("fusion", done, len(maps))
-    for first, width, height in stack.layout:
-        _drop_crumbs(merged[first : first + width * height].reshape(height, width, 3))
-    parts = [_points(m, image, stack, merged, i) for i, (m, image) in enumerate(zip(maps, images, strict=True))]
+        parts = list(pool.map(points_of, range(len(maps))))
     points, normals, colors, sigma, views = (np.concatenate([part[k] for part in parts]) for k in range(5))
     known = merged[:, 0] > 0
     footprint = float(np.median(merged[known, 0])) / maps[0].camera.fx if known.any() else 1.0
@@ -275,9 +282,7 @@ def _drop_crumbs(merged):  # type: ignore[no-untyped-def]
                 merged[y, x] = 0.0
 
 
-def _points(
-    m: DepthMap, image: Image, stack: _Stack, merged: NDArray[np.float32], index: int
-) -> tuple[Array, NDArray[np.float32], Image, NDArray[np.float32], NDArray[np.uint8]]:
+def _points(m: DepthMap, image: Image, stack: _Stack, merged: NDArray[np.float32], index: int) -> _Points:
     """Points, normals, colours, deviations and view counts of the merged pixels of one view."""
     first, width, height = stack.layout[index]
     here = slice(first, first + width * height)

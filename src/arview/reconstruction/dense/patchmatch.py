@@ -86,7 +86,7 @@ def try_hypotheses(p, s, index, planes, costs, hypotheses, spread, randoms, lowe
 
 @njit(cache=True, nogil=True, fastmath=True)
 def sweep(p, s, index, planes, costs, regions, color, step_w, step_tilt, seed):  # type: ignore[no-untyped-def]
-    """One half of a checkerboard iteration: the best neighbours' planes, then perturbations.
+    """One half of a checkerboard iteration: the best neighbours' planes, then a perturbation.
 
     ``step_w`` is the perturbation of w, ``step_tilt`` that of the slope (tangent).
     """
@@ -121,17 +121,13 @@ def sweep(p, s, index, planes, costs, regions, color, step_w, step_tilt, seed): 
                 if new < cost:
                     cost, w, du, dv = new, new_w, new_u, new_v
             if w > _ZERO:
-                for turn in range(3):
-                    new_w, new_u, new_v = w, du, dv
-                    if turn != 1:
-                        new_w += step_w * draw(seed, x, y, 3 * turn)
-                    if turn != 0:
-                        new_u += w / fx * step_tilt * draw(seed, x, y, 3 * turn + 1)
-                        new_v += w / fy * step_tilt * draw(seed, x, y, 3 * turn + 2)
-                    new = element_cost(
-                        pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, new_w, new_u, new_v, variance, cost
-                    )
-                    if new < cost:
-                        cost, w, du, dv = new, new_w, new_u, new_v
+                new_w = w + step_w * draw(seed, x, y, 0)
+                new_u = du + w / fx * step_tilt * draw(seed, x, y, 1)
+                new_v = dv + w / fy * step_tilt * draw(seed, x, y, 2)
+                new = element_cost(
+                    pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, new_w, new_u, new_v, variance, cost
+                )
+                if new < cost:
+                    cost, w, du, dv = new, new_w, new_u, new_v
             costs[y, x] = cost
             planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, du, dv

@@ -260,14 +260,11 @@ class _Search:
                 is_new = (lowest < 2.0) & ~is_same
                 best = torch.where(is_new[:, None], moved, best)
                 costs = torch.where(is_new, better, costs)
-            for turn in range(3):
-                plane = best.clone()
-                if turn != 1:
-                    plane[:, 0] += step_w * self._draw(seed, x, y, 3 * turn)
-                if turn != 0:
-                    plane[:, 1] += best[:, 0] / numbers[FX] * step_tilt * self._draw(seed, x, y, 3 * turn + 1)
-                    plane[:, 2] += best[:, 0] / numbers[FY] * step_tilt * self._draw(seed, x, y, 3 * turn + 2)
-                moved, better = self._better(y, x, window, plane, best, costs)
-                known = best[:, 0] > 0
-                best, costs = torch.where(known[:, None], moved, best), torch.where(known, better, costs)
+            plane = best.clone()
+            plane[:, 0] += step_w * self._draw(seed, x, y, 0)
+            plane[:, 1] += best[:, 0] / numbers[FX] * step_tilt * self._draw(seed, x, y, 1)
+            plane[:, 2] += best[:, 0] / numbers[FY] * step_tilt * self._draw(seed, x, y, 2)
+            moved, better = self._better(y, x, window, plane, best, costs)
+            known = best[:, 0] > 0
+            best, costs = torch.where(known[:, None], moved, best), torch.where(known, better, costs)
             self.planes[y, x], self.costs[y, x] = best, costs
