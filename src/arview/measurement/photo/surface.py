@@ -99,11 +99,19 @@ def face_normals(component: Component) -> Array:
 
 def near_others(points: Array, model: Model, component: int, reach_mm: float) -> NDArray[np.bool_]:
     """(N,) which points (N,3) are within ``reach_mm`` of the surface of another component."""
-    vertices, faces, owner = model.mesh
-    corners = vertices[faces[owner != component]]
-    low, high = points.min(axis=0) - reach_mm, points.max(axis=0) + reach_mm
-    corners = corners[((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)).all(axis=1)]
-    return np.asarray(_nearer_than(points, np.ascontiguousarray(corners), reach_mm))
+    result = np.zeros(len(points), dtype=np.bool_)
+    for index, other in enumerate(model.components):
+        corners = other.vertices_in_model[other.faces]
+        if index == component or len(corners) == 0:
+            continue
+        low, high = corners.min(axis=(0, 1)) - reach_mm, corners.max(axis=(0, 1)) + reach_mm
+        (near,) = np.nonzero(~result & ((points >= low) & (points <= high)).all(axis=1))
+        if len(near) == 0:
+            continue
+        low, high = points[near].min(axis=0) - reach_mm, points[near].max(axis=0) + reach_mm
+        corners = corners[((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)).all(axis=1)]
+        result[near] = _nearer_than(points[near], np.ascontiguousarray(corners), reach_mm)
+    return result
 
 
 def near_edges(points: Array, component: Component, reach_mm: float) -> NDArray[np.bool_]:
