@@ -92,6 +92,7 @@ def write_hdr_clip(path: Path, levels: Sequence[int], transfer: int) -> Path:
         context.colorspace, context.color_primaries, context.color_range = 9, 9, 1
         context.color_trc = transfer
         frame = av.VideoFrame(64 * len(levels), 64, "yuv420p10le")
+        frame.pts, frame.time_base = 0, Fraction(1, 30)  # without them the encoder's flush fails now and then
         luma = np.repeat(np.array(levels, dtype=np.uint16), 64)[None].repeat(64, 0)
         chroma = np.full((32, luma.shape[1] // 2), 512, np.uint16)
         for plane, values in zip(frame.planes, [luma, chroma, chroma], strict=True):

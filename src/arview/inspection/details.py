@@ -161,8 +161,15 @@ class ForeignReport:
 
 
 @dataclass(frozen=True)
-class DistanceRow:
-    """Signed distances of the cloud's points to a component's nominal surface, or to all (``all``), mm."""
+class DistanceStatistics:
+    """Of the signed distances of the cloud's points to one component's nominal surface, or to all: mm.
+
+    Attributes:
+        name: of the component, or ``all``.
+        count: points.
+        mean_mm, sigma_mm, median_mm: of the distances within the reach of the map.
+        fwhm_mm: full width at half maximum of their distribution: the width of its core, however long its tails.
+    """
 
     name: str
     count: int
@@ -177,7 +184,7 @@ class DistanceReport:
     """Distances of the aligned cloud to the CAD: points within ``reach_mm`` alone; files beside the inspection."""
 
     reach_mm: float
-    statistics: tuple[DistanceRow, ...]
+    statistics: tuple[DistanceStatistics, ...]
     files: tuple[str, ...] = ()
 
 

@@ -14,6 +14,7 @@ from arview.atomic import replacing
 from arview.cad.model import Model
 from arview.errors import InputError, OutputError
 from arview.geometry import Array, apply, look_at
+from arview.inspection import DistanceStatistics
 from arview.measurement.plot import Chart, Picture
 from arview.measurement.surface import Surface
 from arview.reconstruction.types import DenseCloud
@@ -22,25 +23,6 @@ _BINS = 400
 _WHOLE = "all"
 _STOPS = np.array([[33, 60, 160], [80, 170, 230], [225, 235, 225], [245, 170, 60], [180, 30, 30]], dtype=np.float64)
 """From − to + limit."""
-
-
-@dataclass(frozen=True)
-class DistanceStatistics:
-    """Of the signed distances of one component, or of all: mm.
-
-    Attributes:
-        name: of the component, or ``all``.
-        count: points.
-        mean_mm, sigma_mm, median_mm: of the distances within the reach of the map.
-        fwhm_mm: full width at half maximum of their distribution: the width of its core, however long its tails.
-    """
-
-    name: str
-    count: int
-    mean_mm: float
-    sigma_mm: float
-    median_mm: float
-    fwhm_mm: float
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from arview.cad.model import Model
 from arview.errors import InputError, OutputError
 from arview.geometry import apply, invert
-from arview.inspection import ComponentDeviation, DistanceReport, DistanceRow, ForeignReport, Verdict
+from arview.inspection import ComponentDeviation, DistanceReport, ForeignReport, Verdict
 from arview.measurement.alignment import Alignment
 from arview.measurement.distance_map import (
     DistanceMap,
@@ -52,11 +52,7 @@ def look_at_cloud(
     except InputError:  # nothing of the cloud is at the part: said of every component already
         return (), None
     files = () if folder is None else write_distance_map(distances, model, folder)
-    rows = tuple(
-        DistanceRow(row.name, row.count, row.mean_mm, row.sigma_mm, row.median_mm, row.fwhm_mm)
-        for row in distances.statistics
-    )
-    return tuple(_report(one) for one in found), DistanceReport(distances.reach_mm, rows, files)
+    return tuple(_report(one) for one in found), DistanceReport(distances.reach_mm, distances.statistics, files)
 
 
 def write_distance_map(distances: DistanceMap, model: Model, folder: Path) -> tuple[str, ...]:
