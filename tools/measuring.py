@@ -8,21 +8,27 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from arview.geometry import Array, apply, rigid
+from arview.cad import load_part
+from arview.geometry import Array, apply, rigid, rotation_angle_rad
 from arview.inspection import ComponentDeviation, Details, MethodResult, Verdict, load_inspection
+from arview.measurement.alignment import align
+from arview.measurement.datums import DatumOptions, measure_datums
 from arview.measurement.decision import decide
+from arview.measurement.folder import read_folder
+from arview.measurement.photo import load_views
 from lines import Line
 from reconstructing import timed_run
 from recordings import PhotoSet
 
 TOLERANCE_MM = 0.5
 CLOUD_TARGET_MM = 0.20
+CHOICES = 20
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,7 @@ def measure_lines(sets: Sequence[PhotoSet], folder: Path, details: dict[str, Any
         text = ", ".join(f"{value:.0f} s {name}" for name, value in seconds.items())
         reached = seconds["in photos"] <= 30 and seconds["without Monte Carlo"] <= 8
         lines.append(Line("time after the cloud", photos.name, text, "≤ 30 s, ≤ 8 s without Monte Carlo", reached))
+        lines += repeatability_lines(photos, out)
         details.setdefault("measure", {})[photos.name] = [plain(row) for row in rows]
     if every:
         lines += honesty_lines(every, len(sets))
@@ -163,6 +170,34 @@ def judgement(row: Row) -> str:
     if (verdict is Verdict.PASS) == is_good:
         return "right"
     return "false pass" if verdict is Verdict.PASS else "false fail"
+
+
+def repeatability_lines(photos: PhotoSet, out: Path) -> list[Line]:
+    """How the datum frame spreads when it is measured in random choices of the photos; nothing without datums."""
+    part = load_part(photos.part)
+    if not part.datums:
+        return []
+    sparse = replace(read_folder(out).sparse, pose_covariance=None)
+    low, high = part.model.component(part.datums[0].component).bounds_in_model
+    rng = np.random.default_rng(0)
+    frames = []
+    for _ in range(CHOICES):
+        kept = np.sort(rng.choice(len(sparse.photos), 2 * len(sparse.photos) // 3, replace=False))
+        is_kept = np.isin(sparse.observed_photo, kept)
+        some = replace(
+            sparse, photos=tuple(sparse.photos[k] for k in kept), observed_point=sparse.observed_point[is_kept],
+            observed_photo=np.searchsorted(kept, sparse.observed_photo[is_kept]).astype(np.int32),
+            observed_px=sparse.observed_px[is_kept],
+        )  # fmt: skip
+        equations = measure_datums(part.datums, load_views(some, part.model), {}, DatumOptions())
+        middle, size_mm = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+        frames.append(align(equations, middle, size_mm).rough_from_datum)
+    found = np.array(frames)
+    spread_mm = float(np.ptp(found[:, :3, 3], axis=0).max())
+    turn_deg = max(float(np.degrees(rotation_angle_rad(a, b))) for i, a in enumerate(found) for b in found[:i])
+    text = f"origin within {spread_mm:.3f} mm, axes within {turn_deg:.4f}° of each other"
+    on = f"{photos.name}, {CHOICES} choices of two thirds of the photos"
+    return [Line("datum repeatability", on, text, "≤ 0.03 mm, ≤ 0.01°", spread_mm <= 0.03 and turn_deg <= 0.01)]
 
 
 def honesty_lines(rows: Sequence[Row], sets: int) -> list[Line]:
