@@ -6,7 +6,6 @@ import json
 import resource
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,14 +47,13 @@ class CameraErrors:
     true_from_found: Similarity
 
 
-def reconstruct_lines(sets: Sequence[PhotoSet], details: dict[str, Any]) -> list[Line]:
-    """Lines for every photo set."""
+def reconstruct_lines(sets: Sequence[PhotoSet], folder: Path, details: dict[str, Any]) -> list[Line]:
+    """Lines for every photo set, done anew into the folder."""
     lines = []
     for photos in sets:
-        with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder)
-            seconds, memory_mb = timed_run(photos, out)
-            lines += lines_of(photos, out, seconds, memory_mb, details)
+        out = folder / photos.name
+        seconds, memory_mb = timed_run(photos, out, "--force")
+        lines += lines_of(photos, out, seconds, memory_mb, details)
     return lines
 
 

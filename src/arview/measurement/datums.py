@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -33,9 +33,7 @@ class DatumOptions:
     reach_mm: float = 1.0  # how far a feature may be from its rough place
     rim_points: int = 120  # around a hole; about a px apart on small ones
     fine_reach_px: float = 3.0  # around the place that the first look at a rim has found
-    rim_px: float = (
-        0.07  # standard uncertainty of a rim's place by what is around it: rust, chalk, burrs: as of four rendered rims
-    )
+    rim_px: float = 0.07  # standard uncertainty of a rim by rust, chalk and burrs beside it: of four rendered rims
     rival_px: float = 3.0  # a point of a rim with the other rim so near, in that photo, is not looked at
     sweep: SweepOptions = field(default_factory=SweepOptions)
     edges: EdgeOptions = field(default_factory=EdgeOptions)
@@ -250,39 +248,75 @@ def _measure_rim(datum: Datum, views: PhotoViews, o: DatumOptions) -> Equations:
     if len(np.unique(view)) < 3:
         raise InputError(f"datum {datum.label} ({datum.feature}): fewer than 3 photos show it; photograph it too")
     px_mm = views.mm_per_px(rim.center)
-    # Two looks: a wide one, and one around what it has found.
-    shift, radius_mm, reach_px = np.zeros(3), 0.0, o.reach_mm / px_mm + 2.0
-    for _ in range(3):
-        moved = points[which] + shift + radius_mm * radial[which]
-        found = edge_offsets(EdgePoints(moved, tangents[which], view), rim.center + shift, views, reach_px, o.edges)
+
+    def edges_at(found: Array) -> tuple[EdgePoints, Array]:
+        moved = points[which] + found[:3] + found[3] * radial[which]
+        return EdgePoints(moved, tangents[which], view), rim.center + found[:3]
+
+    def design_of(directions: Array, ok: NDArray[np.bool_]) -> Array:
+        return np.concatenate([directions, np.sum(directions * radial[which[ok]], axis=1)[:, None]], axis=1)
+
+    steps = _find_steps(datum, views, edges_at, design_of, 4, px_mm, o)
+    equations = surface_equations(
+        datum.label, datum.feature, points[which[steps.ok]], steps.directions, steps.offsets, steps.variances,
+        len(which), steps.design[:, 3], datum.locks,
+    )  # fmt: skip
+    return replace(equations, form_mm=o.rim_px * px_mm)
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Steps of brightness found at some of N edge points.
+
+    ``ok`` (N,); of those: ``directions`` (K,3) across the edge, ``offsets`` (K,) from the nominal place, their
+    ``variances``, mm, and ``design`` (K,U), their derivative by what is unknown of the place.
+    """
+
+    ok: NDArray[np.bool_]
+    directions: Array
+    offsets: Array
+    variances: Array
+    design: Array
+
+
+def _find_steps(
+    datum: Datum, views: PhotoViews, edges_at: Callable[[Array], tuple[EdgePoints, Array]],
+    design_of: Callable[[Array, NDArray[np.bool_]], Array], unknowns: int, px_mm: float, o: DatumOptions,
+    rcond: float = 1e-15,
+) -> _Steps:  # fmt: skip
+    """Three looks: a wide one, then about the place that the one before has found.
+
+    Args:
+        datum: for the message.
+        views: the photos.
+        edges_at: of the unknowns (U,), the edge points there and a point on the feature's inside.
+        design_of: of directions (K,3) and which points they are at, the derivative (K,U) of offsets by the unknowns.
+        unknowns: U.
+        px_mm: size of a pixel.
+        o: reach of the looks.
+        rcond: directions of the unknowns that are known worse than this are left at zero.
+
+    Raises:
+        InputError: too few steps.
+    """
+    place = np.zeros(unknowns)
+    for reach_px in (o.reach_mm / px_mm + 2.0, o.fine_reach_px, o.fine_reach_px):
+        edges, inside = edges_at(place)
+        found = edge_offsets(edges, inside, views, reach_px, o.edges)
         ok = found.seen & (found.slopes != 0.0)
         if np.count_nonzero(ok) < o.edges.least_points:
             raise InputError(
                 f"datum {datum.label} ({datum.feature}): its edge is seen at {np.count_nonzero(ok)} of"
                 f" {len(ok)} places only; is it filled, or covered?"
             )
-        directions, size = found.directions[ok], found.mm_per_px[ok]
-        by_radius = np.sum(directions * radial[which[ok]], axis=1)
-        slope = np.abs(found.slopes[ok])
-        variances = (0.3 * size) ** 2 * (slope + o.edges.half_slope) / slope
-        offsets = found.offsets_mm[ok] + directions @ shift + by_radius * radius_mm
-        design = np.concatenate([directions, by_radius[:, None]], axis=1)
+        directions, slope = found.directions[ok], np.abs(found.slopes[ok])
+        variances = (0.3 * found.mm_per_px[ok]) ** 2 * (slope + o.edges.half_slope) / slope
+        design = design_of(directions, ok)
+        offsets = found.offsets_mm[ok] + design @ place
         share, _ = robust_weights(design, offsets, variances)
         weighted = design * (share / variances)[:, None]
-        solution = np.linalg.pinv(weighted.T @ design, hermitian=True) @ (weighted.T @ offsets)
-        shift, radius_mm, reach_px = solution[:3], float(solution[3]), o.fine_reach_px
-    equations = surface_equations(
-        datum.label,
-        datum.feature,
-        points[which[ok]],
-        directions,
-        offsets,
-        variances,
-        len(which),
-        by_radius,
-        datum.locks,
-    )
-    return replace(equations, form_mm=o.rim_px * px_mm)
+        place = np.linalg.pinv(weighted.T @ design, rcond=rcond, hermitian=True) @ (weighted.T @ offsets)
+    return _Steps(ok, directions, offsets, variances, design)
 
 
 def _rim_views(views: PhotoViews, rim: Rim, points: Array, radial: Array, o: DatumOptions) -> NDArray[np.bool_]:
@@ -330,7 +364,7 @@ def _measure_cylinder(datum: Datum, views: PhotoViews, o: DatumOptions) -> Equat
 
 
 def _measure_edge(datum: Datum, views: PhotoViews, o: DatumOptions) -> Equations:
-    """Steps of brightness across a straight edge, in all photos that show it: two looks, as at a rim."""
+    """Steps of brightness across a straight edge, in all photos that show it."""
     line = edge_line(views.model.component(datum.component), datum)
     px_mm = views.mm_per_px(0.5 * (line.start + line.end))
     points = line.points(o.rim_points, 6.0 * px_mm)
@@ -344,26 +378,15 @@ def _measure_edge(datum: Datum, views: PhotoViews, o: DatumOptions) -> Equations
     which, view = np.nonzero(seen)
     if len(np.unique(view)) < 3:
         raise InputError(f"datum {datum.label} (edge): fewer than 3 photos show it; photograph it too")
-    # Offsets are looked for and fitted about the place that the look before has found.
     project = np.eye(3) - np.outer(line.direction, line.direction)
     inside = 0.5 * (line.start + line.end) - 10.0 * line.normals.sum(axis=0)
     tangents = np.tile(line.direction, (len(which), 1))
-    shift, reach_px = np.zeros(3), o.reach_mm / px_mm + 2.0
-    for _ in range(3):
-        found = edge_offsets(EdgePoints(points[which] + shift, tangents, view), inside, views, reach_px, o.edges)
-        ok = found.seen & (found.slopes != 0.0)
-        if np.count_nonzero(ok) < o.edges.least_points:
-            raise InputError(
-                f"datum {datum.label} (edge): seen at {np.count_nonzero(ok)} of {len(ok)} places only; is it covered?"
-            )
-        directions, slope = found.directions[ok], np.abs(found.slopes[ok])
-        variances = (0.3 * found.mm_per_px[ok]) ** 2 * (slope + o.edges.half_slope) / slope
-        offsets = found.offsets_mm[ok] + directions @ shift
-        share, _ = robust_weights(directions @ project, offsets, variances)
-        weighted = (directions @ project) * (share / variances)[:, None]
-        shift = np.linalg.pinv(weighted.T @ directions @ project, rcond=1e-6) @ (weighted.T @ offsets)
-        reach_px = o.fine_reach_px
+    steps = _find_steps(
+        datum, views, lambda shift: (EdgePoints(points[which] + shift, tangents, view), inside),
+        lambda directions, _: directions @ project, 3, px_mm, o, rcond=1e-6,
+    )  # fmt: skip
     equations = surface_equations(
-        datum.label, "edge", points[which[ok]], directions, offsets, variances, len(which), None, datum.locks
-    )
+        datum.label, "edge", points[which[steps.ok]], steps.directions, steps.offsets, steps.variances, len(which),
+        None, datum.locks,
+    )  # fmt: skip
     return replace(equations, form_mm=o.rim_px * px_mm)

@@ -22,7 +22,8 @@ class MeasuredComponent:
         views, index, options: as given.
         shape: the component.
         center: (3,) of its bounding box.
-        radius_mm: half the diagonal of its bounding box.
+        corners: (8,3) of its bounding box.
+        radius_mm: half its diagonal.
         px_mm: size of a pixel there.
         free: (K,6) moves that its shape does not show, see `free_directions`.
     """
@@ -30,7 +31,9 @@ class MeasuredComponent:
     def __init__(self, views: PhotoViews, index: int, part: Part | None, options: PhotoOptions) -> None:
         self.views, self.index, self.options = views, index, options
         self.shape = views.model.components[index]
+        low, high = self.shape.bounds_in_model
         self.center = self.shape.bounds_in_model.mean(axis=0)
+        self.corners = low + np.array(list(np.ndindex(2, 2, 2))) * (high - low)
         self.radius_mm = 0.5 * float(np.linalg.norm(np.ptp(self.shape.bounds_in_model, axis=0)))
         self.px_mm = views.mm_per_px(self.center)
         self.free = free_directions(self.shape, part, self.center, self.radius_mm)
@@ -47,9 +50,8 @@ class MeasuredComponent:
 
     def is_same(self, place: Array, other: Array) -> bool:
         """Whether no corner of the component's box differs by a quarter of a pixel: too little to hide or show it."""
-        low, high = self.shape.bounds_in_model
-        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
-        return float(np.linalg.norm(apply(place, corners) - apply(other, corners), axis=1).max()) < 0.25 * self.px_mm
+        apart = apply(place, self.corners) - apply(other, self.corners)
+        return float(np.linalg.norm(apart, axis=1).max()) < 0.25 * self.px_mm
 
     def free_at(self, place: Array) -> Array:
         """The free directions turned along with the component."""

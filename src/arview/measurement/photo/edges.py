@@ -198,7 +198,7 @@ class ComponentEdges:
             step = place @ invert(before)
             return EdgePoints(apply(step, edges.points), edges.tangents @ step[:3, :3].T, edges.view)
         o = self.options.edges
-        corners = apply(place, _box_corners(self.body.shape.bounds_in_model))
+        corners = apply(place, self.body.corners)
         points, tangents, views = [], [], []
         for view in range(len(self.views.cameras)):
             window = self.views.window(view, self.body.index, place, corners)
@@ -289,10 +289,6 @@ _FEW_PAIRS = 700
 """Points whose pairs say how alike errors are, while the place is still being sought."""
 _SIGMA_PX = 0.3
 """Of a strong step; what residuals show replaces it."""
-
-
-def _box_corners(bounds: Array) -> Array:
-    return np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

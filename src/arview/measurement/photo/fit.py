@@ -74,7 +74,7 @@ def fit_rigid(
     scaled = rows * scale
     white = scaled / sigmas[:, None]
     target = offsets / sigmas
-    basis = _complement(free)
+    basis = _across(free)
     weights = np.ones(len(rows))
     spread = 1.0
     # A direction is open when the data cannot hold it; neighbours are alike, so that few are independent.
@@ -115,7 +115,7 @@ def fit_rigid(
     return RigidFit(
         twist=project @ solution * scale,
         covariance=project @ covariance @ project * np.outer(scale, scale),
-        undetermined=_complement(held.T).T,
+        undetermined=_across(held.T).T,
         weights=weights,
         residual_mm=1.4826 * float(np.median(np.abs(left[is_in] * sigmas[is_in]))) if is_in.any() else float("inf"),
         gain=scale[:, None] * (project @ gain),
@@ -144,13 +144,6 @@ def _across(directions: Array) -> Array:
     _, values, vectors = np.linalg.svd(directions)
     rank = int(np.count_nonzero(values > 1e-9))
     return np.asarray(vectors[rank:].T)
-
-
-def _complement(directions: Array) -> Array:
-    """(6,6-K) orthonormal columns across K orthonormal rows."""
-    if not len(directions):
-        return np.eye(6)
-    return np.asarray(np.linalg.svd(directions)[2][len(directions) :].T)
 
 
 def _correlated(rows: Array, residuals: Array, places: Array, stride: int = 1) -> Array:
