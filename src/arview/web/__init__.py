@@ -1,4 +1,4 @@
-"""What arview's pages share: three.js in one file, read from the package (see ``tools/vendor-three``)."""
+"""What arview's pages share, read from the package: three.js in one file and a font (see ``tools/vendor-web``)."""
 
 from __future__ import annotations
 
@@ -8,3 +8,8 @@ from importlib import resources
 def three_js() -> str:
     """three.js and OrbitControls, minified, as a classic script that defines the global ``THREE``; MIT licence."""
     return (resources.files("arview.web") / "three.min.js").read_text(encoding="utf-8")
+
+
+def font(name: str) -> bytes:
+    """Inter as WOFF2, SIL Open Font Licence: ``inter-400`` and ``inter-600`` (Latin), ``inter-greek-400``."""
+    return (resources.files("arview.web") / f"{name}.woff2").read_bytes()

@@ -1,4 +1,4 @@
-// What arview's pages use of three.js. `tools/vendor-three` makes three.min.js of it; names may be added.
+// What arview's pages use of three.js. `tools/vendor-web` makes three.min.js of it; names may be added.
 export {
   AmbientLight, ArrowHelper, Box3, BufferAttribute, BufferGeometry, CanvasTexture, Color, ConeGeometry, CylinderGeometry,
   DirectionalLight, DoubleSide, EdgesGeometry, Float32BufferAttribute, FrontSide, Group, HemisphereLight, Line,
