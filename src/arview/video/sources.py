@@ -76,5 +76,18 @@ def open_source(
     )
 
 
+def check_source(spec: str | Path) -> None:
+    """Make sure that a file, folder or glob can be read; a camera or address need not be there yet.
+
+    Raises:
+        InputError: as `open_source`.
+    """
+    text = str(spec)
+    is_url = _URL.match(text) and not text.startswith("file://")
+    is_camera = _CAMERA_INDEX.fullmatch(text) and (text.startswith("/dev/") or not Path(text).exists())
+    if not (is_url or is_camera):
+        open_source(spec).close()
+
+
 def _suffixes() -> str:
     return ", ".join(sorted(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES))

@@ -1,0 +1,244 @@
+"""The command that serves the live overlay: live."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from arview.cli.common import EXIT_INTERRUPTED, RENDERER, UNIT, main, output_path, progress_bar, say
+from arview.errors import InputError, MissingDependencyError
+
+if TYPE_CHECKING:
+    from arview.live.hub import Hub
+    from arview.live.options import LiveOptions
+    from arview.live.server import LiveServer, Place
+    from arview.live.subject import Subject
+
+EXTRA = ("aiortc", "starlette", "uvicorn", "cryptography", "segno")
+_AGES_S = {"min": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+def _parse_age(ctx: click.Context, parameter: click.Parameter, value: str) -> float | None:
+    """Seconds of an age like 8h, 3d or 90min; None for never."""
+    if value == "never":
+        return None
+    for unit, length_s in _AGES_S.items():
+        if value.endswith(unit):
+            try:
+                age_s = float(value.removesuffix(unit)) * length_s
+            except ValueError:
+                break
+            if 0 < age_s < float("inf"):
+                return age_s
+    raise click.BadParameter(f"{value!r}: expected an age like 8h, 3d or 90min, or never")
+
+
+def _parse_size(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[int, int]:
+    """Width and height of 640x480."""
+    width, _, height = value.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise click.BadParameter(f"{value!r}: expected a size like 1280x720")
+    return int(width), int(height)
+
+
+@main.command(
+    short_help="Show the overlay live on a phone or screen.",
+    epilog="""\b
+Examples:
+  arview live --part part.toml --inspection inspection.json
+  arview live --part part.toml --inspection inspection.json --camera phone.json --record session.mp4
+  arview live --part part.toml --source 0 --camera webcam.json
+  arview live --part part.toml --source rtsp://camera.local/1 --camera station.json
+  arview live --part part.toml --source clip.mp4 --camera camera.json --http
+
+\b
+Point a phone in the same network at the printed code. The first time it has to be told to trust the station,
+because browsers give the camera to secure pages only: the second address that is printed explains it. Nothing
+is installed on the phone and nothing leaves the local network. The link holds a token that is new in each run;
+whoever has it may look.
+
+\b
+SOURCE phone: every phone sends its own camera and has its own tracker. A camera number, an RTSP or HTTP
+address, or a file (played at its own rate, over and over): all pages show that picture.
+--http serves this machine's own browser only, without certificates, for trying things out.
+
+\b
+CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt) or fov:DEG; it is
+scaled to the frames if their shape is the same. Without it a common phone is assumed, and the page says so:
+the overlay fits roughly, distances are not to be trusted.
+
+\b
+The page reloads inspection.json when it changes, and says when it is older than --max-age or of another
+serial number than the part file's (or --serial). Recordings made from the page are put in the folder of --record,
+or in the present one. Ctrl-C ends the run and finishes the files.""",
+)
+@click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
+@click.option("--guideviews", "views_path", metavar="SET", help="Guide views; without it they are made and kept.")
+@click.option("--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are shown.")
+@click.option("--source", default="phone", show_default=True, metavar="SOURCE", help="Whose camera; see below.")
+@click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG; see below.")
+@click.option("--init", metavar="guide:NAME", help="Align the part with an outline first, as in annotate.")
+@click.option(
+    "--host", metavar="ADDRESS", help="Address to listen at; default: that in the local network. 0.0.0.0: all."
+)
+@click.option("--port", type=click.IntRange(0, 65534), default=8443, show_default=True,
+              help="Port of the pages; the page about the certificate gets the next one.")  # fmt: skip
+@click.option("--http", "is_plain", is_flag=True, help="Plain HTTP for a browser on this machine.")
+@click.option("--cert", metavar="PEM", type=click.Path(path_type=Path), help="Certificate chain of your own.")
+@click.option("--key", metavar="PEM", type=click.Path(path_type=Path), help="Its key.")
+@click.option("--clients", type=click.IntRange(1, 64), metavar="N",
+              help="Pages at once; default: 2 phones, or 8 that look at a station camera.")  # fmt: skip
+@click.option("--record", metavar="OUT.mp4", help="Record what is shown from the start; a second phone: OUT-2.mp4.")
+@click.option("--serial", metavar="TEXT", help="Serial number of the part at hand; default: the part file's.")
+@click.option("--max-age", callback=_parse_age, default="24h", show_default=True, metavar="AGE",
+              help="An older inspection is called old: 8h, 3d, 90min, never.")  # fmt: skip
+@click.option("--size", callback=_parse_size, default="1280x720", show_default=True, metavar="WxH",
+              help="Of the phone's pictures, held sideways.")  # fmt: skip
+@click.option("--fps", type=float, default=30.0, show_default=True, help="Of the phone's pictures.")
+@RENDERER
+@UNIT
+@click.pass_context
+def live(
+    ctx: click.Context,
+    part_path: str,
+    views_path: str | None,
+    inspection_path: str | None,
+    source: str,
+    camera_spec: str | None,
+    init: str | None,
+    host: str | None,
+    port: int,
+    is_plain: bool,
+    cert: Path | None,
+    key: Path | None,
+    clients: int | None,
+    record: str | None,
+    serial: str | None,
+    max_age: float | None,
+    size: tuple[int, int],
+    fps: float,
+    renderer: str,
+    unit: str | None,
+) -> None:
+    """Serve the overlay of PART to phones and screens in the local network."""
+    require_extra()
+    from arview.live.options import LiveOptions
+    from arview.live.server import LiveServer, take_place
+    from arview.video.sources import check_source
+
+    if init is not None and not init.startswith("guide:"):
+        raise InputError(f"--init {init}: expected guide:NAME")
+    if (cert is None) != (key is None):
+        raise InputError("--cert and --key belong together; give both or none")
+    inputs = [part_path, views_path, inspection_path, camera_spec, source]
+    record_path = output_path(record, inputs) if record else None
+    if record_path is not None and record_path.suffix.lower() not in (".mp4", ".m4v", ".mov"):
+        raise InputError(f"--record {record}: the name of the video must end in .mp4, .m4v or .mov")
+    if source != "phone":
+        check_source(source)
+    options = LiveOptions(
+        source=source,
+        camera=camera_spec,
+        inspection=Path(inspection_path) if inspection_path else None,
+        serial=serial,
+        max_age_s=max_age,
+        guide=init.removeprefix("guide:") if init else None,
+        record=record_path,
+        record_folder=record_path.parent if record_path else Path(),
+        width=size[0],
+        height=size[1],
+        fps=fps,
+        clients=clients,
+    )
+    _tell_logs()
+    place = take_place(host, port, is_plain, cert, key)
+    server = LiveServer(options, place)
+    asyncio.run(_serve(server, options, part_path, views_path, renderer, unit))
+    say("ended; files are finished")
+    ctx.exit(EXIT_INTERRUPTED)
+
+
+def require_extra() -> None:
+    """Make sure that the libraries of the live server are there.
+
+    Raises:
+        MissingDependencyError: with the line that installs them.
+    """
+    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
+    if missing:
+        raise MissingDependencyError(
+            f"arview live needs {', '.join(missing)}: run  pip install 'arview[live]'  and try again"
+        )
+
+
+async def _serve(
+    server: LiveServer, options: LiveOptions, part_path: str, views_path: str | None, renderer: str, unit: str | None
+) -> None:
+    from arview.guideviews import GuideViewOptions
+    from arview.live.loading import load_subject, warm_up
+
+    loop = asyncio.get_running_loop()
+
+    def end(number: int) -> None:
+        """The first signal ends in good order; another one at once."""
+        loop.remove_signal_handler(number)
+        server.stop()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, end, number)
+
+    def load() -> Subject:
+        with progress_bar("guide views") as progress:
+            subject = load_subject(part_path, unit, views_path, options, GuideViewOptions(renderer=renderer), progress)
+        if options.camera is not None:
+            subject.camera(options.width, options.height) if options.is_phone else None
+        return subject
+
+    def ready(hub: Hub) -> None:
+        _print_welcome(server, server.place)
+        if hub.subject is not None:
+            for notice in hub.subject.notices():
+                say(f"{notice.level}: {notice.text}")
+            warm_up(hub.subject)
+
+    await server.serve(load, ready)
+
+
+def _print_welcome(server: LiveServer, place: Place) -> None:
+    click.echo(f"page:  {server.link}")
+    if place.trust_link is not None and place.certificates is not None and place.certificates.authority_der:
+        from arview.live.trust_page import fingerprint
+
+        new = " (made just now: every phone has to trust it once)" if place.certificates.is_authority_new else ""
+        click.echo(f"first time on a phone:  {place.trust_link}{new}")
+        click.echo(f"fingerprint:  {fingerprint(place.certificates.authority_der)}")
+    if sys.stdout.isatty():
+        import segno
+
+        segno.make(server.link, error="l").terminal(compact=True)
+    click.echo("Ctrl-C ends")
+
+
+def _tell_logs() -> None:
+    """Warnings of the server as lines on stderr."""
+
+    class Lines(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            text = record.getMessage()
+            if record.exc_info and record.exc_info[1] is not None:
+                text += f": {type(record.exc_info[1]).__name__}: {record.exc_info[1]}"
+            say(f"{record.levelname.lower()}: {text}")
+
+    logger = logging.getLogger("arview.live")
+    logger.addHandler(Lines())
+    logger.setLevel(logging.INFO)
+    logger.propagate = False
+    for name in ("uvicorn", "uvicorn.error", "aiortc", "aioice", "libav", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)

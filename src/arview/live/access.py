@@ -1,0 +1,157 @@
+"""Access: who may ask. The token of the run, the host asked for, the page that asks, and how often."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from urllib.parse import parse_qs
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import cookie_parser
+from starlette.responses import HTMLResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from arview.live.limits import RateLimit
+from arview.live.protocol import COOKIE
+from arview.live.refusals import Refusal
+
+PAGES = ("/", "/watch")
+"""Where a link may bring the token."""
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
+    "media-src 'self' blob: mediastream:; worker-src 'self' blob:; font-src 'self'; manifest-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(self), microphone=(), geolocation=()",
+}
+NO_TOKEN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>arview</title>
+<h1>This link is not valid</h1>
+<p>Scan the code at the station again: a new one is made each time that arview starts.</p></html>"""
+
+
+@dataclass(frozen=True)
+class Access:
+    """What a request must bring.
+
+    Attributes:
+        hosts: ``Host`` headers under which the server is known, in lower case, with the port.
+        port: of the server; cookies are shared by all ports of a host, so it goes into the name of ours.
+        is_secure: whether it is reached by HTTPS.
+        token: of this run.
+    """
+
+    hosts: frozenset[str]
+    port: int
+    is_secure: bool
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
+
+    @staticmethod
+    def to(names: Collection[str], port: int, is_secure: bool) -> Access:
+        """Access to a server known by these names and addresses."""
+        written = [f"[{name}]" if ":" in name else name for name in names]
+        usual = 443 if is_secure else 80
+        hosts = {f"{name}:{port}".lower() for name in written} | {n.lower() for n in written if port == usual}
+        return Access(frozenset(hosts), port, is_secure)
+
+    @property
+    def scheme(self) -> str:
+        """Of the addresses of the pages."""
+        return "https" if self.is_secure else "http"
+
+    def is_token(self, text: str) -> bool:
+        """Whether a text is the token, found out in constant time."""
+        return hmac.compare_digest(text.encode("utf-8", "replace"), self.token.encode())
+
+    @property
+    def cookie_name(self) -> str:
+        """Name of the cookie that holds the token."""
+        return f"{COOKIE}_{self.port}"
+
+    @property
+    def cookie(self) -> str:
+        """``Set-Cookie`` with the token."""
+        secure = "; Secure" if self.is_secure else ""
+        return f"{self.cookie_name}={self.token}; Path=/; HttpOnly; SameSite=Strict{secure}"
+
+
+class Gate:
+    """ASGI middleware that lets through what `Access` and the rate limit allow, and adds the security headers."""
+
+    def __init__(self, app: ASGIApp, access: Access, rate: RateLimit) -> None:
+        self._app, self._access, self._rate = app, access, rate
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve or refuse one request."""
+        if scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+            return
+        if scope["type"] != "http":
+            return
+        headers = Headers(scope=scope)
+        brings_token = False
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                answer = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    answer.setdefault(name, value)
+                answer.setdefault("Cache-Control", "no-store")
+                if brings_token:
+                    answer.append("Set-Cookie", self._access.cookie)
+            await send(message)
+
+        try:
+            self._check_host(headers)
+            self._rate.check(str((scope.get("client") or ("?",))[0]))
+            brings_token = self._check_token(scope, headers)
+            self._check_origin(scope, headers)
+        except Refusal as refusal:
+            await self._refused(scope, refusal)(scope, receive, send_with_headers)
+            return
+        await self._app(scope, receive, send_with_headers)
+
+    def _check_host(self, headers: Headers) -> None:
+        """A name of somebody else's that resolves to this address must not reach it (DNS rebinding)."""
+        if headers.get("host", "").lower() not in self._access.hosts:
+            raise Refusal(421, "other_host", "this server is not known by that name")
+
+    def _check_token(self, scope: Scope, headers: Headers) -> bool:
+        """Whether the address itself brings a valid token, which then goes into the cookie."""
+        is_page = scope["path"] in PAGES and scope["method"] in ("GET", "HEAD")
+        if is_page and self._access.is_token(_query_token(scope["query_string"])):
+            return True
+        cookies = cookie_parser("; ".join(headers.getlist("cookie")))
+        if not self._access.is_token(cookies.get(self._access.cookie_name, "")):
+            raise Refusal(403, "no_token", "scan the code at the station again")
+        return False
+
+    def _check_origin(self, scope: Scope, headers: Headers) -> None:
+        """What changes something must come from a page of this server."""
+        if scope["method"] in ("GET", "HEAD"):
+            if headers.get("sec-fetch-site") in ("cross-site", "same-site") and scope["path"] not in PAGES:
+                raise Refusal(403, "other_origin", "asked by a page of another site")
+            return
+        if headers.get("origin", "").lower() != f"{self._access.scheme}://{headers.get('host', '').lower()}":
+            raise Refusal(403, "other_origin", "asked by a page of another site")
+
+    def _refused(self, scope: Scope, refusal: Refusal) -> Response:
+        if refusal.code == "no_token" and scope["path"] in PAGES:
+            return HTMLResponse(NO_TOKEN_PAGE, refusal.status)
+        return refusal.response()
+
+
+def _query_token(query: bytes) -> str:
+    """The token in the query of an address, or an empty text."""
+    try:
+        return parse_qs(query.decode("latin-1"), max_num_fields=20).get("token", [""])[0]
+    except ValueError:  # more fields than any page sends
+        return ""

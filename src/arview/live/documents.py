@@ -1,0 +1,187 @@
+"""The JSON documents of the protocol: pose, part, status."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from arview.camera import Camera
+from arview.inspection import ComponentDeviation, Finding, Inspection
+from arview.live.feed import Feed, Tracked
+from arview.live.notices import Notice
+from arview.live.options import LiveOptions
+from arview.live.subject import Look, Subject
+from arview.overlay.labels import arrow_scale, by_urgency, detail_text, value_text
+from arview.overlay.mesh import anchor_in_model, topology
+from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, OverlayOptions
+
+Document = dict[str, Any]
+
+
+def pose_document(tracked: Tracked, now_s: float) -> Document:
+    """*Pose*: what was found in a frame; ``now_s`` is the monotonic time of the answer."""
+    pose = tracked.pose
+    guide = pose.guide_cam_from_model
+    return {
+        "type": "pose",
+        "id": tracked.picture.frame_id,
+        "revision": tracked.revision,
+        "state": str(pose.state),
+        "quality": round(pose.quality, 3),
+        "reason": pose.reason,
+        "mismatches": list(pose.mismatches),
+        "ambiguous": len(pose.alternatives),
+        "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.ravel().tolist(),
+        "guide_cam_from_model": None if guide is None else guide.ravel().tolist(),
+        "camera": camera_document(tracked.camera),
+        "wait_ms": _ms(tracked.started_s - tracked.arrived_s),
+        "track_ms": _ms(tracked.done_s - tracked.started_s),
+        "server_ms": _ms(now_s - tracked.arrived_s),
+        "dropped": tracked.dropped,
+        "scale": round(tracked.picture.scale, 3),
+    }
+
+
+def camera_document(camera: Camera) -> Document:
+    """Intrinsics in px."""
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "dist": camera.dist.tolist(),
+    }
+
+
+def loading_document(options: LiveOptions, state: str, text: str) -> Document:
+    """*Part* as long as there is none."""
+    return {
+        "revision": 0,
+        "state": state,
+        "text": text,
+        "source": "phone" if options.is_phone else "station",
+        "source_name": "phone" if options.is_phone else _source_name(options.source),
+        "wanted": {"width": options.width, "height": options.height, "fps": options.fps},
+        "part": None,
+        "components": [],
+        "inspection": None,
+        "arrow_scale": 1.0,
+    }
+
+
+def part_document(subject: Subject) -> Document:
+    """*Part*: the part, its components and what was measured of them."""
+    model, inspection = subject.part.model, subject.inspection
+    ranks = {one.name: rank for rank, one in enumerate(by_urgency(inspection))} if inspection else {}
+    components = []
+    for component in model.components:
+        found = inspection.find(component.name) if inspection else None
+        components.append(
+            {
+                "name": component.name,
+                "color": _hex(tuple(round(255 * value) for value in component.color)),
+                "anchor_in_model": anchor_in_model(component, topology(component)).tolist(),
+                "rank": ranks.get(component.name),
+                **_measured(found),
+            }
+        )
+    return {
+        **loading_document(subject.options, "ready", ""),
+        "revision": subject.revision,
+        "part": {
+            "name": subject.part.name,
+            "serial": subject.serial or "",
+            "model_hash": model.source_hash,
+            "diameter_mm": model.diameter_mm,
+            "center_in_model": model.center_in_model.tolist(),
+            "bounds_in_model": model.bounds_in_model.tolist(),
+        },
+        "components": components,
+        "inspection": _inspection(inspection),
+        "arrow_scale": arrow_scale(inspection, model.diameter_mm, OverlayOptions()) if inspection else 1.0,
+    }
+
+
+def feed_document(feed: Feed) -> Document:
+    """The ``feed`` of *Status*."""
+    state, text = feed.state
+    newest = feed.newest
+    return {
+        "kind": feed.kind,
+        "state": state,
+        "text": text,
+        "age_ms": None if feed.age_ms is None else round(feed.age_ms, 1),
+        "received_fps": feed.received_rate.value(),
+        "tracked_fps": feed.tracked_rate.value(),
+        "received": feed.received,
+        "dropped": feed.dropped,
+        "unreadable": feed.unreadable,
+        "width": None if newest is None else newest.camera.width,
+        "height": None if newest is None else newest.camera.height,
+    }
+
+
+def notice_documents(notices: list[Notice]) -> list[Document]:
+    """The ``notices`` of *Status*."""
+    return [{"code": one.code, "level": one.level, "text": one.text} for one in notices]
+
+
+def look_document(look: Look) -> Document:
+    """The ``look`` of *Status* and *Control*."""
+    return {
+        "ghost": look.ghost,
+        "edges": look.edges,
+        "labels": look.labels,
+        "opacity": look.opacity,
+        "only": look.only,
+    }
+
+
+def _measured(found: ComponentDeviation | None) -> Document:
+    if found is None:
+        names = ("verdict", "verdict_text", "verdict_color", "distance_mm", "uncertainty_mm", "tolerance_mm")
+        return {**dict.fromkeys(names), "displacement_mm": None, "missing": False, "value_text": "", "detail_text": ""}
+    plain = OverlayOptions()
+    return {
+        "verdict": str(found.verdict),
+        "verdict_text": VERDICT_WORD[found.verdict],
+        "verdict_color": _hex(VERDICT_RGB[found.verdict]),
+        "distance_mm": found.distance_mm,
+        "uncertainty_mm": found.uncertainty_mm,
+        "tolerance_mm": found.tolerance_mm,
+        "displacement_mm": list(found.displacement_mm),
+        "missing": found.finding is Finding.MISSING,
+        "value_text": value_text(found, plain),
+        "detail_text": detail_text(found, plain),
+    }
+
+
+def _inspection(inspection: Inspection | None) -> Document | None:
+    if inspection is None:
+        return None
+    return {
+        "part": inspection.part,
+        "serial": inspection.serial,
+        "created": inspection.created.isoformat().replace("+00:00", "Z"),
+        "age_s": round(inspection.age_s(datetime.now(UTC))),
+        "note": inspection.provenance.note,
+        "method": inspection.provenance.method,
+    }
+
+
+def _source_name(source: str) -> str:
+    """A source without what must not be shown: passwords in addresses, folders of files."""
+    if "://" in source:
+        scheme, rest = source.split("://", 1)
+        return f"{scheme}://{rest.split('/', 1)[0].rsplit('@', 1)[-1]}"
+    return f"camera {source}" if source.isdecimal() else source.replace("\\", "/").rsplit("/", 1)[-1]
+
+
+def _hex(rgb: tuple[int, ...]) -> str:
+    return "#" + "".join(f"{value:02x}" for value in rgb)
+
+
+def _ms(seconds: float) -> float:
+    return round(1e3 * seconds, 2)

@@ -1,0 +1,101 @@
+"""Incoming: a frame as it came to the server; and how each kind becomes a picture of the size it was taken in."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from av.video.frame import VideoFrame
+
+from arview.errors import InputError
+from arview.live.stamp import read_stamp
+from arview.video import Image
+from arview.video.color import rgb_from_video_frame
+
+MOST_SIDE_PX = 2560  # of a picture that is taken at all
+LEAST_SIDE_PX = 64
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame ready to be tracked.
+
+    Attributes:
+        frame_id: 0 to 2^20 - 1, of who made it.
+        image: (H,W,3) uint8 RGB in the size in which it was taken.
+        quarter_turns_clockwise: applied by the browser to the sensor's picture.
+        scale: received over taken size; 1 when nothing scaled it on the way.
+    """
+
+    frame_id: int
+    image: Image
+    quarter_turns_clockwise: int = 0
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """A frame on its way to the tracker.
+
+    Attributes:
+        open: makes the picture, in the tracker's thread; None when it cannot be read.
+        arrived_s: monotonic time.
+    """
+
+    open: Callable[[], Picture | None]
+    arrived_s: float
+
+
+def from_stamped(frame: VideoFrame) -> Picture | None:
+    """The picture of a decoded WebRTC frame without its strip; None when the stamp cannot be read.
+
+    A frame that was scaled on the way is scaled back, so that intrinsics and tracker stay as they are; that agrees with
+    `Camera.scaled` (pixel centres).
+    """
+    if frame.format.name not in ("yuv420p", "yuvj420p", "nv12"):
+        frame = frame.reformat(format="yuv420p")
+    plane = frame.planes[0]
+    brightness = np.frombuffer(memoryview(plane), dtype=np.uint8)
+    gray = brightness.reshape(-1, plane.line_size)[: frame.height, : frame.width]
+    stamp = read_stamp(gray)
+    if stamp is None or max(stamp.width, stamp.height) > MOST_SIDE_PX or stamp.height < LEAST_SIDE_PX:
+        return None
+    scale = frame.width / stamp.width
+    image = rgb_from_video_frame(frame)[: min(frame.height, round(stamp.height * scale))]
+    if image.shape[:2] != (stamp.height, stamp.width):
+        image = np.asarray(cv2.resize(image, (stamp.width, stamp.height), interpolation=cv2.INTER_LINEAR), np.uint8)
+    return Picture(stamp.frame_id, image, stamp.quarter_turns_clockwise, scale)
+
+
+def from_jpeg(content: bytes) -> Image:
+    """(H,W,3) uint8 RGB of a JPEG; its size is looked at before it is decoded.
+
+    Raises:
+        InputError: no JPEG, damaged, or of a size that no camera has.
+    """
+    from PIL import Image as Pillow
+
+    try:
+        with Pillow.open(io.BytesIO(content), formats=["JPEG"]) as header:
+            width, height = header.size
+    except (OSError, ValueError, SyntaxError, Pillow.DecompressionBombError) as error:
+        raise InputError("the body is not a JPEG picture") from error
+    if min(width, height) < LEAST_SIDE_PX or max(width, height) > MOST_SIDE_PX:
+        raise InputError(f"the picture is {width}×{height} px, expected {LEAST_SIDE_PX} to {MOST_SIDE_PX} a side")
+    buffer = np.frombuffer(content, dtype=np.uint8)
+    try:
+        bgr = cv2.imdecode(buffer, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        bgr = None
+    if bgr is None or bgr.shape[:2] != (height, width):
+        raise InputError("the JPEG picture is damaged")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def to_jpeg(image: Image, quality: int = 85) -> bytes:
+    """JPEG of an (H,W,3) uint8 RGB picture."""
+    _, content = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return bytes(content)

@@ -1,0 +1,60 @@
+"""What the server does before pages can take part: part, guide views, inspection, and a first run of the tracker."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from arview.cad import load_part
+from arview.camera_files import guess_camera
+from arview.errors import ArviewError
+from arview.guideview_cache import cached_guide_views
+from arview.guideviews import GuideViewOptions, load_guide_views
+from arview.live.options import LiveOptions
+from arview.live.subject import Subject
+
+logger = logging.getLogger("arview.live")
+
+
+def load_subject(
+    part_path: str,
+    unit: str | None,
+    views_path: str | None,
+    options: LiveOptions,
+    view_options: GuideViewOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Subject:
+    """Part, guide views (of a file, of the cache, or made now) and inspection.
+
+    Raises:
+        InputError, MismatchError: one of the files cannot be used, or they do not belong together.
+    """
+    part = load_part(part_path, unit)
+    if views_path is not None:
+        views = load_guide_views(Path(views_path), part.model)
+    else:
+        views = cached_guide_views(part.model, part.effective_view_range, view_options, progress)
+    return Subject(part, views, options)
+
+
+def warm_up(subject: Subject) -> threading.Thread:
+    """Have the tracker look at a picture of noise, in a thread, so that its loops are compiled when a phone comes."""
+
+    def run() -> None:
+        began_s = time.monotonic()
+        try:
+            session = subject.session(guess_camera(640, 480))
+            rng = np.random.default_rng(0)
+            session.process(rng.integers(0, 255, (480, 640, 3), dtype=np.uint8), 0, 0.0)
+        except ArviewError as error:
+            logger.warning("%s", error)
+        logger.debug("tracker ready after %.1f s", time.monotonic() - began_s)
+
+    thread = threading.Thread(target=run, name="arview-warm-up", daemon=True)
+    thread.start()
+    return thread
