@@ -15,8 +15,11 @@ _WORDS = {
 
 
 def overall_verdict(inspection: Inspection) -> Verdict:
-    """Of the whole part: fail when one component fails; not measured when none was measured; undecided when one is
-    undecided or was not measured, or something foreign is there; else pass."""
+    """Of the whole part.
+
+    Fail when one component fails; not measured when none was measured; undecided when one is undecided or was not
+    measured, or something foreign is there; else pass.
+    """
     verdicts = {component.verdict for component in inspection.components}
     if Verdict.FAIL in verdicts:
         return Verdict.FAIL

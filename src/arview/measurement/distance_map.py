@@ -21,8 +21,13 @@ from arview.reconstruction.types import DenseCloud
 
 _BINS = 400
 _WHOLE = "all"
-_STOPS = np.array([[33, 60, 160], [80, 170, 230], [225, 235, 225], [245, 170, 60], [180, 30, 30]], dtype=np.float64)
+COLOR_STOPS = np.array(
+    [[33, 60, 160], [80, 170, 230], [225, 235, 225], [245, 170, 60], [180, 30, 30]], dtype=np.float64
+)
 """From − to + limit."""
+_FIELDS = ("x", "y", "z", "distance_mm", "red", "green", "blue")
+_VERTEX = np.dtype([(name, "<f4" if index < 4 else "u1") for index, name in enumerate(_FIELDS)])
+_PROPERTIES = [f"property {'float' if index < 4 else 'uchar'} {name}" for index, name in enumerate(_FIELDS)]
 
 
 @dataclass(frozen=True)
@@ -70,18 +75,38 @@ def distance_map(
 
 def write_distance_ply(distances: DistanceMap, path: Path, limit_mm: float = 1.0) -> None:
     """Binary PLY: x y z red green blue distance_mm; colours from −limit (blue) to +limit (red). Raises OutputError."""
-    names = ("x", "y", "z", "distance_mm", "red", "green", "blue")
-    rows = np.zeros(len(distances.points_in_model), dtype=[(n, "<f4" if i < 4 else "u1") for i, n in enumerate(names)])
+    rows = np.zeros(len(distances.points_in_model), dtype=_VERTEX)
     values = [*distances.points_in_model.T, distances.distances, *_colors(distances.distances, limit_mm).T]
-    for name, value in zip(names, values, strict=True):
+    for name, value in zip(_FIELDS, values, strict=True):
         rows[name] = value
-    kinds = [f"property {'float' if i < 4 else 'uchar'} {name}" for i, name in enumerate(names)]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *kinds, "end_header", ""]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *_PROPERTIES, "end_header", ""]
     try:
         with replacing(path) as file:
             file.write("\n".join(header).encode() + rows.tobytes())
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def read_distance_ply(path: Path, reach_mm: float, statistics: tuple[DistanceStatistics, ...]) -> DistanceMap:
+    """A map that ``write_distance_ply`` wrote; which component a point belongs to is not in the file (-1).
+
+    Raises:
+        InputError: the file cannot be read, is cut short or holds other properties.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    header, found, body = data.partition(b"end_header\n")
+    lines = header.decode("ascii", "replace").split("\n")
+    if not found or lines[0] != "ply" or [line for line in lines if line.startswith("property ")] != _PROPERTIES:
+        raise InputError(f"{path}: is not a distance map that arview wrote")
+    count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex ")), -1)
+    if len(body) != count * _VERTEX.itemsize:
+        raise InputError(f"{path}: is cut short; measure again")
+    rows = np.frombuffer(body, dtype=_VERTEX)
+    points = np.stack([rows[name] for name in "xyz"], axis=-1).astype(np.float64)
+    return DistanceMap(points, rows["distance_mm"].astype(np.float64), np.full(count, -1), reach_mm, statistics)
 
 
 def histogram_picture(distances: DistanceMap, model: Model, component: str | None = None) -> Picture:
@@ -167,5 +192,5 @@ def full_width_at_half_maximum(values: Array, reach: float) -> float:
 
 def _colors(distances: Array, limit_mm: float) -> NDArray[np.uint8]:
     share = np.clip(0.5 + 0.5 * distances / limit_mm, 0.0, 1.0)
-    places = np.linspace(0.0, 1.0, len(_STOPS))
-    return np.stack([np.interp(share, places, _STOPS[:, k]) for k in range(3)], axis=-1).astype(np.uint8)
+    places = np.linspace(0.0, 1.0, len(COLOR_STOPS))
+    return np.stack([np.interp(share, places, COLOR_STOPS[:, k]) for k in range(3)], axis=-1).astype(np.uint8)

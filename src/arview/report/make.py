@@ -1,0 +1,94 @@
+"""From an inspection to its report: one call."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from arview.atomic import replacing
+from arview.cad.part import Part
+from arview.errors import InputError, MissingDependencyError, OutputError
+from arview.report.evidence import Evidence, gather
+from arview.report.page import Progress, ReportOptions, build_context, render
+
+PANGO_INSTALL_COMMAND = (
+    "apt-get install -y --no-install-recommends libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0"
+)
+
+
+def make_report(
+    inspection: str | Path, html: str | Path | None = None, pdf: str | Path | None = None, part: Part | None = None,
+    folder: str | Path | None = None, photos: str | Path | None = None, options: ReportOptions | None = None,
+    progress: Progress | None = None,
+) -> Evidence:  # fmt: skip
+    """Write the report of an inspection as one HTML file without links to elsewhere, as PDF, or both.
+
+    Args:
+        inspection: ``inspection.json``; the files that `arview measure` wrote lie beside it.
+        html, pdf: files to write.
+        part: the CAD that was measured against; without it the report has no pictures and no CAD.
+        folder: of `arview reconstruct`; default: the folder of the inspection, if it is one.
+        photos: where the photos are, when not where they were.
+        options: how much the report holds.
+        progress: called with (what, done, total).
+
+    Returns:
+        what the report was made of; ``absent`` says what was not there.
+
+    Raises:
+        InputError: the inspection cannot be read, or ``folder`` is no reconstruction; neither file is asked for.
+        MismatchError: the part is not the one that was inspected.
+        MissingDependencyError: the PDF needs libraries that are not installed.
+        OutputError: a file cannot be written.
+    """
+    if html is None and pdf is None:
+        raise InputError("report: name a file to write, HTML or PDF")
+    tell = progress or (lambda what, done, total: None)
+    if pdf is not None:
+        _weasyprint()
+    tell("reading", 0, 1)
+    evidence = gather(inspection, part, folder, photos)
+    context = build_context(evidence, options or ReportOptions(), tell)
+    if html is not None:
+        _write(Path(html), render(context, for_print=False).encode("utf-8"))
+    if pdf is not None:
+        tell("PDF", 0, 1)
+        _write(Path(pdf), pdf_of(render(context, for_print=True), evidence))
+    tell("done", 1, 1)
+    return evidence
+
+
+def pdf_of(page: str, evidence: Evidence) -> bytes:
+    """The page on A4, with the inspection attached."""
+    weasyprint = _weasyprint()
+    attachment = weasyprint.Attachment(
+        string=evidence.source.read_bytes(), name=evidence.source.name, description="the inspection (arview)",
+        relationship="Source",
+    )  # fmt: skip
+    return bytes(weasyprint.HTML(string=page).write_pdf(attachments=[attachment], pdf_variant="pdf/a-3u"))
+
+
+def _weasyprint() -> Any:
+    import logging
+
+    for name in ("weasyprint", "fontTools"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    try:
+        import weasyprint
+    except ImportError as error:
+        raise MissingDependencyError(
+            "the PDF needs WeasyPrint: pip install weasyprint (the HTML report does not)"
+        ) from error
+    except OSError as error:
+        raise MissingDependencyError(
+            f"the PDF needs the Pango libraries: {PANGO_INSTALL_COMMAND} (the HTML report does not)"
+        ) from error
+    return weasyprint
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        with replacing(path) as file:
+            file.write(content)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error

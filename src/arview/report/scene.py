@@ -1,0 +1,156 @@
+"""What the viewer in the page shows: CAD, cloud and arrows, packed into one JSON text."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.model import Model
+from arview.geometry import Array
+from arview.inspection import Inspection
+from arview.measurement.distance_map import COLOR_STOPS, DistanceMap
+from arview.measurement.surface import Surface
+from arview.overlay.labels import arrow_scale
+from arview.overlay.options import OverlayOptions
+from arview.reconstruction.types import DenseCloud
+
+_STEPS = 65535
+"""Coordinates are stored in 16 bits over the box of what they belong to: a metre in steps of 15 µm."""
+
+_REACH_MM = 3.0
+"""Points farther from the CAD have no distance."""
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How much the viewer is given."""
+
+    most_points: int = 90_000  # about 1.3 MB in the page, dense enough for a part of the size of the screen
+    most_faces: int = 400_000  # beyond that the page gets slow and large; the CAD is then left out
+    around: float = 0.15  # of the part's diameter that the cloud may stand out: the bench is not wanted
+
+
+def make_scene(
+    inspection: Inspection, model: Model | None, cloud: DenseCloud | None, distances: DistanceMap | None,
+    options: SceneOptions | None = None,
+) -> dict[str, Any] | None:  # fmt: skip
+    """The scene as an object for JSON; None when there is neither CAD nor cloud.
+
+    Args:
+        inspection: deviations, in the frame of all others.
+        model: nominal.
+        cloud: in the colours of the photos.
+        distances: of a cloud to the CAD; used when there is no cloud with colours.
+        options: how much.
+    """
+    options = options or SceneOptions()
+    if model is not None and len(model.mesh[1]) > options.most_faces:
+        model = None
+    scene: dict[str, Any] = {"stops": COLOR_STOPS.tolist(), "components": []}
+    if model is not None:
+        scene["mesh"] = _mesh(model)
+        scene["arrow_scale"] = arrow_scale(inspection, model.diameter_mm, OverlayOptions())
+    points = _points(cloud, model, distances, options)
+    if points is not None:
+        scene["cloud"] = points
+    if model is None and points is None:
+        return None
+    names = [c.name for c in model.components] if model is not None else [c.name for c in inspection.components]
+    for name in names:
+        deviation = inspection.find(name)
+        entry: dict[str, Any] = {"name": name, "verdict": None if deviation is None else deviation.verdict.value}
+        if deviation is not None:
+            details = deviation.details
+            place = None if details is None else details.measured_from_nominal
+            entry |= {
+                "displacement": list(deviation.displacement_mm),
+                "distance": deviation.distance_mm,
+                "uncertainty": deviation.uncertainty_mm,
+                "missing": deviation.finding is not None,
+                "place": None if place is None else np.array(place).ravel().tolist(),
+            }
+        if model is not None:
+            entry["center"] = model.component(name).bounds_in_model.mean(axis=0).tolist()
+        scene["components"].append(entry)
+    scene["foreign"] = [
+        {"center": list(one.center_mm), "size": list(one.size_mm), "text": one.text}
+        for one in inspection.foreign_objects
+    ]
+    return scene
+
+
+def scene_json(scene: dict[str, Any]) -> str:
+    """As text that can stand in a script element: no ``<`` in it."""
+    return json.dumps(_rounded(scene), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _mesh(model: Model) -> dict[str, Any]:
+    vertices, faces, owner = model.mesh
+    ranges = []
+    for index in range(len(model.components)):
+        mine = np.flatnonzero(owner == index)
+        ranges.append([int(mine[0]), int(mine[-1]) + 1])
+    return {**_packed(vertices), "faces": _text(faces.astype("<u4")), "ranges": ranges}
+
+
+def _points(
+    cloud: DenseCloud | None, model: Model | None, distances: DistanceMap | None, options: SceneOptions
+) -> dict[str, Any] | None:
+    """A random choice of the points near the part, with photo colours and distances as far as they are known."""
+    chance = np.random.default_rng(0)
+    if cloud is not None:
+        points = np.asarray(cloud.points, dtype=np.float64)
+        keep = np.isfinite(points).all(axis=1)
+        if model is not None:
+            reach = options.around * model.diameter_mm
+            low, high = model.bounds_in_model
+            keep &= ((points > low - reach) & (points < high + reach)).all(axis=1)
+        chosen = _choice(np.flatnonzero(keep), options.most_points, chance)
+        if len(chosen) == 0:
+            return None
+        near: dict[str, Any] = {"colors": _text(np.asarray(cloud.colors[chosen], dtype="u1"))}
+        if model is not None:
+            near["distances"] = _text(_distances_um(points[chosen], model))
+        return {**_packed(points[chosen]), **near, "of": len(points)}
+    if distances is not None:
+        chosen = _choice(np.arange(len(distances.distances)), options.most_points, chance)
+        um = np.round(1000.0 * distances.distances[chosen]).clip(-32767, 32767).astype("<i2")
+        return {**_packed(distances.points_in_model[chosen]), "distances": _text(um), "of": len(distances.distances)}
+    return None
+
+
+def _distances_um(points: Array, model: Model) -> NDArray[np.int16]:
+    """Signed distances of the points in micrometres, −32768 for those that are far from the CAD."""
+    closest = Surface(*model.mesh).closest(points, _REACH_MM)
+    um = np.where(closest.faces >= 0, np.round(1000.0 * closest.distances).clip(-32767, 32767), -32768)
+    return np.asarray(um.astype("<i2"))
+
+
+def _choice(indices: NDArray[np.int64], most: int, chance: np.random.Generator) -> NDArray[np.int64]:
+    return indices if len(indices) <= most else np.sort(chance.choice(indices, most, replace=False))
+
+
+def _packed(points: Array) -> dict[str, Any]:
+    """Points (N,3) in 16 bits each over their box."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    step = np.maximum(high - low, 1e-6) / _STEPS
+    whole = np.round((points - low) / step).astype("<u2")
+    return {"low": low.tolist(), "step": step.tolist(), "points": _text(whole)}
+
+
+def _text(values: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")
+
+
+def _rounded(value: Any) -> Any:
+    """Floats to seven digits: the page need not carry seventeen."""
+    if isinstance(value, float):
+        return float(f"{value:.7g}")
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return [_rounded(item) for item in value] if isinstance(value, list) else value
