@@ -221,7 +221,7 @@ class Handlers:
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
-    """All files that may be served, by their path in the folder of the page: content and media type."""
+    """All files that may be served: content and media type by path, of the page, and under ``web/`` what pages share."""
     files: dict[str, tuple[bytes, str]] = {}
 
     def add(folder: Traversable, prefix: str) -> None:
@@ -233,9 +233,8 @@ def page_files() -> dict[str, tuple[bytes, str]]:
                 media_type = _TYPES.get(suffix) or mimetypes.guess_type(entry.name)[0] or "application/octet-stream"
                 files[f"{prefix}{entry.name}"] = entry.read_bytes(), media_type
 
-    page = resources.files("arview.live") / "page"
-    if page.is_dir():
-        add(page, "")
+    add(resources.files("arview.live") / "page", "")
+    add(resources.files("arview.web"), "web/")
     return files
 
 

@@ -1,9 +1,12 @@
 // What arview's pages use of three.js. `tools/vendor-web` makes three.min.js of it; names may be added.
 export {
-  AmbientLight, ArrowHelper, Box3, BufferAttribute, BufferGeometry, CanvasTexture, Color, ConeGeometry, CylinderGeometry,
-  DirectionalLight, DoubleSide, EdgesGeometry, Float32BufferAttribute, FrontSide, Group, HemisphereLight, Line,
+  AmbientLight, ArrowHelper, Box3, BufferAttribute, BufferGeometry, Camera, CanvasTexture, ClampToEdgeWrapping, Color,
+  ConeGeometry, CustomBlending, CylinderGeometry, DirectionalLight, DoubleSide, EdgesGeometry, Float32BufferAttribute,
+  FrontSide, GLSL3, Group, HemisphereLight, InstancedBufferAttribute, InstancedBufferGeometry, Line, LinearFilter,
   LineBasicMaterial, LineSegments, Matrix4, Mesh, MeshBasicMaterial, MeshLambertMaterial, MeshStandardMaterial,
-  OrthographicCamera, PerspectiveCamera, Points, PointsMaterial, Quaternion, Raycaster, SRGBColorSpace, Scene,
-  Sphere, Sprite, SpriteMaterial, Texture, Vector2, Vector3, WebGLRenderer,
+  NearestFilter, NoBlending, NoColorSpace, OneFactor, OneMinusSrcAlphaFactor, OrthographicCamera, PerspectiveCamera,
+  Points, PointsMaterial, Quaternion, RawShaderMaterial, Raycaster, RGBAFormat, SRGBColorSpace, Scene, Sphere, Sprite,
+  SpriteMaterial, Texture, UnsignedByteType, Vector2, Vector3, Vector4, WebGLRenderer, WebGLRenderTarget,
 } from "three";
 export { OrbitControls } from "three/addons/controls/OrbitControls.js";
+export { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
