@@ -98,9 +98,13 @@ def test_annotated_picture_by_jpeg(page: Http) -> None:
     changed = np.abs(drawn - frames()[0]).max(axis=2) > 60
     assert 0.05 < changed.mean() < 0.6  # ghosts, labels and the status line, not the whole picture
     # Less is drawn when the page asks for less.
-    page.json("POST", f"/api/clients/{name}/control", {"look": {"ghost": False, "labels": False, "edges": "none"}})
+    page.json(
+        "POST",
+        f"/api/clients/{name}/control",
+        {"look": {"ghost": False, "labels": False, "edges": "none", "status": False}},
+    )
     plain = from_jpeg(send(page, name, 1)[2]).astype(int)
-    assert (np.abs(plain - frames()[1]).max(axis=2) > 60)[: HEIGHT - 60].mean() < 0.02
+    assert (np.abs(plain - frames()[1]).max(axis=2) > 60).mean() < 0.02
 
 
 def test_control_changes_what_is_asked_for_and_nothing_on_a_wrong_wish(page: Http) -> None:
@@ -108,7 +112,8 @@ def test_control_changes_what_is_asked_for_and_nothing_on_a_wrong_wish(page: Htt
     path = f"/api/clients/{name}/control"
     status, answer = page.json("POST", path, {"way": "video", "look": {"opacity": 0.2, "only": "post_1"}})
     assert status == 200 and answer["way"] == "video"
-    assert answer["look"] == {"ghost": True, "edges": "visible", "labels": True, "opacity": 0.2, "only": "post_1"}
+    look = {"ghost": True, "edges": "visible", "labels": True, "opacity": 0.2, "only": "post_1", "status": True}
+    assert answer["look"] == look
     for wrong in (
         {"way": "sideways"}, {"way": 3}, {"look": {"opacity": 7}}, {"look": {"opacity": True}}, {"unknown": 1},
         {"look": {"edges": "x"}}, {"look": {"only": "no_such"}}, {"look": []}, {"look": {"ghost": None}},

@@ -1,4 +1,4 @@
-"""WebRTC on the loopback interface: poses of the very frame, both ways back, faults, clients that vanish or are slow."""
+"""WebRTC on the loopback interface: poses of the very frame, both ways back, faults, clients that vanish or lag."""
 
 from __future__ import annotations
 

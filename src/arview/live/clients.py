@@ -23,6 +23,7 @@ _LOOKS: dict[str, tuple[type, ...]] = {
     "labels": (bool,),
     "opacity": (int, float),
     "only": (str, type(None)),
+    "status": (bool,),
 }
 
 

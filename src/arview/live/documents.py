@@ -136,6 +136,7 @@ def look_document(look: Look) -> Document:
         "labels": look.labels,
         "opacity": look.opacity,
         "only": look.only,
+        "status": look.status,
     }
 
 

@@ -12,6 +12,7 @@ from starlette.types import Receive, Scope, Send
 from arview.live.drawing import Drawing
 from arview.live.feed import Tracked
 from arview.live.hub import Hub
+from arview.live.subject import Look
 
 BOUNDARY = "arview-frame"
 SEND_TIMEOUT_S = 10.0
@@ -59,7 +60,7 @@ class MotionJpeg(Response):
 
 
 def _jpeg(drawing: Drawing, tracked: Tracked) -> bytes:
-    return drawing.draw(tracked).jpeg
+    return drawing.draw(tracked, Look()).jpeg
 
 
 async def _disconnected(receive: Receive) -> None:

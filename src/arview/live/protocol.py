@@ -99,7 +99,7 @@ Control, every key and every key of ``look`` may be absent::
 
     {"way": "poses" | "video",
      "look": {"ghost": bool, "edges": "none" | "visible" | "all", "labels": bool, "opacity": 0 to 1,
-              "only": name of the component that alone is drawn | null},     of what the server draws
+              "only": name of the component that alone is drawn | null, "status": bool},     of what the server draws
      "reset": true,               search again
      "hold": frame id | null,     keep this frame for a snapshot
      "record": bool}

@@ -81,7 +81,7 @@ class Recorder:
         self._slot.close()
 
     def _write(self, tracked: Tracked) -> None:
-        image = self._drawing.draw(tracked).image
+        image = self._drawing.draw_record(tracked).image
         if self._sink is None:
             height, width = image.shape[:2]
             self._size = width, height

@@ -20,7 +20,7 @@ def snapshot_png(subject: Subject, drawing: Drawing, tracked: Tracked) -> bytes:
     """PNG of an annotated frame with a text chunk of JSON about it; takes some ten milliseconds."""
     from PIL import Image, PngImagePlugin
 
-    image = drawing.draw(tracked).image
+    image = drawing.draw_record(tracked).image
     about = PngImagePlugin.PngInfo()
     about.add_itxt(CHUNK, json.dumps(_about(subject, tracked), ensure_ascii=False, allow_nan=False))
     about.add_itxt("Software", f"arview {__version__}")

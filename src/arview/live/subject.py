@@ -35,6 +35,7 @@ class Look:
     labels: bool = True
     opacity: float = OverlayOptions.opacity
     only: str | None = None  # the component that alone is drawn and labelled; None: all
+    status: bool = True  # the line at the lower edge; a page shows the same in its own letters
 
     def __post_init__(self) -> None:
         self.overlay_options()
@@ -42,7 +43,11 @@ class Look:
     def overlay_options(self) -> OverlayOptions:
         """The same for the renderer."""
         return OverlayOptions(
-            show_ghost=self.ghost, show_edges=self.edges, show_labels=self.labels, opacity=self.opacity
+            show_ghost=self.ghost,
+            show_edges=self.edges,
+            show_labels=self.labels,
+            show_status=self.status,
+            opacity=self.opacity,
         )
 
 
