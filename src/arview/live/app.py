@@ -221,7 +221,7 @@ class Handlers:
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
-    """All files that may be served: content and media type by path, of the page, and under ``web/`` what pages share."""
+    """Files that may be served, by path: content and media type. Of the page, and under ``web/`` what pages share."""
     files: dict[str, tuple[bytes, str]] = {}
 
     def add(folder: Traversable, prefix: str) -> None:
