@@ -96,14 +96,19 @@ def paragraphs(inspection: Inspection) -> list[str]:
 def uncertainty(inspection: Inspection) -> str:
     """What U means."""
     options = dict(inspection.provenance.options)
-    draws = int(options["monte_carlo"]) if options.get("monte_carlo", "").isdigit() else 0
-    text = (
-        f"U is the expanded uncertainty (k = {options.get('k', '2')}) of the distance from the design place; near zero"
-        " it is as large as makes its interval hold the true distance 95 times of 100, as a distance cannot be negative"
-    )
-    if draws:
-        text += f" (GUM Supplement 1, {draws:,} draws)"
-    return text + ". The budget lists the standard uncertainty of each contribution along the displacement."
+    text = f"U is the expanded uncertainty (k = {options.get('k', '2')}) of the distance from the design place"
+    if "probability" in options:
+        share = 100.0 * float(options["probability"])
+        text += (
+            f"; near zero it is as large as makes its interval hold the true distance {share:g} times of 100, as a"
+            " distance cannot be negative"
+        )
+    draws = options.get("monte_carlo", "0")
+    if draws.isdigit() and int(draws):
+        text += f" (GUM Supplement 1, {int(draws):,} draws)"
+    if any(c.details is not None and c.details.budget for c in inspection.components):
+        return f"{text}. The budget lists the standard uncertainty of each contribution along the displacement."
+    return f"{text}."
 
 
 def provenance(inspection: Inspection, part: Part | None) -> list[tuple[str, str]]:

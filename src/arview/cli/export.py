@@ -1,0 +1,99 @@
+"""The command export: an inspection in the formats of the trade."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+
+from arview.cli.common import UNIT, main, output_path, say, write_bytes
+from arview.errors import InputError
+
+FORMATS = ("csv", "qif", "dfq", "glb", "html", "pdf")
+
+
+def _parse_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name.strip().lower() for name in value.split(",") if name.strip()))
+    if not names or any(name not in FORMATS for name in names):
+        raise click.BadParameter(f"{value!r}: expected some of {','.join(FORMATS)}")
+    return names
+
+
+@main.command(
+    short_help="Write an inspection as CSV, QIF, DFQ, GLB, HTML or PDF.",
+    epilog="""\b
+Examples:
+  arview export out/inspection.json --to csv
+  arview export out/inspection.json --to qif,dfq -o /mnt/cmm/
+  arview export out/inspection.json --to glb --part part.toml -o deviations.glb
+
+\b
+csv   one line a component; what is undetermined is empty
+qif   QIF 3.0 results (ISO 23952): position with spherical zone, x y z, rotation, with standard uncertainties
+dfq   Q-DAS ASCII transfer format (AQDEF): distance, dx, dy, dz, tilt of each component as characteristics
+glb   glTF 2.0: components at design and measured place, coloured by verdict, arrows; needs --part
+html  the report, as `arview report` writes it
+pdf   the report on paper
+\b
+What is undetermined has no value in any of them. The fields of inspection.json itself are described in
+docs/inspection-json.md and by the JSON Schema in src/arview/inspection/schema/.""",
+)
+@click.argument("inspection", metavar="INSPECTION")
+@click.option("--to", "formats", callback=_parse_formats, required=True, metavar="LIST",
+              help="csv, qif, dfq, glb, html, pdf, separated by commas.")  # fmt: skip
+@click.option("-o", "--output", metavar="FILE|FOLDER", help="File to write, or folder; default: beside INSPECTION.")
+@click.option("--part", "part_path", metavar="PART", help="Part file or CAD file, for glb, html and pdf.")
+@click.option("--folder", metavar="OUT", help="Folder of `arview reconstruct`, for html and pdf.")
+@click.option("--photos", metavar="FOLDER", help="Where the photos are, for html and pdf.")
+@UNIT
+def export(
+    inspection: str,
+    formats: tuple[str, ...],
+    output: str | None,
+    part_path: str | None,
+    folder: str | None,
+    photos: str | None,
+    unit: str | None,
+) -> None:
+    """Write INSPECTION in other formats."""
+    from arview.cad import load_part
+    from arview.inspection import load_inspection
+    from arview.inspection.export import to_csv, to_dfq, to_glb, to_qif
+
+    source = Path(inspection)
+    targets = _targets(source, formats, output, part_path)
+    part = None if part_path is None else load_part(part_path, unit)
+    if "glb" in formats and part is None:
+        raise InputError("glb: the CAD is needed; name it with --part")
+    loaded = load_inspection(source, None if part is None else part.model)
+    made: dict[str, Callable[[], bytes]] = {
+        "csv": lambda: to_csv(loaded).encode("utf-8"),
+        "qif": lambda: to_qif(loaded),
+        "dfq": lambda: to_dfq(loaded),
+    }
+    if part is not None:
+        model = part.model
+        made["glb"] = lambda: to_glb(loaded, model)
+    for name, target in targets.items():
+        if name in made:
+            write_bytes(target, made[name]())
+    if {"html", "pdf"} & set(targets):
+        from arview.report import make_report
+
+        evidence = make_report(source, targets.get("html"), targets.get("pdf"), part, folder, photos)
+        for reason in evidence.absent.values():
+            say(f"left out: {reason}")
+    for target in targets.values():
+        click.echo(f"wrote {target}")
+
+
+def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_path: str | None) -> dict[str, Path]:
+    """Where each format goes."""
+    inputs = [source, part_path]
+    if output is not None and not Path(output).is_dir():
+        if len(formats) > 1:
+            raise InputError(f"{output}: {len(formats)} formats need a folder that exists, not one file")
+        return {formats[0]: output_path(output, inputs)}
+    folder = source.parent if output is None else Path(output)
+    return {name: output_path(str(folder / f"{source.stem}.{name}"), inputs) for name in formats}

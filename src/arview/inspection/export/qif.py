@@ -1,0 +1,263 @@
+"""QIF 3.0 results (ISO 23952, DMSC): characteristics with their nominals, and what was measured of them.
+
+The position of a component's middle is a position characteristic with a spherical zone, whose diameter is twice the
+tolerance; its x, y, z are linear coordinate characteristics without tolerance; its rotation is a user defined angular
+characteristic. Structure and order of the elements follow QIFDocument.xsd, QIFResults.xsd, Characteristics.xsd,
+Units.xsd and PrimitivesPMI.xsd of QIF 3.0.0.
+"""
+
+from __future__ import annotations
+
+import uuid
+from typing import Any
+
+from lxml import etree
+
+from arview.inspection.record import ComponentDeviation, Finding, Inspection, Verdict
+from arview.inspection.summary import overall_verdict
+
+NAMESPACE = "http://qifstandards.org/xsd/qif3"
+_OURS = uuid.UUID("6c0f8f2e-2f5c-4f0e-9a5d-1f7f0c1a5b11")
+_STATUS = {
+    Verdict.PASS: "PASS",
+    Verdict.FAIL: "FAIL",
+    Verdict.UNDECIDED: "INDETERMINATE",
+    Verdict.NOT_MEASURED: "NOT_ANALYZED",
+}
+_INSPECTION_STATUS = {
+    Verdict.PASS: "PASS",
+    Verdict.FAIL: "FAIL",
+    Verdict.UNDECIDED: "UNKNOWN",
+    Verdict.NOT_MEASURED: "NOT_MEASURED",
+}
+_DIRECTION = ("XAXIS", "YAXIS", "ZAXIS")
+
+
+def to_qif(inspection: Inspection) -> bytes:
+    """The inspection as a QIF 3.0 document, UTF-8. The same inspection always gives the same document."""
+    return _Document(inspection).encoded()
+
+
+class _Document:
+    """Builds the document; ids are numbered as elements are made."""
+
+    def __init__(self, inspection: Inspection) -> None:
+        self.inspection = inspection
+        self._last_id = 0
+        self.definitions: list[Any] = []
+        self.nominals: list[Any] = []
+        self.items: list[Any] = []
+        self.measurements: list[Any] = []
+        self._positions: dict[float, str] = {}
+        self._coordinates = ""
+        self._angles: dict[float | None, str] = {}
+        self.actual_id = self._next_id()
+        for component in inspection.components:
+            self._add(component)
+
+    def encoded(self) -> bytes:
+        """The whole, after everything was added."""
+        results_id = self._next_id()
+        root = etree.Element(_name("QIFDocument"), nsmap={None: NAMESPACE})
+        root.set("versionQIF", "3.0.0")
+        _add(root, "QPId", self._uuid("document"))
+        header = _add(root, "Header")
+        _add(header, "Description", self._description())
+        _add(header, "Scope", "Results")
+        units = _add(_add(root, "FileUnits"), "PrimaryUnits")
+        _unit(units, "AngularUnit", "radian", "degree", "0.017453292519943")
+        _unit(units, "LinearUnit", "meter", "mm", "0.001")
+        characteristics = _add(root, "Characteristics")
+        for name, members in (
+            ("CharacteristicDefinitions", self.definitions),
+            ("CharacteristicNominals", self.nominals),
+            ("CharacteristicItems", self.items),
+        ):
+            _list(characteristics, name, members)
+        self._results(_add(root, "Results"), results_id)
+        root.set("idMax", str(self._last_id))
+        return bytes(etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True))
+
+    def _results(self, results: Any, results_id: str) -> None:
+        overall = _INSPECTION_STATUS[overall_verdict(self.inspection)]
+        measured = etree.Element(_name("MeasurementResults"), id=results_id)
+        _list(results, "MeasurementResultsSet", [measured])
+        _add(measured, "ThisResultsInstanceQPId", self._uuid("results"))
+        _list(_add(measured, "MeasuredCharacteristics"), "CharacteristicMeasurements", self.measurements)
+        _add(_add(measured, "InspectionStatus"), "InspectionStatusEnum", overall)
+        reference = etree.Element(_name("Id"))
+        reference.text = self.actual_id
+        _list(measured, "ActualComponentIds", [reference])
+        actual = etree.Element(_name("ActualComponent"), id=self.actual_id)
+        if self.inspection.serial:
+            _add(actual, "SerialNumber", self.inspection.serial)
+        _add(_add(actual, "Status"), "InspectionStatusEnum", overall)
+        sets = etree.Element(_name("ActualComponentSet"), n="1")
+        sets.append(actual)
+        _list(results, "ActualComponentSets", [sets])
+
+    def _add(self, one: ComponentDeviation) -> None:
+        k = 2.0 if one.details is None or one.details.k is None else one.details.k
+        std = None if one.uncertainty_mm is None else one.uncertainty_mm / k
+        if one.tolerance_mm is not None:
+            item = self._item("Position", one.name, f"{one.name} position", self._position(one.tolerance_mm), [])
+            value = None if one.distance_mm is None else 2.0 * one.distance_mm
+            if None in one.displacement_mm:
+                value = None  # an undetermined axis would make it larger
+            self._measurement("Position", item, _STATUS[one.verdict], value, None if std is None else 2.0 * std)
+        self._add_coordinates(one)
+        self._add_angle(one)
+
+    def _add_coordinates(self, one: ComponentDeviation) -> None:
+        if not self._coordinates:
+            self._coordinates, definition = self._definition("LinearCoordinate")
+            _add(definition, "NonTolerance", "MEASURED")
+        center = None if one.details is None else one.details.center_mm
+        covariance = None if one.details is None else one.details.covariance
+        for axis, moved in enumerate(one.displacement_mm):
+            nominal = 0.0 if center is None else center[axis]
+            what = "deviation" if center is None else "place"
+            more = [("TargetValue", _decimal(nominal)), ("Direction", _DIRECTION[axis])]
+            name = f"{one.name} {what} {'xyz'[axis]}"
+            item = self._item("LinearCoordinate", one.name, name, self._coordinates, more)
+            status = _open_status(one) if moved is None else "BASIC_OR_TED"
+            std = None if covariance is None else max(covariance[3 + axis][3 + axis], 0.0) ** 0.5
+            value = None if moved is None else nominal + moved
+            self._measurement("LinearCoordinate", item, status, value, std)
+
+    def _add_angle(self, one: ComponentDeviation) -> None:
+        details = one.details
+        if details is None or (details.angle_deg is None and details.angle_tolerance_deg is None):
+            return
+        limit = details.angle_tolerance_deg
+        if limit not in self._angles:
+            self._angles[limit], definition = self._definition("UserDefinedAngular")
+            if limit is None:
+                _add(definition, "NonTolerance", "MEASURED")
+            else:
+                tolerance = _add(definition, "Tolerance")
+                _add(tolerance, "MaxValue", _decimal(limit))
+                _add(tolerance, "DefinedAsLimit", "true")
+            _add(definition, "WhatToMeasure", "angle of the determined rotation from the design orientation")
+        item = self._item("UserDefinedAngular", one.name, f"{one.name} rotation", self._angles[limit], [])
+        std = None if details.angle_uncertainty_deg is None else details.angle_uncertainty_deg / 2.0
+        self._measurement("UserDefinedAngular", item, _angle_status(one), details.angle_deg, std)
+
+    def _position(self, tolerance_mm: float) -> str:
+        """Id of the definition with this tolerance."""
+        if tolerance_mm not in self._positions:
+            self._positions[tolerance_mm], definition = self._definition("Position")
+            _add(definition, "ToleranceValue", _decimal(2.0 * tolerance_mm))
+            _add(definition, "MaterialCondition", "NONE")
+            _add(_add(definition, "ZoneShape"), "SphericalZone")
+        return self._positions[tolerance_mm]
+
+    def _definition(self, kind: str) -> tuple[str, Any]:
+        number = self._next_id()
+        definition = etree.Element(_name(f"{kind}CharacteristicDefinition"), id=number)
+        self.definitions.append(definition)
+        return number, definition
+
+    def _item(self, kind: str, component: str, name: str, definition: str, more: list[tuple[str, str]]) -> str:
+        """A nominal of a definition and its item; the item's id."""
+        nominal = etree.Element(_name(f"{kind}CharacteristicNominal"), id=self._next_id())
+        _add(nominal, "CharacteristicDefinitionId", definition)
+        for tag, text in more:
+            _add(nominal, tag, text)
+        self.nominals.append(nominal)
+        item = etree.Element(_name(f"{kind}CharacteristicItem"), id=self._next_id())
+        _add(item, "Description", f"component {component}")
+        _add(item, "Name", name)
+        _add(item, "CharacteristicNominalId", str(nominal.get("id")))
+        self.items.append(item)
+        return str(item.get("id"))
+
+    def _measurement(self, kind: str, item: str, status: str, value: float | None, std: float | None) -> None:
+        one = etree.Element(_name(f"{kind}CharacteristicMeasurement"), id=self._next_id())
+        _add(_add(one, "Status"), "CharacteristicStatusEnum", status)
+        _add(one, "CharacteristicItemId", item)
+        _add(one, "TimeStamp", self.inspection.created.strftime("%Y-%m-%dT%H:%M:%SZ"))
+        _add(one, "ActualComponentId", self.actual_id)
+        if kind == "LinearCoordinate":
+            _add(_add(one, "TypeOfCoordinates"), "CoordinateEnum", "CARTESIAN_3D")
+        if value is not None:
+            element = _add(one, "Value", _decimal(value))
+            if std is not None:
+                element.set("combinedUncertainty", _decimal(std))
+                element.set("meanError", "0")
+        self.measurements.append(one)
+
+    def _description(self) -> str:
+        source = self.inspection.provenance
+        return _printable(
+            f"part {self.inspection.part}, serial {self.inspection.serial or 'none'}, measured"
+            f" {self.inspection.created:%Y-%m-%dT%H:%M:%SZ} by {source.tool} {source.version} ({source.method})"
+            f" against CAD sha256 {self.inspection.model_hash}"
+        )
+
+    def _uuid(self, what: str) -> str:
+        one = self.inspection
+        return str(uuid.uuid5(_OURS, f"{what}|{one.part}|{one.serial}|{one.model_hash}|{one.created.isoformat()}"))
+
+    def _next_id(self) -> str:
+        self._last_id += 1
+        return str(self._last_id)
+
+
+def _open_status(one: ComponentDeviation) -> str:
+    """Of a value that is not there."""
+    if one.finding is Finding.MISSING or one.verdict is Verdict.NOT_MEASURED:
+        return "NOT_ANALYZED"
+    return "INDETERMINATE"
+
+
+def _angle_status(one: ComponentDeviation) -> str:
+    """By the same rule as the position, with all of U kept from the tolerance."""
+    assert one.details is not None
+    limit, angle, uncertainty = (
+        one.details.angle_tolerance_deg, one.details.angle_deg, one.details.angle_uncertainty_deg,
+    )  # fmt: skip
+    if angle is None:
+        return _open_status(one)
+    if limit is None:
+        return "BASIC_OR_TED"
+    if angle + (uncertainty or 0.0) <= limit:
+        return "PASS"
+    return "FAIL" if angle - (uncertainty or 0.0) > limit else "INDETERMINATE"
+
+
+def _name(tag: str) -> str:
+    return f"{{{NAMESPACE}}}{tag}"
+
+
+def _add(parent: Any, tag: str, text: str | None = None) -> Any:
+    child = etree.SubElement(parent, _name(tag))
+    if text is not None:
+        child.text = _printable(text)
+    return child
+
+
+def _list(parent: Any, tag: str, members: list[Any]) -> None:
+    """A list with its number of members; left out when it is empty."""
+    if members:
+        holder = _add(parent, tag)
+        holder.set("n", str(len(members)))
+        holder.extend(members)
+
+
+def _unit(parent: Any, tag: str, si_name: str, name: str, factor: str) -> None:
+    unit = _add(parent, tag)
+    _add(unit, "SIUnitName", si_name)
+    _add(unit, "UnitName", name)
+    _add(_add(unit, "UnitConversion"), "Factor", factor)
+
+
+def _decimal(value: float) -> str:
+    """An xs:decimal, which knows no exponents."""
+    text = f"{value:.6f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text
+
+
+def _printable(text: str) -> str:
+    """Without the control characters that XML cannot hold."""
+    return "".join(c if c >= " " and c not in "\ufffe\uffff" else " " for c in text)
