@@ -61,7 +61,7 @@ async def body(request: Request, most_bytes: int) -> bytes:
                 if len(content) > most_bytes:
                     raise too_large
     except TimeoutError as error:
-        raise Refusal(408, "too_slow", "the body did not arrive in time") from error
+        raise Refusal(408, "too_slow", "the body did not arrive in time", {"Connection": "close"}) from error
     except ClientDisconnect as error:
         raise Refusal(400, "bad_request", "the body broke off") from error
     return bytes(content)
