@@ -234,8 +234,8 @@ def test_a_mad_client_harms_nobody(server: Running) -> None:
     good, mad = server.session(), server.session()
     good_name = good.join()
     pieces = [
-        "/", "api", "clients", "part", "static", "watch", "frame", "control", good_name, "..", "%00", "é", "?id=", "1", "=",
-        "&", "snapshot.png", "recordings", "{}", "index.html", "\\", "//", "#", "model.glb", "status",
+        "/", "api", "clients", "part", "static", "watch", "frame", "control", good_name, "..", "%00", "é", "?id=", "1",
+        "=", "&", "snapshot.png", "recordings", "{}", "index.html", "\\", "//", "#", "model.glb", "status",
     ]  # fmt: skip
     statuses: dict[int, int] = {}
     for number in range(10_000):

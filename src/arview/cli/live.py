@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import logging
+import os
 import signal
 import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -162,7 +164,16 @@ def live(
     server = LiveServer(options, place)
     asyncio.run(_serve(server, options, part_path, views_path, renderer, unit))
     say("ended; files are finished")
+    _leave_threads()
     ctx.exit(EXIT_INTERRUPTED)
+
+
+def _leave_threads() -> None:
+    """End the program at once when a thread is still in a long search or compiling: nobody waits for its result."""
+    if any(thread.name.startswith("arview-") and thread.is_alive() for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(EXIT_INTERRUPTED)
 
 
 def require_extra() -> None:

@@ -132,6 +132,8 @@ class Recordings:
         elif recorder.trouble:
             self._trouble[feed] = recorder.trouble
             logger.warning("%s", recorder.trouble)
+        else:
+            logger.warning("%s is not written: no picture came", recorder.path)
 
     def forget(self, feed: Feed) -> None:
         """End the recording of a feed that has gone."""
