@@ -4,7 +4,7 @@ SHELL := /bin/bash
 READY := .venv/.ready
 SAMPLE := samples/bracket_plate
 
-.PHONY: help demo test check bench evaluate clean
+.PHONY: help demo test check bench evaluate soak clean
 
 help:
 	@echo "make demo      annotate the sample clip: out/demo/annotated.mp4 and poses.jsonl"
@@ -12,6 +12,7 @@ help:
 	@echo "make check     formatting, linting, types, tests"
 	@echo "make bench     measure speed: out/bench.json"
 	@echo "make evaluate  measure accuracy on the recorded sequences: out/evaluation.json, out/evaluation.md"
+	@echo "make soak      the live server for ten minutes: does its memory grow, do its frames get old?"
 	@echo "make clean     remove what these made, but for .venv"
 
 $(READY): pyproject.toml tools/setup
@@ -34,6 +35,9 @@ bench: $(READY)
 
 evaluate: $(READY)
 	.venv/bin/python tools/evaluate --folder out
+
+soak: $(READY)
+	.venv/bin/python tools/soak
 
 clean:
 	rm -rf out dist .pytest_cache .mypy_cache .ruff_cache
