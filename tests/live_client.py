@@ -168,6 +168,7 @@ class Phone:
     shown: list[tuple[float, int | None]] = field(default_factory=list)
     picture: Image | None = None
     name: str = ""
+    change_offer: Callable[[str], str] = str
 
     async def __aenter__(self) -> Self:
         self._peer = peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
@@ -183,7 +184,7 @@ class Phone:
         channel.on("open", opened.set)
         bind_to(peer, [LOOPBACK])
         await peer.setLocalDescription(await peer.createOffer())
-        offer = {"type": "offer", "sdp": peer.localDescription.sdp}
+        offer = {"type": "offer", "sdp": self.change_offer(peer.localDescription.sdp)}
         wish = {"transport": "webrtc", "way": self.way, "offer": offer}
         status, answer = await asyncio.to_thread(self.http.json, "POST", "/api/clients", wish)
         if status != 201:

@@ -266,6 +266,28 @@ def test_inspection_is_reloaded_and_garbage_keeps_the_last_good_one(page: Http, 
     assert json.loads(send(page, name, 0)[1]["x-arview-answer"])["revision"] == after["revision"]
 
 
+def test_part_is_aligned_with_a_guide_view_when_asked_for() -> None:
+    """The outline of the answer is where the guide view is; far from it the part is not taken, near it it is."""
+    chosen = options(guide="az-110_el50_d550", max_age_s=None)
+    with running(chosen, loader(chosen)) as server:
+        page = server.session()
+        name = page.join()
+        answers = [json.loads(send(page, name, 0)[2]) for _ in range(4)]
+        assert answers[-1]["state"] == "tracked" and errors(answers[-1], truth()[0])[0] < 3.0
+    chosen = options(guide="az-40_el30", max_age_s=None)
+    with running(chosen, loader(chosen)) as server:
+        page = server.session()
+        name = page.join(way="video")
+        for index in range(3):
+            _, headers, content = send(page, name, index)
+            answer = json.loads(headers["x-arview-answer"])
+            assert answer["state"] == "searching" and answer["cam_from_model"] is None
+            outline = np.array(answer["guide_cam_from_model"]).reshape(4, 4)
+            np.testing.assert_allclose(outline[:3, :3] @ outline[:3, :3].T, np.eye(3), atol=1e-9)
+            yellow = (np.abs(from_jpeg(content).astype(int) - [255, 221, 87]).max(axis=2) < 60).sum()
+            assert yellow > 500
+
+
 def test_old_inspection_and_guessed_camera_are_told() -> None:
     chosen = options(camera=None, max_age_s=60.0)
     with running(chosen, loader(chosen)) as server:

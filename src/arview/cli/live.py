@@ -207,10 +207,7 @@ async def _serve(
 
     def load() -> Subject:
         with progress_bar("guide views") as progress:
-            subject = load_subject(part_path, unit, views_path, options, GuideViewOptions(renderer=renderer), progress)
-        if options.camera is not None:
-            subject.camera(options.width, options.height) if options.is_phone else None
-        return subject
+            return load_subject(part_path, unit, views_path, options, GuideViewOptions(renderer=renderer), progress)
 
     def ready(hub: Hub) -> None:
         _print_welcome(server, server.place)

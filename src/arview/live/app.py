@@ -186,10 +186,8 @@ class Handlers:
         """A PNG of one frame."""
         client = self._client(request)
         subject, _ = self._hub.ready()
-        if "id" in request.query_params:
-            tracked = client.feed.find(_number(request, "id", FRAME_IDS))
-        else:
-            tracked = client.feed.newest
+        wants_newest = "id" not in request.query_params
+        tracked = client.feed.newest if wants_newest else client.find(_number(request, "id", FRAME_IDS))
         if tracked is None:
             raise Refusal(404, "no_such_frame", "that picture is no longer kept")
         png = await asyncio.to_thread(snapshot_png, subject, client.drawing, tracked)

@@ -36,6 +36,7 @@ class Client:
         way: what it wants back.
         connection: its WebRTC connection, if that is its transport.
         inbox: newest frame of the feed, for the transport without WebRTC.
+        held: frame that it keeps for a snapshot.
         is_busy: a JPEG of it is being tracked.
         seen_s: monotonic time of its last request.
     """
@@ -45,6 +46,7 @@ class Client:
         self.feed, self.drawing, self.transport, self.way = feed, drawing, transport, way
         self.connection: Connection | None = None
         self.inbox: Inbox[Tracked] = Inbox(asyncio.get_running_loop())
+        self.held: Tracked | None = None
         self.is_busy = False
         self.joined_s = self.seen_s = time.monotonic()
         self.told: tuple[object, float] = (None, 0.0)  # what the last status said, and when
@@ -56,6 +58,12 @@ class Client:
         self.feed.unlisten(self.inbox.put)
         if self.connection is not None:
             await self.connection.close()
+
+    def find(self, frame_id: int) -> Tracked | None:
+        """A tracked frame that is still kept."""
+        if self.held is not None and self.held.picture.frame_id == frame_id:
+            return self.held
+        return self.feed.find(frame_id)
 
     def seen(self) -> None:
         """Note a sign of life."""

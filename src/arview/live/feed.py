@@ -98,8 +98,6 @@ class Feed:
         self._slot: NewestSlot[Incoming] = NewestSlot()
         self._listeners: list[Callable[[Tracked], None]] = []
         self._kept: deque[Tracked] = deque(maxlen=KEPT_FRAMES)
-        self._held_id: int | None = None
-        self._held: Tracked | None = None
         self._arrived_s: float | None = None
         self._session: TrackingSession | None = None
         self._wants_reset = False
@@ -130,15 +128,9 @@ class Feed:
         """Search again, from the next frame on."""
         self._wants_reset = True
 
-    def hold(self, frame_id: int | None) -> None:
-        """Keep the frame of this id until another is held."""
-        self._held_id = frame_id
-        self._held = self.find(frame_id) if frame_id is not None else None
-
     def find(self, frame_id: int) -> Tracked | None:
         """A tracked frame that is still kept."""
-        kept = [*([self._held] if self._held else []), *reversed(tuple(self._kept))]
-        return next((one for one in kept if one.picture.frame_id == frame_id), None)
+        return next((one for one in reversed(tuple(self._kept)) if one.picture.frame_id == frame_id), None)
 
     def close(self) -> None:
         """End the tracking; a frame being tracked is finished first."""
@@ -190,7 +182,7 @@ class Feed:
                 self.failures += 1
                 self._shape = None
         self._kept.clear()
-        self._held = self._session = None
+        self._session = None
 
     def _step(self, incoming: Incoming) -> None:
         started_s = time.monotonic()
@@ -203,8 +195,6 @@ class Feed:
         tracked = self._track(picture, incoming.arrived_s, started_s)
         self.newest = tracked
         self._kept.append(tracked)
-        if picture.frame_id == self._held_id and self._held is None:
-            self._held = tracked
         self.tracked_rate.tick()
         for listener in tuple(self._listeners):
             listener(tracked)

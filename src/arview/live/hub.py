@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from arview.errors import ArviewError, InputError
@@ -57,7 +58,7 @@ class Hub:
         self._glb: asyncio.Task[bytes] | None = None
         self._station: StationCamera | None = None
         self._shared: tuple[Feed, Drawing] | None = None
-        self._recorded_phones = 0
+        self._recorded: set[Path] = set()
         self._ticker: asyncio.Task[None] | None = None
         self._joining = 0
         self._leaving: set[asyncio.Future[bool]] = set()
@@ -134,8 +135,9 @@ class Hub:
         finally:
             self._joining -= 1
         self.clients[client.name] = client
+        logger.info("a page takes part by %s (%d of %d)", transport, len(self.clients), self.options.most_clients)
         if self.options.is_phone and self.options.record is not None:
-            self._record_phone(recordings, client)
+            self._record_phone(recordings, client, self.options.record)
         return client, answer
 
     async def leave(self, name: str) -> bool:
@@ -143,6 +145,7 @@ class Hub:
         client = self.clients.pop(name, None)
         if client is None:
             return False
+        logger.info("a page has left (%d of %d)", len(self.clients), self.options.most_clients)
         await self._let_go(client)
         return True
 
@@ -167,13 +170,17 @@ class Hub:
         subject, recordings = self.ready()
         names = tuple(component.name for component in subject.part.model.components)
         look = check_control(wish, client.drawing.look, names)
-        if look != client.drawing.look:
-            client.drawing.look = look
+        held = None
+        if wish.get("hold") is not None:
+            held = client.find(wish["hold"])
+            if held is None:
+                raise Refusal(404, "no_such_frame", "that picture is no longer kept")
+        client.drawing.look = look
         client.way = wish.get("way", client.way)
         if wish.get("reset"):
             client.feed.reset()
         if "hold" in wish:
-            client.feed.hold(wish["hold"])
+            client.held = held
         if wish.get("record") is True:
             recordings.start(client.feed, client.drawing)
         elif wish.get("record") is False:
@@ -254,15 +261,14 @@ class Hub:
                 await asyncio.to_thread(self.recordings.forget, client.feed)
             await asyncio.to_thread(client.feed.close)
 
-    def _record_phone(self, recordings: Recordings, client: Client) -> None:
-        """Record a phone from its first frame: OUT.mp4, then OUT-2.mp4, ..."""
-        path = self.options.record
-        if path is None:
-            return
-        self._recorded_phones += 1
-        if self._recorded_phones > 1:
-            path = path.with_name(f"{path.stem}-{self._recorded_phones}{path.suffix}")
-        recordings.start(client.feed, client.drawing, path)
+    def _record_phone(self, recordings: Recordings, client: Client, path: Path) -> None:
+        """Record a phone from its first frame: OUT.mp4, then the next of OUT-2.mp4, OUT-3.mp4, ... that is free."""
+        wanted, number = path, 1
+        while wanted in self._recorded or (number > 1 and wanted.exists()):
+            number += 1
+            wanted = path.with_name(f"{path.stem}-{number}{path.suffix}")
+        self._recorded.add(wanted)
+        recordings.start(client.feed, client.drawing, wanted)
 
     def _notices(self, feed: Feed | None) -> list[Notice]:
         said = self.subject.notices() if self.subject is not None else []

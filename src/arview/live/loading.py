@@ -6,13 +6,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from arview.cad import load_part
 from arview.camera_files import guess_camera
-from arview.errors import ArviewError
+from arview.errors import ArviewError, MismatchError
 from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewOptions, load_guide_views
 from arview.live.options import LiveOptions
@@ -29,7 +30,7 @@ def load_subject(
     view_options: GuideViewOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Subject:
-    """Part, guide views (of a file, of the cache, or made now) and inspection.
+    """Part, guide views (of a file, of the cache, or made now), inspection and camera.
 
     Raises:
         InputError, MismatchError: one of the files cannot be used, or they do not belong together.
@@ -39,7 +40,13 @@ def load_subject(
         views = load_guide_views(Path(views_path), part.model)
     else:
         views = cached_guide_views(part.model, part.effective_view_range, view_options, progress)
-    return Subject(part, views, options)
+    subject = Subject(part, views, options)
+    if options.is_phone:
+        subject.camera(options.width, options.height)
+    elif options.camera is not None:
+        with suppress(MismatchError):  # the size of a station's pictures is not known before the first
+            subject.camera(options.width, options.height)
+    return subject
 
 
 def warm_up(subject: Subject) -> threading.Thread:

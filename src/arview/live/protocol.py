@@ -101,7 +101,7 @@ Control, every key and every key of ``look`` may be absent::
      "look": {"ghost": bool, "edges": "none" | "visible" | "all", "labels": bool, "opacity": 0 to 1,
               "only": name of the component that alone is drawn | null, "status": bool},     of what the server draws
      "reset": true,               search again
-     "hold": frame id | null,     keep this frame for a snapshot
+     "hold": frame id | null,     keep this frame for a snapshot; 404 no_such_frame when it is no longer there
      "record": bool}
 
 Part::
