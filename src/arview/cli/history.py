@@ -1,0 +1,304 @@
+"""The commands history: a store of inspections, and what it says over time."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import click
+
+from arview.cli.common import main, output_path, progress_bar, say, write_bytes
+from arview.errors import ArviewError, InputError
+
+if TYPE_CHECKING:
+    from arview.history import HistoryStore, Listed
+
+EXIT_DAMAGED = 3
+_QUANTITIES = ("distance", "dx", "dy", "dz", "tilt", "twist")
+
+STORE = click.option(
+    "--store", metavar="FILE|URL",
+    help="SQLite file or postgresql://user@host/database; default: ARVIEW_STORE, else a file in your data folder.",
+)  # fmt: skip
+PART = click.option("--part", metavar="NAME", help="Only results of this part.")
+SERIAL = click.option("--serial", metavar="SERIAL", help="Only results of this serial.")
+STATION = click.option("--station", metavar="NAME", help="Only results of this station.")
+SINCE = click.option(
+    "--since", metavar="DATE", help="Only what was measured from then on: 2026-03-01 or with a time, UTC."
+)
+
+
+@main.group(
+    short_help="Keep results, list them, trends and capability.",
+    epilog="""\b
+Examples:
+  arview history add out/*/inspection.json --station cell-3
+  arview history list --part plate --limit 20
+  arview history show 12 -o inspection.json
+  arview history chart --part plate --component post_1 -o post_1.svg
+  arview history export -o plate.csv --part plate
+  arview history --help; arview history add --store postgresql://qa@db/arview out/inspection.json
+
+\b
+The store only grows: results are added, never changed or deleted; the database itself refuses it. Each is known by the
+SHA-256 of its content, so that adding it again changes nothing. Two stations may add at once. SQLite serves one
+machine; for several use PostgreSQL (pip install 'arview[postgres]').""",
+)
+def history() -> None:
+    """Keep inspections in a store that only grows, and see what they say over time."""
+
+
+@history.command(
+    short_help="Add inspections.",
+    epilog="""\b
+Examples:
+  arview history add out/inspection.json
+  arview history add out/*/inspection.json --station cell-3 --store /data/plate.sqlite
+
+\b
+Files that are no inspection are named and left out; the exit code is then 2. What is in the store already stays as it
+is.""",
+)
+@click.argument("inspections", nargs=-1, required=True, metavar="INSPECTION...")
+@click.option("--station", metavar="NAME", help="Where they were measured; default: ARVIEW_STATION or this machine.")
+@STORE
+def add(inspections: tuple[str, ...], station: str | None, store: str | None) -> None:
+    """Add the INSPECTIONs to the store."""
+    new = same = 0
+    failed: list[str] = []
+    with _open(store) as opened, progress_bar("history", len(inspections)) as progress:
+        for done, path in enumerate(inspections, 1):
+            try:
+                added = opened.add(path, station)
+            except InputError as error:
+                failed.append(str(error))
+                continue
+            new, same = new + added.is_new, same + (not added.is_new)
+            if len(inspections) == 1:
+                state = "added as" if added.is_new else "is there already as"
+                click.echo(f"{path}: {state} {added.id}, {added.content_hash[:12]}")
+            progress(done, len(inspections))
+        name = opened.name
+    for reason in failed:
+        say(f"error: {reason}")
+    if len(inspections) > 1:
+        click.echo(f"{new} added, {same} there already, {len(failed)} refused: {name}")
+    if failed:
+        click.get_current_context().exit(2)
+
+
+@history.command("list", short_help="List results.", epilog="""\b
+Examples:
+  arview history list
+  arview history list --part plate --verdict fail --since 2026-03-01""")  # fmt: skip
+@PART
+@SERIAL
+@STATION
+@SINCE
+@click.option("--verdict", type=click.Choice(["pass", "fail", "undecided", "not_measured"]), help="Only these.")
+@click.option("--limit", type=click.IntRange(min=1), metavar="N", help="The newest N.")
+@STORE
+def list_results(
+    part: str | None, serial: str | None, station: str | None, since: str | None, verdict: str | None,
+    limit: int | None, store: str | None,
+) -> None:  # fmt: skip
+    """List the results in the order in which they were measured."""
+    with _open(store, must_exist=True) as opened:
+        found = opened.listed(part, serial, station, verdict, _moment(since), limit=limit)
+    _table(
+        ("no.", "measured (UTC)", "part", "serial", "station", "verdict", "hash"),
+        [(str(r.id), f"{r.measured:%Y-%m-%d %H:%M:%S}", r.part, r.serial or "-", r.station,
+          r.verdict.replace("_", " "), r.content_hash[:12]) for r in found],
+    )  # fmt: skip
+    click.echo(f"{len(found)} result{'s' * (len(found) != 1)}")
+
+
+@history.command(short_help="Show one result.", epilog="""\b
+Examples:
+  arview history show 12
+  arview history show 3fa94c21b0 -o inspection.json""")  # fmt: skip
+@click.argument("result")
+@click.option("-o", "--output", metavar="FILE", help="Write its inspection.json.")
+@STORE
+def show(result: str, output: str | None, store: str | None) -> None:
+    """Show the RESULT of a number or of the beginning of a hash."""
+    target = None if output is None else output_path(output, [])
+    with _open(store, must_exist=True) as opened:
+        found, document = opened.find(result)
+        order = {one["name"]: place for place, one in enumerate(json.loads(document)["components"])}
+        rows = sorted(opened.components([found.id]), key=lambda row: order.get(row["name"], 0))
+    _about(found)
+    _table(
+        ("component", "dx", "dy", "dz", "distance", "U", "tolerance", "tilt", "verdict"),
+        [(row["name"], *(_number(row[key], sign) for key, sign in
+                         (("dx_mm", "+"), ("dy_mm", "+"), ("dz_mm", "+"), ("distance_mm", ""), ("uncertainty_mm", ""),
+                          ("tolerance_mm", ""))),
+          _number(row["tilt_deg"], "", 2), row["finding"] or row["verdict"].replace("_", " ")) for row in rows],
+    )  # fmt: skip
+    if target is not None:
+        text = json.dumps(json.loads(document), indent=2, ensure_ascii=False) + "\n"
+        write_bytes(target, text.encode())
+        click.echo(f"wrote {target}")
+
+
+@history.command(
+    short_help="Trend, control limits, Cp and Cpk of a component.",
+    epilog="""\b
+Examples:
+  arview history chart --component post_1
+  arview history chart --part plate --component post_1 --of dx -o post_1_dx.svg
+  arview history chart --component nut_2 --of tilt --upper 0.5 -o tilt.png
+
+\b
+Individuals and moving ranges (ISO 7870-2): limits are 3 standard deviations by the mean moving range; a value beyond
+them, 8 in a row on one side of the mean or 6 in a row that rise or fall are out of the ordinary. Cp and Cpk
+(ISO 22514-2) come with their 95 % confidence intervals; they are called Pp and Ppk when the process is not in control,
+refused below 10 values and doubted below 50. A distance has an upper limit only, so Cpk alone; distances near zero are
+not normally distributed, dx, dy, dz are the better judges of a process. A serial that was measured again counts
+once, unless --repeats.""",
+)
+@click.option("--component", required=True, metavar="NAME", help="Component to look at.")
+@click.option("--of", "quantity", type=click.Choice(_QUANTITIES), default="distance", show_default=True,
+              help="What of it.")  # fmt: skip
+@click.option("--lower", type=float, metavar="X", help="Lower limit, instead of that of the tolerance.")
+@click.option("--upper", type=float, metavar="X", help="Upper limit, instead of that of the tolerance.")
+@click.option("--repeats", is_flag=True, help="Count every measurement of a serial.")
+@click.option("-o", "--output", metavar="FILE", help="Picture to write: .svg, .png or .pdf.")
+@PART
+@STATION
+@SINCE
+@STORE
+def chart(
+    component: str, quantity: str, lower: float | None, upper: float | None, repeats: bool, output: str | None,
+    part: str | None, station: str | None, since: str | None, store: str | None,
+) -> None:  # fmt: skip
+    """Trend of a component over the parts, with control limits, Cp and Cpk."""
+    from dataclasses import replace
+
+    from arview.history import capability, control_chart, series_of
+    from arview.history.chart import FORMATS, draw
+
+    target = None if output is None else output_path(output, [])
+    if target is not None and target.suffix.lstrip(".").lower() not in FORMATS:
+        raise InputError(f"{target}: expected a name that ends with {', '.join('.' + one for one in FORMATS)}")
+    with _open(store, must_exist=True) as opened:
+        series = series_of(opened, component, quantity, part, station, _moment(since), repeats)  # type: ignore[arg-type]
+    series = replace(
+        series, lower=series.lower if lower is None else lower, upper=series.upper if upper is None else upper
+    )
+    for reason in series.left_out:
+        say(f"left out: {reason}")
+    values = [one.value for one in series.values]
+    count = f"{len(values)} value{'s' * (len(values) != 1)}"
+    click.echo(f"{series.part}, {series.component}, {series.quantity} in {series.unit}: {count}")
+    limits = ability = None
+    try:
+        limits = control_chart(values)
+        click.echo(f"mean {limits.center:+.4f}, control limits {limits.lower:+.4f} to {limits.upper:+.4f}, "
+                   f"mean moving range {limits.range_center:.4f}")  # fmt: skip
+        for index, why in limits.signals.items():
+            one = series.values[index]
+            click.echo(
+                f"  {one.serial or f'no. {one.result_id}'} ({one.measured:%Y-%m-%d %H:%M}): {one.value:+.4f}, {why}"
+            )
+    except ArviewError as error:
+        say(str(error))
+    try:
+        ability = capability(values, series.lower, series.upper, [one.std for one in series.values])
+        name_cp, name_cpk = ability.names
+        if ability.cp is not None and ability.cp_interval is not None:
+            click.echo(
+                f"{name_cp} {ability.cp:.2f} (95 %: {ability.cp_interval[0]:.2f} to {ability.cp_interval[1]:.2f})"
+            )
+        click.echo(
+            f"{name_cpk} {ability.cpk:.2f} (95 %: {ability.cpk_interval[0]:.2f} to {ability.cpk_interval[1]:.2f})"
+        )
+        for warning in ability.warnings:
+            say(f"warning: {warning}")
+    except ArviewError as error:
+        say(str(error))
+    if target is not None:
+        write_bytes(target, draw(series, limits, ability, target.suffix.lstrip(".").lower()))
+        click.echo(f"wrote {target}")
+
+
+@history.command(short_help="Write results as CSV or JSON lines.", epilog="""\b
+Examples:
+  arview history export -o plate.csv --part plate
+  arview history export -o all.jsonl
+
+\b
+.csv has a line for each component of each result, .jsonl the whole inspections, one a line.""")  # fmt: skip
+@click.option("-o", "--output", required=True, metavar="FILE", help="File to write: .csv or .jsonl.")
+@PART
+@SERIAL
+@STATION
+@SINCE
+@STORE
+def export(
+    output: str, part: str | None, serial: str | None, station: str | None, since: str | None, store: str | None
+) -> None:
+    """Write results to a file."""
+    from arview.history.export import to_csv, to_json_lines
+
+    target = output_path(output, [])
+    kind = target.suffix.lower()
+    if kind not in (".csv", ".jsonl"):
+        raise InputError(f"{target}: expected a name that ends with .csv or .jsonl")
+    with _open(store, must_exist=True) as opened:
+        found = opened.listed(part, serial, station, since=_moment(since))
+        content = to_csv(opened, found) if kind == ".csv" else to_json_lines(opened, found)
+    write_bytes(target, content)
+    click.echo(f"wrote {target}: {len(found)} results")
+
+
+@history.command(short_help="Check that nothing was changed.", epilog="""\b
+Exit codes: 0 everything is as it was added, 3 something is not.""")  # fmt: skip
+@STORE
+def check(store: str | None) -> None:
+    """Check each result against its hash."""
+    with _open(store, must_exist=True) as opened:
+        count, faults = opened.check()
+    for fault in faults:
+        click.echo(fault)
+    click.echo(f"{count} results, {len(faults)} damaged")
+    if faults:
+        click.get_current_context().exit(EXIT_DAMAGED)
+
+
+def _open(store: str | None, must_exist: bool = False) -> HistoryStore:
+    from arview.history.store import HistoryStore, default_store
+
+    return HistoryStore(store or default_store(), must_exist)
+
+
+def _moment(text: str | None) -> datetime | None:
+    if text is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise InputError(f"--since {text!r}: expected a date like 2026-03-01 or 2026-03-01T12:00") from error
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+
+
+def _about(one: Listed) -> None:
+    click.echo(f"no. {one.id}, {one.part} {one.serial}, {one.verdict.replace('_', ' ')}")
+    click.echo(f"measured {one.measured:%Y-%m-%d %H:%M:%S} UTC at {one.station} by {one.tool}")
+    click.echo(f"added    {one.added:%Y-%m-%d %H:%M:%S} UTC, content {one.content_hash}")
+    click.echo(f"CAD      {one.model_hash}")
+
+
+def _number(value: float | None, sign: str, digits: int = 3) -> str:
+    return "?" if value is None else format(value, f"{sign}.{digits}f")
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    """Columns as wide as they must be; the first and texts to the left, numbers to the right."""
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    numeric = [bool(rows) and all(row[i][:1] in "+-?0123456789" and "." in row[i] + "." for row in rows)
+               and i > 0 and head[i] not in ("hash", "serial", "measured (UTC)") for i in range(len(head))]  # fmt: skip
+    for row in [head, *rows]:
+        cells = [c.rjust(w) if n else c.ljust(w) for c, w, n in zip(row, widths, numeric, strict=True)]
+        click.echo("  ".join(cells).rstrip())

@@ -1,0 +1,133 @@
+"""The trend of a component as a picture: individuals and moving ranges, with limits, tolerance and signals."""
+
+from __future__ import annotations
+
+import io
+import logging
+from typing import Any
+
+import numpy as np
+
+from arview.errors import InputError
+from arview.history.series import Series
+from arview.history.statistics import Capability, ControlChart
+
+FORMATS = ("svg", "png", "pdf")
+_INK, _MUTED, _BLUE, _RED = "#1c2430", "#5b6675", "#2b5c8a", "#c22f2b"
+_STYLE: dict[str, Any] = {
+    "svg.fonttype": "path",
+    "svg.hashsalt": "arview",
+    "font.family": "sans-serif",
+    "font.sans-serif": ["Inter", "DejaVu Sans"],
+    "font.size": 9.5,
+    "text.color": _INK,
+    "axes.edgecolor": "#9aa5b1",
+    "axes.labelcolor": _MUTED,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": _MUTED,
+    "ytick.color": _MUTED,
+}
+
+
+def draw(series: Series, chart: ControlChart | None, ability: Capability | None, kind: str = "svg") -> bytes:
+    """The series as a picture of the kind svg, png or pdf.
+
+    Args:
+        series: values.
+        chart: control limits; None when there are too few values for them.
+        ability: written into the title; None when it is not known.
+        kind: see FORMATS.
+
+    Raises:
+        InputError: no values, or an unknown kind.
+    """
+    if kind not in FORMATS:
+        raise InputError(f"chart: {kind!r}: expected one of {', '.join(FORMATS)}")
+    if not series.values:
+        raise InputError(f"{series.component}: there is no determined {series.quantity} to draw")
+    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    settings: Any = _STYLE
+    with mpl.rc_context(settings):
+        figure = Figure(figsize=(9.0, 5.6), layout="constrained")
+        FigureCanvasAgg(figure)
+        above, below = figure.subplots(2, sharex=True, height_ratios=[2.2, 1.0])
+        _individuals(above, series, chart)
+        _ranges(below, series, chart)
+        figure.suptitle(_title(series, ability), x=0.01, ha="left", fontsize=11)
+        out = io.BytesIO()
+        metadata = {"Date": None} if kind == "svg" else {"CreationDate": None} if kind == "pdf" else {}
+        figure.savefig(out, format=kind, dpi=150, metadata=metadata)
+    return out.getvalue()
+
+
+def _individuals(axes: Any, series: Series, chart: ControlChart | None) -> None:
+    x = np.array([one.value for one in series.values])
+    places = np.arange(1, len(x) + 1)
+    for limit in (series.lower, series.upper):
+        if limit is not None:
+            axes.axhline(limit, color=_INK, linewidth=1.1)
+            _label(
+                axes, limit, f"tolerance {limit:+.3f}" if series.lower is not None else f"tolerance {limit:.3f}", _INK
+            )
+    if chart is not None:
+        axes.axhline(chart.center, color=_BLUE, linewidth=0.9)
+        _label(axes, chart.center, f"mean {chart.center:.3f}", _BLUE)
+        for limit, name in ((chart.lower, "LCL"), (chart.upper, "UCL")):
+            axes.axhline(limit, color=_BLUE, linewidth=0.9, linestyle=(0, (5, 3)))
+            _label(axes, limit, f"{name} {limit:.3f}", _BLUE)
+    stds = np.array([one.std or 0.0 for one in series.values])
+    if stds.any():
+        axes.errorbar(places, x, yerr=2.0 * stds, fmt="none", ecolor="#c3ccd6", elinewidth=1.4, zorder=1)
+    axes.plot(places, x, color="#9db4cb", linewidth=0.9, zorder=2)
+    signals = set(chart.signals) if chart is not None else set()
+    calm = [i for i in range(len(x)) if i not in signals]
+    axes.plot(places[calm], x[calm], "o", color=_BLUE, markersize=4.5, zorder=3)
+    odd = sorted(signals)
+    axes.plot(places[odd], x[odd], "D", color=_RED, markersize=6, zorder=4)
+    for index in odd[:12]:
+        axes.annotate(series.values[index].serial or f"#{series.values[index].result_id}", (places[index], x[index]),
+                      xytext=(5, 6), textcoords="offset points", fontsize=8, color=_RED)  # fmt: skip
+    axes.set_ylabel(f"{series.quantity}, {series.unit}")
+    axes.margins(x=0.02, y=0.14)
+
+
+def _ranges(axes: Any, series: Series, chart: ControlChart | None) -> None:
+    x = np.array([one.value for one in series.values])
+    places = np.arange(2, len(x) + 1)
+    axes.plot(places, np.abs(np.diff(x)), "-o", color="#9db4cb", markerfacecolor=_BLUE, markeredgecolor=_BLUE,
+              markersize=3.5, linewidth=0.9)  # fmt: skip
+    if chart is not None:
+        axes.axhline(chart.range_center, color=_BLUE, linewidth=0.9)
+        axes.axhline(chart.range_upper, color=_BLUE, linewidth=0.9, linestyle=(0, (5, 3)))
+        _label(axes, chart.range_upper, f"UCL {chart.range_upper:.3f}", _BLUE)
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel("moving range")
+    first, last = series.values[0], series.values[-1]
+    axes.set_xlabel(
+        f"{len(x)} parts in the order in which they were measured, {first.measured:%Y-%m-%d} to"
+        f" {last.measured:%Y-%m-%d}; diamond: out of the ordinary"
+    )
+
+
+def _label(axes: Any, y: float, text: str, color: str) -> None:
+    """At the right end of a line."""
+    text = text.replace("-", "−")
+    axes.annotate(text, (1.0, y), xycoords=("axes fraction", "data"), xytext=(4, 0), textcoords="offset points",
+                  va="center", fontsize=8, color=color, annotation_clip=False)  # fmt: skip
+
+
+def _title(series: Series, ability: Capability | None) -> str:
+    title = f"{series.part}: {series.component}, {series.quantity}"
+    if ability is not None:
+        name_cp, name_cpk = ability.names
+        low, high = ability.cpk_interval
+        title += f"   {name_cpk} {ability.cpk:.2f} ({low:.2f} to {high:.2f})"
+        if ability.cp is not None:
+            title += f", {name_cp} {ability.cp:.2f}"
+    return title

@@ -1,0 +1,404 @@
+"""The results store: inspections are added and read, never changed; two stations may write at once.
+
+SQLite keeps a write-ahead log and lets writers wait for each other; PostgreSQL does so by itself. What is added is
+known by the hash of its content: adding it twice, or again after an interruption, leaves it there once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+from sqlalchemy.exc import (
+    ArgumentError,
+    DBAPIError,
+    IntegrityError,
+    NoSuchModuleError,
+    OperationalError,
+    SQLAlchemyError,
+)
+
+from arview.errors import InputError, MissingDependencyError, OutputError
+from arview.history.tables import STORE_VERSION, about, components, guards, metadata, results
+from arview.inspection import Inspection, load_inspection
+from arview.inspection.summary import overall_verdict
+
+_BUSY_S = 30.0
+"""How long a writer waits for others; a result is written in milliseconds."""
+_TRIES = 6
+_PASSING = ("locked", "busy", "deadlock", "serialize", "could not connect", "server closed", "terminating connection")
+_NETWORK_FILE_SYSTEMS = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "glusterfs", "ceph")
+_LOCK = 0x61727669  # of PostgreSQL's advisory lock while tables are made
+Found = TypeVar("Found")
+
+
+@dataclass(frozen=True)
+class Added:
+    """What became of an inspection: its number and hash, and whether it was new."""
+
+    id: int
+    content_hash: str
+    is_new: bool
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One result without its document; times are UTC."""
+
+    id: int
+    content_hash: str
+    part: str
+    serial: str
+    station: str
+    model_hash: str
+    measured: datetime
+    added: datetime
+    verdict: str
+    tool: str
+
+
+def default_store() -> str:
+    """``ARVIEW_STORE``, or a file in the user's data folder."""
+    named = os.environ.get("ARVIEW_STORE")
+    if named:
+        return named
+    data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+    return str(data / "arview" / "history.sqlite")
+
+
+def default_station() -> str:
+    """``ARVIEW_STATION``, or the name of this machine."""
+    return os.environ.get("ARVIEW_STATION") or socket.gethostname()
+
+
+class HistoryStore:
+    """A results store, made when it is not there yet.
+
+    Args:
+        where: a file (SQLite), or the URL of a PostgreSQL database: ``postgresql://user@host/database``.
+        must_exist: refuse to make a new file, for reading.
+
+    Raises:
+        InputError: no such file or database, no store, or one of a newer arview.
+        OutputError: the file cannot be made.
+        MissingDependencyError: the driver of the database is not installed.
+    """
+
+    def __init__(self, where: str | Path, must_exist: bool = False) -> None:
+        url = _url(str(where))
+        self.name = url.render_as_string(hide_password=True) if url.host else str(url.database)
+        self.is_sqlite = url.get_backend_name() == "sqlite"
+        if self.is_sqlite:
+            self._check_file(Path(str(url.database)), must_exist)
+        try:
+            self._engine = sa.create_engine(url, **({"connect_args": {"timeout": _BUSY_S}} if self.is_sqlite else {}))
+        except (ImportError, NoSuchModuleError) as error:
+            raise MissingDependencyError(
+                f"{self.name}: the driver is not installed: pip install 'arview[postgres]' ({error})"
+            ) from error
+        if self.is_sqlite:
+            sa.event.listen(self._engine, "connect", _prepare_sqlite)
+            sa.event.listen(self._engine, "begin", _begin_sqlite)
+        self._make_tables()
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._engine.dispose()
+
+    def __enter__(self) -> HistoryStore:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def add(self, inspection: str | Path, station: str | None = None) -> Added:
+        """Add the inspection in a file, unless it is there already.
+
+        Args:
+            inspection: ``inspection.json``; it is checked before.
+            station: where it was measured; default: ``ARVIEW_STATION`` or the name of this machine.
+
+        Raises:
+            InputError: the file is no inspection.
+            OutputError: the store cannot be written to.
+        """
+        path = Path(inspection)
+        loaded = load_inspection(path)
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
+        row = {
+            "content_hash": content_hash(document),
+            "part": loaded.part,
+            "serial": loaded.serial,
+            "station": station or default_station(),
+            "model_hash": loaded.model_hash,
+            "measured": _stamp(loaded.created),
+            "added": _stamp(datetime.now(UTC)),
+            "verdict": overall_verdict(loaded).value,
+            "tool": f"{loaded.provenance.tool} {loaded.provenance.version}",
+            "document": json.dumps(document, ensure_ascii=False, allow_nan=False),
+        }
+        return self._again(lambda: self._insert(row, loaded))
+
+    def _insert(self, row: dict[str, Any], inspection: Inspection) -> Added:
+        same = sa.select(results.c.id).where(results.c.content_hash == row["content_hash"])
+        with self._begin(writes=True) as connection:
+            known = connection.scalar(same)
+            if known is None:
+                try:
+                    with connection.begin_nested():
+                        number = connection.execute(sa.insert(results).values(row).returning(results.c.id)).scalar()
+                except IntegrityError:  # another station added it a moment ago (PostgreSQL)
+                    number = None
+                if number is not None:
+                    rows = [_component_row(number, component) for component in inspection.components]
+                    if rows:
+                        connection.execute(sa.insert(components), rows)
+                    return Added(int(number), row["content_hash"], True)
+                known = connection.scalar(same)
+            return Added(int(known or 0), row["content_hash"], False)
+
+    def listed(
+        self, part: str | None = None, serial: str | None = None, station: str | None = None,
+        verdict: str | None = None, since: datetime | None = None, model_hash: str | None = None,
+        limit: int | None = None,
+    ) -> list[Listed]:  # fmt: skip
+        """Results in the order in which they were measured; of a ``limit``, the newest ones."""
+        wanted = {"part": part, "serial": serial, "station": station, "verdict": verdict, "model_hash": model_hash}
+        query = sa.select(*(c for c in results.c if c.name != "document"))
+        for name, value in wanted.items():
+            if value is not None:
+                query = query.where(results.c[name] == value)
+        if since is not None:
+            query = query.where(results.c.measured >= _stamp(since))
+        query = query.order_by(results.c.measured.desc(), results.c.id.desc())
+        if limit is not None:
+            query = query.limit(limit)
+        with self._begin() as connection:
+            return [_listed(row) for row in reversed(connection.execute(query).all())]
+
+    def find(self, key: str) -> tuple[Listed, str]:
+        """A result and its document by its number, or by the beginning of its hash (at least six digits).
+
+        Raises:
+            InputError: there is none, or more than one begins so.
+        """
+        is_hash = len(key) >= 6 and set(key.lower()) <= set("0123456789abcdef")
+        if not is_hash and not key.isdigit():
+            raise InputError(f"{key!r}: expected the number of a result or at least six digits of its hash")
+        rows: Sequence[Any] = ()
+        with self._begin() as connection:
+            if key.isdigit() and len(key) <= 18:
+                rows = connection.execute(sa.select(results).where(results.c.id == int(key))).all()
+            if not rows and is_hash:
+                begins = results.c.content_hash.startswith(key.lower(), autoescape=True)
+                rows = connection.execute(sa.select(results).where(begins).limit(2)).all()
+        if not rows:
+            raise InputError(f"{self.name}: no result {key}")
+        if len(rows) > 1:
+            raise InputError(f"{self.name}: more than one result begins with {key}; give more digits")
+        return _listed(rows[0]), str(rows[0].document)
+
+    def components(self, ids: list[int] | None = None, name: str | None = None) -> Iterator[dict[str, Any]]:
+        """Rows of the components of results, of all or of one name, in the order of ``ids`` or of their numbers."""
+        query = sa.select(components).order_by(components.c.result_id, components.c.name)
+        if name is not None:
+            query = query.where(components.c.name == name)
+        with self._begin() as connection:
+            rows = [dict(row._mapping) for row in connection.execute(query)]
+        if ids is None:
+            yield from rows
+            return
+        by_result: dict[int, list[dict[str, Any]]] = {}
+        for row in rows:
+            by_result.setdefault(row["result_id"], []).append(row)
+        for number in ids:
+            yield from by_result.get(number, ())
+
+    def check(self) -> tuple[int, list[str]]:
+        """How many results there are, and in words what is not as it was added."""
+        faults = []
+        count = 0
+        query = sa.select(results.c.id, results.c.content_hash, results.c.document).order_by(results.c.id)
+        held = sa.select(components.c.result_id, sa.func.count()).group_by(components.c.result_id)
+        with self._begin() as connection:
+            of_result = {int(number): int(rows) for number, rows in connection.execute(held)}
+            for row in connection.execute(query.execution_options(yield_per=200)):
+                count += 1
+                document = json.loads(row.document)
+                if content_hash(document) != row.content_hash:
+                    faults.append(f"result {row.id}: its document does not have the hash {row.content_hash[:12]}…")
+                elif len(document["components"]) != of_result.get(row.id, 0):
+                    faults.append(f"result {row.id}: components are missing or too many")
+        return count, faults
+
+    # ---- connections
+
+    @contextmanager
+    def _begin(self, writes: bool = False) -> Iterator[sa.Connection]:
+        """A transaction; errors of the database as ours, in one line and without a password."""
+        try:
+            with self._engine.connect().execution_options(arview_writes=writes) as connection, connection.begin():
+                yield connection
+        except (InputError, OutputError):
+            raise
+        except SQLAlchemyError as error:
+            raise _Failure(self._in_words(error), _is_passing(error)) from error
+
+    def _again(self, work: Callable[[], Found]) -> Found:
+        """Do the work; when others hold the store, wait and do it again: what is added is added once all the same."""
+        for attempt in range(_TRIES):
+            try:
+                return work()
+            except _Failure as failure:
+                if not failure.is_passing or attempt == _TRIES - 1:
+                    raise
+                time.sleep(0.05 * 2**attempt * random.uniform(0.5, 1.5))
+        raise AssertionError("unreachable")
+
+    def _make_tables(self) -> None:
+        def make() -> None:
+            with self._begin(writes=True) as connection:
+                if not self.is_sqlite:
+                    connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
+                metadata.create_all(connection)
+                for statement in guards("sqlite" if self.is_sqlite else "postgresql"):
+                    connection.exec_driver_sql(statement)
+                version = connection.scalar(sa.select(sa.func.max(about.c.version)))
+                if version is None:
+                    connection.execute(sa.insert(about).values(version=STORE_VERSION))
+                elif version > STORE_VERSION:
+                    raise InputError(f"{self.name}: is a store of a newer arview (version {version}); update arview")
+
+        def look() -> bool:
+            with self._begin() as connection:
+                if not sa.inspect(connection).has_table(about.name):
+                    return False
+                version = connection.scalar(sa.select(sa.func.max(about.c.version)))
+            if version is not None and version > STORE_VERSION:
+                raise InputError(f"{self.name}: is a store of a newer arview (version {version}); update arview")
+            return version is not None
+
+        if not self._again(look):
+            self._again(make)
+
+    def _check_file(self, path: Path, must_exist: bool) -> None:
+        if not path.exists():
+            if must_exist:
+                raise InputError(f"{path}: no such store; `arview history add` makes it")
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise OutputError(f"{path.parent}: cannot be made ({error.strerror or error})") from error
+        elif path.is_dir():
+            raise InputError(f"{path}: is a folder; give the file of a store")
+        kind = _file_system(path)
+        if kind in _NETWORK_FILE_SYSTEMS:
+            raise InputError(
+                f"{path}: lies on a network file system ({kind}), where SQLite is not safe when two stations write; use"
+                " PostgreSQL (--store postgresql://…)"
+            )
+
+    def _in_words(self, error: SQLAlchemyError) -> str:
+        cause = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
+        text = " ".join(str(cause).split())
+        if "not a database" in text:
+            return f"{self.name}: is no results store"
+        return f"{self.name}: {text[:240]}"
+
+
+class _Failure(OutputError):
+    """The database refused; ``is_passing`` when trying again may help."""
+
+    def __init__(self, message: str, is_passing: bool) -> None:
+        super().__init__(message)
+        self.is_passing = is_passing
+
+
+def content_hash(document: Any) -> str:
+    """SHA-256 of a JSON document however it was written: of its text with sorted keys and no spaces, UTF-8."""
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _is_passing(error: SQLAlchemyError) -> bool:
+    return isinstance(error, OperationalError | DBAPIError) and any(word in str(error).lower() for word in _PASSING)
+
+
+def _url(where: str) -> sa.URL:
+    if "://" not in where:
+        return sa.URL.create("sqlite", database=where)
+    try:
+        url = sa.make_url(where)
+    except ArgumentError as error:
+        raise InputError("store: is no URL of a database; expected postgresql://user@host/database") from error
+    kind = url.get_backend_name()
+    if kind == "postgresql":
+        return url.set(drivername="postgresql+psycopg")
+    if kind == "sqlite" and url.database:
+        return url
+    raise InputError(f"store: {kind} is not supported; give a file (SQLite) or postgresql://user@host/database")
+
+
+def _prepare_sqlite(connection: Any, record: Any) -> None:
+    connection.isolation_level = None  # transactions are begun below, not by the driver
+    for pragma in (
+        "journal_mode = WAL",
+        "synchronous = FULL",
+        "foreign_keys = ON",
+        f"busy_timeout = {_BUSY_S * 1000:.0f}",
+    ):
+        connection.execute(f"PRAGMA {pragma}")
+
+
+def _begin_sqlite(connection: sa.Connection) -> None:
+    # A writer takes the lock at once: one that reads first and writes then could not wait for another.
+    writes = connection.get_execution_options().get("arview_writes")
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+
+def _file_system(path: Path) -> str:
+    """Kind of the file system that a path lies on, as /proc/mounts names it; empty where that is unknown."""
+    try:
+        mounts = Path("/proc/mounts").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    place = path.resolve()
+    best, kind = -1, ""
+    for line in mounts:
+        _, point, name, *_ = line.split(" ")
+        folder = Path(point.replace("\\040", " "))
+        if place.is_relative_to(folder) and len(folder.parts) >= best:
+            best, kind = len(folder.parts), name
+    return kind
+
+
+def _component_row(result_id: int, one: Any) -> dict[str, Any]:
+    dx, dy, dz = one.displacement_mm
+    return {
+        "result_id": result_id, "name": one.name, "dx_mm": dx, "dy_mm": dy, "dz_mm": dz,
+        "distance_mm": one.distance_mm, "uncertainty_mm": one.uncertainty_mm, "tolerance_mm": one.tolerance_mm,
+        "tilt_deg": one.tilt_deg, "twist_deg": one.twist_deg, "verdict": one.verdict.value,
+        "finding": None if one.finding is None else one.finding.value,
+    }  # fmt: skip
+
+
+def _stamp(moment: datetime) -> str:
+    return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+
+
+def _listed(row: Any) -> Listed:
+    return Listed(
+        int(row.id), row.content_hash, row.part, row.serial, row.station, row.model_hash,
+        datetime.fromisoformat(row.measured), datetime.fromisoformat(row.added), row.verdict, row.tool,
+    )  # fmt: skip
