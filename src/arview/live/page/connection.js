@@ -1,0 +1,202 @@
+// The connection to the server for as long as the page lives: which transport, what when it breaks, and that in words.
+
+import { Refusal, control, getModel, getPart } from "./api.js";
+import { JpegLink } from "./jpeg.js";
+import { NoWebrtc, WebrtcLink } from "./webrtc.js";
+
+export const WISHES = ["auto", "poses", "video", "jpeg"];
+const FIRST_PAUSE_S = 1, LONGEST_PAUSE_S = 15, LOADING_PAUSE_S = 1, BUSY_PAUSE_S = 4;
+const MUTE_MS = 6000; // connected, sending, and nothing arrives: WebRTC does not work here
+
+export class Connection {
+  link = null;
+  wish = "auto";
+  hasGhost = true; // whether this page can draw one
+  status = null;
+  #part = null;
+  #modelHash = null;
+  #isWebrtcBlocked = false;
+  #isOver = false;
+  #skipPause = () => {};
+  #abort = new AbortController();
+
+  /**
+   * @param video element for what the server sends.
+   * @param events {onPhase({name, text, inS}), onPart(part), onModel(buffer, part), onOpen(link), onPose, onStatus,
+   *     onFrame}; names of phases: loading, connecting, connected, retrying, busy, denied.
+   */
+  constructor(video, events) {
+    Object.assign(this, { video, events });
+  }
+
+  get way() {
+    return this.wish === "video" || (!this.hasGhost && this.wish !== "poses") ? "video" : "poses";
+  }
+
+  /** Whether automatic choice has given WebRTC up. */
+  get hasFallenBack() {
+    return this.#isWebrtcBlocked && this.wish !== "jpeg";
+  }
+
+  /** Stay connected until `end`. */
+  async run() {
+    let pauseS = FIRST_PAUSE_S;
+    while (!this.#isOver) {
+      try {
+        await this.#refreshPart();
+        const reason = await this.#connect(() => { pauseS = FIRST_PAUSE_S; });
+        if (reason === null) continue; // another transport was chosen
+        this.#phase("retrying", reason, pauseS);
+      } catch (error) {
+        if (this.#isOver) return;
+        if (error instanceof NoWebrtc && this.wish === "auto") {
+          this.#isWebrtcBlocked = true;
+          continue;
+        }
+        if (!(error instanceof Refusal || error instanceof NoWebrtc || error.name === "AbortError")) console.error(error);
+        if (error.code === "loading") this.#phase("loading", error.message, LOADING_PAUSE_S);
+        else if (error.code === "busy") this.#phase("busy", error.message, (pauseS = BUSY_PAUSE_S));
+        else if (error.code === "no_token") this.#phase("denied", "arview was started again: scan the code at the station once more", LONGEST_PAUSE_S);
+        else this.#phase("retrying", error.message, Math.max(pauseS, error.waitS ?? 0));
+        if (error.code === "loading") pauseS = 0.5;
+      }
+      await this.#pause();
+      pauseS = Math.min(2 * pauseS, LONGEST_PAUSE_S);
+    }
+  }
+
+  /** Choose how to be connected: one of WISHES. */
+  choose(wish) {
+    const before = this.wish;
+    this.wish = wish;
+    this.#isWebrtcBlocked = false;
+    if (!this.link || wish === before) return;
+    const kind = wish === "jpeg" ? "jpeg" : "webrtc";
+    if (kind === this.link.kind) this.ask({ way: this.way });
+    else this.#restart();
+  }
+
+  /** Ask the server for something; its words when it refuses, else "". */
+  async ask(wish) {
+    if (!this.link?.client) return "there is no connection to the station";
+    try {
+      this.#tell(await control(this.link.client, wish));
+      return "";
+    } catch (error) {
+      return error.message;
+    }
+  }
+
+  /** Try again now. */
+  hurry() {
+    this.#skipPause();
+  }
+
+  /** Leave. */
+  end() {
+    this.#isOver = true;
+    this.#abort.abort();
+    this.link?.close();
+    this.#skipPause();
+  }
+
+  #ended = () => {};
+
+  #restart() {
+    this.link?.close();
+    this.#ended(null);
+  }
+
+  #phase(name, text = "", inS = 0) {
+    this.#nextInS = inS;
+    this.events.onPhase({ name, text, inS });
+  }
+
+  #nextInS = 0;
+
+  #pause() {
+    return new Promise((resolve) => {
+      const timer = setTimeout(resolve, 1e3 * this.#nextInS);
+      this.#skipPause = () => {
+        clearTimeout(timer);
+        resolve();
+      };
+    });
+  }
+
+  async #refreshPart() {
+    const part = await getPart();
+    if (part.state === "loading") throw new Refusal(503, "loading", part.text);
+    if (part.state === "failed") throw new Refusal(503, "failed", part.text);
+    this.#part = part;
+    this.events.onPart(part);
+    if (part.part.model_hash !== this.#modelHash) {
+      await this.events.onModel(await getModel(), part);
+      this.#modelHash = part.part.model_hash;
+    }
+  }
+
+  /** Connect and stay; why it ended, or null when another transport was chosen. */
+  async #connect(onOpen) {
+    const isPhone = this.#part.source === "phone";
+    const ended = new Promise((resolve) => { this.#ended = resolve; });
+    const events = {
+      onPose: (pose) => {
+        if (pose.revision !== this.#part.revision) this.#refreshSoon();
+        this.events.onPose(pose);
+      },
+      onStatus: (status) => this.#tell(status),
+      onFrame: this.events.onFrame,
+      onEnd: this.#ended,
+    };
+    const isJpeg = this.wish === "jpeg" || this.#isWebrtcBlocked;
+    this.#phase("connecting", isJpeg ? "" : "by WebRTC");
+    const link = isJpeg ? new JpegLink(isPhone, events) : new WebrtcLink(isPhone, this.video, events);
+    const { wish } = this;
+    this.link = null;
+    await link.open(this.way, this.#abort.signal);
+    if (this.#isOver || this.wish !== wish) {
+      link.close();
+      return null;
+    }
+    this.link = link;
+    this.#openMs = performance.now();
+    onOpen();
+    this.#phase("connected");
+    this.events.onOpen(link);
+    const reason = await ended;
+    this.link = null;
+    if (reason === MUTE) throw new NoWebrtc("pictures do not get through by WebRTC");
+    return reason;
+  }
+
+  #openMs = 0;
+  #isRefreshing = false;
+
+  #tell(status) {
+    this.status = status;
+    if (this.#part && status.revision !== this.#part.revision) this.#refreshSoon();
+    const { link } = this;
+    const isMute = link?.kind === "webrtc" && link.isPhone && link.sent > 60 && performance.now() - this.#openMs > MUTE_MS;
+    if (isMute && status.feed && status.feed.received === 0) {
+      link.close();
+      this.#ended(MUTE);
+    }
+    this.events.onStatus(status);
+  }
+
+  async #refreshSoon() {
+    if (this.#isRefreshing) return;
+    this.#isRefreshing = true;
+    try {
+      await this.#refreshPart();
+    } catch (error) {
+      if (!(error instanceof Refusal)) console.error(error);
+      await new Promise((resolve) => setTimeout(resolve, 1000)); // the next answer asks again
+    } finally {
+      this.#isRefreshing = false;
+    }
+  }
+}
+
+const MUTE = Symbol("mute");

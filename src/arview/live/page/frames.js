@@ -1,0 +1,56 @@
+// The last frames, each with its id, so that an answer that comes later finds the very picture it speaks of.
+
+import { isNewer } from "./stamp.js";
+
+export class FrameRing {
+  #slots = [];
+  newest = null;
+
+  /** Keeps so many frames. */
+  constructor(size) {
+    this.size = size;
+  }
+
+  /**
+   * Keep a copy of a picture.
+   * @param source video or canvas, of which the upper width × height px are the picture.
+   * @param about {id, turns, takenMs}
+   * @param pinned frames that must not be overwritten, because they are on the screen or on their way.
+   */
+  take(source, width, height, about, pinned) {
+    const slot = this.#slots.length < this.size ? this.#add() : this.#oldest(pinned);
+    if (slot.canvas.width !== width || slot.canvas.height !== height) {
+      slot.canvas.width = width;
+      slot.canvas.height = height;
+    }
+    slot.context.drawImage(source, 0, 0, width, height, 0, 0, width, height);
+    Object.assign(slot, about, { width, height, order: (this.newest?.order ?? 0) + 1 });
+    this.newest = slot;
+    return slot;
+  }
+
+  find(id) {
+    return this.#slots.find((slot) => slot.id === id) ?? null;
+  }
+
+  /** The newest frame with an id for which `is` holds. */
+  newestWhere(is) {
+    return this.#slots.reduce((best, slot) => (is(slot.id) && (!best || isNewer(slot.id, best.id)) ? slot : best), null);
+  }
+
+  clear() {
+    for (const slot of this.#slots) slot.id = null;
+    this.newest = null;
+  }
+
+  #add() {
+    const canvas = document.createElement("canvas"), context = canvas.getContext("2d", { alpha: false });
+    const slot = { canvas, context, id: null, order: 0 };
+    this.#slots.push(slot);
+    return slot;
+  }
+
+  #oldest(pinned) {
+    return this.#slots.reduce((best, slot) => (!pinned.includes(slot) && (!best || slot.order < best.order) ? slot : best), null);
+  }
+}

@@ -1,0 +1,111 @@
+// Transport without WebRTC: JPEG pictures by HTTP, one in flight.
+
+import { ask, getStatus, join, leave } from "./api.js";
+
+const QUALITY = 0.85, STATUS_EVERY_MS = 1000, PATIENCE = 3;
+
+export class JpegLink {
+  kind = "jpeg";
+  client = null;
+  rttMs = null;
+  sent = 0;
+  inFlight = null; // the frame that waits for its answer
+  #abort = new AbortController();
+  #waiting = null; // wakes the loop when there is a picture to send
+
+  /** Like WebrtcLink; there is no video element. */
+  constructor(isPhone, events) {
+    Object.assign(this, { isPhone, events });
+  }
+
+  /** Take part; raises a Refusal. */
+  async open(way, signal) {
+    this.way = way;
+    this.client = (await join({ transport: "jpeg", way }, signal)).client;
+    this.#run();
+    return this;
+  }
+
+  /** Offer a picture of the camera; it is sent if it is the newest when the line is free. */
+  send(frame) {
+    this.newest = frame;
+    this.#waiting?.();
+  }
+
+  close() {
+    this.#abort.abort();
+    this.#waiting?.();
+    if (this.client) leave(this.client);
+    this.client = null;
+  }
+
+  async #run() {
+    const { signal } = this.#abort;
+    let failures = 0, statusMs = -Infinity, after = -1;
+    while (!signal.aborted) {
+      try {
+        if (performance.now() - statusMs > STATUS_EVERY_MS) {
+          statusMs = performance.now();
+          this.events.onStatus(await getStatus(this.client, signal));
+        }
+        after = this.isPhone ? await this.#exchange(signal) : await this.#fetch(after, signal);
+        failures = 0;
+      } catch (error) {
+        if (signal.aborted) return;
+        failures += 1;
+        const isOver = error.code === "no_such_client" || error.code === "no_token" || failures >= PATIENCE;
+        if (isOver) {
+          this.close();
+          this.events.onEnd(error.message);
+          return;
+        }
+        await new Promise((resolve) => setTimeout(resolve, 1000 * Math.max(error.waitS ?? 0, 0.3 * failures)));
+      }
+    }
+  }
+
+  /** Send the newest picture and take its answer. */
+  async #exchange(signal) {
+    if (!this.newest) {
+      await new Promise((resolve) => {
+        this.#waiting = resolve;
+        setTimeout(resolve, STATUS_EVERY_MS);
+      });
+      this.#waiting = null;
+      if (!this.newest) return -1;
+    }
+    const frame = this.newest, { id, turns, takenMs } = frame;
+    this.newest = null;
+    this.inFlight = frame;
+    const body = await new Promise((resolve) => frame.canvas.toBlob(resolve, "image/jpeg", QUALITY));
+    if (signal.aborted) return -1;
+    const sentMs = performance.now();
+    const answer = await ask(`/api/clients/${this.client}/frame?id=${id}&turns=${turns}`, {
+      method: "POST", body, headers: { "Content-Type": "image/jpeg" }, signal,
+    });
+    this.sent += 1;
+    await this.#take(answer, takenMs, sentMs);
+    return -1;
+  }
+
+  /** Take the next picture of a station. */
+  async #fetch(after, signal) {
+    const sentMs = performance.now();
+    const answer = await ask(`/api/clients/${this.client}/frame${after < 0 ? "" : `?after=${after}`}`, { signal });
+    return answer.status === 204 ? after : this.#take(answer, null, sentMs);
+  }
+
+  async #take(answer, takenMs, sentMs) {
+    const header = answer.headers.get("X-Arview-Answer");
+    const pose = header ? JSON.parse(header) : await answer.json();
+    // Of a station's picture it is not known how long the request waited for it: the round trip is that of a phone's.
+    if (takenMs !== null) this.rttMs = Math.max(0, performance.now() - sentMs - pose.server_ms);
+    if (header) {
+      const picture = await createImageBitmap(await answer.blob());
+      this.events.onFrame(picture, picture.width, picture.height, pose.id, performance.now());
+      picture.close();
+    }
+    this.events.onPose(pose);
+    return pose.id;
+  }
+}

@@ -1,0 +1,369 @@
+// The page: camera, connection, picture and controls put together.
+
+import { Camera, quarterTurns } from "./camera.js";
+import { Connection } from "./connection.js";
+import { icon } from "./icons.js";
+import { Parts, tally } from "./parts.js";
+import { Player } from "./player.js";
+import { Stage } from "./stage.js";
+import { Message, Notices, StatusBar, Toast } from "./status.js";
+
+const FIGURES_EVERY_MS = 500, LOOK_DELAY_MS = 150;
+const find = (id) => document.getElementById(id);
+
+history.replaceState(null, "", location.pathname); // the token stays out of bookmarks and shared links
+for (const sign of document.querySelectorAll("[data-icon]")) sign.append(icon(sign.dataset.icon));
+
+const look = { ghost: true, edges: "visible", labels: true, opacity: 0.42, only: null };
+const state = { phase: { name: "loading", text: "" }, part: null, status: null, trouble: "", latencies: [], isRecording: false };
+
+const bar = new StatusBar({
+  icon: find("state-icon"), word: find("state-name"), why: find("state-why"), quality: find("quality"),
+  meter: find("quality-meter"), latency: find("latency"), age: find("age"), body: document.body,
+});
+const notices = new Notices(find("notices")), message = new Message(find("message")), toast = new Toast(find("toast"));
+const parts = new Parts(
+  { name: find("part-name"), tally: find("tally"), list: find("components"), provenance: find("provenance"), card: find("card") },
+  isolate,
+);
+const stage = new Stage({
+  stage: find("stage"), canvas: find("picture"), leaders: find("leaders"), labels: find("labels"),
+  obstacles: [find("bar"), find("notices"), find("actions"), find("card"), find("side")],
+}, look, isolate);
+const camera = new Camera(find("camera"), takeCameraFrame, (trouble) => {
+  state.trouble = trouble;
+  refresh();
+});
+const connection = new Connection(find("remote"), {
+  onPhase(phase) {
+    state.phase = phase;
+    if (phase.name !== "connected") player?.reset();
+    refresh();
+  },
+  onPart(part) {
+    state.part = part;
+    player ??= new Player(part.source === "phone");
+    document.body.dataset.source = part.source;
+    document.title = `${part.part.name} ${part.part.serial} · arview`;
+    parts.setPart(part);
+    find("open-parts").querySelector(".badge")?.remove();
+    const bad = tally(part.components).find((one) => one.classList.contains("fail") || one.classList.contains("undecided"));
+    if (bad) {
+      const badge = document.createElement("span");
+      badge.className = `badge ${bad.classList[1]}`;
+      badge.append(icon(bad.classList[1]), bad.textContent.split(" ")[0]);
+      find("open-parts").append(badge);
+    }
+    stage.setPart(part);
+    if (look.only && !part.components.some((one) => one.name === look.only)) isolate(null);
+    if (part.source === "phone" && !camera.isOn && !state.trouble) camera.start(part.wanted);
+    requestDraw();
+  },
+  async onModel(buffer, part) {
+    await stage.setModel(buffer, part);
+  },
+  onOpen() {
+    player.way = connection.way;
+    sendLook();
+    if (connection.hasFallenBack) toast.say("This network blocks WebRTC: pictures go one by one");
+  },
+  onPose(pose) {
+    player.takePose(pose, performance.now());
+    requestDraw();
+  },
+  onStatus(status) {
+    const before = state.status?.recording.finished ?? status.recording.finished;
+    state.status = status;
+    if (status.way) player.way = status.way;
+    const finished = status.recording.finished.filter((number) => !before.includes(number));
+    if (finished.length && state.isRecording) offerRecording(finished.at(-1));
+    if (!status.recording.is_on && finished.length) state.isRecording = false;
+    refresh();
+  },
+  onFrame(source, width, height, id, moment) {
+    player.takeSent(source, width, height, id, moment);
+    requestDraw();
+  },
+});
+let player = null;
+
+// --- pictures ---------------------------------------------------------------------------------------
+
+function takeCameraFrame(video, takenMs) {
+  if (!player) return;
+  const { link } = connection;
+  const frame = player.takeOwn(video, takenMs, quarterTurns(), link?.inFlight);
+  if (!frame) return;
+  link?.send(frame);
+  requestDraw();
+}
+
+let isDrawAsked = false;
+
+function requestDraw() {
+  if (isDrawAsked) return;
+  isDrawAsked = true;
+  requestAnimationFrame(() => {
+    isDrawAsked = false;
+    draw();
+  });
+}
+
+let drawn = { frame: null };
+
+function draw() {
+  if (!player) return;
+  const shown = player.choose(performance.now());
+  stage.draw(shown, player.isFrozen);
+  const nowMs = performance.now(), { frame, pose } = shown;
+  if (frame && frame !== drawn.frame && !player.isFrozen) {
+    // A station's picture was on its way before this page had it.
+    const before = player.isPhone ? 0 : (pose?.server_ms ?? 0) + (connection.link?.rttMs ?? 0) / 2;
+    state.latencies.push({ atMs: nowMs, ms: nowMs - frame.takenMs + before, hasPose: Boolean(pose) });
+    drawn = { frame, id: frame.id, takenMs: frame.takenMs - before };
+  }
+  const detail = { id: frame?.id ?? null, pose, isAnnotated: shown.isAnnotated, takenMs: frame?.takenMs ?? null, drawnMs: nowMs };
+  document.dispatchEvent(new CustomEvent("arview:drawn", { detail }));
+  refreshState(shown);
+}
+
+// --- words and figures ------------------------------------------------------------------------------
+
+function refreshState(shown = player?.shown) {
+  const { phase, trouble, status, part } = state;
+  const nowMs = performance.now();
+  if (player?.isFrozen) {
+    const ago = Math.round((Date.now() - player.frozenAt) / 1000);
+    return bar.say("frozen", `picture of ${ago < 2 ? "this moment" : `${ago} s ago`}; press Resume to go on`);
+  }
+  if (phase.name !== "connected") return bar.say(phase.name, sayWhen(phase));
+  if (part?.source === "phone" && trouble) return bar.say("trouble", trouble);
+  if (!player.isAnswered(nowMs)) {
+    const words = status?.feed?.text || (camera.isOn || part?.source !== "phone" ? "for an answer of the station" : "for the camera");
+    return bar.say("waiting", words);
+  }
+  const answer = shown?.pose ?? player.answer;
+  if (answer.guide_cam_from_model && !answer.cam_from_model) {
+    return bar.say("align", sentence(answer.reason, "Bring the part into the yellow outline"));
+  }
+  const why = {
+    tracked: [],
+    critical: [answer.reason || "the position is not sure"],
+    searching: [answer.reason || "for the part in the picture"],
+    lost: [answer.reason || "the part is not seen any more"],
+  }[answer.state];
+  bar.say(answer.state, [...why, ...answer.mismatches].join("; "));
+}
+
+const sentence = (...texts) => texts.filter(Boolean).join(". ");
+const sayWhen = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);
+
+function refresh() {
+  if (player) refreshState();
+  else bar.say(state.phase.name, sayWhen(state.phase));
+  const { phase, trouble, part, status } = state;
+  const said = [...(status?.notices ?? [])];
+  if (status?.feed && ["reconnecting", "frozen"].includes(status.feed.state) && !said.some((one) => one.code.startsWith("source_"))) {
+    said.push({ level: "error", text: status.feed.text });
+  }
+  if (part?.inspection?.note) said.push({ level: "warning", text: part.inspection.note });
+  if (!stage.hasGhost) said.push({ level: "warning", text: "this browser has no WebGL 2: the station draws the overlay" });
+  notices.show(said.filter((one) => one.level !== "info"));
+  message.show(blocking(phase, trouble, part));
+  const { recording } = status ?? {};
+  setPressed("record", Boolean(recording?.is_on), recording?.is_on ? "stop" : "record", recording?.is_on ? clock(recording.seconds) : "Record");
+  const link = connection.link;
+  find("link-state").textContent = link
+    ? [`Connected by ${link.kind === "jpeg" ? "JPEG over HTTP" : "WebRTC"}, ${player.way === "video" ? "annotated video" : "poses"}`,
+      status?.feed ? `${status.feed.tracked_fps.toFixed(0)} of ${status.feed.received_fps.toFixed(0)} pictures a second tracked` : "",
+      link.rttMs === null ? "" : `network ${link.rttMs.toFixed(0)} ms`].filter(Boolean).join("; ")
+    : "Not connected";
+}
+
+/** What has to be dealt with before anything can be seen. */
+function blocking(phase, trouble, part) {
+  if (phase.name === "busy") {
+    return { sign: "busy", title: "Busy", text: `${phase.text}. This page goes on as soon as there is room.`, button: "Try now", onPress: () => connection.hurry() };
+  }
+  if (phase.name === "denied") {
+    return { sign: "offline", title: "This link is not valid any more", text: `${phase.text}.`, button: "Try again", onPress: () => location.reload() };
+  }
+  if (phase.name === "retrying") {
+    return { sign: "offline", title: "Connection lost, retrying", text: `${phase.text}.`, button: "Try now", onPress: () => connection.hurry() };
+  }
+  if (phase.name === "loading" && phase.text) return { sign: "busy", title: "Loading", text: phase.text, button: "" };
+  if (part?.source === "phone" && trouble) {
+    return { sign: "camera", title: "No camera", text: trouble, button: "Try again", onPress: () => camera.start(part.wanted) };
+  }
+  return null;
+}
+
+setInterval(() => {
+  const nowMs = performance.now();
+  state.latencies = state.latencies.filter((one) => nowMs - one.atMs < 2000);
+  const sorted = state.latencies.map((one) => one.ms).sort((a, b) => a - b);
+  const pose = player?.shown?.pose;
+  bar.figures({
+    quality: pose ? pose.quality : null,
+    latencyMs: sorted.length ? sorted[sorted.length >> 1] : null,
+    ageMs: drawn.frame ? nowMs - drawn.takenMs : null,
+  });
+  requestDraw(); // an answer that stays away makes the ghost go
+  refresh();
+}, FIGURES_EVERY_MS);
+
+// --- controls ---------------------------------------------------------------------------------------
+
+function isolate(name) {
+  look.only = name;
+  parts.show(name);
+  changeLook();
+}
+
+let lookTimer = 0;
+
+function changeLook() {
+  stage.setLook(look);
+  requestDraw();
+  clearTimeout(lookTimer);
+  lookTimer = setTimeout(sendLook, LOOK_DELAY_MS);
+}
+
+/** Have the server draw the same way: for annotated video, snapshots and recordings. */
+async function sendLook() {
+  if (connection.link) await connection.ask({ look });
+}
+
+function setPressed(id, isPressed, sign, text) {
+  const button = find(id), words = button.querySelector(".sign + span");
+  button.setAttribute("aria-pressed", String(isPressed));
+  if (words.textContent !== text) {
+    words.textContent = text;
+    button.querySelector(".sign").replaceChildren(icon(sign));
+  }
+}
+
+const clock = (seconds) => `${Math.floor(seconds / 60)}:${String(Math.floor(seconds % 60)).padStart(2, "0")}`;
+
+function freeze() {
+  if (!player?.shown?.frame) return;
+  player.isFrozen = !player.isFrozen;
+  player.frozenAt = Date.now() - (performance.now() - player.shown.frame.takenMs);
+  document.body.classList.toggle("is-frozen", player.isFrozen);
+  setPressed("freeze", player.isFrozen, player.isFrozen ? "play" : "pause", player.isFrozen ? "Resume" : "Freeze");
+  connection.ask({ hold: player.isFrozen ? player.shown.frame.id : null });
+  requestDraw();
+}
+
+async function snapshot() {
+  const { link } = connection, frame = player?.shown?.frame;
+  if (!link || !frame) return toast.say("There is no picture to keep yet");
+  try {
+    clearTimeout(lookTimer);
+    await connection.ask({ hold: frame.id, look });
+    const answer = await fetch(`/api/clients/${link.client}/snapshot.png?id=${frame.id}`, { cache: "no-store" });
+    if (!answer.ok) throw new Error((await answer.json()).message);
+    const { name, serial } = state.part.part;
+    const moment = new Date().toISOString().slice(0, 19).replaceAll(":", "");
+    const file = [name, state.part.inspection?.serial || serial, moment].filter(Boolean).join("_").replace(/[^\w.-]+/g, "-");
+    save(await answer.blob(), `${file}.png`);
+    toast.say("Snapshot saved, with its numbers inside");
+  } catch (error) {
+    toast.say(`No snapshot: ${error.message}`);
+  } finally {
+    if (!player.isFrozen) connection.ask({ hold: null });
+  }
+}
+
+function save(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}
+
+async function record() {
+  const isOn = state.status?.recording.is_on;
+  if (!isOn) state.isRecording = true;
+  const refusal = await connection.ask({ record: !isOn });
+  if (refusal) toast.say(`No recording: ${refusal}`);
+}
+
+function offerRecording(number) {
+  toast.say("Recording finished", { href: `/api/recordings/${number}`, text: "Save it", download: "" });
+}
+
+/** Open a section of the side sheet, or close it. */
+function openSide(section) {
+  const body = document.body, isOpen = body.dataset.side === section;
+  body.dataset.side = isOpen || !section ? "" : section;
+  find("open-parts").setAttribute("aria-expanded", String(body.dataset.side === "parts"));
+  find("open-view").setAttribute("aria-expanded", String(body.dataset.side === "view"));
+  if (body.dataset.side) find("close-side").focus({ preventScroll: true });
+  stage.measure();
+  requestDraw();
+}
+
+function toggle(key) {
+  if (key === "edges") look.edges = look.edges === "none" ? "visible" : "none";
+  else look[key] = !look[key];
+  find(`show-${key}`).setAttribute("aria-checked", String(key === "edges" ? look.edges !== "none" : look[key]));
+  changeLook();
+}
+
+for (const key of ["ghost", "edges", "labels"]) find(`show-${key}`).addEventListener("click", () => toggle(key));
+find("opacity").addEventListener("input", (event) => {
+  look.opacity = Number(event.target.value);
+  find("opacity-text").textContent = `${Math.round(100 * look.opacity)} %`;
+  changeLook();
+});
+find("search-again").addEventListener("click", async () => {
+  toast.say((await connection.ask({ reset: true })) || "Searching for the part anew");
+});
+find("transports").addEventListener("change", (event) => {
+  connection.choose(event.target.value);
+  player.way = connection.way;
+});
+find("freeze").addEventListener("click", freeze);
+find("snapshot").addEventListener("click", snapshot);
+find("record").addEventListener("click", record);
+find("open-parts").addEventListener("click", () => openSide("parts"));
+find("open-view").addEventListener("click", () => openSide("view"));
+find("close-side").addEventListener("click", () => openSide(""));
+
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  const isTyping = ["INPUT", "SELECT"].includes(event.target.tagName), isButton = event.target.tagName === "BUTTON";
+  const keys = {
+    s: snapshot, r: record, g: () => toggle("ghost"), e: () => toggle("edges"), l: () => toggle("labels"),
+    Escape: () => (document.body.dataset.side ? openSide("") : isolate(null)),
+    ArrowRight: () => isolate(parts.neighbour(1)), ArrowLeft: () => isolate(parts.neighbour(-1)),
+    " ": freeze,
+  };
+  const act = keys[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  if (!act || (isTyping && event.key !== "Escape") || (isButton && event.key === " ") || event.repeat) return;
+  event.preventDefault();
+  act();
+});
+
+// --- beginning and end ------------------------------------------------------------------------------
+
+new ResizeObserver(() => {
+  document.documentElement.style.setProperty("--bar", `${find("bar").offsetHeight}px`);
+}).observe(find("bar"));
+
+let wakeLock = null;
+
+async function stayAwake() {
+  if (document.visibilityState !== "visible") return;
+  wakeLock = await navigator.wakeLock?.request("screen").catch(() => null);
+}
+
+document.addEventListener("visibilitychange", stayAwake);
+window.addEventListener("pagehide", () => connection.end());
+window.addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); });
+stayAwake();
+connection.hasGhost = stage.hasGhost;
+refresh();
+connection.run();

@@ -1,0 +1,126 @@
+// The list of components with their verdicts, and the card of the one that is looked at alone.
+
+import { icon, make } from "./icons.js";
+
+const ORDER = ["fail", "undecided", "not_measured", "pass"];
+const WORDS = { fail: "FAIL", undecided: "UNDECIDED", not_measured: "NOT MEASURED", pass: "PASS" };
+
+/** "3 h ago" of seconds, in the largest unit that gives more than one. */
+export function ageText(seconds) {
+  if (seconds < -60) return "in the future";
+  for (const [unit, length] of [["d", 86400], ["h", 3600]]) {
+    if (seconds >= 2 * length) return `${Math.round(seconds / length)} ${unit} ago`;
+  }
+  return seconds >= 60 ? `${Math.round(seconds / 60)} min ago` : "just now";
+}
+
+export class Parts {
+  /**
+   * @param elements {name, tally, list, provenance, card}
+   * @param onPick called with the name of a component, or null for all of them.
+   */
+  constructor(elements, onPick) {
+    Object.assign(this, elements, { onPick });
+    this.only = null;
+    this.components = [];
+  }
+
+  /** Show a part document. */
+  setPart({ part, components, inspection }) {
+    const place = (one) => one.rank ?? Infinity;
+    this.components = [...components].sort((a, b) => place(a) - place(b));
+    this.inspected = this.components.filter((one) => one.rank !== null);
+    const serial = inspection?.serial || part.serial;
+    this.name.replaceChildren(make("b", "", [part.name]), serial ? ` ${serial}` : "");
+    const about = inspection ? `Inspected ${ageText(inspection.age_s)}${inspection.method ? `, ${inspection.method}` : ""}` : "Not inspected yet";
+    this.provenance.replaceChildren(about);
+    this.tally.replaceChildren(...tally(components));
+    this.list.replaceChildren(...this.components.map((one) => this.#row(one)));
+    this.show(components.some((one) => one.name === this.only) ? this.only : null);
+  }
+
+  /** Mark the component that is looked at alone and show its card. */
+  show(name) {
+    this.only = name;
+    for (const row of this.list.querySelectorAll("button")) {
+      row.setAttribute("aria-pressed", String(row.dataset.name === name));
+    }
+    const component = this.components.find((one) => one.name === name);
+    this.card.hidden = !component;
+    this.card.replaceChildren(...(component ? this.#details(component) : []));
+    this.card.className = component?.verdict ?? "none";
+  }
+
+  /** Name of the next inspected component, or the one before. */
+  neighbour(step) {
+    const list = this.inspected.length ? this.inspected : this.components;
+    const at = list.findIndex((one) => one.name === this.only);
+    return list.length ? list[(at + step + list.length) % list.length].name : null;
+  }
+
+  #row(one) {
+    const verdict = one.verdict ?? "none";
+    const value = make("span", "value", [one.value_text || (one.missing ? "missing" : "–")]);
+    if (one.uncertainty_mm !== null) value.append(make("small", "", [`U ${one.uncertainty_mm.toFixed(2)}`]));
+    const row = make("button", verdict, [
+      icon(verdict), make("span", "name", [one.name]), value,
+      make("span", "verdict", [one.verdict_text ?? "not inspected"]),
+    ], { "aria-pressed": "false" });
+    row.dataset.name = one.name;
+    row.addEventListener("click", () => this.onPick(this.only === one.name ? null : one.name));
+    return make("li", "", [row]);
+  }
+
+  #details(one) {
+    const button = (name, label, onClick) => {
+      const made = make("button", "step", [icon(name)], { "aria-label": label });
+      made.addEventListener("click", onClick);
+      return made;
+    };
+    const forward = button("back", "Next component", () => this.onPick(this.neighbour(1)));
+    forward.classList.add("forward");
+    const head = make("div", "head", [
+      button("back", "Previous component", () => this.onPick(this.neighbour(-1))),
+      make("span", "title", [make("b", "", [one.name]), make("span", "verdict", [icon(one.verdict ?? "none"), one.verdict_text ?? "not inspected"])]),
+      forward, button("close", "Show all components", () => this.onPick(null)),
+    ]);
+    if (one.distance_mm === null) {
+      return [head, make("p", "big", [one.value_text || (one.verdict ? "not measured" : "not part of the inspection")])];
+    }
+    const u = one.uncertainty_mm ?? 0;
+    const numbers = make("p", "numbers", [
+      make("span", "big", [one.value_text]),
+      make("span", "rest", [`U ${u.toFixed(2)} mm (k = 2)`, ...(one.tolerance_mm === null ? [] : [make("br"), `tolerance ${one.tolerance_mm.toFixed(2)} mm`])]),
+    ]);
+    const axes = one.displacement_mm.map((value, k) => {
+      const text = value === null ? "?" : `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}`;
+      return make("span", value !== null && Math.abs(value) <= u ? "small" : "", [`d${"xyz"[k]} ${text}`]);
+    });
+    const turn = one.detail_text.split("   ").filter((text) => text.startsWith("tilt") || text.startsWith("twist"));
+    return [head, numbers, ...gauge(one), make("p", "axes", [...axes, ...turn.map((text) => make("span", "", [text]))])];
+  }
+}
+
+/** Distance with U against the tolerance, to scale. */
+function gauge({ distance_mm: d, uncertainty_mm: u, tolerance_mm: tolerance }) {
+  if (tolerance === null) return [];
+  const end = Math.max(1.5 * tolerance, 1.1 * (d + (u ?? 0))), share = (value) => `${(100 * Math.min(1, Math.max(0, value / end))).toFixed(2)}%`;
+  const part = (name, left, right) => {
+    const made = make("span", name);
+    made.style.left = share(left);
+    if (right !== undefined) made.style.right = `calc(100% - ${share(right)})`;
+    return made;
+  };
+  const bar = make("div", "gauge", [part("allowed", 0, tolerance), part("band", d - (u ?? 0), d + (u ?? 0)), part("limit", tolerance), part("mark", d)], {
+    role: "img", "aria-label": `${d.toFixed(2)} mm with U ${(u ?? 0).toFixed(2)} against a tolerance of ${tolerance.toFixed(2)} mm`,
+  });
+  return [bar];
+}
+
+/** How many components have which verdict, the gravest first. */
+export function tally(components) {
+  return ORDER.flatMap((verdict) => {
+    const count = components.filter((one) => one.verdict === verdict).length;
+    return count ? [make("span", `count ${verdict}`, [icon(verdict), `${count} ${WORDS[verdict]}`])] : [];
+  });
+}

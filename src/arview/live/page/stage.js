@@ -1,0 +1,190 @@
+// The stage: where the picture lies on the screen, and what is drawn over it.
+
+import { Ghost } from "./ghost.js";
+import { Labels } from "./labels.js";
+
+const MOST_CANVAS_PX = 1600; // of the longer side; more is not seen, but has to be drawn
+const SEEN_EVERY_MS = 150;
+const LINE_CSS_PX = 1.7;
+const PASS_DIMMING = 0.65; // ghosts of components that passed are fainter, so that the others stand out
+const NEUTRAL = "#46c4ff", CONTEXT = "#e2e8f0", CONTEXT_ALPHA = 0.5;
+const ROOMY = 0.8; // the picture moves aside for bars when it stays this large
+const MARGIN_PX = 8;
+
+export class Stage {
+  #seenMs = -Infinity;
+  #place = null;
+  #size = null;
+  #free = null;
+
+  /**
+   * @param elements {stage, canvas, leaders, labels, obstacles: [bar, notices, actions, card, side]}
+   * @param onPick called with the name of a component that was pressed in the picture, or null beside all.
+   */
+  constructor(elements, look, onPick) {
+    Object.assign(this, elements, { look, onPick });
+    try {
+      this.ghost = new Ghost(this.canvas);
+    } catch {
+      this.ghost = null;
+      this.context = this.canvas.getContext("2d", { alpha: false });
+    }
+    this.part = null;
+    this.labelBoxes = new Labels(this.labels, this.leaders, onPick);
+    this.calm = matchMedia("(prefers-reduced-motion: reduce)");
+    new ResizeObserver(() => this.measure()).observe(this.stage);
+    for (const one of this.obstacles) new ResizeObserver(() => { this.#free = null; }).observe(one);
+    this.canvas.addEventListener("click", (event) => this.#pick(event));
+    document.fonts?.ready.then(() => this.labelBoxes.remeasure());
+    this.measure();
+  }
+
+  /** Whether this browser can draw ghosts. */
+  get hasGhost() {
+    return this.ghost !== null;
+  }
+
+  /** Take a part document. */
+  setPart(part) {
+    this.part = part;
+    if (this.ghost?.components.length === part.components.length) this.#arrange();
+  }
+
+  /** Take the CAD. */
+  async setModel(buffer, part) {
+    await this.ghost?.load(buffer, part.components.length);
+    this.#arrange();
+  }
+
+  setLook(look) {
+    this.look = look;
+    if (this.ghost?.components.length) this.ghost.style(this.#styles());
+    this.#seenMs = -Infinity;
+  }
+
+  /** The window has changed. */
+  measure() {
+    this.#free = null;
+    this.labelBoxes.remeasure();
+  }
+
+  /** Draw what the player has chosen. */
+  draw({ frame, pose, guide, isAnnotated }) {
+    if (!frame) return this.labelBoxes.hide();
+    this.#lay(frame);
+    const isReady = this.ghost?.components.length > 0 && this.part !== null;
+    const ownPose = isReady && pose && !isAnnotated && frame.width === pose.lens.width && frame.height === pose.lens.height ? pose : null;
+    const ownGuide = isReady && guide && frame.width === guide.lens.width ? guide : null;
+    if (!this.ghost) {
+      this.context.drawImage(frame.canvas, 0, 0, this.canvas.width, this.canvas.height);
+    } else {
+      this.ghost.draw({
+        source: frame.canvas, pose: ownPose?.cam_from_model ?? null,
+        guide: ownPose ? null : ownGuide?.guide_cam_from_model ?? null,
+        camera: (ownPose ?? ownGuide)?.lens, isCritical: ownPose?.state === "critical",
+        lineWidth: (LINE_CSS_PX * this.canvas.width) / this.#size.width,
+      });
+    }
+    this.#drawn = ownPose;
+    if (!ownPose?.cam_from_model) return this.labelBoxes.hide();
+    const nowMs = performance.now();
+    if (nowMs - this.#seenMs > SEEN_EVERY_MS) {
+      this.#seenMs = nowMs;
+      this.labelBoxes.setSeen(this.ghost.seen());
+    }
+    this.labelBoxes.update(ownPose, this.#place, this.#free.labels, this.look, !this.calm.matches);
+  }
+
+  #drawn = null;
+
+  #arrange() {
+    this.labelBoxes.setPart(this.part, this.ghost?.components.map((one) => one.center_in_model) ?? []);
+    this.ghost?.style(this.#styles());
+  }
+
+  #styles() {
+    const { ghost, edges, opacity, only } = this.look, isInspected = this.part.inspection !== null;
+    return this.part.components.map((one) => {
+      const isContext = isInspected && one.verdict === null;
+      const color = rgb(isContext ? CONTEXT : one.verdict_color ?? NEUTRAL);
+      const alpha = isContext || !ghost ? 0 : opacity * (one.verdict === "pass" ? PASS_DIMMING : 1);
+      const edgeAlpha = edges === "none" ? 0 : isContext ? CONTEXT_ALPHA : 1;
+      return {
+        ghost: [...color, only === one.name && ghost ? opacity : alpha],
+        edges: [...color.map((value) => 0.75 * value + 0.25), edgeAlpha],
+        isShown: !only || only === one.name,
+      };
+    });
+  }
+
+  /** Put the canvas where the picture of this frame belongs. */
+  #lay(frame) {
+    const shape = `${frame.width}×${frame.height}`;
+    if (this.#free && this.#shape === shape) return;
+    this.#shape = shape;
+    const whole = this.stage.getBoundingClientRect(), free = freeOf(whole, this.obstacles);
+    const fit = (area) => Math.min(area.width / frame.width, area.height / frame.height);
+    const isRoomy = fit(free) >= ROOMY * fit({ width: whole.width, height: whole.height });
+    const area = isRoomy ? free : { left: 0, top: 0, width: whole.width, height: whole.height };
+    const scale = fit(area), width = frame.width * scale, height = frame.height * scale;
+    const left = area.left + (area.width - width) / 2, top = area.top + (area.height - height) / 2;
+    Object.assign(this.canvas.style, { left: `${left}px`, top: `${top}px`, width: `${width}px`, height: `${height}px` });
+    const density = Math.min(devicePixelRatio || 1, MOST_CANVAS_PX / Math.max(width, height));
+    const size = [Math.max(1, Math.round(width * density)), Math.max(1, Math.round(height * density))];
+    if (this.ghost) this.ghost.resize(...size);
+    else [this.canvas.width, this.canvas.height] = size;
+    this.#size = { width, height };
+    this.#place = { left, top, scale };
+    this.#free = { labels: inset(free, MARGIN_PX) };
+    this.#seenMs = -Infinity;
+  }
+
+  #shape = "";
+
+  #pick(event) {
+    if (!this.#drawn || !this.ghost) return;
+    const { columns, rows, cells, window } = this.ghost.seen(), { scale } = this.#place;
+    const box = this.canvas.getBoundingClientRect();
+    const column = (((event.clientX - box.left) / scale - window.left) / window.width) * columns;
+    const row = (((event.clientY - box.top) / scale - window.top) / window.height) * rows;
+    const reach = Math.ceil(((24 / scale) * columns) / window.width); // a thumb is 48 px wide
+    let best = null, least = Infinity;
+    for (let r = Math.floor(row) - reach; r <= row + reach; r++) {
+      for (let c = Math.floor(column) - reach; c <= column + reach; c++) {
+        if (r < 0 || c < 0 || r >= rows || c >= columns) continue;
+        const component = this.part.components[cells[r * columns + c] - 1];
+        const distance = Math.hypot(c + 0.5 - column, r + 0.5 - row);
+        if (component && component.rank !== null && distance < least && distance <= reach) [best, least] = [component.name, distance];
+      }
+    }
+    this.onPick(best);
+  }
+}
+
+/** The largest part of the stage beside bars along its sides, in its own coordinates. */
+function freeOf(whole, obstacles) {
+  let [left, top, right, bottom] = [0, 0, whole.width, whole.height];
+  for (const one of obstacles) {
+    const box = one.getBoundingClientRect();
+    const shown = box.width > 0 && box.height > 0 && getComputedStyle(one).visibility !== "hidden" && one.childElementCount > 0;
+    const x0 = box.left - whole.left, x1 = box.right - whole.left, y0 = box.top - whole.top, y1 = box.bottom - whole.top;
+    if (!shown || x1 <= left || x0 >= right || y1 <= top || y0 >= bottom) continue;
+    // What is cut off is the side that costs the least room.
+    const costs = {
+      top: (y1 - top) * (right - left), bottom: (bottom - y0) * (right - left),
+      left: (x1 - left) * (bottom - top), right: (right - x0) * (bottom - top),
+    };
+    const side = Object.keys(costs).reduce((a, b) => (costs[a] <= costs[b] ? a : b));
+    if (side === "top") top = y1;
+    else if (side === "bottom") bottom = y0;
+    else if (side === "left") left = x1;
+    else right = x0;
+  }
+  return { left, top, width: Math.max(1, right - left), height: Math.max(1, bottom - top) };
+}
+
+const inset = ({ left, top, width, height }, by) => ({
+  left: left + by, top: top + by, width: Math.max(1, width - 2 * by), height: Math.max(1, height - 2 * by),
+});
+
+const rgb = (hex) => [1, 3, 5].map((from) => parseInt(hex.slice(from, from + 2), 16) / 255);

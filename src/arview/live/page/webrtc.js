@@ -1,0 +1,173 @@
+// Transport by WebRTC: the camera goes up, poses come by a data channel, pictures of the server come as video.
+
+import { ask, join, leave } from "./api.js";
+import { watchFrames } from "./camera.js";
+import { drawStrip, readStamp, stripHeight } from "./stamp.js";
+
+const GATHER_MS = 1500, CONNECT_MS = 9000, SILENT_MS = 5000, RTT_EVERY_MS = 2000;
+const BITRATE = 8_000_000;
+
+/** The network does not let WebRTC through, or the browser has none. */
+export class NoWebrtc extends Error {}
+
+export class WebrtcLink {
+  kind = "webrtc";
+  client = null;
+  rttMs = null;
+  sent = 0;
+  #ended = false;
+
+  /**
+   * @param isPhone whether the camera goes up.
+   * @param video element for what the server sends.
+   * @param events {onPose, onStatus, onFrame(source, width, height, id, ms), onEnd(words)}
+   */
+  constructor(isPhone, video, events) {
+    Object.assign(this, { isPhone, video, events });
+  }
+
+  /** Connect; raises NoWebrtc or a Refusal. */
+  async open(way, signal) {
+    if (!globalThis.RTCPeerConnection) throw new NoWebrtc("this browser has no WebRTC");
+    const peer = (this.peer = new RTCPeerConnection({ iceServers: [] }));
+    try {
+      const channel = peer.createDataChannel("arview", { ordered: false, maxRetransmits: 0 });
+      channel.addEventListener("message", (event) => this.#take(JSON.parse(event.data)));
+      channel.addEventListener("close", () => this.#end("the connection was closed"));
+      this.#addVideo(peer);
+      await peer.setLocalDescription(await peer.createOffer());
+      await gathered(peer);
+      const offer = { type: "offer", sdp: peer.localDescription.sdp };
+      const joined = await join({ transport: "webrtc", way, offer }, signal);
+      this.client = joined.client;
+      await peer.setRemoteDescription(joined.answer);
+      await connected(peer, channel);
+    } catch (error) {
+      this.close();
+      throw error;
+    }
+    peer.addEventListener("connectionstatechange", () => {
+      if (["failed", "closed"].includes(peer.connectionState)) this.#end("the connection broke");
+    });
+    this.#heardMs = performance.now();
+    this.#timer = setInterval(() => this.#watch(), RTT_EVERY_MS);
+    return this;
+  }
+
+  /** Send a picture of the camera. */
+  send(frame) {
+    const { context } = this, { canvas } = context, height = frame.height + stripHeight(frame.width);
+    if (canvas.width !== frame.width || canvas.height !== height) {
+      canvas.width = frame.width;
+      canvas.height = height;
+    }
+    context.drawImage(frame.canvas, 0, 0);
+    drawStrip(context, frame);
+    this.track.requestFrame?.();
+    this.sent += 1;
+  }
+
+  close() {
+    this.#ended = true;
+    clearInterval(this.#timer);
+    this.#stopWatching();
+    this.track?.stop();
+    this.peer?.close();
+    this.video.srcObject = null;
+    if (this.client) leave(this.client);
+    this.client = null;
+  }
+
+  #timer = 0;
+  #heardMs = 0;
+  #stopWatching = () => {};
+
+  #addVideo(peer) {
+    if (this.isPhone) {
+      const canvas = document.createElement("canvas");
+      [canvas.width, canvas.height] = [640, 500];
+      this.context = canvas.getContext("2d", { alpha: false });
+      const byHand = "requestFrame" in (globalThis.CanvasCaptureMediaStreamTrack?.prototype ?? {});
+      [this.track] = (byHand ? canvas.captureStream(0) : canvas.captureStream()).getVideoTracks();
+      this.track.contentHint = "detail"; // rather fewer pictures than smaller ones
+      const { sender } = peer.addTransceiver(this.track, { direction: "sendrecv" });
+      const parameters = sender.getParameters();
+      parameters.degradationPreference = "maintain-resolution";
+      if (parameters.encodings?.length) parameters.encodings[0].maxBitrate = BITRATE;
+      sender.setParameters(parameters).catch(() => {});
+    } else {
+      peer.addTransceiver("video", { direction: "recvonly" });
+    }
+    peer.addEventListener("track", ({ track, receiver }) => {
+      if ("jitterBufferTarget" in receiver) receiver.jitterBufferTarget = 0;
+      if ("playoutDelayHint" in receiver) receiver.playoutDelayHint = 0;
+      this.video.srcObject = new MediaStream([track]);
+      this.video.play().catch(() => {});
+      this.#stopWatching = watchFrames(this.video, (moment) => this.#takeFrame(moment));
+    });
+  }
+
+  #takeFrame(moment) {
+    const { video } = this, { videoWidth: width, videoHeight: height } = video;
+    if (width < 64) return;
+    const stamp = readStamp(video, width, height);
+    if (stamp) this.events.onFrame(video, width, height - stripHeight(width), stamp.id, moment);
+  }
+
+  #take(document) {
+    this.#heardMs = performance.now();
+    if (document.type === "pose") this.events.onPose(document);
+    else if (document.type === "status") this.events.onStatus(document);
+  }
+
+  async #watch() {
+    if (performance.now() - this.#heardMs > SILENT_MS) {
+      // The server says something every second; ask by another way before giving up.
+      try {
+        this.events.onStatus(await (await ask(`/api/clients/${this.client}/status`)).json());
+      } catch (error) {
+        return this.#end(error.message);
+      }
+      return this.#end("nothing comes through the connection any more");
+    }
+    const report = await this.peer.getStats().catch(() => []);
+    for (const entry of report.values?.() ?? []) {
+      if (entry.type === "candidate-pair" && entry.nominated && entry.currentRoundTripTime !== undefined) {
+        this.rttMs = 1e3 * entry.currentRoundTripTime;
+      }
+    }
+  }
+
+  #end(words) {
+    if (this.#ended) return;
+    this.close();
+    this.events.onEnd(words);
+  }
+}
+
+function gathered(peer) {
+  if (peer.iceGatheringState === "complete") return Promise.resolve();
+  return new Promise((resolve) => {
+    const timer = setTimeout(resolve, GATHER_MS);
+    peer.addEventListener("icegatheringstatechange", () => {
+      if (peer.iceGatheringState !== "complete") return;
+      clearTimeout(timer);
+      resolve();
+    });
+  });
+}
+
+function connected(peer, channel) {
+  return new Promise((resolve, reject) => {
+    const timer = setTimeout(() => reject(new NoWebrtc("no WebRTC connection within 9 s")), CONNECT_MS);
+    channel.addEventListener("open", () => {
+      clearTimeout(timer);
+      resolve();
+    });
+    peer.addEventListener("connectionstatechange", () => {
+      if (peer.connectionState !== "failed") return;
+      clearTimeout(timer);
+      reject(new NoWebrtc("this network does not let WebRTC through"));
+    });
+  });
+}

@@ -1,0 +1,107 @@
+"""Chromium with the sample clip as its camera: the frames, which of them a screenshot shows, the browser itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+from live_sample import CLIP, SAMPLE
+
+from arview.camera import Camera
+from arview.camera_files import load_camera
+from arview.geometry import Array
+from arview.video import Image, open_source
+
+CHROMIUM = os.environ.get("ARVIEW_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+START, COUNT = 27, 30
+"""Frames of the clip in which the part is in full view."""
+BITS, CELL_PX, EDGE_PX = 8, 12, 4
+"""The counter in the upper left corner: the number of the frame and, below, the same inverted."""
+
+
+@cache
+def frames(width: int, height: int) -> list[Image]:
+    """(H,W,3) frames of the clip with their number drawn into the corner."""
+    source = open_source(CLIP, START, START + COUNT, 1)
+    images = [cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA) for frame in source]
+    for number, image in enumerate(images):
+        image[: 2 * (CELL_PX + EDGE_PX), : BITS * CELL_PX + 2 * EDGE_PX] = 128
+        for bit in range(BITS):
+            is_set = number >> (BITS - 1 - bit) & 1
+            columns = slice(EDGE_PX + bit * CELL_PX, EDGE_PX + (bit + 1) * CELL_PX)
+            image[EDGE_PX : EDGE_PX + CELL_PX, columns] = 255 * is_set
+            image[EDGE_PX + CELL_PX : EDGE_PX + 2 * CELL_PX, columns] = 255 * (1 - is_set)
+    return images
+
+
+def number_in(picture: Image, scale: float = 1.0) -> int | None:
+    """The number of the frame that a picture shows, ``scale`` times its size; None when it cannot be read for sure."""
+    number = 0
+    for bit in range(BITS):
+        u = round(scale * (EDGE_PX + (bit + 0.5) * CELL_PX))
+        upper, lower = (
+            picture[round(scale * v) - 1 : round(scale * v) + 2, u - 1 : u + 2].mean()
+            for v in (EDGE_PX + 0.5 * CELL_PX, EDGE_PX + 1.5 * CELL_PX)
+        )
+        if abs(upper - lower) < 80:
+            return None
+        number = 2 * number + int(upper > lower)
+    return number if number < COUNT else None
+
+
+@cache
+def truth() -> list[Array]:
+    """``cam_from_model`` (4,4) mm of each frame."""
+    described = json.loads((SAMPLE / "truth.json").read_text())["frames"]
+    return [np.array(described[START + k]["cam_from_model"]) for k in range(COUNT)]
+
+
+def camera(width: int, height: int) -> Camera:
+    """Intrinsics of the frames."""
+    return load_camera(str(SAMPLE / "camera.json"), width, height)
+
+
+def there_and_back() -> list[int]:
+    """Order in which the frames are played over and over, without a jump."""
+    return [*range(COUNT), *range(COUNT - 2, 0, -1)]
+
+
+def write_y4m(path: Path, images: Sequence[Image], fps: int) -> None:
+    """A film for ``--use-file-for-fake-video-capture``, which plays it over and over at its own rate."""
+    height, width = images[0].shape[:2]
+    with path.open("wb") as file:
+        file.write(f"YUV4MPEG2 W{width} H{height} F{fps}:1 Ip A1:1 C420jpeg\n".encode())
+        for image in images:
+            yuv = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="yuv420p").to_ndarray()
+            file.write(b"FRAME\n" + np.ascontiguousarray(yuv).tobytes())
+
+
+@contextmanager
+def browser(film: Path | None, *more: str) -> Iterator[Any]:
+    """A headless Chromium; skips the test when there is none."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install playwright")
+    if CHROMIUM is None:
+        pytest.skip("Chromium is not installed: apt-get install chromium")
+    arguments = [
+        "--no-sandbox", "--disable-dev-shm-usage", "--allow-loopback-in-peer-connection",
+        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+        "--use-fake-ui-for-media-stream", "--autoplay-policy=no-user-gesture-required", *more,
+    ]  # fmt: skip
+    if film is not None:
+        arguments += ["--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={film}"]
+    with playwright.sync_playwright() as driver:
+        running = driver.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        try:
+            yield running
+        finally:
+            running.close()
