@@ -33,7 +33,8 @@ _PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
 <h1>Trust this station, once</h1>
 <p>The browser gives the camera to secure pages only. This station signs its pages with its own certificate,
 <b>{name}</b>. It may sign for addresses of local networks only, never for a site on the internet.</p>
-<p>Compare the fingerprint with the one on the station's terminal:<br><code>{fingerprint}</code></p>
+<p>The phone shows the certificate's SHA-256 fingerprint under its details; it must be the one on the station's
+terminal:<br><code>{fingerprint}</code></p>
 <h2>iPhone, iPad</h2>
 <ol><li>In Safari: <a class="button" href="{profile}">Load the profile</a>, then <i>Allow</i>.</li>
 <li><i>Settings › Profile Downloaded › Install</i> (or <i>Settings › General › VPN &amp; Device Management</i>).</li>
