@@ -38,7 +38,7 @@ Examples:
   arview history show 12 -o inspection.json
   arview history chart --part plate --component post_1 -o post_1.svg
   arview history export -o plate.csv --part plate
-  arview history --help; arview history add --store postgresql://qa@db/arview out/inspection.json
+  arview history add out/inspection.json --store postgresql://qa@db/arview
 
 \b
 The store only grows: results are added, never changed or deleted; the database itself refuses it. Each is known by the

@@ -22,7 +22,7 @@ Examples:
 INSPECTION is the file of `arview measure`. The report holds verdict, table of components, a picture of each finding
 (photo, ghost of the design place, arrow), distance map and histogram, uncertainty budget, datums, photos, how it was
 measured, and a 3D view of CAD, cloud and arrows. It is one file that needs no network and can be opened from a disk;
-the PDF has the same but for the 3D view, and the inspection itself as an attachment (A4, PDF/A-3).
+the PDF has the same but for the 3D view, and the inspection itself as an attachment.
 \b
 Pictures are made of the photos in the folder that `arview reconstruct` wrote (default: that of INSPECTION), and need
 --part. What is not at hand is left out, and the report says so. An undetermined degree of freedom is written as

@@ -195,7 +195,7 @@ def _findings(evidence: Evidence, gallery: Gallery, options: ReportOptions) -> d
             }
         )
     foreign = [
-        {"text": foreign_text(one), "crops": [_crop(crop, options) for crop in crops]}
+        {"text": foreign_text(one), "crops": [_crop(crop, options, "its box") for crop in crops]}
         for one, crops in zip(
             inspection.foreign_objects, gallery.foreign or [()] * len(inspection.foreign_objects), strict=True
         )
@@ -213,9 +213,9 @@ def _own_notes(details: Details) -> list[str]:
     return [note for note in details.notes if note not in of_methods]
 
 
-def _crop(crop: Crop, options: ReportOptions) -> dict[str, Any]:
+def _crop(crop: Crop, options: ReportOptions, what: str = "ghost: design place") -> dict[str, Any]:
     arrow = "" if crop.arrow_scale is None else f"; arrow × {crop.arrow_scale:g}"
-    caption = f"{crop.photo}; ghost: design place{arrow}"
+    caption = f"{crop.photo}; {what}{arrow}"
     return {"photo": crop.photo, "caption": caption, **_embedded(crop.image, options.jpeg_quality)}
 
 

@@ -25,8 +25,9 @@
     try {
       renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
     } catch (error) {
+      host.classList.add("flat");
       host.querySelector(".viewer-note").textContent =
-        "This browser gives no WebGL, which the 3D view needs; the picture shows the part instead.";
+        "This browser gives no WebGL, which the 3D view needs; the pictures of this page do without it.";
       return;
     }
     host.classList.add("live");
@@ -207,7 +208,7 @@
       renderer.setSize(width, height, false);
       camera.aspect = width / height;
       camera.updateProjectionMatrix();
-      if (cloud) cloud.material.size = diameter / 450;
+      if (cloud) cloud.material.size = diameter / 320;
       if (!isMoved) look(...view);
       ask();
     }
@@ -282,10 +283,11 @@
     host.dataset.state = "ready";
   }
 
-  if ("IntersectionObserver" in window) {
-    const watch = new IntersectionObserver((entries) => {
-      if (entries.some((entry) => entry.isIntersecting)) { watch.disconnect(); start(); }
-    }, { rootMargin: "400px" });
-    watch.observe(host);
-  } else start();
+  // When it comes near the window, or when the page has been there for a while.
+  let isStarted = false;
+  const once = () => { if (!isStarted) { isStarted = true; start(); } };
+  if ("IntersectionObserver" in window)
+    new IntersectionObserver((entries) => { if (entries.some((entry) => entry.isIntersecting)) once(); },
+                             { rootMargin: "400px" }).observe(host);
+  addEventListener("load", () => setTimeout(once, 1500));
 })();

@@ -82,4 +82,4 @@ def foreign_text(one: ForeignReport) -> str:
     """What and where, in a sentence."""
     x, y, z = (number(value, 1) for value in one.center_mm)
     a, b, c = (number(value, 1) for value in one.size_mm)
-    return f"{one.text}. Its box of {a} × {b} × {c} mm is about ({x}, {y}, {z}) mm."
+    return f"{one.text[:1].upper()}{one.text[1:]}. Its box of {a} × {b} × {c} mm is about ({x}, {y}, {z}) mm."
