@@ -55,7 +55,7 @@ export class Connection {
         }
         if (!(error instanceof Refusal || error instanceof NoWebrtc || error.name === "AbortError")) console.error(error);
         if (error.code === "loading") this.#phase("loading", error.message, LOADING_PAUSE_S);
-        else if (error.code === "busy") this.#phase("busy", error.message, (pauseS = BUSY_PAUSE_S));
+        else if (error.code === "busy") this.#phase("busy", error.message.replace(/^busy: /, ""), (pauseS = BUSY_PAUSE_S));
         else if (error.code === "no_token") this.#phase("denied", "arview was started again: scan the code at the station once more", LONGEST_PAUSE_S);
         else this.#phase("retrying", error.message, Math.max(pauseS, error.waitS ?? 0));
         if (error.code === "loading") pauseS = 0.5;

@@ -5,13 +5,15 @@ import { LabelLayout } from "./layout.js";
 import { toCam } from "./projection.js";
 
 const MOST_LABELS = 12;
+const NARROW_PX = 560, MOST_NARROW = 4; // on a phone held upright more would hide the part
+const LEAST_ROOM_PX = 200; // with less height only the component that is looked at alone has a label
 const CONTEXT_WEIGHT = 0.25; // how bad it is to cover a component that was not inspected, against one that was
 const SVG = "http://www.w3.org/2000/svg";
 const STUB_PX = 10, ARROW_HEAD_PX = 11;
 
 export class Labels {
   #layout = new LabelLayout();
-  #labels = new Map(); // name → {element, leader, dot, width, height}
+  #labels = new Map(); // name → {element, leader, dot, sign, width, height}
   #arrows = new Map();
   #integral = null;
   #seen = null;
@@ -27,7 +29,7 @@ export class Labels {
     this.part = part;
     this.centers = centersInModel;
     this.clear();
-    for (const { element, leader, dot } of this.#labels.values()) [element, leader, dot].forEach((one) => one.remove());
+    for (const { element, leader, dot, sign } of this.#labels.values()) [element, leader, dot, sign].forEach((one) => one.remove());
     for (const arrow of this.#arrows.values()) arrow.remove();
     this.#labels.clear();
     this.#arrows.clear();
@@ -64,7 +66,10 @@ export class Labels {
   }
 
   hide() {
-    for (const label of this.#labels.values()) show(label, false);
+    for (const label of this.#labels.values()) {
+      show(label, false);
+      label.sign.classList.add("off");
+    }
     for (const arrow of this.#arrows.values()) arrow.setAttribute("visibility", "hidden");
   }
 
@@ -85,11 +90,18 @@ export class Labels {
     const wanted = this.inspected.filter((component) => !only || component.name === only);
     this.#drawArrows(wanted, toScreen);
     this.box.style.setProperty("--widest", `${Math.floor((area.width - 6) / 2)}px`);
-    const requests = [];
+    const isNarrow = area.width < NARROW_PX, isCramped = area.height < LEAST_ROOM_PX && !only;
+    if (this.box.classList.contains("narrow") !== isNarrow) {
+      this.box.classList.toggle("narrow", isNarrow);
+      this.remeasure();
+    }
+    const most = isCramped ? 0 : isNarrow ? MOST_NARROW : MOST_LABELS;
+    const requests = [], signs = new Map();
     for (const component of labels ? wanted : []) {
-      if (requests.length === MOST_LABELS) break;
       const anchor = toScreen(component.anchor_in_model);
       if (!anchor || !isInside(anchor, picture) || !this.#deserves(component)) continue;
+      signs.set(component.name, anchor);
+      if (requests.length === most) continue;
       const label = this.#labels.get(component.name);
       if (!label.width) [label.width, label.height] = [label.element.offsetWidth, label.element.offsetHeight];
       requests.push({ key: component.name, width: label.width, height: label.height, x: anchor[0], y: anchor[1] });
@@ -98,7 +110,12 @@ export class Labels {
     const placed = this.#layout.place(area, requests, this.#extent(place, requests), covered, glides);
     const anchors = new Map(requests.map((one) => [one.key, one]));
     const names = new Set(placed.map((one) => one.key));
-    for (const [name, label] of this.#labels) if (!names.has(name)) show(label, false);
+    for (const [name, label] of this.#labels) {
+      if (!names.has(name)) show(label, false);
+      const sign = names.has(name) ? null : signs.get(name);
+      label.sign.classList.toggle("off", !sign);
+      if (sign) label.sign.style.transform = `translate(${sign[0].toFixed(1)}px, ${sign[1].toFixed(1)}px)`;
+    }
     for (const one of placed) this.#put(one, anchors.get(one.key));
   }
 
@@ -109,21 +126,23 @@ export class Labels {
 
   #add(component) {
     const value = component.value_text || (component.missing ? "missing" : ""), u = component.uncertainty_mm;
-    const what = [make("span", "verdict", [component.verdict_text])];
-    if (u !== null) what.unshift(make("span", "u", [`U ${u.toFixed(2)}`]));
+    const isLong = component.verdict !== "pass" && component.detail_text, what = [make("span", "verdict", [component.verdict_text])];
+    if (u !== null && !isLong) what.unshift(make("span", "u", [`U ${u.toFixed(2)}`]));
     if (value) what.unshift(make("span", "value", [value]));
     const who = make("span", "who", [icon(component.verdict), make("b", "", [component.name])]);
     const rows = [who, make("span", "what", what)];
-    const details = component.detail_text.split("   ").filter((text) => !text.startsWith("U "));
-    if (component.verdict !== "pass" && details.length) rows.push(make("span", "detail", [details.join("   ")]));
+    if (isLong) rows.push(make("span", "detail", [component.detail_text]));
     const element = make("button", `label ${component.verdict}`, rows, { tabindex: "-1" });
     element.addEventListener("click", () => this.onPick(component.name));
     const leader = document.createElementNS(SVG, "path"), dot = document.createElementNS(SVG, "circle");
     leader.classList.add("leader", component.verdict);
     dot.classList.add("dot", component.verdict);
-    this.box.append(element);
+    // Where there is no room for the label, its sign stands on the component.
+    const sign = make("button", `sign off ${component.verdict}`, [icon(component.verdict)], { tabindex: "-1" });
+    sign.addEventListener("click", () => this.onPick(component.name));
+    this.box.append(element, sign);
     this.svg.append(leader, dot);
-    const label = { element, leader, dot, width: 0, height: 0, isShown: true };
+    const label = { element, leader, dot, sign, width: 0, height: 0, isShown: true };
     show(label, false);
     this.#labels.set(component.name, label);
     const isWorthAnArrow = component.displacement_mm && component.distance_mm > (component.uncertainty_mm ?? 0);

@@ -6,7 +6,8 @@
 
 const STEP_PX = 6; // between rows that are tried
 const COVER_COST = 60; // of covering components wholly; in comparison a tenth of the area's height off costs 1
-const SWITCH_SHARE = 0.06; // of the area's width: how far an anchor must be across the middle to change columns
+const REACH_COST = 10, FULLNESS_COST = 3; // of crossing the area's width, and of the fuller column
+const STAY_GAIN = 1.5; // for staying in a column
 const GLIDE = 0.2; // fraction of the way gone at each call
 const GAP_PX = 6;
 
@@ -29,7 +30,7 @@ export class LabelLayout {
    * @returns [{key, left, top, side, isNew}]; labels for which there is no room are left out.
    */
   place(area, requests, part, covered, glides) {
-    const columns = this.#assign(area, requests);
+    const columns = this.#assign(area, requests, part);
     const widest = { left: 0, right: 0 };
     for (const side of ["left", "right"]) for (const one of columns[side]) widest[side] = Math.max(widest[side], one.width);
     const step = glides && this.#edges ? GLIDE : 1;
@@ -37,19 +38,19 @@ export class LabelLayout {
     return ["left", "right"].flatMap((side) => this.#column(side, area, columns[side], covered, step));
   }
 
-  /** Who goes left and who right; as many as there is room for. */
-  #assign(area, requests) {
-    const middle = area.left + area.width / 2, free = { left: area.height, right: area.height };
-    const columns = { left: [], right: [] };
-    const before = (key) => ["left", "right"].find((side) => this.#columns[side].some((one) => one.key === key));
+  /** Who goes left and who right: to the column that is nearer, less full, and where the label is already. */
+  #assign(area, requests, part) {
+    const free = { left: area.height, right: area.height }, columns = { left: [], right: [] };
+    const edges = this.#edges ?? part;
     for (const request of requests) {
-      const was = before(request.key), slack = was ? SWITCH_SHARE * area.width : 0;
-      let side = request.x + (was === "right" ? slack : -slack) < middle ? "left" : "right";
-      const other = side === "left" ? "right" : "left", needed = request.height + GAP_PX;
-      // A column that is much fuller than the other one leaves its newcomers to that.
-      if (free[side] < needed || (!was && free[side] + 2 * needed < free[other])) side = other;
-      if (was && side !== was && free[was] >= needed && Math.abs(request.x - middle) < slack) side = was;
-      if (free[side] < needed) continue;
+      const cost = (side) => {
+        const wasHere = this.#columns[side].some((one) => one.key === request.key);
+        const reach = Math.abs(request.x - edges[side]) / area.width, fullness = 1 - free[side] / area.height;
+        return REACH_COST * reach + FULLNESS_COST * fullness - (wasHere ? STAY_GAIN : 0);
+      };
+      const needed = request.height + GAP_PX, roomy = ["left", "right"].filter((side) => free[side] >= needed);
+      if (!roomy.length) continue;
+      const side = roomy.reduce((a, b) => (cost(a) <= cost(b) ? a : b));
       free[side] -= needed;
       columns[side].push(request);
     }

@@ -14,7 +14,7 @@ const find = (id) => document.getElementById(id);
 history.replaceState(null, "", location.pathname); // the token stays out of bookmarks and shared links
 for (const sign of document.querySelectorAll("[data-icon]")) sign.append(icon(sign.dataset.icon));
 
-const look = { ghost: true, edges: "visible", labels: true, opacity: 0.42, only: null };
+const look = { ghost: true, edges: "visible", labels: true, opacity: 0.42, only: null, status: false };
 const state = { phase: { name: "loading", text: "" }, part: null, status: null, trouble: "", latencies: [], isRecording: false };
 
 const bar = new StatusBar({
@@ -144,7 +144,7 @@ function refreshState(shown = player?.shown) {
   }
   const answer = shown?.pose ?? player.answer;
   if (answer.guide_cam_from_model && !answer.cam_from_model) {
-    return bar.say("align", sentence(answer.reason, "Bring the part into the yellow outline"));
+    return bar.say("align", "bring the part into the yellow outline");
   }
   const why = {
     tracked: [],
@@ -155,7 +155,6 @@ function refreshState(shown = player?.shown) {
   bar.say(answer.state, [...why, ...answer.mismatches].join("; "));
 }
 
-const sentence = (...texts) => texts.filter(Boolean).join(". ");
 const sayWhen = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);
 
 function refresh() {

@@ -17,7 +17,11 @@ const STATES = {
   waiting: ["busy", "Waiting"],
   frozen: ["pause", "Frozen"],
 };
+/** Notices of which the inspector must not go on without knowing. */
+const STRONG = { inspection_old: "Stale inspection: ", inspection_serial: "", inspection_model: "", inspection_unreadable: "" };
 const RANKS = { error: 0, warning: 1, info: 2 };
+
+const upper = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
 export class StatusBar {
   /** @param elements {icon, word, why, quality, meter, latency, age, body} */
@@ -37,7 +41,7 @@ export class StatusBar {
     this.body.dataset.state = state;
     this.icon.replaceChildren(icon(sign));
     if (this.word.textContent !== word) this.word.textContent = word;
-    this.why.textContent = why;
+    this.why.textContent = upper(why);
   }
 
   /** Show the figures; null is a dash. */
@@ -64,17 +68,17 @@ export class Notices {
     const said = JSON.stringify(notices);
     if (said === this.#said) return;
     this.#said = said;
-    this.notices = [...notices].sort((a, b) => RANKS[a.level] - RANKS[b.level]);
+    this.notices = [...notices].sort((a, b) => RANKS[a.level] - RANKS[b.level] || (b.code in STRONG) - (a.code in STRONG));
     this.#draw();
   }
 
   #draw() {
     const shown = this.#isOpen ? this.notices : this.notices.slice(0, 1), more = this.notices.length - 1;
     this.box.replaceChildren(
-      ...shown.map(({ level, text }, i) => {
-        const inside = [icon(level), make("span", "", [text])];
+      ...shown.map(({ code, level, text }, i) => {
+        const inside = [icon(level), make("span", "", [upper((STRONG[code] ?? "") + text)])];
         if (i === 0 && more > 0) inside.push(make("span", "more", [this.#isOpen ? "less" : `+${more}`]));
-        const line = make("button", `notice ${level}`, inside, more > 0 ? { "aria-expanded": String(this.#isOpen) } : {});
+        const line = make("button", `notice ${level}${code in STRONG ? " strong" : ""}`, inside, more > 0 ? { "aria-expanded": String(this.#isOpen) } : {});
         line.addEventListener("click", () => {
           this.#isOpen = !this.#isOpen && more > 0;
           this.#draw();
@@ -100,7 +104,7 @@ export class Message {
     this.#said = said;
     this.box.hidden = !content;
     if (!content) return this.box.replaceChildren();
-    const inside = [icon(content.sign), make("h2", "", [content.title]), make("p", "", [content.text])];
+    const inside = [icon(content.sign), make("h2", "", [content.title]), make("p", "", [upper(content.text)])];
     if (content.button) {
       const button = make("button", "wide", [content.button]);
       button.addEventListener("click", content.onPress);

@@ -1,0 +1,49 @@
+// A screen that only watches: the annotated picture as motion JPEG, and what is wrong in words.
+
+import { ask, getPart } from "./api.js";
+import { Message, Notices } from "./status.js";
+
+const EVERY_MS = 2000;
+const film = document.getElementById("film");
+const notices = new Notices(document.getElementById("notices")), message = new Message(document.getElementById("message"));
+
+history.replaceState(null, "", location.pathname);
+
+let isOn = false;
+
+function begin() {
+  isOn = true;
+  film.src = `/watch.mjpg?${Date.now()}`;
+}
+
+film.addEventListener("error", () => { isOn = false; });
+film.addEventListener("load", () => message.show(null));
+
+async function look() {
+  try {
+    const part = await getPart();
+    if (part.state !== "ready") {
+      message.show({ sign: "busy", title: part.state === "failed" ? "The part cannot be shown" : "Loading", text: part.text });
+      return;
+    }
+    document.title = `${part.part.name} ${part.part.serial} · arview`;
+    const status = await (await ask("/api/status")).json();
+    notices.show(status.notices.filter((one) => one.level !== "info"));
+    if (!isOn) begin();
+    const { feed } = status;
+    if (!feed && part.source === "phone" && status.clients === 0) {
+      message.show({ sign: "camera", title: "No phone yet", text: "The picture of the phone that joins next is shown here." });
+    } else if (feed && feed.state !== "live") {
+      message.show({ sign: "offline", title: "No picture", text: feed.text });
+    } else {
+      message.show(null);
+    }
+  } catch (error) {
+    isOn = false;
+    const title = error.code === "no_token" ? "This link is not valid any more" : "Connection lost, retrying";
+    message.show({ sign: "offline", title, text: error.message });
+  }
+}
+
+look();
+setInterval(look, EVERY_MS);
