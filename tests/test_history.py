@@ -371,6 +371,7 @@ def test_control_limits_of_a_known_example() -> None:
     assert chart.upper == pytest.approx(55.8041, abs=5e-3)
     assert chart.range_upper == pytest.approx(3.267 * 1.8778, abs=1e-3)
     assert chart.is_in_control
+    assert control_chart(np.abs(np.random.default_rng(0).normal(size=30)), is_length=True).lower == 0.0
 
 
 def test_signals() -> None:

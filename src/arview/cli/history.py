@@ -194,7 +194,7 @@ def chart(
     click.echo(f"{series.part}, {series.component}, {series.quantity} in {series.unit}: {count}")
     limits = ability = None
     try:
-        limits = control_chart(values)
+        limits = control_chart(values, series.is_length)
         click.echo(f"mean {limits.center:+.4f}, control limits {limits.lower:+.4f} to {limits.upper:+.4f}, "
                    f"mean moving range {limits.range_center:.4f}")  # fmt: skip
         for index, why in limits.signals.items():

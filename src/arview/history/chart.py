@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 import io
-import logging
 from typing import Any
 
 import numpy as np
 
 from arview.errors import InputError
+from arview.figures import INK, figure
 from arview.history.series import Series
 from arview.history.statistics import Capability, ControlChart
 
 FORMATS = ("svg", "png", "pdf")
-_INK, _MUTED, _BLUE, _RED = "#1c2430", "#5b6675", "#2b5c8a", "#c22f2b"
-_STYLE: dict[str, Any] = {
-    "svg.fonttype": "path",
-    "svg.hashsalt": "arview",
-    "font.family": "sans-serif",
-    "font.sans-serif": ["Inter", "DejaVu Sans"],
-    "font.size": 9.5,
-    "text.color": _INK,
-    "axes.edgecolor": "#9aa5b1",
-    "axes.labelcolor": _MUTED,
-    "axes.linewidth": 0.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "xtick.color": _MUTED,
-    "ytick.color": _MUTED,
-}
+_BLUE, _RED = "#2b5c8a", "#c22f2b"
 
 
 def draw(series: Series, chart: ControlChart | None, ability: Capability | None, kind: str = "svg") -> bytes:
@@ -47,22 +32,14 @@ def draw(series: Series, chart: ControlChart | None, ability: Capability | None,
         raise InputError(f"chart: {kind!r}: expected one of {', '.join(FORMATS)}")
     if not series.values:
         raise InputError(f"{series.component}: there is no determined {series.quantity} to draw")
-    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    settings: Any = _STYLE
-    with mpl.rc_context(settings):
-        figure = Figure(figsize=(9.0, 5.6), layout="constrained")
-        FigureCanvasAgg(figure)
-        above, below = figure.subplots(2, sharex=True, height_ratios=[2.2, 1.0])
+    rows = {"nrows": 2, "sharex": True, "height_ratios": [2.2, 1.0]}
+    with figure(5.6, 9.0, has_grid=False, text_as_paths=True, **rows) as (made, (above, below)):
         _individuals(above, series, chart)
         _ranges(below, series, chart)
-        figure.suptitle(_title(series, ability), x=0.01, ha="left", fontsize=11)
+        made.suptitle(_title(series, ability), x=0.01, ha="left", fontsize=11)
         out = io.BytesIO()
-        metadata = {"Date": None} if kind == "svg" else {"CreationDate": None} if kind == "pdf" else {}
-        figure.savefig(out, format=kind, dpi=150, metadata=metadata)
+        metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+        made.savefig(out, format=kind, dpi=150, metadata=metadata)
     return out.getvalue()
 
 
@@ -71,14 +48,15 @@ def _individuals(axes: Any, series: Series, chart: ControlChart | None) -> None:
     places = np.arange(1, len(x) + 1)
     for limit in (series.lower, series.upper):
         if limit is not None:
-            axes.axhline(limit, color=_INK, linewidth=1.1)
+            axes.axhline(limit, color=INK, linewidth=1.1)
             _label(
-                axes, limit, f"tolerance {limit:+.3f}" if series.lower is not None else f"tolerance {limit:.3f}", _INK
+                axes, limit, f"tolerance {limit:+.3f}" if series.lower is not None else f"tolerance {limit:.3f}", INK
             )
     if chart is not None:
         axes.axhline(chart.center, color=_BLUE, linewidth=0.9)
         _label(axes, chart.center, f"mean {chart.center:.3f}", _BLUE)
-        for limit, name in ((chart.lower, "LCL"), (chart.upper, "UCL")):
+        limits = [(chart.upper, "UCL")] + ([(chart.lower, "LCL")] if chart.lower > 0.0 or not series.is_length else [])
+        for limit, name in limits:
             axes.axhline(limit, color=_BLUE, linewidth=0.9, linestyle=(0, (5, 3)))
             _label(axes, limit, f"{name} {limit:.3f}", _BLUE)
     stds = np.array([one.std or 0.0 for one in series.values])

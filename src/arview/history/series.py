@@ -24,6 +24,9 @@ class Value:
     std: float | None
 
 
+NOT_NEGATIVE = ("distance", "tilt")
+
+
 @dataclass(frozen=True)
 class Series:
     """Values in the order in which they were measured.
@@ -43,6 +46,11 @@ class Series:
     lower: float | None
     upper: float | None
     left_out: tuple[str, ...]
+
+    @property
+    def is_length(self) -> bool:
+        """The values cannot be negative."""
+        return self.quantity in NOT_NEGATIVE
 
 
 def series_of(

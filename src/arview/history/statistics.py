@@ -78,12 +78,16 @@ class Capability:
         return ("Cp", "Cpk") if self.is_in_control else ("Pp", "Ppk")
 
 
-def control_chart(values: ArrayLike) -> ControlChart:
+def control_chart(values: ArrayLike, is_length: bool = False) -> ControlChart:
     """Limits from the mean moving range: they do not widen when the process wanders, as its standard deviation would.
 
     Signals: a value beyond 3 standard deviations, 8 values in a row on one side of the mean, 6 in a row that rise or
     fall (ISO 7870-2; Nelson, J. Quality Technology 16, 1984). A range beyond its limit is none: ranges of neighbours
     share a value and are not normal, every fourth series of 40 good values has one.
+
+    Args:
+        values: (N,) in order.
+        is_length: they cannot be negative, and neither is the lower limit.
 
     Raises:
         InputError: fewer than 8 values, or one that is not finite.
@@ -99,8 +103,9 @@ def control_chart(values: ArrayLike) -> ControlChart:
     # Six points in a row that rise are five steps of one sign.
     steps = np.concatenate([[0.0], np.sign(np.diff(x))])
     _add_runs(signals, steps, _TREND - 1, f"{_TREND} in a row that rise or fall")
+    lower = max(0.0, center - reach) if is_length else center - reach
     return ControlChart(
-        x, center, center - reach, center + reach, ranges, mean_range, _D4 * mean_range, dict(sorted(signals.items()))
+        x, center, lower, center + reach, ranges, mean_range, _D4 * mean_range, dict(sorted(signals.items()))
     )
 
 

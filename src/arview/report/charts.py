@@ -5,18 +5,17 @@ from __future__ import annotations
 import io
 import re
 import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.figures import INK, MUTED, figure
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, DatumReport, Verdict
 from arview.measurement.distance_map import DistanceMap
 
-INK, MUTED, GRID = "#1c2430", "#5b6675", "#dfe4ea"
 VERDICT_HEX = {
     Verdict.PASS: "#12805c",
     Verdict.FAIL: "#c22f2b",
@@ -26,44 +25,6 @@ VERDICT_HEX = {
 """Dark enough on white for text (contrast above 4.5 : 1)."""
 _MARKER = {Verdict.PASS: "o", Verdict.FAIL: "X", Verdict.UNDECIDED: "D", Verdict.NOT_MEASURED: "_"}
 _SERIES = ("#2b5c8a", "#e0912f", "#7aa6c2", "#7a5195", "#5a8f5a", "#b0413e", "#9c8a5a", "#8796a5", "#3d8b8b", "#c58fb4")
-_WIDTH_IN = 6.0
-_STYLE: dict[str, Any] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "arview",
-    "font.family": "sans-serif",
-    "font.sans-serif": ["Inter", "DejaVu Sans"],
-    "font.size": 9.5,
-    "text.color": INK,
-    "axes.edgecolor": "#9aa5b1",
-    "axes.labelcolor": MUTED,
-    "axes.linewidth": 0.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.7,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-}
-
-
-@contextmanager
-def figure(height_in: float, width_in: float = _WIDTH_IN, **options: Any) -> Iterator[tuple[Any, Any]]:
-    """A matplotlib figure in the reports' style, and its axes; nothing of matplotlib's own state is changed."""
-    import logging
-
-    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # Inter is the page's font, not the system's
-    import matplotlib as mpl
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(_STYLE):
-        made = Figure(figsize=(width_in, height_in), layout="constrained")
-        FigureCanvasSVG(made)
-        yield made, made.subplots(**options)
 
 
 def svg(made: Any, label: str) -> str:
