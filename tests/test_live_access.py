@@ -199,6 +199,31 @@ def test_slow_headers_and_bodies_are_cut(server: Running, page: Http, monkeypatc
     assert time.monotonic() - began_s < 7
 
 
+def test_a_client_that_takes_no_answer_is_cut(server: Running, page: Http, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving, "WRITE_TIMEOUT_S", 0.5)
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as line:
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        line.settimeout(10)
+        line.connect((LOOPBACK, server.port))
+        head = (
+            f"GET /api/model.glb HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nCookie: {page.headers['Cookie']}\r\n\r\n"
+        )
+        line.sendall(20 * head.encode())
+        time.sleep(2.0)
+        taken = 0
+        with suppress(ConnectionError):
+            while chunk := line.recv(1 << 20):
+                taken += len(chunk)
+        assert taken < 20 * 448_168
+
+
+def test_snapshots_are_not_for_free(page: Http) -> None:
+    name = page.join()
+    page.ask("POST", f"/api/clients/{name}/frame?id=0", to_jpeg(frames()[0]), Content_Type="image/jpeg")
+    statuses = [page.ask("GET", f"/api/clients/{name}/snapshot.png")[0] for _ in range(20)]
+    assert statuses[:6] == [200] * 6 and statuses.count(429) >= 8
+
+
 def test_too_many_requests_are_slowed_down() -> None:
     chosen = options(requests_per_s=5.0, requests_burst=10.0)
     with running(chosen, loader(chosen)) as slow:

@@ -35,6 +35,8 @@ logger = logging.getLogger("arview.live")
 TRACKING_TIMEOUT_S = 10.0
 """A frame that is not tracked by then, in a search on a busy machine, is given up."""
 FRAME_WAIT_S = 5.0
+SNAPSHOTS_PER_S, SNAPSHOTS_BURST = 2.0, 6.0
+"""Of one page: drawing and packing a PNG takes 50 ms of a core that others track with."""
 SERVED = {".html", ".js", ".css", ".svg", ".png", ".webmanifest", ".woff2", ".txt", ".json"}
 _TYPES = {".js": "text/javascript", ".webmanifest": "application/manifest+json", ".woff2": "font/woff2"}
 _CODES = {404: "not_found", 405: "bad_method"}
@@ -72,6 +74,7 @@ class Handlers:
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
         self._joins = RateLimit(hub.options.joins_per_s, hub.options.joins_burst)
+        self._snapshots = RateLimit(SNAPSHOTS_PER_S, SNAPSHOTS_BURST)
         self._files = page_files()
 
     async def index(self, request: Request) -> Response:
@@ -185,6 +188,7 @@ class Handlers:
     async def snapshot(self, request: Request) -> Response:
         """A PNG of one frame."""
         client = self._client(request)
+        self._snapshots.check(client.name)
         subject, _ = self._hub.ready()
         wants_newest = "id" not in request.query_params
         tracked = client.feed.newest if wants_newest else client.find(_number(request, "id", FRAME_IDS))

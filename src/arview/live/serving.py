@@ -15,13 +15,15 @@ from arview.live.certificates import Certificates
 
 HEADERS_TIMEOUT_S = 10.0
 """A connection that has not sent a whole request by then is closed (Slowloris)."""
+WRITE_TIMEOUT_S = 20.0
+"""A client that takes nothing of an answer for so long is cut."""
 MOST_CONNECTIONS = 200
 KEEP_ALIVE_S = 20
 HEADER_BYTES = 16_384
 
 
 class PatientProtocol(H11Protocol):
-    """HTTP/1.1 that does not wait for ever for the headers of a request."""
+    """HTTP/1.1 that waits neither for the headers of a request nor for a reader of its answers for ever."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first request."""
@@ -44,11 +46,24 @@ class PatientProtocol(H11Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop waiting."""
-        if self._headers_timer is not None:
-            self._headers_timer.cancel()
+        for timer in (self._headers_timer, self._write_timer):
+            if timer is not None:
+                timer.cancel()
         super().connection_lost(exc)
 
+    def pause_writing(self) -> None:
+        """Begin to wait for the client to take what is sent."""
+        super().pause_writing()
+        self._write_timer = self.loop.call_later(WRITE_TIMEOUT_S, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """It has taken it."""
+        if self._write_timer is not None:
+            self._write_timer.cancel()
+        super().resume_writing()
+
     _headers_timer: asyncio.TimerHandle | None = None
+    _write_timer: asyncio.TimerHandle | None = None
 
     def _await_headers(self, timeout_s: float = HEADERS_TIMEOUT_S) -> None:
         if self._headers_timer is not None:
