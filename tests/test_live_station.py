@@ -137,6 +137,30 @@ def test_screens_that_watch_get_motion_jpeg_and_only_so_many(playing: Running) -
     wait(lambda: playing.hub.watchers == 0)
 
 
+def test_twenty_pages_look_at_one_station(clip: Path) -> None:
+    """Each gets its pictures, plain or annotated; each picture is drawn and packed once, whoever asks."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    chosen = options(source=str(clip), max_age_s=None, clients=20)
+    with running(chosen, loader(chosen)) as server:
+
+        def look(number: int) -> list[int]:
+            page = server.session()
+            name = page.join(way="video" if number % 2 else "poses")
+            ids = []
+            for _ in range(4):
+                answer, picture = newest(page, name, ids[-1] if ids else -1)
+                assert picture.shape == (HEIGHT, WIDTH, 3)
+                ids.append(answer["id"])
+            return ids
+
+        with ThreadPoolExecutor(20) as pool:
+            for ids in pool.map(look, range(20)):
+                assert len(set(ids)) == 4
+        assert len(server.hub.clients) == 20
+        assert server.session().json("POST", "/api/clients", {"transport": "jpeg"})[0] == 503
+
+
 def test_camera_that_breaks_is_told_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     cable = Cable()
     monkeypatch.setattr(station, "open_source", cable.open)
