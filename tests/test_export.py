@@ -217,7 +217,9 @@ def test_glb_refuses_another_model(found: Inspection) -> None:
 
 
 def test_the_schema_page_is_that_of_the_schema() -> None:
-    assert (HERE.parent / "docs" / "inspection-json.md").read_text(encoding="utf-8") == schema_markdown()
+    assert (HERE.parent / "src" / "arview" / "inspection" / "schema" / "inspection-json.md").read_text(
+        encoding="utf-8"
+    ) == schema_markdown()
 
 
 def test_the_command(tmp_path: Path, found: Inspection) -> None:

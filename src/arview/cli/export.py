@@ -37,7 +37,7 @@ html  the report, as `arview report` writes it
 pdf   the report on paper
 \b
 What is undetermined has no value in any of them. The fields of inspection.json itself are described in
-docs/inspection-json.md and by the JSON Schema in src/arview/inspection/schema/.""",
+src/arview/inspection/schema/inspection-json.md and by the JSON Schema beside it.""",
 )
 @click.argument("inspection", metavar="INSPECTION")
 @click.option("--to", "formats", callback=_parse_formats, required=True, metavar="LIST",
