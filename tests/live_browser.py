@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -15,16 +16,20 @@ import av
 import cv2
 import numpy as np
 import pytest
-from live_sample import CLIP, SAMPLE
+from live_sample import CLIP, PART, SAMPLE
+from numpy.typing import NDArray
+from PIL import Image as PilImage
 
+from arview.cad import load_part
 from arview.camera import Camera
 from arview.camera_files import load_camera
 from arview.geometry import Array
+from arview.render import open_renderer
 from arview.video import Image, open_source
 
 CHROMIUM = os.environ.get("ARVIEW_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-START, COUNT = 27, 30
-"""Frames of the clip in which the part is in full view."""
+START, STRIDE, COUNT = 21, 3, 14
+"""Frames of the clip in which the part is in full view, every third: it moves 3 to 5 px from one to the next."""
 BITS, CELL_PX, EDGE_PX = 8, 12, 4
 """The counter in the upper left corner: the number of the frame and, below, the same inverted."""
 
@@ -32,7 +37,7 @@ BITS, CELL_PX, EDGE_PX = 8, 12, 4
 @cache
 def frames(width: int, height: int) -> list[Image]:
     """(H,W,3) frames of the clip with their number drawn into the corner."""
-    source = open_source(CLIP, START, START + COUNT, 1)
+    source = open_source(CLIP, START, START + STRIDE * COUNT, STRIDE)
     images = [cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA) for frame in source]
     for number, image in enumerate(images):
         image[: 2 * (CELL_PX + EDGE_PX), : BITS * CELL_PX + 2 * EDGE_PX] = 128
@@ -63,7 +68,7 @@ def number_in(picture: Image, scale: float = 1.0) -> int | None:
 def truth() -> list[Array]:
     """``cam_from_model`` (4,4) mm of each frame."""
     described = json.loads((SAMPLE / "truth.json").read_text())["frames"]
-    return [np.array(described[START + k]["cam_from_model"]) for k in range(COUNT)]
+    return [np.array(described[START + STRIDE * k]["cam_from_model"]) for k in range(COUNT)]
 
 
 def camera(width: int, height: int) -> Camera:
@@ -89,12 +94,14 @@ def write_y4m(path: Path, images: Sequence[Image], fps: int) -> None:
 @contextmanager
 def browser(film: Path | None, *more: str) -> Iterator[Any]:
     """A headless Chromium; skips the test when there is none."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install playwright")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="Playwright is not installed: pip install playwright"
+    )
     if CHROMIUM is None:
         pytest.skip("Chromium is not installed: apt-get install chromium")
     arguments = [
         "--no-sandbox", "--disable-dev-shm-usage", "--allow-loopback-in-peer-connection",
-        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb",
         "--use-fake-ui-for-media-stream", "--autoplay-policy=no-user-gesture-required", *more,
     ]  # fmt: skip
     if film is not None:
@@ -105,3 +112,39 @@ def browser(film: Path | None, *more: str) -> Iterator[Any]:
             yield running
         finally:
             running.close()
+
+
+def screenshot(page: Any) -> Image:
+    """(H,W,3) what the screen shows where the page has its picture."""
+    return np.array(PilImage.open(io.BytesIO(page.locator("#picture").screenshot())).convert("RGB"))
+
+
+def true_mask(shape: tuple[int, int], number: int) -> NDArray[np.uint8]:
+    """(H,W) 0 or 1: the inspected components at the true pose, as the lens shows them in a picture of this size.
+
+    The lens is OpenCV's here, so that it is not arview's own formula that arview is compared with.
+    """
+    height, width = shape
+    lens = camera(width, height)
+    model = load_part(str(PART)).model
+    ids = open_renderer(model, lens.without_distortion(), "zbuffer").render(truth()[number]).component_ids
+    names = [component.name for component in model.components]
+    mask = ((ids >= 0) & (ids != names.index("base_plate"))).astype(np.uint8)
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    ideal = cv2.undistortPoints(pixels, lens.matrix, lens.dist, P=lens.matrix).reshape(height, width, 2)
+    return np.asarray(cv2.remap(mask, *np.float32(ideal).transpose(2, 0, 1), cv2.INTER_NEAREST))
+
+
+def outline_errors_px(found: NDArray[np.uint8], true: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Distances between the outlines of two masks, from each pixel of either to the nearest of the other."""
+    outlines = [mask - cv2.erode(mask, np.ones((3, 3), np.uint8)) for mask in (found, true)]
+    distances = [cv2.distanceTransform(1 - outline, cv2.DIST_L2, 5) for outline in outlines]
+    return np.concatenate([distances[1][outlines[0] > 0], distances[0][outlines[1] > 0]]).astype(np.float64)
+
+
+def difference_mask(one: Image, other: Image, least: float, blur_px: int = 1) -> NDArray[np.uint8]:
+    """(H,W) 0 or 1: where two pictures differ by so many grey levels; specks and pin holes are cleaned away."""
+    difference = cv2.GaussianBlur(cv2.absdiff(one, other), (blur_px, blur_px), 0).max(axis=2)
+    mask = (difference > least).astype(np.uint8)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    return np.asarray(cv2.morphologyEx(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disc), cv2.MORPH_OPEN, disc))

@@ -322,7 +322,7 @@ find("search-again").addEventListener("click", async () => {
 });
 find("transports").addEventListener("change", (event) => {
   connection.choose(event.target.value);
-  player.way = connection.way;
+  if (player) player.way = connection.way;
 });
 find("freeze").addEventListener("click", freeze);
 find("snapshot").addEventListener("click", snapshot);
