@@ -59,7 +59,7 @@ def find_corners(gray: NDArray[np.uint8], camera: Camera, sources: ScaleSources)
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     taken: dict[str, set[int]] = defaultdict(set)
     for number, board in enumerate(sources.boards):
-        drawn: Any = _cv_board(board)
+        drawn: Any = cv_board(board)
         taken[board.dictionary] |= {int(i) for i in drawn.getIds().ravel()}
         if board.is_charuco:
             charuco = cv2.aruco.CharucoDetector(drawn, detectorParams=parameters)
@@ -124,7 +124,7 @@ def scale_from_targets(
         _add(evidence, missing, _board_evidence(board, number, corners), str(board))
     for tags in sources.tags:
         in_boards = {
-            int(i) for b in sources.boards if b.dictionary == tags.dictionary for i in _cv_board(b).getIds().ravel()
+            int(i) for b in sources.boards if b.dictionary == tags.dictionary for i in cv_board(b).getIds().ravel()
         }
         what = f"tags {tags.dictionary.removeprefix('DICT_')} of {tags.side_mm:g} mm"
         _add(evidence, missing, _tag_evidence(tags, in_boards, corners, _side_px(seen, tags), what), what)
@@ -218,7 +218,7 @@ def triangulate(
 
 
 def _board_evidence(board: Board, number: int, corners: Corners) -> ScaleEvidence | None:
-    drawn = _cv_board(board)
+    drawn = cv_board(board)
     on_board: dict[Key, Array] = {}
     if board.is_charuco:
         for index, place in enumerate(drawn.getChessboardCorners()):
@@ -289,7 +289,8 @@ def _add(evidence: list[ScaleEvidence], missing: list[str], found: ScaleEvidence
         evidence.append(found)
 
 
-def _cv_board(board: Board) -> Any:
+def cv_board(board: Board) -> Any:
+    """The board as OpenCV has it, in mm."""
     import cv2
 
     size = (board.columns, board.rows)

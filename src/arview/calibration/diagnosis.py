@@ -1,0 +1,116 @@
+"""Why no picture shows the board: another dictionary, another layout, or nothing there at all."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.geometry import Array
+from arview.reconstruction.scale import Board
+from arview.reconstruction.scale.targets import cv_board
+
+if TYPE_CHECKING:
+    from arview.calibration.views import BoardFinder, Sightings
+
+_DICTIONARIES = (
+    "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
+    "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9",
+)  # fmt: skip
+"""The largest of each family: smaller ones are parts of it."""
+_LEAST_MARKERS = 4
+_FIT = 0.1
+"""Share of a marker's side that corners may lie off a homography: lens distortion bends boards by less."""
+
+
+def why_no_board(finder: BoardFinder, sightings: Sightings, pictures: Iterable[NDArray[np.uint8]]) -> str:
+    """In words, why none of the pictures shows the board, and what to do.
+
+    Args:
+        finder: it has kept the markers that were seen.
+        sightings: of all pictures.
+        pictures: some of them, gray.
+    """
+    board = finder.board
+    if any(len(ids) >= _LEAST_MARKERS for _, ids in finder.markers_seen):
+        columns = _columns_that_fit(board, finder.markers_seen)
+        if columns is not None and columns != board.columns:
+            return (
+                f"markers of {board.dictionary} are seen, but they lie as on a board of {columns} columns, not of"
+                f" {board.columns}; correct --board"
+            )
+        if columns is None:
+            return (
+                f"markers of {board.dictionary} are seen, but they do not lie as on a board of {board.columns}×"
+                f"{board.rows} squares of {board.cell_mm:g} mm with markers of {board.marker_mm:g} mm; check --board"
+            )
+        return (
+            "the markers of the board are seen, but hardly any place where squares meet: it is too small, blurred or"
+            " covered; bring it nearer and in focus, with light"
+        )
+    other = _other_dictionary(pictures)
+    if other is not None:
+        return f"no marker of {board.dictionary} is seen, but such of {other}; give the board that is in the pictures"
+    count = sightings.looked_at
+    return (
+        f"no marker of the board in any of {count} picture{'s' if count > 1 else ''}; it must be whole, in focus and"
+        " fill about half of the picture"
+    )
+
+
+def _columns_that_fit(board: Board, seen: list[tuple[Array, NDArray[np.int64]]]) -> int | None:
+    """The number of columns with which the ids of the markers make a plane board in most pictures."""
+    pictures = sorted((one for one in seen if len(one[1]) >= _LEAST_MARKERS), key=lambda one: -len(one[1]))[:10]
+    votes: Counter[int] = Counter()
+    for quads, ids in pictures:
+        fits = [columns for columns in range(3, 31) if _fits(board, columns, quads, ids)]
+        votes.update([board.columns] if board.columns in fits else fits[:1])
+    columns, count = votes.most_common(1)[0] if votes else (0, 0)
+    return columns if 2 * count > len(pictures) else None
+
+
+def _fits(board: Board, columns: int, quads: Array, ids: NDArray[np.int64]) -> bool:
+    import cv2
+
+    rows = 2 * (int(ids.max()) + 1) // columns + 2
+    if columns * rows // 2 > len(cv_board(board).getDictionary().bytesList):
+        rows = 2 * len(cv_board(board).getDictionary().bytesList) // columns
+    if rows < 3:
+        return False
+    for legacy in (False, True):
+        drawn = cv_board(replace(board, columns=columns, rows=rows + rows % 2))
+        drawn.setLegacyPattern(legacy)
+        place = {
+            int(i): np.asarray(c)[:, :2] for i, c in zip(drawn.getIds().ravel(), drawn.getObjPoints(), strict=True)
+        }
+        known = [k for k, index in enumerate(ids) if int(index) in place]
+        if len(known) < max(_LEAST_MARKERS, 0.8 * len(ids)):
+            continue
+        on_board = np.concatenate([place[int(ids[k])] for k in known]).astype(np.float64)
+        pixels = np.concatenate([quads[k] for k in known])
+        side = float(np.median(np.linalg.norm(quads[:, 0] - quads[:, 1], axis=1)))
+        found, _ = cv2.findHomography(on_board, pixels, cv2.RANSAC, _FIT * side)
+        if found is None:
+            continue
+        there = cv2.perspectiveTransform(on_board[None], found)[0]
+        if np.mean(np.linalg.norm(there - pixels, axis=1) < 2.0 * _FIT * side) > 0.9:
+            return True
+    return False
+
+
+def _other_dictionary(pictures: Iterable[NDArray[np.uint8]]) -> str | None:
+    """The family of markers of which most are seen."""
+    import cv2
+
+    counts: Counter[str] = Counter()
+    for gray in pictures:
+        for name in _DICTIONARIES:
+            detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)))
+            _, ids, _ = detector.detectMarkers(gray)
+            counts[name] += 0 if ids is None else len(ids)
+    name, count = counts.most_common(1)[0] if counts else ("", 0)
+    return name if count >= _LEAST_MARKERS else None

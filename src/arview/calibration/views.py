@@ -1,0 +1,347 @@
+"""Pictures of a ChArUco board: from photos and videos to corners, with what each picture is worth.
+
+Corners are those of OpenCV's ChArUco detector (Garrido-Jurado et al. 2014), refined where the squares meet. Pictures
+are taken as the sensor saw them, before the turn that makes them upright: portrait and landscape photos of one phone
+calibrate one camera, and that is how ``load_camera`` expects it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.errors import InputError
+from arview.geometry import Array
+from arview.photo_exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
+from arview.reconstruction.scale import Board
+from arview.reconstruction.scale.targets import cv_board
+
+LEAST_CORNERS = 8
+"""A picture with fewer says little and is easily wrong."""
+_LOOKS_PER_S = 5.0
+"""Frames of a video that are looked at; a hand-held camera hardly moves in between."""
+_MOST_LOOKS = 400
+_SHUTTER_S = 0.02
+"""How long a phone takes to read a picture out: it bends what moves."""
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """The corners of the board in one picture.
+
+    Attributes:
+        name: of the photo, or ``frame N``.
+        ids: (N,) numbers of the corners.
+        points_in_board: (N,3) mm, z = 0.
+        pixels: (N,2) in the sensor's picture, integers at pixel centres.
+        blur_px: spread of edges on the board (Gaussian sigma), NaN when not known.
+        speed_px_s: how fast the board moved in the picture; 0 of photos.
+    """
+
+    name: str
+    ids: NDArray[np.int64]
+    points_in_board: Array
+    pixels: Array
+    blur_px: float = float("nan")
+    speed_px_s: float = 0.0
+
+    @property
+    def sigma_px(self) -> float:
+        """How well its corners are likely to be placed: noise, blur beyond the usual, and motion while it was read."""
+        blur = max(0.0, (1.0 if np.isnan(self.blur_px) else self.blur_px) - 1.0)
+        return float(np.linalg.norm([0.1, 0.1 * blur, 0.05 * _SHUTTER_S * self.speed_px_s]))
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """What the pictures show.
+
+    Attributes:
+        label: the source, for messages.
+        width, height: of the sensor's picture, px.
+        views: pictures with the board.
+        rejected: by name, why a picture is not used.
+        looked_at: number of pictures.
+        exif: what the first used photo (or the video) says of its camera.
+        quarter_turns_clockwise: from the sensor's picture to the upright one, of most pictures.
+        warnings: in words.
+    """
+
+    label: str
+    width: int
+    height: int
+    views: tuple[BoardView, ...]
+    rejected: dict[str, str]
+    looked_at: int
+    exif: PhotoExif
+    quarter_turns_clockwise: int = 0
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass
+class BoardFinder:
+    """Finds the corners of one board in gray pictures; boards of OpenCV before 4.6 are recognised by themselves."""
+
+    board: Board
+    markers_seen: list[tuple[Array, NDArray[np.int64]]] = field(default_factory=list)
+    """Quads (N,4,2) and ids of the markers in pictures whose corners could not be told: for the diagnosis."""
+
+    def __post_init__(self) -> None:
+        import cv2
+
+        if not self.board.is_charuco:
+            raise InputError(f"{self.board}: calibration needs a ChArUco board (`arview calibrate board` prints one)")
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        self._parameters = parameters
+        self._detectors = [self._detector(False)]
+        if self.board.rows % 2 == 0:
+            self._detectors.append(self._detector(True))
+
+    def find(self, name: str, gray: NDArray[np.uint8]) -> BoardView | str:
+        """The view of a picture (H,W) uint8, or in words why there is none."""
+        for detector in list(self._detectors):
+            corners, ids, quads, marker_ids = detector.detectBoard(gray)
+            if ids is not None and len(ids) >= LEAST_CORNERS:
+                self._detectors = [detector]
+                points = np.asarray(detector.getBoard().getChessboardCorners(), dtype=np.float64)
+                number = np.asarray(ids).ravel().astype(np.int64)
+                pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+                if detector.getBoard().checkCharucoCornersCollinear(np.asarray(ids)):
+                    return "shows one line of the board's corners only"
+                return BoardView(name, number, points[number], pixels, _blur_px(gray, pixels))
+        found = 0 if marker_ids is None else len(marker_ids)
+        if found == 0:
+            return "shows no marker of the board"
+        self.markers_seen.append(
+            (np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2), np.asarray(marker_ids).ravel().astype(np.int64))
+        )
+        count = 0 if ids is None else len(ids)
+        return f"shows {found} markers and {count} corners of the board; {LEAST_CORNERS} are needed"
+
+    def _detector(self, is_legacy: bool) -> Any:
+        import cv2
+
+        drawn = cv_board(self.board)
+        if is_legacy:
+            drawn.setLegacyPattern(True)
+        return cv2.aruco.CharucoDetector(drawn, detectorParams=self._parameters)
+
+
+def find_views(
+    sources: Sequence[str | Path], board: Board, progress: Callable[[int, int], None] | None = None
+) -> Sightings:
+    """Look for the board in photos, or in one video.
+
+    Args:
+        sources: photo files, folders or globs of them; or one video file.
+        board: which board it is.
+        progress: called with pictures done and in all.
+
+    Raises:
+        InputError: nothing there or readable, pictures of several cameras in equal parts, or no board in any
+            picture; the message says what was seen instead.
+    """
+    finder = BoardFinder(board)
+    if not sources:
+        raise InputError("give photos of the board, or a video of it")
+    if len(sources) == 1 and _is_video(Path(sources[0])):
+        sightings = _look_at_video(Path(sources[0]), finder, progress)
+    else:
+        sightings = _look_at_photos(sources, finder, progress)
+    if not sightings.views:
+        from arview.calibration.diagnosis import why_no_board
+
+        raise InputError(f"{sightings.label}: {why_no_board(finder, sightings, _some_pictures(sources))}")
+    return sightings
+
+
+# --- photos ------------------------------------------------------------------------------------------------
+
+
+def _look_at_photos(
+    sources: Sequence[str | Path], finder: BoardFinder, progress: Callable[[int, int], None] | None
+) -> Sightings:
+    from arview.reconstruction.intake.reading import photo_paths
+
+    paths: list[Path] = []
+    for source in sources:
+        paths += photo_paths(source)[0]
+    paths, names = photo_paths(list(paths))
+    label = str(sources[0]) if len(sources) == 1 else f"{len(paths)} photos"
+    exifs, rejected = _exif_of_all(paths, names)
+    if not exifs:
+        why = "; ".join(f"{name} {reason}" for name, reason in list(rejected.items())[:3])
+        raise InputError(f"{label}: none of the {len(paths)} photos can be read ({why})")
+    chosen, others = _one_lens(label, exifs)
+    rejected |= others
+    views = []
+    for done, (path, name) in enumerate(zip(paths, names, strict=True), 1):
+        if name in chosen:
+            found = _look_at(path, name, chosen[name].quarter_turns_clockwise, finder)
+            if isinstance(found, BoardView):
+                views.append(found)
+            else:
+                rejected[name] = found
+        if progress:
+            progress(done, len(paths))
+    first = next(iter(chosen.values()))
+    width, height = _sensor_size(first)
+    turns = Counter(exif.quarter_turns_clockwise for exif in chosen.values()).most_common(1)[0][0]
+    warnings = []
+    if others:
+        warnings.append(
+            f"{len(others)} of {len(paths)} photos are of another camera, zoom or size and are left out: "
+            f"{', '.join(list(others)[:4])}; calibrate each by itself"
+        )
+    return Sightings(label, width, height, tuple(views), rejected, len(paths), first, turns, tuple(warnings))
+
+
+def _exif_of_all(paths: Sequence[Path], names: Sequence[str]) -> tuple[dict[str, PhotoExif], dict[str, str]]:
+    from arview.photo_exif import read_exif
+
+    exifs, rejected = {}, {}
+    for path, name in zip(paths, names, strict=True):
+        try:
+            exifs[name] = read_exif(path)
+        except InputError as error:
+            rejected[name] = str(error).removeprefix(f"{path}: ")
+    return exifs, rejected
+
+
+def _one_lens(label: str, exifs: dict[str, PhotoExif]) -> tuple[dict[str, PhotoExif], dict[str, str]]:
+    """The photos of the lens that took more than half of them, and why the others are left out."""
+    from arview.reconstruction.intake.lenses import Lens, lenses_of
+
+    turned = []
+    for exif in exifs.values():
+        width, height = _sensor_size(exif)
+        turned.append(replace(exif, width=width, height=height, orientation=1))
+    lenses, _ = lenses_of(turned, None)
+    keys = [lens.key if isinstance(lens, Lens) else "?" for lens in lenses]
+    counts = Counter(keys).most_common()
+    if len(counts) > 1 and 2 * counts[0][1] <= len(keys):
+        listed = "; ".join(f"{count} of {key}" for key, count in counts[:4])
+        raise InputError(
+            f"{label}: photos of {len(counts)} cameras, zooms or sizes ({listed}); give those of one, each has its own"
+            " calibration"
+        )
+    main = counts[0][0]
+    chosen = {name: exif for (name, exif), key in zip(exifs.items(), keys, strict=True) if key == main}
+    others = {name: f"is of {key}, not of {main}" for name, key in zip(exifs, keys, strict=True) if key != main}
+    return chosen, others
+
+
+def _sensor_size(exif: PhotoExif) -> tuple[int, int]:
+    width, height = exif.upright_size
+    return (height, width) if exif.quarter_turns_clockwise % 2 else (width, height)
+
+
+def _look_at(path: Path, name: str, turns: int, finder: BoardFinder) -> BoardView | str:
+    import cv2
+
+    from arview.reconstruction.intake.reading import read_photo
+
+    try:
+        upright = read_photo(path)
+    except InputError as error:
+        return str(error).removeprefix(f"{path}: ")
+    gray = cv2.cvtColor(upright, cv2.COLOR_RGB2GRAY)
+    return finder.find(name, np.ascontiguousarray(np.rot90(gray, turns)))
+
+
+# --- video -------------------------------------------------------------------------------------------------
+
+
+def _is_video(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES
+
+
+def _look_at_video(path: Path, finder: BoardFinder, progress: Callable[[int, int], None] | None) -> Sightings:
+    import cv2
+
+    from arview.camera_profiles import exif_of_video
+    from arview.video import open_source
+
+    with open_source(path) as source:
+        fps, count = source.fps or 30.0, source.frame_count
+    stride = max(1, round(fps / _LOOKS_PER_S), -(-(count or 0) // _MOST_LOOKS))
+    views: list[BoardView] = []
+    rejected: dict[str, str] = {}
+    looked_at = 0
+    with open_source(path, stride=stride) as source:
+        turns = source.quarter_turns_clockwise
+        before: BoardView | None = None
+        before_s = 0.0
+        for frame in source:
+            looked_at += 1
+            gray = np.rot90(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), turns)
+            found = finder.find(f"frame {frame.index}", np.ascontiguousarray(gray))
+            if isinstance(found, BoardView):
+                speed = _speed_px_s(before, found, frame.time_s - before_s)
+                before, before_s = found, frame.time_s
+                views.append(replace(found, speed_px_s=speed))
+            else:
+                before = None
+                rejected[f"frame {frame.index}"] = found
+            if progress and source.frame_count:
+                progress(min(looked_at, source.frame_count), source.frame_count)
+        ended = source.ended_reason
+        size = (source.height, source.width) if turns % 2 else (source.width, source.height)
+    if looked_at == 0:
+        raise InputError(f"{path}: no frame could be read; record or copy the video again")
+    warnings = (ended,) if ended else ()
+    exif = exif_of_video(path, *size)
+    return Sightings(str(path), *size, tuple(views), rejected, looked_at, exif, turns, warnings)
+
+
+def _speed_px_s(before: BoardView | None, now: BoardView, seconds: float) -> float:
+    if before is None or seconds <= 0.0:
+        return 0.0
+    _, here, there = np.intersect1d(now.ids, before.ids, return_indices=True)
+    if len(here) < 4:
+        return 0.0
+    return float(np.median(np.linalg.norm(now.pixels[here] - before.pixels[there], axis=1)) / seconds)
+
+
+# --- both --------------------------------------------------------------------------------------------------
+
+
+def _blur_px(gray: NDArray[np.uint8], pixels: Array) -> float:
+    """Spread of the edges in the part of the picture that holds the corners."""
+    from arview.reconstruction.intake.checks import blur_and_texture
+
+    height, width = gray.shape
+    low = np.maximum(np.floor(pixels.min(axis=0)).astype(int), 0)
+    high = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 1, (width, height))
+    if min(high - low) < 40:
+        return float("nan")
+    return blur_and_texture(np.ascontiguousarray(gray[low[1] : high[1], low[0] : high[0]]))[0]
+
+
+def _some_pictures(sources: Sequence[str | Path], most: int = 6) -> Iterator[NDArray[np.uint8]]:
+    """A few gray pictures of the sources, for the diagnosis."""
+    import cv2
+
+    from arview.reconstruction.intake.reading import photo_paths, read_photo
+    from arview.video import open_source
+
+    if len(sources) == 1 and _is_video(Path(sources[0])):
+        with open_source(sources[0]) as source:
+            stride = max(1, (source.frame_count or 60) // most)
+        with open_source(sources[0], stride=stride) as source:
+            for frame in source:
+                yield cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        return
+    paths = [path for item in sources for path in photo_paths(item)[0]]
+    for path in paths[:: max(1, len(paths) // most)]:
+        try:
+            yield cv2.cvtColor(read_photo(path), cv2.COLOR_RGB2GRAY)
+        except InputError:
+            continue
