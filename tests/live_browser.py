@@ -16,7 +16,6 @@ import av
 import cv2
 import numpy as np
 import pytest
-from live_sample import CLIP, PART, SAMPLE
 from numpy.typing import NDArray
 from PIL import Image as PilImage
 
@@ -26,6 +25,7 @@ from arview.camera_files import load_camera
 from arview.geometry import Array
 from arview.render import open_renderer
 from arview.video import Image, open_source
+from live_sample import CLIP, PART, SAMPLE
 
 CHROMIUM = os.environ.get("ARVIEW_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 START, STRIDE, COUNT = 21, 3, 14

@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import live_browser
 import numpy as np
 import pytest
+from PIL import Image as PilImage
+
+import live_browser
+from arview.video import VideoSink
 from live_browser import difference_mask, number_in, outline_errors_px, screenshot, true_mask
 from live_client import Running, running
 from live_sample import INSPECTION, loader, options
-from PIL import Image as PilImage
-
-from arview.video import VideoSink
 
 WIDTH, HEIGHT, FPS = 640, 360, 5
 TIMEOUT_S = 120.0
@@ -101,7 +101,8 @@ def until(page: Any, condition: str | Callable[[], Any], timeout_s: float = TIME
 
 WATCH = """
 window.drawn = null;
-document.addEventListener("arview:drawn", (event) => { window.drawn = event.detail; });
+window.draws = 0;
+document.addEventListener("arview:drawn", (event) => { window.drawn = event.detail; window.draws += 1; });
 """
 
 
@@ -225,7 +226,8 @@ def test_labels_stay_apart(chromium: Any, server: Running) -> None:
         until(page, "window.drawn?.pose?.state === 'tracked'")
         for width, height in ((390, 844), (844, 390), (1280, 800), (320, 568)):
             page.set_viewport_size({"width": width, "height": height})
-            page.wait_for_timeout(600)
+            draws = page.evaluate("window.draws")
+            until(page, f"window.innerWidth === {width} && window.draws > {draws + 2}")
             until(page, "document.querySelectorAll('#labels .label:not(.off)').length >= 2")
             for _ in range(4):
                 page.wait_for_timeout(250)
@@ -306,8 +308,10 @@ def test_inspection_changes(chromium: Any, tmp_path: Path) -> None:
         until(page, lambda: row.count() and "1.36 mm" in row.text_content())
         assert page.locator(".notice.strong").count() == 0
         record = json.loads(INSPECTION.read_text())
-        changed = [{**one, "displacement_mm": [0.5, 0, 0], "distance_mm": 0.5, "verdict": "pass"} if one["name"] == "post_1" else one
-                   for one in record["components"]]  # fmt: skip
+        changed = [
+            {**one, **({"displacement_mm": [0.5, 0, 0], "distance_mm": 0.5, "verdict": "pass"} if k == 0 else {})}
+            for k, one in enumerate(record["components"])
+        ]
         write_inspection(path, timedelta(hours=50), components=changed)
         until(page, lambda: "0.50 mm" in row.text_content())
         until(page, "document.querySelector('.notice.strong')?.innerText.includes('Stale inspection')")

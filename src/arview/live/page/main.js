@@ -17,6 +17,8 @@ for (const sign of document.querySelectorAll("[data-icon]")) sign.append(icon(si
 const look = { ghost: true, edges: "visible", labels: true, opacity: 0.42, only: null, status: false };
 const state = { phase: { name: "loading", text: "" }, part: null, status: null, trouble: "", latencies: [], isRecording: false };
 
+let player = null, isDrawAsked = false;
+
 const bar = new StatusBar({
   icon: find("state-icon"), word: find("state-name"), why: find("state-why"), quality: find("quality"),
   meter: find("quality-meter"), latency: find("latency"), age: find("age"), body: document.body,
@@ -29,7 +31,7 @@ const parts = new Parts(
 const stage = new Stage({
   stage: find("stage"), canvas: find("picture"), leaders: find("leaders"), labels: find("labels"),
   obstacles: [find("bar"), find("notices"), find("actions"), find("card"), find("side")],
-}, look, isolate);
+}, look, isolate, () => requestDraw());
 const camera = new Camera(find("camera"), takeCameraFrame, (trouble) => {
   state.trouble = trouble;
   refresh();
@@ -85,7 +87,6 @@ const connection = new Connection(find("remote"), {
     requestDraw();
   },
 });
-let player = null;
 
 // --- pictures ---------------------------------------------------------------------------------------
 
@@ -97,8 +98,6 @@ function takeCameraFrame(video, takenMs) {
   link?.send(frame);
   requestDraw();
 }
-
-let isDrawAsked = false;
 
 function requestDraw() {
   if (isDrawAsked) return;
@@ -301,7 +300,6 @@ function openSide(section) {
   find("open-view").setAttribute("aria-expanded", String(body.dataset.side === "view"));
   if (body.dataset.side) find("close-side").focus({ preventScroll: true });
   stage.measure();
-  requestDraw();
 }
 
 function toggle(key) {

@@ -20,9 +20,10 @@ export class Stage {
   /**
    * @param elements {stage, canvas, leaders, labels, obstacles: [bar, notices, actions, card, side]}
    * @param onPick called with the name of a component that was pressed in the picture, or null beside all.
+   * @param onResize called when everything has to be drawn anew.
    */
-  constructor(elements, look, onPick) {
-    Object.assign(this, elements, { look, onPick });
+  constructor(elements, look, onPick, onResize) {
+    Object.assign(this, elements, { look, onPick, onResize });
     try {
       this.ghost = new Ghost(this.canvas);
     } catch {
@@ -33,10 +34,9 @@ export class Stage {
     this.labelBoxes = new Labels(this.labels, this.leaders, onPick);
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
     new ResizeObserver(() => this.measure()).observe(this.stage);
-    for (const one of this.obstacles) new ResizeObserver(() => { this.#free = null; }).observe(one);
+    for (const one of this.obstacles) new ResizeObserver(() => this.measure()).observe(one);
     this.canvas.addEventListener("click", (event) => this.#pick(event));
     document.fonts?.ready.then(() => this.labelBoxes.remeasure());
-    this.measure();
   }
 
   /** Whether this browser can draw ghosts. */
@@ -66,6 +66,7 @@ export class Stage {
   measure() {
     this.#free = null;
     this.labelBoxes.remeasure();
+    this.onResize();
   }
 
   /** Draw what the player has chosen. */
