@@ -82,6 +82,11 @@ class Drawing:
                 self._pencils.popitem(last=False)
             return pencil.draw(tracked)
 
+    def close(self) -> None:
+        """Let go of pictures and renderers."""
+        with self._lock:
+            self._pencils.clear()
+
     def draw_record(self, tracked: Tracked) -> Drawn:
         """As `draw`, with the status line: for files, which nothing else explains."""
         return self.draw(tracked, replace(self.look, status=True))

@@ -181,8 +181,9 @@ class Feed:
                 logger.exception("tracking failed; it begins anew")
                 self.failures += 1
                 self._shape = None
+        # A connection that broke can live on in cycles of references for a while; the pictures must not.
         self._kept.clear()
-        self._session = None
+        self._session = self.newest = None
 
     def _step(self, incoming: Incoming) -> None:
         started_s = time.monotonic()

@@ -260,6 +260,7 @@ class Hub:
             if self.recordings is not None:
                 await asyncio.to_thread(self.recordings.forget, client.feed)
             await asyncio.to_thread(client.feed.close)
+            await asyncio.to_thread(client.drawing.close)
 
     def _record_phone(self, recordings: Recordings, client: Client, path: Path) -> None:
         """Record a phone from its first frame: OUT.mp4, then the next of OUT-2.mp4, OUT-3.mp4, ... that is free."""

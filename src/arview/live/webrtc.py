@@ -166,6 +166,7 @@ class Connection:
             self._track.stop()
         with suppress(Exception):  # a connection that broke half-way cannot always be closed in good order
             await asyncio.wait_for(self._peer.close(), timeout=5.0)
+        self._peer.remove_all_listeners()
 
     def _on_track(self, track: Any) -> None:
         for transceiver in self._peer.getTransceivers():
