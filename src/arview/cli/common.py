@@ -35,11 +35,16 @@ class _Group(click.Group):
         except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise
         except Exception as error:
-            if os.environ.get("ARVIEW_DEBUG"):
-                traceback.print_exc()
-            hint = "" if os.environ.get("ARVIEW_DEBUG") else " with what ARVIEW_DEBUG=1 prints"
-            say(f"internal error: {type(error).__name__}: {error}; please report this{hint}")
+            say_bug(error)
             ctx.exit(EXIT_BUG)
+
+
+def say_bug(error: Exception) -> None:
+    """One line on an error that nobody foresaw; what Python knows of it when ARVIEW_DEBUG is set."""
+    if os.environ.get("ARVIEW_DEBUG"):
+        traceback.print_exception(error)
+    hint = "" if os.environ.get("ARVIEW_DEBUG") else " with what ARVIEW_DEBUG=1 prints"
+    say(f"internal error: {type(error).__name__}: {error}; please report this{hint}")
 
 
 def say(text: str) -> None:

@@ -148,13 +148,7 @@ def _print(inspection: Inspection, target: Path) -> None:
             )
         for note in system.notes:
             click.echo(f"datums: {note}")
-    width = max(len(component.name) for component in inspection.components)
-    head = ("dx", "dy", "dz", "distance", "U", "tilt")
-    click.echo(
-        f"{'component':{width}}" + "".join(f"{title:>9}" for title in head) + "  verdict       largest term of U"
-    )
-    for component in inspection.components:
-        click.echo(f"{component.name:{width}}{_row(component)}")
+    print_components(inspection)
     for component in inspection.components:
         for note in component.details.notes if component.details else ():
             say(f"{component.name}: {note}")
@@ -176,6 +170,17 @@ def _print(inspection: Inspection, target: Path) -> None:
     if inspection.distance_map is not None and inspection.distance_map.files:
         cloud, *pictures = inspection.distance_map.files
         click.echo(f"wrote {target.parent / cloud} and {len(pictures)} pictures")
+
+
+def print_components(inspection: Inspection) -> None:
+    """A line for each component."""
+    width = max(len(component.name) for component in inspection.components)
+    head = ("dx", "dy", "dz", "distance", "U", "tilt")
+    click.echo(
+        f"{'component':{width}}" + "".join(f"{title:>9}" for title in head) + "  verdict       largest term of U"
+    )
+    for component in inspection.components:
+        click.echo(f"{component.name:{width}}{_row(component)}")
 
 
 def _row(component: ComponentDeviation) -> str:

@@ -34,6 +34,10 @@ class Stages:
         """True when the stage was finished with this key."""
         return self._finished.get(name) == key
 
+    def key(self, name: str) -> str | None:
+        """The key that a stage was finished with, or None."""
+        return self._finished.get(name)
+
     def finish(self, name: str, key: str) -> None:
         """Note that a stage is finished. Call it when the stage's files are complete."""
         self._finished[name] = key
@@ -58,10 +62,10 @@ def key_of(*parts: Any) -> str:
 
 
 def content_key(paths: Iterable[Path]) -> str:
-    """A short hash of the content of files; missing or unreadable ones count by name."""
+    """A short hash of the names and the content of files, wherever they lie; of unreadable ones, the name alone."""
     digest = hashlib.sha256()
     for path in paths:
-        digest.update(str(path).encode())
+        digest.update(path.name.encode())
         try:
             with path.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
