@@ -25,7 +25,7 @@ PAPERS_MM = {
 """Sheets, landscape: width and height."""
 DICTIONARY = "DICT_5X5_100"
 COLUMNS, ROWS = 11, 8
-"""Squares of a board for which nothing was asked: enough corners, markers still legible when it fills half a picture."""
+"""Squares when nothing was asked: many corners, markers still legible when the board fills half a picture."""
 _MARGIN_MM, _STRIP_MM = 10.0, 15.0
 """What printers leave white; and the room for rulers and text below the board (left of it for the upright one)."""
 _PT_PER_MM = 72.0 / 25.4
@@ -201,7 +201,7 @@ def _draw_rulers(stream: Any, sheet: Sheet) -> None:
         stream.set_matrix(*((1, 0, 0, 1) if turn == 0 else (0, 1, -1, 0)), _short(x), _short(y))
         stream.move_to(0, 0)
         stream.line_to(_short(length), 0)
-        for mm in range(0, int(length) + 1):
+        for mm in range(int(length) + 1):
             tick = _TICK_MM * (1.0 if mm % 10 == 0 else 0.7 if mm % 5 == 0 else 0.4)
             stream.move_to(mm, 0)
             stream.line_to(mm, _short(-tick if turn == 0 else tick))

@@ -1,0 +1,229 @@
+"""The camera from views of a board, without those that do not fit, and how sure each of its numbers is.
+
+OpenCV adjusts intrinsics and poses together (Zhang 2000, A flexible new technique for camera calibration); views and
+corners whose residuals stand out are left out, round by round. The covariance is that of the adjustment with the poses
+eliminated, not smaller than what the scatter from view to view says (the sandwich of Huber 1967, clustered by view):
+corners of one picture err together by blur, motion and a board that is not quite flat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arview.calibration.views import LEAST_CORNERS, BoardView
+from arview.camera import Camera
+from arview.errors import InputError
+from arview.geometry import Array, rigid
+
+PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+K = 2.0
+"""Coverage factor of all U here: 95 % of a normal distribution."""
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """What is left out."""
+
+    least_views: int = 5  # poses and nine intrinsics from less are hardly checked by anything
+    view_outlier: float = 2.5  # times the median view's rms: a blurred or bent view
+    view_floor_px: float = 0.15  # views that fit this well are kept, however well the others do
+    corner_outlier: float = 4.5  # robust standard deviations: 1 corner of 25,000 of normal errors
+    rounds: int = 8  # of solving and leaving out
+
+    def __post_init__(self) -> None:
+        if self.least_views < 3 or not (self.view_outlier > 1 and self.corner_outlier > 2 and self.rounds > 0):
+            raise InputError("calibration: expected at least 3 views, and outliers beyond 1 (views) and 2 (corners)")
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A calibrated camera.
+
+    Attributes:
+        camera: of the sensor's picture.
+        covariance: (9,9) of PARAMETERS; infinite where the views do not tell.
+        views: those that were used, without the corners that were left out.
+        cams_from_board: (V,4,4) their poses, mm.
+        residuals: of each view (N,2) px, found minus projected.
+        rms_px: of all residuals, per coordinate.
+        rejected: by name, why a view was left out.
+        corners_left_out: number of them, in views that were kept.
+    """
+
+    camera: Camera
+    covariance: Array
+    views: tuple[BoardView, ...]
+    cams_from_board: Array
+    residuals: tuple[Array, ...]
+    rms_px: float
+    rejected: dict[str, str]
+    corners_left_out: int
+
+    @property
+    def std(self) -> Array:
+        """(9,) standard uncertainty of PARAMETERS."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOptions | None = None) -> Solution:
+    """The camera that took the views, of width × height px.
+
+    Raises:
+        InputError: too few views, or the adjustment breaks down; in words that say what to take.
+    """
+    options = options or SolveOptions()
+    kept, rejected = list(views), dict[str, str]()
+    before = sum(len(view.ids) for view in kept)
+    solution: Solution | None = None
+    for _ in range(options.rounds):
+        if len(kept) < options.least_views:
+            raise InputError(
+                f"only {len(kept)} of {len(views)} views of the board fit together; {options.least_views} are the"
+                " least, 20 are good: hold the board flat and still, in focus, and take it from many sides"
+            )
+        solution = _adjust(kept, width, height, None if solution is None else solution.camera)
+        bad = _bad_views(solution, options)
+        rejected |= bad
+        trimmed = [_without_outliers(view, r, options) for view, r in zip(kept, solution.residuals, strict=True)]
+        changed = bool(bad) or any(len(a.ids) != len(b.ids) for a, b in zip(kept, trimmed, strict=True))
+        if not changed:
+            break
+        kept = [view for view in trimmed if view.name not in bad and len(view.ids) >= LEAST_CORNERS]
+    if solution is None:
+        raise InputError("no views of the board")
+    gone = {view.name for view in views} - {view.name for view in solution.views} - set(rejected)
+    rejected |= dict.fromkeys(gone, "most of its corners do not fit")
+    lost = before - sum(len(v.ids) for v in views if v.name in rejected) - sum(len(v.ids) for v in solution.views)
+    return replace(solution, rejected=rejected, corners_left_out=lost)
+
+
+def information(view: BoardView, camera: Camera, cam_from_board: Array) -> tuple[Array, Array]:
+    """(9,9) information on PARAMETERS of a view's corners at 1 px, its pose unknown; and (N·2,9) their Jacobian."""
+    _, intrinsics, pose = _project(view.points_in_board, camera, cam_from_board)
+    # What a change of the pose explains as well says nothing of the camera.
+    basis, _ = np.linalg.qr(pose)
+    left = intrinsics - basis @ (basis.T @ intrinsics)
+    return left.T @ left, left
+
+
+def pixel_uncertainty(solution: Solution, pixels: Array) -> Array:
+    """(N,) expanded uncertainty (px, k = 2, of the worst direction) of where a ray is seen, at pixels (N,2).
+
+    What a rotation of the camera explains as well is taken out over these pixels: no use of a camera notices it.
+    """
+    rays = solution.camera.unproject(pixels)
+    _, intrinsics, pose = _project(rays, solution.camera, np.eye(4))
+    basis, _ = np.linalg.qr(pose[:, :3])
+    field = intrinsics - basis @ (basis.T @ intrinsics)
+    if not np.isfinite(solution.covariance).all():
+        return np.full(len(pixels), np.inf)
+    blocks = field.reshape(-1, 2, 9)
+    covariance = np.einsum("nij,jk,nlk->nil", blocks, solution.covariance, blocks)
+    return K * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
+
+
+def pixel_difference(camera: Camera, other: Camera, pixels: Array) -> Array:
+    """(N,2) px: where ``other`` sees the rays that ``camera`` sees at pixels (N,2), less the best rotation."""
+    rays = camera.unproject(pixels)
+    _, _, pose = _project(rays, camera, np.eye(4))
+    basis, _ = np.linalg.qr(pose[:, :3])
+    moved = (other.project(rays) - pixels).ravel()
+    return np.asarray(moved - basis @ (basis.T @ moved)).reshape(-1, 2)
+
+
+def picture_grid(width: int, height: int, columns: int = 9, rows: int = 7) -> Array:
+    """(columns·rows,2) pixels from corner to corner of the picture, row by row."""
+    u, v = np.meshgrid(np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows))
+    return np.stack([u.ravel(), v.ravel()], axis=1)
+
+
+# --- adjustment ----------------------------------------------------------------------------------------------
+
+
+def _adjust(views: Sequence[BoardView], width: int, height: int, start: Camera | None) -> Solution:
+    import cv2
+
+    objects = [view.points_in_board.astype(np.float32)[:, None] for view in views]
+    images = [view.pixels.astype(np.float32)[:, None] for view in views]
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+    matrix, dist = (None, None) if start is None else (start.matrix, start.dist.copy())
+    flags = 0 if start is None else cv2.CALIB_USE_INTRINSIC_GUESS
+    try:
+        _, k, d, turns, shifts = cv2.calibrateCamera(
+            objects, images, (width, height), matrix, dist, flags=flags, criteria=criteria
+        )
+        found = Camera(width, height, *(float(k[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))), np.ravel(d)[:5])
+    except (cv2.error, InputError, ValueError) as error:
+        raise InputError(
+            "no camera explains the views of the board; tilt it by 20° to 45° to all sides, bring it near and far, and"
+            " check that --board is the one in the pictures"
+        ) from error
+    poses = np.array([
+        rigid(cv2.Rodrigues(np.asarray(turn))[0], np.asarray(shift).ravel())
+        for turn, shift in zip(turns, shifts, strict=True)
+    ])  # fmt: skip
+    residuals = [
+        view.pixels - _project(view.points_in_board, found, pose)[0] for view, pose in zip(views, poses, strict=True)
+    ]
+    covariance = _covariance(views, found, poses, residuals)
+    rms = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
+    return Solution(found, covariance, tuple(views), poses, tuple(residuals), rms, {}, 0)
+
+
+def _covariance(views: Sequence[BoardView], camera: Camera, poses: Array, residuals: Sequence[Array]) -> Array:
+    """(9,9), of the adjustment's own and of the scatter between views the larger, parameter by parameter."""
+    total, scatter, squares = np.zeros((9, 9)), np.zeros((9, 9)), 0.0
+    for view, pose, residual in zip(views, poses, residuals, strict=True):
+        one, jacobian = information(view, camera, pose)
+        score = jacobian.T @ residual.ravel()
+        total += one
+        scatter += np.outer(score, score)
+        squares += float(np.sum(residual**2))
+    count = 2 * sum(len(view.ids) for view in views)
+    freedom = count - 6 * len(views) - 9
+    size = np.sqrt(np.maximum(np.diag(total), 1e-30))
+    values, vectors = np.linalg.eigh(total / np.outer(size, size))
+    if freedom <= 0 or values[0] < 1e-12:
+        return np.full((9, 9), np.inf)
+    inverse = (vectors / values) @ vectors.T / np.outer(size, size)
+    own = inverse * squares / freedom
+    # As many views as there are numbers leave no scatter: degrees of freedom as in HC1 of MacKinnon and White (1985).
+    between = inverse @ scatter @ inverse * len(views) / max(1.0, len(views) - 9.0 / 2.0)
+    grow = np.sqrt(np.maximum(1.0, np.diag(between) / np.diag(own)))
+    return np.asarray(own * np.outer(grow, grow))
+
+
+def _project(points: Array, camera: Camera, cam_from_points: Array) -> tuple[Array, Array, Array]:
+    """Pixels (N,2), and their derivatives (2N,9) by PARAMETERS and (2N,6) by rotation vector and shift."""
+    import cv2
+
+    turn = cv2.Rodrigues(cam_from_points[:3, :3])[0]
+    pixels, jacobian = cv2.projectPoints(
+        np.asarray(points, dtype=np.float64)[:, None], turn, cam_from_points[:3, 3], camera.matrix, camera.dist
+    )
+    return pixels.reshape(-1, 2), np.asarray(jacobian[:, 6:15]), np.asarray(jacobian[:, :6])
+
+
+def _bad_views(solution: Solution, options: SolveOptions) -> dict[str, str]:
+    """Views that fit much worse than the others, at most a third of them at once, the worst first."""
+    rms = np.array([np.sqrt(np.mean(residual**2)) for residual in solution.residuals])
+    # Of each view the robust size: a single wrong corner is left out by itself.
+    size = np.array([np.median(np.abs(residual)) / 0.6745 for residual in solution.residuals])
+    usual = float(np.median(size))
+    limit = max(options.view_outlier * usual, options.view_floor_px)
+    bad = [int(i) for i in np.argsort(-size) if size[i] > limit][: max(1, len(rms) // 3)]
+    return {
+        solution.views[i].name: f"does not fit the others ({rms[i]:.2f} px, the others {usual:.2f} px)" for i in bad
+    }
+
+
+def _without_outliers(view: BoardView, residual: Array, options: SolveOptions) -> BoardView:
+    length = np.linalg.norm(residual, axis=1)
+    # The median length of a two-dimensional normal error is 1.1774 σ.
+    keep = length < options.corner_outlier * max(float(np.median(length)) / 1.1774, 0.02)
+    if keep.all():
+        return view
+    return replace(view, ids=view.ids[keep], points_in_board=view.points_in_board[keep], pixels=view.pixels[keep])

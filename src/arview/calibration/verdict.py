@@ -1,0 +1,160 @@
+"""Whether a calibration is good enough, in words: what the views cover, how sure the numbers are, what to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from arview.calibration.solve import PARAMETERS, K, Solution, picture_grid, pixel_uncertainty
+from arview.geometry import Array
+
+
+class Grade(StrEnum):
+    """What a calibration is worth."""
+
+    GOOD = "good"
+    USABLE = "usable"
+    NOT_ENOUGH = "not enough"
+
+
+@dataclass(frozen=True)
+class VerdictOptions:
+    """Limits of the grades; lengths in px as shares of the picture's diagonal."""
+
+    good_focal: float = 0.002  # U of the focal length: 0.2 % of the distance, 1 mm at arm's length
+    usable_focal: float = 0.01  # beyond, a guess from EXIF data is as good
+    good_pixel: float = 5e-4  # U of where a ray is seen, at the worst of 63 places: 1 px at 1080p
+    usable_pixel: float = 3e-3
+    usable_rms: float = 1e-3  # residuals: above, the board is not flat, or it is not this board
+    good_coverage: float = 0.7  # share of the picture's cells with a corner of the board
+    usable_coverage: float = 0.4
+    tilted_deg: float = 20.0  # a view tilted by more tells the focal length
+    least_tilted: int = 4  # such views, to at least two sides
+    good_range: float = 1.3  # farthest over nearest board
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A calibration judged.
+
+    Attributes:
+        grade: the whole.
+        focal_u: U of the focal length, relative.
+        centre_u_px: U of the principal point.
+        pixel_u_px: U of where a ray is seen: median and worst over the picture.
+        coverage: share of the picture's 8×6 cells that hold a corner.
+        cells: (6,8) corners in each cell.
+        tilts_deg: smallest, median, largest angle between the board's normal and the line of sight.
+        distance_ratio: farthest over nearest board.
+        reasons: why it is not better.
+        advice: what to do about it.
+    """
+
+    grade: Grade
+    focal_u: float
+    centre_u_px: float
+    pixel_u_px: tuple[float, float]
+    coverage: float
+    cells: Array
+    tilts_deg: tuple[float, float, float]
+    distance_ratio: float
+    reasons: tuple[str, ...]
+    advice: tuple[str, ...]
+
+
+def judge(solution: Solution, options: VerdictOptions | None = None) -> Judgement:
+    """The calibration against the limits, with what to do when it is not good."""
+    options = options or VerdictOptions()
+    camera = solution.camera
+    diagonal = float(np.hypot(camera.width, camera.height))
+    std = dict(zip(PARAMETERS, solution.std, strict=True))
+    focal_u = K * float(max(std["fx"] / camera.fx, std["fy"] / camera.fy))
+    centre_u = K * float(max(std["cx"], std["cy"]))
+    pixel_u = pixel_uncertainty(solution, picture_grid(camera.width, camera.height))
+    cells = _cells(solution)
+    coverage = float(np.mean(cells > 0))
+    tilts, sides, distances = _attitudes(solution, options.tilted_deg)
+    ratio = float(distances.max() / distances.min())
+    worst = float(pixel_u.max())
+
+    grades = [
+        _grade(focal_u, options.good_focal, options.usable_focal),
+        _grade(worst / diagonal, options.good_pixel, options.usable_pixel),
+        _grade(solution.rms_px / diagonal, 0.5 * options.usable_rms, options.usable_rms),
+        _grade(-coverage, -options.good_coverage, -options.usable_coverage),
+    ]
+    reasons = [
+        f"the focal length is known to ± {100 * focal_u:.2f} % only" if np.isfinite(focal_u)
+        else "the views do not tell the focal length",
+        f"a ray at the worst place of the picture is known to ± {worst:.2f} px only" if np.isfinite(worst)
+        else "the views do not tell where rays are seen",
+        f"the corners scatter by {solution.rms_px:.2f} px",
+        f"corners of the board were seen in {100 * coverage:.0f} % of the picture only",
+    ]  # fmt: skip
+    why = [reason for reason, grade in zip(reasons, grades, strict=True) if grade is not Grade.GOOD]
+    order = list(Grade)
+    grade = max(grades, key=order.index)
+    advice: list[str] = []
+    if grade is not Grade.GOOD:
+        tilted = int(np.sum(tilts >= options.tilted_deg))
+        focal_is_poor = grades[0] is not Grade.GOOD
+        if focal_is_poor and (tilted < options.least_tilted or sides < 2):
+            advice.append("tilt the board more, by 30° to 45°, to the left, the right, upwards and downwards")
+        if grades[1] is not Grade.GOOD or grades[3] is not Grade.GOOD:
+            missing = _empty_corners(cells)
+            where = f": none was seen in the {', '.join(missing)}" if missing else ""
+            advice.append(f"bring the board to the corners and edges of the picture{where}")
+        if focal_is_poor and ratio < options.good_range:
+            advice.append("take it from nearer and from farther: once filling the picture, once half of it")
+        if len(solution.views) < 15:
+            advice.append(f"take more views: {len(solution.views)} were used, 20 to 40 are good")
+        if grades[2] is not Grade.GOOD:
+            advice.append(
+                "glue the board on something flat (glass, aluminium), hold still, use more light, and lock the focus"
+            )
+        if not advice:
+            advice.append("take more views, tilted to all sides, with the board filling the picture")
+    return Judgement(
+        grade, focal_u, centre_u, (float(np.median(pixel_u)), worst), coverage, cells,
+        (float(tilts.min()), float(np.median(tilts)), float(tilts.max())), ratio, tuple(why), tuple(advice),
+    )  # fmt: skip
+
+
+def _grade(value: float, good: float, usable: float) -> Grade:
+    if value <= good:
+        return Grade.GOOD
+    return Grade.USABLE if value <= usable else Grade.NOT_ENOUGH
+
+
+def _cells(solution: Solution) -> Array:
+    pixels = np.concatenate([view.pixels for view in solution.views])
+    camera = solution.camera
+    sides = (-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5)
+    upright = camera.height > camera.width
+    shape = (8, 6) if upright else (6, 8)
+    return np.histogram2d(pixels[:, 1], pixels[:, 0], bins=shape, range=sides)[0]
+
+
+def _attitudes(solution: Solution, tilted_deg: float) -> tuple[Array, int, Array]:
+    """Tilt of each view in degrees; to how many of four sides tilted ones lean; distances of their middles in mm."""
+    tilts, distances = [], []
+    sides: set[int] = set()
+    for view, pose in zip(solution.views, solution.cams_from_board, strict=True):
+        middle = pose[:3, :3] @ view.points_in_board.mean(axis=0) + pose[:3, 3]
+        sight = middle / np.linalg.norm(middle)
+        normal = pose[:3, 2]
+        tilts.append(float(np.degrees(np.arccos(np.clip(abs(normal @ sight), 0.0, 1.0)))))
+        distances.append(float(np.linalg.norm(middle)))
+        across = normal - (normal @ sight) * sight
+        if tilts[-1] >= tilted_deg:
+            sides.add(int(np.floor(np.arctan2(across[1], across[0]) / (np.pi / 2))))
+    return np.array(tilts), len(sides), np.array(distances)
+
+
+def _empty_corners(cells: Array) -> list[str]:
+    names = {
+        "upper left": (0, 0), "upper right": (0, -1), "lower left": (-1, 0), "lower right": (-1, -1),
+    }  # fmt: skip
+    return [name for name, place in names.items() if cells[place] == 0]
