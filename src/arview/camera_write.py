@@ -111,7 +111,8 @@ def _ros(camera: Camera) -> str:
 
 def _colmap(camera: Camera) -> str:
     k1, k2, p1, p2, k3 = (float(value) for value in camera.dist)
-    model, terms = "PINHOLE", []
+    model = "PINHOLE"
+    terms: list[float] = []
     if camera.is_distorted:
         model, terms = ("FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]) if k3 else ("OPENCV", [k1, k2, p1, p2])
     numbers = [camera.fx, camera.fy, camera.cx + _COLMAP_HALF_PX, camera.cy + _COLMAP_HALF_PX, *terms]

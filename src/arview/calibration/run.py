@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -69,8 +69,8 @@ def calibrate(
     if len(sightings.views) < least:
         why = "; ".join(f"{name} {reason}" for name, reason in list(sightings.rejected.items())[:3])
         raise InputError(
-            f"{sightings.label}: the board is seen in {len(sightings.views)} of {sightings.looked_at} pictures, at least"
-            f" {least} are needed, 20 are good" + (f" ({why})" if why else "")
+            f"{sightings.label}: the board is seen in {len(sightings.views)} of {sightings.looked_at} pictures, at"
+            f" least {least} are needed, 20 are good" + (f" ({why})" if why else "")
         )
     try:
         views, left_out = choose_views(sightings.views, sightings.width, sightings.height, choice)
@@ -109,15 +109,10 @@ def record_of(calibration: Calibration) -> dict[str, Any]:
             "focal_uncertainty": plain(judged.focal_u),
             "pixel_uncertainty_px": {"median": plain(judged.pixel_u_px[0]), "worst": plain(judged.pixel_u_px[1])},
             "coverage": judged.coverage,
-            "tilts_deg": {key: value for key, value in zip(("least", "median", "most"), judged.tilts_deg, strict=True)},
+            "tilts_deg": dict(zip(("least", "median", "most"), judged.tilts_deg, strict=True)),
             "distance_ratio": judged.distance_ratio,
             "quarter_turns_clockwise": seen.quarter_turns_clockwise,
             "rejected": calibration.rejected,
         },
         "lens": calibration.lens,
     }
-
-
-def upright_camera(calibration: Calibration) -> Camera:
-    """The camera of the upright pictures, for programs that know nothing of the turn."""
-    return replace(calibration.camera).rotated(calibration.sightings.quarter_turns_clockwise)

@@ -155,7 +155,8 @@ def _adjust(views: Sequence[BoardView], width: int, height: int, start: Camera |
         _, k, d, turns, shifts = cv2.calibrateCamera(
             objects, images, (width, height), matrix, dist, flags=flags, criteria=criteria
         )
-        found = Camera(width, height, *(float(k[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))), np.ravel(d)[:5])
+        fx, fy, cx, cy = (float(k[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        found = Camera(width, height, fx, fy, cx, cy, np.ravel(d)[:5])
     except (cv2.error, InputError, ValueError) as error:
         raise InputError(
             "no camera explains the views of the board; tilt it by 20° to 45° to all sides, bring it near and far, and"
