@@ -2,7 +2,7 @@
 
 Formats are told apart by what is in the file, not by its name: arview's JSON, BOP ``camera.json`` and
 ``scene_camera.json``, OpenCV FileStorage (YAML, XML, JSON), ROS ``camera_info`` YAML, COLMAP ``cameras.txt``.
-Besides files, ``fov:DEG`` and ``exif`` are understood.
+Besides files, ``fov:DEG``, ``exif``, ``profile`` and ``profile:NAME`` are understood.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from arview.camera import Camera
+from arview.camera_profiles import find_profile
 from arview.errors import ArviewError, InputError, MismatchError, OutputError
 from arview.photo_exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, focal_length_px, read_exif
 
@@ -59,10 +60,12 @@ def load_camera(
 
     Args:
         spec: path of a camera file (formats: see the module), ``fov:DEG`` (field of view in degrees along
-            the longer side of the frame) or ``exif`` (focal length from the first photo of ``source``).
+            the longer side of the frame), ``exif`` (focal length from the first photo of ``source``),
+            ``profile:NAME`` or ``profile`` (a calibration kept by `arview calibrate --profile`; the latter by what
+            ``source`` says of its camera).
         width: width of the frames in px as the tracker sees them; None takes the file's size.
         height: height of the frames in px; given together with ``width``.
-        source: photo, folder or glob of photos that ``exif`` reads.
+        source: photo, folder or glob of photos that ``exif`` reads; or video, for ``profile``.
         quarter_turns_clockwise: turns that the video source has already applied to its frames. The camera
             is turned with them, unless the file already describes the turned size.
 
@@ -75,7 +78,7 @@ def load_camera(
         return _camera_from_fov(text, width, height)
     if text == "exif":
         return _camera_from_exif(source, width, height)
-    path = Path(text)
+    path = find_profile(text, source) if text == "profile" or text.startswith("profile:") else Path(text)
     entry = _only_entry(_read_entries(path), path)
     turns = quarter_turns_clockwise % 4
     if turns == 0 or width is None or height is None:

@@ -1,6 +1,18 @@
 """The command line: parse, call one function, print. Everything heavy is imported inside the commands."""
 
-from arview.cli import export, history, inspect, live, measure, reconstruct, report, study, tracking
+from arview.cli import calibrate, export, history, inspect, live, measure, reconstruct, report, study, tracking
 from arview.cli.common import main
 
-__all__ = ["export", "history", "inspect", "live", "main", "measure", "reconstruct", "report", "study", "tracking"]
+__all__ = [
+    "calibrate",
+    "export",
+    "history",
+    "inspect",
+    "live",
+    "main",
+    "measure",
+    "reconstruct",
+    "report",
+    "study",
+    "tracking",
+]

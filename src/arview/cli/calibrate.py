@@ -1,0 +1,252 @@
+"""The commands calibrate …: a board to print, and the camera from photos or a video of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from arview.cli.common import main, output_path, progress_bar, say, write_bytes
+from arview.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from arview.calibration.run import Calibration
+
+EXIT_NOT_ENOUGH = 4
+
+
+class _WithDefault(click.Group):
+    """A group whose command ``lens`` need not be named: ``arview calibrate PHOTOS …``."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if args and args[0] not in self.commands and args[0] not in ("-h", "--help"):
+            args = ["lens", *args]
+        return super().parse_args(ctx, args)
+
+
+@main.group(
+    cls=_WithDefault,
+    short_help="Calibrate a camera from pictures of a ChArUco board.",
+    epilog="""\b
+Examples:
+  arview calibrate board -o board.pdf
+  arview calibrate photos/ --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json
+  arview calibrate clip.mp4 --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json --plot camera.png --profile
+
+\b
+1. Print the board (actual size), glue it on something flat. 2. Take 20 to 40 photos of it, or a slow video of a
+minute, in the mode and with the zoom that will be used, focus locked: tilted by 30° to 45° to all sides, from near
+and far, and so that it reaches every corner of the picture. 3. `arview calibrate PHOTOS` is short for
+`arview calibrate lens PHOTOS`; `arview calibrate lens --help` has its options.""",
+)
+def calibrate() -> None:
+    """Calibrate a camera: print a board, photograph it, get the camera with its uncertainty."""
+
+
+@calibrate.command(
+    short_help="A ChArUco board to print, PDF in true scale.",
+    epilog="""\b
+Examples:
+  arview calibrate board -o board.pdf
+  arview calibrate board -o board.pdf --paper A3
+  arview calibrate board -o board.pdf --paper 600x400 --squares 14x9
+  arview calibrate board -o board.pdf --board charuco:9x6:25:18:DICT_4X4_50
+
+\b
+Without --board the squares are as large as fit on the paper. Print at 100 % ("actual size"); two rulers on the page
+show whether the printer kept it. What to give to `arview calibrate --board` is on the page too.""",
+)
+@click.option("-o", "--output", required=True, metavar="PDF", help="File to write.")
+@click.option("--paper", default="A4", show_default=True, metavar="SIZE",
+              help="A4 to A0, letter, tabloid (landscape), or WIDTHxHEIGHT in mm.")  # fmt: skip
+@click.option("--squares", metavar="COLUMNSxROWS", help="Number of squares.  [default: 11x8]")
+@click.option("--board", "board_spec", metavar="SPEC", help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY.")
+def board(output: str, paper: str, squares: str | None, board_spec: str | None) -> None:
+    """Write a ChArUco board as PDF whose lengths are exact."""
+    from arview.calibration.board import board_pdf, fit_board, parse_paper, place_board, spec_of
+    from arview.reconstruction.scale import parse_board
+
+    target = output_path(output, [])
+    size = parse_paper(paper)
+    if board_spec and squares:
+        raise InputError("--board says the number of squares too; leave out --squares")
+    one = parse_board(board_spec) if board_spec else fit_board(size, *_parse_squares(squares))
+    sheet = place_board(one, size)
+    write_bytes(target, board_pdf(sheet))
+    click.echo(
+        f"{one}, {sheet.width_mm:g}×{sheet.height_mm:g} mm: print it at 100 %; both rulers must measure"
+        f" {sheet.ruler_mm:g} mm"
+    )
+    click.echo(f"then: arview calibrate PHOTOS --board {spec_of(one)} -o camera.json")
+    click.echo(f"wrote {target}")
+
+
+@calibrate.command(
+    name="lens",
+    short_help="The camera from photos or a video of the board (the default).",
+    epilog="""\b
+Examples:
+  arview calibrate photos/ --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json
+  arview calibrate clip.mp4 --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json --plot camera.png
+  arview calibrate *.heic --board charuco:11x8:21:16:DICT_5X5_100 --profile
+  arview calibrate photos/ --board charuco:9x6:25:18:DICT_4X4_50 -o camera.json -o ros:info.yaml -o cameras.txt
+
+\b
+-o may be given several times: .json is arview's own format (with uncertainties, covariance and verdict beside the
+numbers), .yaml and .xml OpenCV's, .txt COLMAP's; FORMAT:FILE asks for another: arview, bop, opencv, opencv-xml,
+opencv-json, ros, colmap. The camera is that of the sensor's picture: portrait and landscape photos of one phone give
+one camera, and the other commands turn it as they turn pictures.
+
+\b
+--profile keeps the calibration by make, model, focal length and size of the pictures, or by the name that is given:
+`--camera profile:NAME` in the other commands, and `--camera profile` where the pictures say what took them.
+`arview calibrate profiles` lists them. A calibration that is not enough is not written, unless --anyway.
+
+\b
+Exit codes: 0 good or usable, 4 not enough, 2 bad input, 130 interrupted.""",
+)
+@click.argument("sources", nargs=-1, required=True, metavar="PHOTOS...|VIDEO")
+@click.option("--board", "board_spec", required=True, metavar="SPEC",
+              help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, as printed on the board.")  # fmt: skip
+@click.option("-o", "--output", "outputs", multiple=True, metavar="[FORMAT:]CAMERA", help="Camera file to write.")
+@click.option("--profile", is_flag=False, flag_value="", metavar="[NAME]", help="Also keep it as a profile.")
+@click.option("--plot", metavar="PNG", help="Corners, residuals and uncertainty over the picture (png, svg, pdf).")
+@click.option("--max-views", type=click.IntRange(min=5), default=40, show_default=True, metavar="N",
+              help="Views to calibrate from, the most telling of those found.")  # fmt: skip
+@click.option("--anyway", is_flag=True, help="Write the camera though the views are not enough.")
+def lens(
+    sources: tuple[str, ...],
+    board_spec: str,
+    outputs: tuple[str, ...],
+    profile: str | None,
+    plot: str | None,
+    max_views: int,
+    anyway: bool,
+) -> None:
+    """Calibrate the camera that took PHOTOS (files, folders, globs), or VIDEO, of a ChArUco board."""
+    from arview.calibration.choose import ChoiceOptions
+    from arview.calibration.run import calibrate as run
+    from arview.calibration.run import record_of
+    from arview.camera_profiles import profile_name, profile_path
+    from arview.camera_write import holds_distortion, write_camera
+    from arview.reconstruction.scale import parse_board
+
+    if not outputs and profile is None:
+        raise InputError("nothing to write: give -o camera.json or --profile")
+    targets: list[tuple[str, Path]] = []
+    for text in outputs:
+        kind, name = _format_and_path(text)
+        targets.append((kind, output_path(name, [*sources, *(other for _, other in targets)])))
+    picture = None if plot is None else output_path(plot, [*sources, *(path for _, path in targets)])
+    if profile:
+        profile_path(profile)
+    one = parse_board(board_spec)
+    with progress_bar("looking for the board") as progress:
+        choice = ChoiceOptions(most=max_views, candidates=max(max_views, ChoiceOptions.candidates))
+        result = run(sources, one, choice, progress=progress)
+    _print(result)
+    if picture is not None:
+        from arview.calibration.plot import draw
+
+        write_bytes(picture, draw(result, picture.suffix.lower().removeprefix(".")))
+        click.echo(f"wrote {picture}")
+    not_enough = result.judgement.grade.value == "not enough"
+    if not_enough and not (anyway and np.isfinite(result.solution.covariance).all()):
+        say("no camera was written; do as advised" + ("" if anyway else ", or take it --anyway"))
+        click.get_current_context().exit(EXIT_NOT_ENOUGH)
+    extra = record_of(result)
+    if profile is not None:
+        kept = profile_path(profile or profile_name(result.lens))
+        if not profile and not result.lens.get("model"):
+            raise InputError("--profile: the pictures do not say what took them; give --profile NAME")
+        try:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{kept.parent}: cannot be made ({error.strerror or error})") from error
+        targets.append(("arview", kept))
+        say(f"use it with --camera profile:{kept.stem}")
+    for kind, path in targets:
+        if not holds_distortion(kind) and result.camera.is_distorted:
+            say(f"warning: {path}: BOP files hold no distortion; it is for pictures that were undistorted with it")
+        write_camera(result.camera, path, kind, extra)
+        click.echo(f"wrote {path}")
+    if not_enough:
+        click.get_current_context().exit(EXIT_NOT_ENOUGH)
+
+
+@calibrate.command(short_help="The calibrations that are kept.")
+def profiles() -> None:
+    """List the profiles that `--profile` has kept, and where they are."""
+    from arview.camera_profiles import list_profiles, profile_folder
+
+    found = list_profiles()
+    for one in found:
+        words = [one.lens.get("make"), one.lens.get("model"), f"{one.lens.get('width')}×{one.lens.get('height')}"]
+        click.echo(f"{one.name:40} {' '.join(str(word) for word in words if word)}")
+    click.echo(f"{len(found)} profile{'' if len(found) == 1 else 's'} in {profile_folder()}")
+
+
+def _format_and_path(text: str) -> tuple[str, str]:
+    from arview.camera_write import FORMATS, format_of
+
+    kind, colon, path = text.partition(":")
+    if colon and kind in FORMATS:
+        return kind, path
+    return format_of(Path(text)), text
+
+
+def _parse_squares(text: str | None) -> tuple[int | None, int | None]:
+    if text is None:
+        return None, None
+    columns, _, rows = text.lower().partition("x")
+    if not (columns.isdecimal() and rows.isdecimal() and 3 <= int(columns) <= 60 and 3 <= int(rows) <= 60):
+        raise InputError(f"--squares {text!r}: expected COLUMNSxROWS, 3 to 60 each, e.g. 11x8")
+    return int(columns), int(rows)
+
+
+def _print(result: Calibration) -> None:
+    """What was seen, the camera with U, the verdict and what to do; doubts go to stderr."""
+    seen, solution, judged = result.sightings, result.solution, result.judgement
+    for warning in seen.warnings:
+        say(f"warning: {warning}")
+    reasons: dict[str, list[str]] = {}
+    for name, reason in result.rejected.items():
+        reasons.setdefault(reason, []).append(name)
+    for reason, names in list(reasons.items())[:12]:
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        say(f"left out {', '.join(names[:3])}{more}: {reason}")
+    if len(reasons) > 12:
+        say(f"left out {sum(len(names) for names in list(reasons.values())[12:])} more, each for its reason")
+    corners = sum(len(view.ids) for view in solution.views)
+    click.echo(
+        f"board found in {len(seen.views)} of {seen.looked_at} pictures of {seen.width}×{seen.height} px;"
+        f" {len(solution.views)} views with {corners} corners used, residuals {solution.rms_px:.3f} px rms"
+    )
+    for line in _camera_lines(result):
+        click.echo(line)
+    least, _, most = judged.tilts_deg
+    click.echo(
+        f"coverage: {100 * judged.coverage:.0f} % of the picture, tilts {least:.0f}° to {most:.0f}°, farthest view"
+        f" {judged.distance_ratio:.1f} × the nearest"
+    )
+    click.echo(f"verdict: {judged.grade.value}" + (f": {'; '.join(judged.reasons)}" if judged.reasons else ""))
+    for advice in judged.advice:
+        click.echo(f"advice: {advice}")
+
+
+def _camera_lines(result: Calibration) -> list[str]:
+    camera, judged = result.camera, result.judgement
+    values: Any = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist]
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    cells = [
+        f"{name} {value:{form}} ± {2 * std:{form}}"
+        for name, value, std, form in zip(names, values, result.solution.std, [".2f"] * 4 + [".5f"] * 5, strict=True)
+    ]
+    worst = f"{judged.pixel_u_px[0]:.2f} px in the median, {judged.pixel_u_px[1]:.2f} px at worst"
+    return [
+        f"camera: {', '.join(cells[:4])} px",
+        f"lens: {', '.join(cells[4:])}",
+        f"uncertainty (k = 2): focal length {100 * judged.focal_u:.2f} %, where a ray is seen {worst}",
+    ]
