@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import importlib.util
 import logging
 import os
@@ -210,6 +211,8 @@ async def _serve(
             return load_subject(part_path, unit, views_path, options, GuideViewOptions(renderer=renderer), progress)
 
     def ready(hub: Hub) -> None:
+        gc.collect()
+        gc.freeze()  # what is loaded stays: the collector need not look at it again while phones wait
         _print_welcome(server, server.place)
         if hub.subject is not None:
             for notice in hub.subject.notices():

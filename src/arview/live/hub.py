@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import time
 from collections.abc import Sequence
@@ -261,6 +262,8 @@ class Hub:
                 await asyncio.to_thread(self.recordings.forget, client.feed)
             await asyncio.to_thread(client.feed.close)
             await asyncio.to_thread(client.drawing.close)
+            # A peer connection and a session are full of cycles: without this some thirty of them pile up first.
+            await asyncio.to_thread(gc.collect)
 
     def _record_phone(self, recordings: Recordings, client: Client, path: Path) -> None:
         """Record a phone from its first frame: OUT.mp4, then the next of OUT-2.mp4, OUT-3.mp4, ... that is free."""
