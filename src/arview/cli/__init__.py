@@ -1,6 +1,6 @@
 """The command line: parse, call one function, print. Everything heavy is imported inside the commands."""
 
-from arview.cli import calibrate, export, history, inspect, live, measure, reconstruct, report, study, tracking
+from arview.cli import calibrate, export, history, inspect, live, measure, reconstruct, report, study, tracking, verify
 from arview.cli.common import main
 
 __all__ = [
@@ -15,4 +15,5 @@ __all__ = [
     "report",
     "study",
     "tracking",
+    "verify",
 ]

@@ -1,0 +1,282 @@
+"""Measured places and known lengths, from the files that hold them.
+
+Measured: an ``inspection.json`` (the middles of components), or a CSV of points. Known: the calibration certificate of
+an artefact as TOML or CSV, or the ``truth.json`` of a rendered sample, which knows the lengths exactly.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arview.errors import InputError
+from arview.geometry import Array, apply, check_rigid
+
+K = 2.0
+"""Coverage factor of all U here."""
+_ARTEFACT_KEYS = ("name", "certificate", "length")
+_LENGTH_KEYS = ("between", "mm", "U_mm")
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A measured place: (3,) mm, and its covariance (3,3), None when none was stated."""
+
+    place: Array
+    covariance: Array | None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured.
+
+    Attributes:
+        label: the file.
+        marks: by name.
+        nominal: by name, where the middle of a component is in the CAD: what a rendered truth moves; may be empty.
+        scale_std: relative standard uncertainty of all lengths together.
+        absent: by name, why a component has no place.
+    """
+
+    label: str
+    marks: dict[str, Mark]
+    nominal: dict[str, Array]
+    scale_std: float
+    absent: dict[str, str]
+
+
+@dataclass(frozen=True)
+class KnownLength:
+    """A length between two marks with its expanded uncertainty (k = 2), mm."""
+
+    first: str
+    second: str
+    mm: float
+    uncertainty_mm: float = 0.0
+
+
+def read_measured(path: str | Path) -> Measured:
+    """Measured places of an ``inspection.json``, or of a CSV with the columns name, x, y, z and perhaps U_mm.
+
+    Raises:
+        InputError: unreadable, of another kind, or without any measured place.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "inspection.json"
+    text = _text_of(path)
+    measured = _of_inspection(path) if text.lstrip().startswith("{") else _of_points(path, text)
+    if len(measured.marks) < 2:
+        why = "; ".join(f"{name}: {reason}" for name, reason in list(measured.absent.items())[:3])
+        raise InputError(
+            f"{path}: {len(measured.marks)} places were measured, a length needs two" + (f" ({why})" if why else "")
+        )
+    return measured
+
+
+def read_known(path: str | Path, measured: Measured) -> list[KnownLength]:
+    """Known lengths of a TOML or CSV file, or of a ``truth.json``: then between all measured components.
+
+    TOML has ``[[length]]`` with ``between = ["a", "b"]``, ``mm`` and perhaps ``U_mm`` (k = 2); CSV the columns from,
+    to, mm and perhaps U_mm.
+
+    Raises:
+        InputError: unreadable, of another kind, twice the same length, or no length.
+    """
+    path = Path(path)
+    text = _text_of(path)
+    if text.lstrip().startswith("{"):
+        lengths = _of_truth(path, text, measured)
+    elif path.suffix.lower() == ".csv":
+        lengths = [
+            _length(f"{path}: line {number}", (row.get("from"), row.get("to")), row.get("mm"), row.get("U_mm"))
+            for number, row in _rows(path, text, ("from", "to", "mm"))
+        ]
+    else:
+        lengths = _of_artefact(path, text)
+    if not lengths:
+        raise InputError(f"{path}: holds no length; expected [[length]] with between, mm and U_mm")
+    seen: set[frozenset[str]] = set()
+    for one in lengths:
+        pair = frozenset((one.first, one.second))
+        if pair in seen:
+            raise InputError(f"{path}: the length from {one.first} to {one.second} is there twice")
+        seen.add(pair)
+    return lengths
+
+
+def covariance_of_lengths(measured: Measured, pairs: Sequence[tuple[str, str]]) -> Array | None:
+    """(N,N) covariance of measured lengths, mm²; None when a place has none.
+
+    Places err independently, lengths that share one do not; a wrong scale makes all of them wrong together.
+    """
+    names = sorted({name for pair in pairs for name in pair})
+    column = {name: 3 * k for k, name in enumerate(names)}
+    jacobian = np.zeros((len(pairs), 3 * len(names)))
+    whole = np.zeros((3 * len(names), 3 * len(names)))
+    lengths = np.zeros(len(pairs))
+    for name in names:
+        covariance = measured.marks[name].covariance
+        if covariance is None:
+            return None
+        whole[column[name] : column[name] + 3, column[name] : column[name] + 3] = covariance
+    for row, (first, second) in enumerate(pairs):
+        between = measured.marks[second].place - measured.marks[first].place
+        lengths[row] = np.linalg.norm(between)
+        along = between / lengths[row]
+        jacobian[row, column[second] : column[second] + 3] = along
+        jacobian[row, column[first] : column[first] + 3] = -along
+    return np.asarray(jacobian @ whole @ jacobian.T + measured.scale_std**2 * np.outer(lengths, lengths))
+
+
+# --- measured --------------------------------------------------------------------------------------------
+
+
+def _of_inspection(path: Path) -> Measured:
+    from arview.inspection import load_inspection
+
+    inspection = load_inspection(path)
+    marks: dict[str, Mark] = {}
+    nominal: dict[str, Array] = {}
+    absent: dict[str, str] = {}
+    for one in inspection.components:
+        if one.details is None:
+            absent[one.name] = "the inspection has no details; measure with this version of arview"
+            continue
+        nominal[one.name] = np.array(one.details.center_mm)
+        known = [value for value in one.displacement_mm if value is not None]
+        if len(known) < 3:
+            absent[one.name] = "was not measured" if not known else "is undetermined in a direction"
+            continue
+        covariance = None if one.details.covariance is None else np.array(one.details.covariance)[3:, 3:]
+        marks[one.name] = Mark(nominal[one.name] + np.array(known), covariance)
+    # The datum frame's own scale error is in each covariance as a shift; as one factor of all it is here.
+    system = inspection.datum_system
+    scale_std = (system.scale_std or 0.0) if system is not None else 0.0
+    return Measured(str(path), marks, nominal, scale_std, absent)
+
+
+def _of_points(path: Path, text: str) -> Measured:
+    marks: dict[str, Mark] = {}
+    for number, row in _rows(path, text, ("name", "x", "y", "z")):
+        where = f"{path}: line {number}"
+        name = str(row["name"] or "").strip()
+        if not name or name in marks:
+            raise InputError(f"{where}: the name {name!r} is {'there twice' if name else 'empty'}")
+        place = np.array([_number(where, row[key], key) for key in "xyz"])
+        u = row.get("U_mm")
+        std = None if u in (None, "") else _number(where, u, "U_mm", least=0.0) / K
+        marks[name] = Mark(place, None if std is None else std**2 * np.eye(3))
+    return Measured(str(path), marks, {}, 0.0, {})
+
+
+# --- known -----------------------------------------------------------------------------------------------
+
+
+def _of_truth(path: Path, text: str, measured: Measured) -> list[KnownLength]:
+    try:
+        truth = json.loads(text).get("truth")
+    except ValueError as error:
+        raise InputError(f"{path}: is not valid JSON ({error})") from error
+    if not isinstance(truth, dict):
+        raise InputError(f"{path}: holds no 'truth'; give the truth.json of a sample, or a TOML file with [[length]]")
+    places: dict[str, Array] = {}
+    for name in measured.marks:
+        if name not in truth or name not in measured.nominal:
+            continue
+        places[name] = apply(_true_move(path, name, truth[name]), measured.nominal[name])
+    if len(places) < 2:
+        raise InputError(f"{path}: fewer than two of its components were measured in {measured.label}")
+    return [
+        KnownLength(a, b, float(np.linalg.norm(places[b] - places[a])))
+        for a, b in combinations(sorted(places), 2)
+    ]  # fmt: skip
+
+
+def _true_move(path: Path, name: str, entry: Any) -> Array:
+    where = f"{path}: truth.{name}"
+    try:
+        if "measured_from_nominal" in entry:
+            return check_rigid(entry["measured_from_nominal"], where)
+        shift = np.array(entry["displacement_mm"], dtype=np.float64).reshape(3)
+    except (TypeError, KeyError, ValueError) as error:
+        raise InputError(f"{where}: expected measured_from_nominal or displacement_mm") from error
+    move = np.eye(4)
+    move[:3, 3] = shift
+    return check_rigid(move, where)
+
+
+def _of_artefact(path: Path, text: str) -> list[KnownLength]:
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: is neither TOML nor JSON, and not named .csv ({error})") from error
+    _only(content, _ARTEFACT_KEYS, f"{path}:")
+    entries = content.get("length", [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{path}: length: expected tables [[length]]")
+    lengths = []
+    for number, entry in enumerate(entries, 1):
+        where = f"{path}: [[length]] {number}"
+        _only(entry, _LENGTH_KEYS, where)
+        ends = entry.get("between")
+        if not isinstance(ends, list) or len(ends) != 2:
+            raise InputError(f"{where}: between = {ends!r}: expected two names of marks")
+        lengths.append(_length(where, (ends[0], ends[1]), entry.get("mm"), entry.get("U_mm")))
+    return lengths
+
+
+def _length(where: str, ends: tuple[Any, Any], mm: Any, uncertainty: Any) -> KnownLength:
+    first, second = (str(end if end is not None else "").strip() for end in ends)
+    if not first or not second or first == second:
+        raise InputError(f"{where}: from {first!r} to {second!r}: expected two different marks")
+    value = _number(where, mm, "mm", least=1e-6)
+    return KnownLength(
+        first, second, value, 0.0 if uncertainty in (None, "") else _number(where, uncertainty, "U_mm", least=0.0)
+    )
+
+
+# --- reading ---------------------------------------------------------------------------------------------
+
+
+def _text_of(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not a text file") from error
+
+
+def _rows(path: Path, text: str, needed: Iterable[str]) -> list[tuple[int, Mapping[str, Any]]]:
+    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    missing = [name for name in needed if name not in (reader.fieldnames or ())]
+    if missing:
+        raise InputError(f"{path}: the column {missing[0]!r} is missing; the first line must name the columns")
+    return [(number, row) for number, row in enumerate(reader, 2) if any(row.values())]
+
+
+def _number(where: str, value: Any, key: str, least: float = -math.inf) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number) or isinstance(value, bool) or number < least or abs(number) > 1e7:
+        raise InputError(f"{where}: {key} = {value!r}: expected a {'number' if least < 0 else 'positive number'} in mm")
+    return number
+
+
+def _only(table: Mapping[str, Any], allowed: Sequence[str], where: str) -> None:
+    for key in table:
+        if key not in allowed:
+            raise InputError(f"{where} unknown key {key!r}; allowed: {', '.join(allowed)}")
