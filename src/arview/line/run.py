@@ -23,7 +23,8 @@ from arview.errors import ArviewError, InputError, MismatchError, MissingDepende
 from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.line.film import camera_of_video, make_film
-from arview.line.job import InspectJob, Prepared, measurement_key, prepare
+from arview.line.job import InspectJob
+from arview.line.prepare import Prepared, measurement_key, prepare
 from arview.reconstruction.run import Reconstruction, reconstruct
 from arview.reconstruction.stages import Stages, content_key, key_of
 

@@ -1,0 +1,134 @@
+"""The command batch: inspections of many parts, by Dask."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from arview.cli.common import main, say
+from arview.cli.inspect import EXIT_CANNOT_MEASURE, EXIT_CODES, VerdictCommand
+
+if TYPE_CHECKING:
+    from arview.line.batch import JobResult
+
+
+@main.command(
+    cls=VerdictCommand,
+    short_help="Inspect many parts, on this machine or a cluster.",
+    epilog="""\b
+Examples:
+  arview batch jobs.toml
+  arview batch jobs.toml --workers 4 --memory-limit 3GB --store plate.sqlite
+  arview batch jobs.toml --scheduler tcp://10.0.0.5:8786
+
+\b
+JOBS.toml:
+
+  out = "results"                # a folder or URL; a folder for each job below it
+  [defaults]                     # for jobs that do not say otherwise
+  part = "part.toml"
+  tolerance_mm = 0.5             # or any other field of a job
+  [[job]]
+  serial = "PL-0417"             # its folder's name too, unless there is a name
+  photos = "photos/PL-0417"
+  [[job]]
+  name = "PL-0418_again"
+  serial = "PL-0418"
+  photos = "s3://plates/PL-0418"
+  video = "films/PL-0418.mp4"
+  # camera, video_camera, scale_file, unit, guard, max_frames, seed, threads, device, makes_pdf
+
+\b
+Paths are relative to JOBS.toml, or URLs that fsspec knows (s3, gs, abfs, sftp, http; some need a package, which is then
+named). With a URL as out, results are sent when they are complete. A job is known by the content of its inputs: one
+that is done is not done again, so an interrupted batch is simply run again, and a file may grow.
+
+\b
+A worker has one job at a time. A job whose worker dies goes to another one; one that fails by storage or memory is
+tried again; what cannot be done stops nothing else. A cluster's workers need arview, the same paths or URLs, and
+one thread: dask worker tcp://10.0.0.5:8786 --nthreads 1 --memory-limit 4GB
+
+\b
+Exit codes, the worst of all jobs: 0 all pass, 1 one fails, 2 one is undecided, 3 one could not be measured or has
+an error, 64 bad input or usage, 70 a bug in arview, 130 interrupted (what is finished is kept). 3 goes before 1.""",
+)
+@click.argument("jobs_path", metavar="JOBS.toml")
+@click.option("--scheduler", metavar="URL", help="tcp://host:port of a Dask scheduler; default: workers of our own.")
+@click.option("--workers", type=click.IntRange(min=1), metavar="N",
+              help="On this machine; default: one for two cores, as far as memory reaches.")  # fmt: skip
+@click.option("--memory-limit", default="4GB", show_default=True, metavar="SIZE",
+              help="Per job, on this machine: a job that takes more is broken off.")  # fmt: skip
+@click.option("--retries", type=click.IntRange(min=0), default=2, show_default=True, metavar="N",
+              help="Of a job that was broken off.")  # fmt: skip
+@click.option("--connect-s", type=click.FloatRange(min=0.1), default=15.0, show_default=True, metavar="S",
+              help="How long a scheduler may take to answer.")  # fmt: skip
+@click.option("--store", metavar="FILE|URL", help="Also add the results to this store (`arview history`).")
+@click.option("--station", metavar="NAME", help="Where they were measured.")
+def batch(
+    jobs_path: str, scheduler: str | None, workers: int | None, memory_limit: str, retries: int, connect_s: float,
+    store: str | None, station: str | None,
+) -> None:  # fmt: skip
+    """Inspect all parts that JOBS.toml names."""
+    from tqdm import tqdm
+
+    from arview.line.batch import BatchOptions, run_batch
+    from arview.line.jobs_file import load_jobs
+
+    jobs = load_jobs(jobs_path)
+    if store is not None:
+        from arview.history import HistoryStore
+
+        HistoryStore(store).close()
+    options = BatchOptions(scheduler, workers or 0, memory_limit, retries, connect_s)
+    with tqdm(desc="jobs", total=len(jobs), disable=None, leave=False, unit="") as bar:
+
+        def started(link: str, count: int) -> None:
+            tqdm.write(f"{len(jobs)} jobs on {count} worker{'s' * (count != 1)}; dashboard: {link}")
+
+        def came(result: JobResult) -> None:
+            tqdm.write(_line(result))
+            bar.update()
+
+        results = run_batch(jobs, options, started=started, progress=came)
+    if store is not None:
+        _add(results, store, station)
+    counts = Counter(one.verdict.replace("_", " ") for one in results)
+    kept = sum(one.is_kept for one in results)
+    click.echo(f"{len(results)} jobs: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
+               + (f"; {kept} of them done before" if kept else ""))  # fmt: skip
+    code = exit_code(results)
+    if code:
+        click.get_current_context().exit(code)
+
+
+def exit_code(results: list[JobResult]) -> int:
+    """The worst: no verdict, then fail, then undecided."""
+    codes = {EXIT_CODES.get(one.verdict, EXIT_CANNOT_MEASURE) for one in results}
+    return next((code for code in (EXIT_CANNOT_MEASURE, 1, 2) if code in codes), 0)
+
+
+def _line(result: JobResult) -> str:
+    kept = " (done before)" if result.is_kept else ""
+    return f"{result.name}: {result.verdict.replace('_', ' ')}{kept}; {result.text}; {result.out}"
+
+
+def _add(results: list[JobResult], store: str, station: str | None) -> None:
+    """Add what was measured to the store; what is there already stays as it is."""
+    from arview.history import HistoryStore
+    from arview.line.storage import read
+
+    with HistoryStore(store) as opened, tempfile.TemporaryDirectory() as folder:
+        new = 0
+        for one in results:
+            content = read(f"{one.out}/inspection.json") if one.inspection_sha256 else None
+            if content is None:
+                say(f"history: nothing of {one.name}")
+                continue
+            path = Path(folder) / "inspection.json"
+            path.write_bytes(content)
+            new += opened.add(path, station).is_new
+        click.echo(f"history: {new} added to {opened.name}")
