@@ -49,6 +49,7 @@ def options(**more: Any) -> LiveOptions:
     usual: dict[str, Any] = {
         "camera": str(CAMERA), "inspection": INSPECTION, "width": WIDTH, "height": HEIGHT,
         "requests_per_s": 1e6, "requests_burst": 1e6, "joins_per_s": 1e6, "joins_burst": 1e6,
+        "jpeg_silence_s": 120.0, "connect_timeout_s": 60.0,  # tests share their cores
     }  # fmt: skip
     return LiveOptions(**{**usual, **more})
 

@@ -41,7 +41,7 @@ def send(page: Http, name: str, index: int, **headers: str) -> tuple[int, dict[s
     )
 
 
-def wait(condition: Callable[[], Any], timeout_s: float = 20.0) -> Any:
+def wait(condition: Callable[[], Any], timeout_s: float = 60.0) -> Any:
     """What the condition gives once it is true."""
     ends_s = time.monotonic() + timeout_s
     while not (value := condition()):
@@ -316,4 +316,4 @@ def test_silent_pages_leave_by_themselves() -> None:
     with running(chosen, loader(chosen)) as server:
         page = server.session()
         page.join()
-        wait(lambda: not server.hub.clients, 5.0)
+        wait(lambda: not server.hub.clients)
