@@ -211,8 +211,8 @@ def run_batch(
         workers = client.nthreads()
         if started is not None:
             started(client.dashboard_link, len(workers))
-        if options.scheduler is None:  # a machine's cores are shared out; elsewhere each worker has its own
-            threads = max(1, (os.cpu_count() or 1) // max(1, len(workers)))
+        if options.scheduler is None and len(workers) > 1:  # they share the cores; elsewhere each has its own
+            threads = max(1, (os.cpu_count() or 1) // len(workers))
             jobs = [one if one.job.threads else replace(one, job=replace(one.job, threads=threads)) for one in jobs]
         futures = {
             client.submit(carry_out, one, work, options.scratch, key=f"arview-{one.name}", pure=False,
