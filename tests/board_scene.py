@@ -17,7 +17,7 @@ BOARD = parse_board("charuco:11x8:21:16:DICT_5X5_100")
 LENS = Camera(640, 480, 563.0, 561.2, 326.4, 233.7, np.array([-0.16, 0.07, 6e-4, -4e-4, -0.015]))
 """A webcam: 59° across, barrel distortion of 7 px at the corners, principal point off the centre."""
 _PX_PER_MM = 10
-_SUPER = 3
+_SUPER = 2
 
 
 @cache

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from arview.calibration.views import BoardFinder, Sightings
 
 _DICTIONARIES = (
-    "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
+    "DICT_4X4_250", "DICT_5X5_250", "DICT_6X6_250", "DICT_7X7_250", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
     "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9",
 )  # fmt: skip
-"""The largest of each family: smaller ones are parts of it."""
+"""Of each family one that the others are parts of, but for boards of more than 250 markers."""
 _LEAST_MARKERS = 4
 _FIT = 0.1
 """Share of a marker's side that corners may lie off a homography: lens distortion bends boards by less."""
@@ -64,7 +64,7 @@ def why_no_board(finder: BoardFinder, sightings: Sightings, pictures: Iterable[N
 
 def _columns_that_fit(board: Board, seen: list[tuple[Array, NDArray[np.int64]]]) -> int | None:
     """The number of columns with which the ids of the markers make a plane board in most pictures."""
-    pictures = sorted((one for one in seen if len(one[1]) >= _LEAST_MARKERS), key=lambda one: -len(one[1]))[:10]
+    pictures = sorted((one for one in seen if len(one[1]) >= _LEAST_MARKERS), key=lambda one: -len(one[1]))[:3]
     votes: Counter[int] = Counter()
     for quads, ids in pictures:
         fits = [columns for columns in range(3, 31) if _fits(board, columns, quads, ids)]
@@ -93,7 +93,7 @@ def _fits(board: Board, columns: int, quads: Array, ids: NDArray[np.int64]) -> b
         on_board = np.concatenate([place[int(ids[k])] for k in known]).astype(np.float64)
         pixels = np.concatenate([quads[k] for k in known])
         side = float(np.median(np.linalg.norm(quads[:, 0] - quads[:, 1], axis=1)))
-        found, _ = cv2.findHomography(on_board, pixels, cv2.RANSAC, _FIT * side)
+        found, _ = cv2.findHomography(on_board, pixels, cv2.RANSAC, _FIT * side, maxIters=60)
         if found is None:
             continue
         there = cv2.perspectiveTransform(on_board[None], found)[0]

@@ -31,7 +31,7 @@ class SolveOptions:
     view_outlier: float = 2.5  # times the median view's rms: a blurred or bent view
     view_floor_px: float = 0.15  # views that fit this well are kept, however well the others do
     corner_outlier: float = 4.5  # robust standard deviations: 1 corner of 25,000 of normal errors
-    rounds: int = 8  # of solving and leaving out
+    rounds: int = 12  # of solving and leaving out; wrong corners go a few at a time
 
     def __post_init__(self) -> None:
         if self.least_views < 3 or not (self.view_outlier > 1 and self.corner_outlier > 2 and self.rounds > 0):
@@ -85,11 +85,12 @@ def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOpt
                 " least, 20 are good: hold the board flat and still, in focus, and take it from many sides"
             )
         solution = _adjust(kept, width, height, None if solution is None else solution.camera)
-        bad = _bad_views(solution, options)
-        rejected |= bad
         trimmed = [_without_outliers(view, r, options) for view, r in zip(kept, solution.residuals, strict=True)]
-        changed = bool(bad) or any(len(a.ids) != len(b.ids) for a, b in zip(kept, trimmed, strict=True))
-        if not changed:
+        # A wrong corner spoils its view's pose: whether the view fits is seen when it is gone.
+        settled = {view.name for view, less in zip(kept, trimmed, strict=True) if len(view.ids) == len(less.ids)}
+        bad = _bad_views(solution, settled, options)
+        rejected |= bad
+        if not bad and len(settled) == len(kept):
             break
         kept = [view for view in trimmed if view.name not in bad and len(view.ids) >= LEAST_CORNERS]
     if solution is None:
@@ -114,12 +115,13 @@ def pixel_uncertainty(solution: Solution, pixels: Array) -> Array:
 
     What a rotation of the camera explains as well is taken out over these pixels: no use of a camera notices it.
     """
-    rays = solution.camera.unproject(pixels)
-    _, intrinsics, pose = _project(rays, solution.camera, np.eye(4))
+    with np.errstate(all="ignore"):  # a wild lens has no ray for pixels far from all corners
+        rays = solution.camera.unproject(pixels)
+        _, intrinsics, pose = _project(rays, solution.camera, np.eye(4))
+    if not all(np.isfinite(one).all() for one in (solution.covariance, intrinsics, pose)):
+        return np.full(len(pixels), np.inf)
     basis, _ = np.linalg.qr(pose[:, :3])
     field = intrinsics - basis @ (basis.T @ intrinsics)
-    if not np.isfinite(solution.covariance).all():
-        return np.full(len(pixels), np.inf)
     blocks = field.reshape(-1, 2, 9)
     covariance = np.einsum("nij,jk,nlk->nil", blocks, solution.covariance, blocks)
     return K * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
@@ -208,14 +210,15 @@ def _project(points: Array, camera: Camera, cam_from_points: Array) -> tuple[Arr
     return pixels.reshape(-1, 2), np.asarray(jacobian[:, 6:15]), np.asarray(jacobian[:, :6])
 
 
-def _bad_views(solution: Solution, options: SolveOptions) -> dict[str, str]:
+def _bad_views(solution: Solution, settled: set[str], options: SolveOptions) -> dict[str, str]:
     """Views that fit much worse than the others, at most a third of them at once, the worst first."""
     rms = np.array([np.sqrt(np.mean(residual**2)) for residual in solution.residuals])
     # Of each view the robust size: a single wrong corner is left out by itself.
     size = np.array([np.median(np.abs(residual)) / 0.6745 for residual in solution.residuals])
     usual = float(np.median(size))
     limit = max(options.view_outlier * usual, options.view_floor_px)
-    bad = [int(i) for i in np.argsort(-size) if size[i] > limit][: max(1, len(rms) // 3)]
+    bad = [int(i) for i in np.argsort(-size) if size[i] > limit and solution.views[i].name in settled]
+    bad = bad[: max(1, len(rms) // 3)]
     return {
         solution.views[i].name: f"does not fit the others ({rms[i]:.2f} px, the others {usual:.2f} px)" for i in bad
     }

@@ -46,7 +46,7 @@ class Judgement:
         pixel_u_px: U of where a ray is seen: median and worst over the picture.
         coverage: share of the picture's 8×6 cells that hold a corner.
         cells: (6,8) corners in each cell.
-        tilts_deg: smallest, median, largest angle between the board's normal and the line of sight.
+        tilts_deg: smallest, median, largest angle between the board and the picture's plane.
         distance_ratio: farthest over nearest board.
         reasons: why it is not better.
         advice: what to do about it.
@@ -102,7 +102,7 @@ def judge(solution: Solution, options: VerdictOptions | None = None) -> Judgemen
         focal_is_poor = grades[0] is not Grade.GOOD
         if focal_is_poor and (tilted < options.least_tilted or sides < 2):
             advice.append("tilt the board more, by 30° to 45°, to the left, the right, upwards and downwards")
-        if grades[1] is not Grade.GOOD or grades[3] is not Grade.GOOD:
+        if grades[3] is not Grade.GOOD or (grades[1] is not Grade.GOOD and not focal_is_poor):
             missing = _empty_corners(cells)
             where = f": none was seen in the {', '.join(missing)}" if missing else ""
             advice.append(f"bring the board to the corners and edges of the picture{where}")
@@ -139,18 +139,15 @@ def _cells(solution: Solution) -> Array:
 
 def _attitudes(solution: Solution, tilted_deg: float) -> tuple[Array, int, Array]:
     """Tilt of each view in degrees; to how many of four sides tilted ones lean; distances of their middles in mm."""
-    tilts, distances = [], []
-    sides: set[int] = set()
-    for view, pose in zip(solution.views, solution.cams_from_board, strict=True):
-        middle = pose[:3, :3] @ view.points_in_board.mean(axis=0) + pose[:3, 3]
-        sight = middle / np.linalg.norm(middle)
-        normal = pose[:3, 2]
-        tilts.append(float(np.degrees(np.arccos(np.clip(abs(normal @ sight), 0.0, 1.0)))))
-        distances.append(float(np.linalg.norm(middle)))
-        across = normal - (normal @ sight) * sight
-        if tilts[-1] >= tilted_deg:
-            sides.add(int(np.floor(np.arctan2(across[1], across[0]) / (np.pi / 2))))
-    return np.array(tilts), len(sides), np.array(distances)
+    middles = np.array([
+        pose[:3, :3] @ view.points_in_board.mean(axis=0) + pose[:3, 3]
+        for view, pose in zip(solution.views, solution.cams_from_board, strict=True)
+    ])  # fmt: skip
+    normals = solution.cams_from_board[:, :3, 2]
+    # Against the picture's plane: a board parallel to it tells no focal length, wherever it is seen.
+    tilts = np.degrees(np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0)))
+    sides = np.floor(np.arctan2(normals[:, 1], normals[:, 0]) / (np.pi / 2))
+    return tilts, len(set(sides[tilts >= tilted_deg])), np.linalg.norm(middles, axis=1)
 
 
 def _empty_corners(cells: Array) -> list[str]:

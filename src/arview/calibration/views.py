@@ -325,7 +325,7 @@ def _blur_px(gray: NDArray[np.uint8], pixels: Array) -> float:
     return blur_and_texture(np.ascontiguousarray(gray[low[1] : high[1], low[0] : high[0]]))[0]
 
 
-def _some_pictures(sources: Sequence[str | Path], most: int = 6) -> Iterator[NDArray[np.uint8]]:
+def _some_pictures(sources: Sequence[str | Path], most: int = 3) -> Iterator[NDArray[np.uint8]]:
     """A few gray pictures of the sources, for the diagnosis."""
     import cv2
 

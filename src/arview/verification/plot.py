@@ -32,7 +32,7 @@ def draw(test: Verification, kind: str = "png") -> bytes:
             limit = np.array([test.limit.at(length) for length in steps])
             for sign in (1.0, -1.0):
                 axes.plot(steps, sign * limit, color=INK, linewidth=1.1,
-                          label=f"permissible: ± ({test.limit})" if sign > 0 else None)  # fmt: skip
+                          label=f"permissible: ± {test.limit}" if sign > 0 else None)  # fmt: skip
         for verdict, color in _COLORS.items():
             mine = np.array([one.verdict is verdict for one in test.lengths])
             shown = verdict if test.limit is not None else "error"
