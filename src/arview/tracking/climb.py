@@ -133,7 +133,7 @@ def climb_outlines(  # type: ignore[no-untyped-def]
 
     Args:
         maps: (8,H,W) from `response_maps`, padded.
-        points, angles, neighbours, turns: see `Outlines`.
+        points, angles: see `Outlines`; neighbours, turns: see `Neighbours`.
         views (M,), rolls (M,) rad, radii_px (M,), places (M,2) px of the maps: the matches.
         focal_px: of the maps.
         roll_step_rad, stretch_step: steps of the roll and, as a share, of the size.

@@ -153,16 +153,17 @@ class Detection:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A refined pose about the model's centre, its evidence, and the distinct lines that its view shows."""
+    """A refined pose about the model's centre, its evidence, the distinct lines that its view shows, and its size."""
 
     cam_from_body: Array
     evidence: Evidence
     lines: float
+    radius_px: float
 
     @property
     def logit(self) -> float:
         """For comparing the hypotheses of one picture, see `found_logit`."""
-        return found_logit(self.evidence, self.lines)
+        return found_logit(self.evidence, self.lines, self.radius_px)
 
 
 class Detector:
@@ -246,7 +247,7 @@ class Detector:
             found_probability(
                 hypothesis.evidence,
                 hypothesis.lines,
-                self.tracker.radius_px(hypothesis.cam_from_body),
+                hypothesis.radius_px,
                 self._leads(hypothesis, hypotheses[k + 1 :]),
             )
             for k, hypothesis in enumerate(hypotheses)
@@ -376,7 +377,7 @@ class Detector:
         pose = self.tracker.refine_fresh(picture.image, picture.gray, start, stages)
         look = self.tracker.fresh_appearance(picture.image, pose)
         evidence = self.tracker.evidence(picture.image, picture.gray, pose, tolerance_px, look)
-        return Hypothesis(pose, evidence, self._view_lines(pose))
+        return Hypothesis(pose, evidence, self._view_lines(pose), self.tracker.radius_px(pose))
 
     def _ordered(self, found: Iterable[Hypothesis], apart_deg: float, most: int = 1000) -> list[Hypothesis]:
         """Best first, without those near a better one."""

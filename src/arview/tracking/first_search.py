@@ -1,9 +1,10 @@
 """The first search of the detector: where in the picture might which view of the part be, over the whole range?
 
-Templates (`templates`) give tens of thousands of rough matches. In clutter the right one is seldom among the first
-hundred of them, but nearly always among the first twenty thousand; and once each is improved as an outline in the
-picture (`climb_outlines`, some 20 µs), on maps of a finer scale, it comes to the front. This is what makes clutter
-tractable on a CPU; own here, measured on semi-synthetic sequences.
+Templates (`templates`) give thousands of rough matches. In clutter the right one is seldom among the first hundred of
+them, but often among the first five thousand; and once each is improved as an outline in the picture
+(`climb_outlines`, some 30 µs), on maps of a finer and finer scale, it comes to the front: the larger the part in the
+picture, the fewer wrong poses fit by chance. This is what makes clutter tractable on a CPU; own here, measured on
+semi-synthetic sequences.
 """
 
 from __future__ import annotations
@@ -17,10 +18,17 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
-from arview.guideviews.sphere import icosphere_directions
 from arview.tracking.climb import climb_outlines
 from arview.tracking.picture import STEPS_PER_OCTAVE, Picture
-from arview.tracking.templates import choose_apart, decimate, make_bank, make_outlines, match_templates, outlines_around
+from arview.tracking.templates import (
+    GROUPS,
+    choose_apart,
+    decimate,
+    make_bank,
+    make_outlines,
+    match_templates,
+    outlines_around,
+)
 from arview.tracking.threads import pool
 
 POINTS = 64
@@ -32,9 +40,31 @@ LARGEST_SCALE = 1.5
 LOWEST_SCORE = 0.3
 """Template matches below this are noise."""
 CELL_PX, CELL_ROLL = 4.0, 0.33
-"""Of matches whose place and roll (rad) fall in one cell, and whose view and scale are alike, the best is enough."""
-STEPS_UP, ROLL_STEP, STRETCH_STEP, SHIFT_PX = 2, 0.16, 0.07, 2
-"""Matches are improved on maps so many scale steps larger, in steps of so many rad, so large a share and so many px."""
+"""Of matches whose place and roll (rad) fall in one cell, of one scale and group of views, the best is enough."""
+ALIKE = 5
+"""So many matches are there for one that is left then."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """A round in which matches are improved as outlines on larger maps.
+
+    Attributes:
+        steps_up: maps so many scale steps larger than those before.
+        roll_step_rad, stretch_step: first steps of the roll and, as a share, of the size.
+        is_fine: with the nearest other directions, not those further away.
+    """
+
+    steps_up: int
+    roll_step_rad: float
+    stretch_step: float
+    is_fine: bool
+
+
+GROWTHS = (Growth(2, 0.16, 0.07, False), Growth(2, 0.16, 0.07, False), Growth(2, 0.08, 0.04, True))
+"""From half diameters of 20 px by 28 and 40 to 57."""
+GROWTH_ROUNDS, SHIFT_PX = 2, 2
+"""Over all steps; places are tried so far away."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +72,8 @@ class Effort:
     """How far a search goes.
 
     Attributes:
-        matches: of templates that are improved once as outlines; skipped: the best of them, tried by the effort before.
-        improved: of these, how many are improved further.
+        matches: of templates that are improved as outlines; skipped: the best of them, tried by the effort before.
+        improved: of these, how many are improved in the last round too.
         starts: of these, how many poses are searched around.
         kept: hypotheses left after each level of that search.
     """
@@ -55,8 +85,8 @@ class Effort:
     kept: tuple[int, ...]
 
 
-QUICK = Effort(1500, 0, 500, 40, (12, 5))
-WIDE = Effort(20000, QUICK.matches, 6000, 1000, (60, 10))
+QUICK = Effort(600, 0, 300, 40, (12, 5))
+WIDE = Effort(5000, QUICK.matches, 2500, 300, (100, 40))
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 
@@ -132,9 +162,7 @@ class FirstSearch:
         self._radius_px = radius_px
         self._diameter_mm = views.diameter_mm
         self._focal_px = 0.5 * (camera.fx + camera.fy)
-        self.outlines = make_outlines(views, model_from_body, POINTS, max(3, subdivisions))
-        # Views that count as one when alike matches are thinned out.
-        self._clusters = np.argmax(self.outlines.rotations[:, 2] @ icosphere_directions(1).T, axis=1)
+        self.outlines = make_outlines(views, model_from_body, POINTS)
         # Scale steps of the templates, large distances (large pictures) first.
         low, high = views.view_range.distance_mm
         near, far = self.step_at(low), self.step_at(high)
@@ -159,28 +187,29 @@ class FirstSearch:
         phases = list(pool().map(lambda step: decimate(picture.maps(step)[0], GRID_PX), self._steps))
         count = len(next(iter(self.banks.values())).bins)
         halves = [0, count // 2, count]
-        # Small pictures first: what is found there raises the bar for the large ones.
-        votes = np.zeros(1024, dtype=np.int64)
-        smallest_first = list(zip(self._steps, phases, strict=True))[::-1]
-        jobs = [(*level, first, last) for level in smallest_first for first, last in pairwise(halves)]
-        found = pool().map(lambda job: self._match(picture, votes, effort.matches, *job), jobs)
+        votes = {step: np.zeros((GROUPS, 1024), dtype=np.int64) for step in self._steps}
+        # Of each group of views at each scale as many; most that are found are alike.
+        kept = ALIKE * -(-effort.matches // (GROUPS * len(self._steps)))
+        levels = list(zip(self._steps, phases, strict=True))
+        jobs = [(*level, first, last) for level in levels for first, last in pairwise(halves)]
+        found = pool().map(lambda job: self._match(votes[job[0]], kept, picture, *job), jobs)
         raw = [m for m in found if m is not None]
         if not raw:
             return []
         matches = self._distinct(_joined(raw), effort.matches, effort.skipped)
         if not len(matches.keys):
             return []
-        # The first round goes through all, with every other point, on larger maps; there the best go on.
-        matches = self._improved(picture, matches, 1, POINTS // 2, STEPS_UP).best(effort.improved)
-        matches = self._improved(picture, matches, 2, POINTS, 0)
+        for growth in GROWTHS[:-1]:
+            matches = self._improved(picture, matches, growth)
+        matches = self._improved(picture, matches.best(effort.improved), GROWTHS[-1])
         matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.starts)
         return [Candidate(float(k), rigid(r, p)) for k, r, p in zip(matches.keys, *self._posed(matches), strict=True)]
 
     def _match(
         self,
-        picture: Picture,
         votes: NDArray[np.int64],
         kept: int,
+        picture: Picture,
         step: int,
         phases: NDArray[np.uint8],
         first: int,
@@ -192,7 +221,7 @@ class FirstSearch:
         if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
             return None
         keys, templates, places = match_templates(
-            phases, bank.offsets, bank.bins, bank.gains, first, last, kept, LOWEST_SCORE, votes
+            phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, LOWEST_SCORE, votes
         )
         return Matches(
             keys, np.full(len(keys), step), bank.views[templates], bank.rolls[templates],
@@ -219,23 +248,30 @@ class FirstSearch:
         return matches.of(choose_apart(rotations, positions, reach / positions[:, 2], np.cos(angle_rad), ratio, most))
 
     def _distinct(self, matches: Matches, most: int, skipped: int) -> Matches:
-        """The best, one for each cell of places, scales and rotations, but the first."""
+        """The best, one for each cell of places, scales and rotations, but the first.
+
+        The best of each group of views at each scale come first, then all second best, and so on.
+        """
         matches = matches.best(len(matches.keys))
         cells = np.floor(matches.places / CELL_PX).astype(np.int64) + 4096
         rolls = np.floor(matches.rolls / CELL_ROLL).astype(np.int64) + 64
-        code = ((cells[:, 0] * 8192 + cells[:, 1]) * 128 + rolls) * 1024 + self._clusters[matches.views]
-        code = code * 128 + matches.steps + 64
-        _, first = np.unique(code, return_index=True)
-        return matches.of(np.sort(first)[skipped:most])
+        groups = self.outlines.groups[matches.views].astype(np.int64) * 128 + matches.steps + 64
+        _, first = np.unique(((groups * 8192 + cells[:, 0]) * 8192 + cells[:, 1]) * 128 + rolls, return_index=True)
+        first.sort()
+        by_group = np.argsort(groups[first], kind="stable")
+        _, starts, counts = np.unique(groups[first][by_group], return_index=True, return_counts=True)
+        rank = np.empty(len(first), dtype=np.int64)
+        rank[by_group] = np.arange(len(first)) - np.repeat(starts, counts)
+        return matches.of(first[np.argsort(rank, kind="stable")[skipped:most]])
 
-    def _improved(self, picture: Picture, matches: Matches, rounds: int, count: int, up: int) -> Matches:
-        """The matches after some rounds of improving each by itself, with so many points, so many scale steps up."""
+    def _improved(self, picture: Picture, matches: Matches, growth: Growth) -> Matches:
+        """The matches improved each by itself, on larger maps."""
         shapes = self.outlines
-        points, angles = shapes.points[:, :count], shapes.angles[:, :count]
+        around = shapes.near if growth.is_fine else shapes.far
         jobs = []
         for step in np.unique(matches.steps):
             group = np.flatnonzero(matches.steps == step)
-            jobs += [(min(0, step + up), part) for part in np.array_split(group, 2)]
+            jobs += [(min(0, step + growth.steps_up), part) for part in np.array_split(group, 2)]
         picture.make([step for step, _ in jobs])
 
         def improve(job: tuple[int, NDArray[np.intp]]) -> Matches:
@@ -246,8 +282,9 @@ class FirstSearch:
             maps, _ = picture.maps(step)
             places = (some.places + 0.5) * scale[:, None] - 0.5 + picture.pad_px
             scores, views, rolls, radii, places = climb_outlines(
-                maps, points, angles, shapes.neighbours, shapes.turns, some.views, some.rolls,
-                some.radii_px * scale, places, focal_px, ROLL_STEP, STRETCH_STEP, rounds, SHIFT_PX, SHIFT_PX,
+                maps, shapes.points, shapes.angles, around.views, around.turns, some.views, some.rolls,
+                some.radii_px * scale, places, focal_px, growth.roll_step_rad, growth.stretch_step, GROWTH_ROUNDS,
+                SHIFT_PX, SHIFT_PX,
             )  # fmt: skip
             keys = weighed(scores, shapes.lines[views])
             return Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)

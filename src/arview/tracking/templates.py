@@ -4,8 +4,9 @@ The picture becomes a response map for each of eight edge orientations, spread s
 do not matter; a template is a short list of (dx, dy, orientation) and its score at a place is the mean response
 under its points: Hinterstoisser et al., "Gradient Response Maps for Real-Time Detection of Textureless Objects"
 (PAMI 2012). Own here: matches are compared by how far they stand out from what the same template scores elsewhere
-in this picture, and by how many distinct lines they explain, so that plain views do not win in clutter; and the
-bar that a match must clear rises as better ones are found, so that most of the work is cut short.
+in this picture, and by how many distinct lines they explain, so that plain views do not win in clutter; each group of
+like views at each scale keeps its best, for some fit any clutter and would crowd out the others; and the bar that a
+match must clear rises as better ones of its group are found, so that most of the work is cut short.
 """
 
 from __future__ import annotations
@@ -42,6 +43,20 @@ BLOCK = 64
 """Places passed over together where none of them bodes well."""
 KEY_STEP = 0.005
 """Keys are counted in steps of this."""
+OUTLINE_SUBDIVISIONS, LINES_SUBDIVISIONS = 4, 3
+"""Of the icospheres of directions that have an outline (2,562, about 4° apart), and whose lines are counted."""
+GROUP_SUBDIVISIONS, GROUPS = 1, 42
+"""Of the icosphere whose directions part the views in groups, about 35° apart."""
+FAR_DEG = 8.5
+"""Twice as far as the directions are apart."""
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Directions around each of some: their indices (V,6), and (V,6) rad, the roll that brings each closest."""
+
+    views: NDArray[np.int32]
+    turns: Array
 
 
 @dataclass(frozen=True)
@@ -54,15 +69,17 @@ class Outlines:
         angles: (V,N) uint8 of their normals, 256 to the half turn.
         rotations: (V,3,3) of ``cam_from_body``.
         lines: (V,) distinct lines shown.
-        neighbours: (V,6) nearest other directions; turns: (V,6) rad, the roll that brings each closest.
+        groups: (V,) of like views, `GROUPS` at most.
+        near: the nearest other directions; far: some on all sides, `FAR_DEG` away.
     """
 
     points: NDArray[np.float32]
     angles: NDArray[np.uint8]
     rotations: Array
     lines: Array
-    neighbours: NDArray[np.int32]
-    turns: Array
+    groups: NDArray[np.int32]
+    near: Neighbours
+    far: Neighbours
 
 
 @dataclass(frozen=True)
@@ -72,7 +89,7 @@ class TemplateBank:
     Attributes:
         offsets: (T,N,2) int32 dx, dy ≥ 0 of the points; bins: (T,N) orientations, see `orientation_bins`.
         origins: (T,2) place of the part's centre in the frame of the offsets.
-        views: (T,) of the outlines; rolls: (T,) rad.
+        views: (T,) of the outlines; rolls: (T,) rad; groups: (T,) of like views.
         gains: (T,) by which a match counts: more for views that show many distinct lines.
     """
 
@@ -81,17 +98,17 @@ class TemplateBank:
     origins: Array
     views: NDArray[np.int32]
     rolls: Array
+    groups: NDArray[np.int32]
     gains: Array
 
 
-def make_outlines(views: GuideViewSet, model_from_body: Array, points: int, subdivisions: int) -> Outlines:
+def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> Outlines:
     """Outlines over the directions of the declared range.
 
     Args:
         views: of the part; the nearest to each direction of an icosphere is taken.
         model_from_body: (4,4) to the model's centre.
         points: per view; views with few points repeat some.
-        subdivisions: of the icosphere; 3 gives 642 directions, about 9° apart.
 
     Raises:
         InputError: no view shows an outline.
@@ -100,8 +117,8 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int, subd
     intrinsics = np.array([focal, focal, 0.0, 0.0, 0, 0, 0, 0, 0, 0])
     # One order for all in which every beginning is spread over the whole.
     order = np.random.default_rng(0).permutation(points)
-    rows: list[tuple[Array, Array, Array, float, Array]] = []
-    for index in _nearest_views(views, subdivisions):
+    rows: list[tuple[Array, Array, Array, Array]] = []
+    for index in _nearest_views(views, OUTLINE_SUBDIVISIONS):
         view = views.view(int(index))
         cam_from_body = view.cam_from_model @ model_from_body
         found = _view_points(view.features, views.center_in_model, cam_from_body, points)
@@ -115,23 +132,44 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int, subd
         body[depths <= 0], normals[depths <= 0] = body[depths > 0][0], normals[depths > 0][0]
         shown = body @ cam_from_body[:3, :3].T / (0.5 * views.diameter_mm)
         angles = np.arctan2(normals[:, 1], normals[:, 0]) / np.pi
-        lines = max(view_lines(view, views.diameter_mm), 1.0)
-        rows.append((shown[order], angles[order], cam_from_body[:3, :3], lines, views.directions[index]))
+        rows.append((shown[order], angles[order], cam_from_body[:3, :3], views.directions[index]))
     if not rows:
         raise InputError("guide views: no view shows an outline; check the model and the declared distances")
-    shown, angles, rotations, lines_shown, seen_from = (np.stack([row[k] for row in rows]) for k in range(5))
-    cosines = seen_from @ seen_from.T
-    np.fill_diagonal(cosines, -2.0)
-    count = min(6, len(rows) - 1)
-    nearest = np.argsort(-cosines, axis=1, kind="stable")[:, :count]
+    shown, angles, rotations, seen_from = (np.stack([row[k] for row in rows]) for k in range(4))
+    near, far = _around(seen_from, 6)
     return Outlines(
         points=shown.astype(np.float32),
         angles=(np.round(angles * 256.0).astype(np.int64) % 256).astype(np.uint8),
         rotations=rotations,
-        lines=lines_shown,
-        neighbours=nearest.astype(np.int32),
-        turns=rolls_between(rotations[nearest], rotations[:, None]),
+        lines=_lines_shown(views, seen_from),
+        groups=np.argmax(seen_from @ icosphere_directions(GROUP_SUBDIVISIONS).T, axis=1).astype(np.int32),
+        near=Neighbours(near, rolls_between(rotations[near], rotations[:, None])),
+        far=Neighbours(far, rolls_between(rotations[far], rotations[:, None])),
     )
+
+
+def _lines_shown(views: GuideViewSet, directions: Array) -> Array:
+    """Distinct lines, at least 1, of the view nearest to each direction (V,3) among those of a coarser icosphere."""
+    counted = _nearest_views(views, LINES_SUBDIVISIONS)
+    lines = np.array([view_lines(views.view(int(index)), views.diameter_mm) for index in counted])
+    return np.maximum(lines[np.argmax(directions @ views.directions[counted].T, axis=1)], 1.0)
+
+
+def _around(directions: Array, count: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Of unit vectors (V,3), indices (V,count) of the nearest others, and of some on all sides `FAR_DEG` away."""
+    cosines = directions @ directions.T
+    np.fill_diagonal(cosines, -2.0)
+    some = min(count, len(directions) - 1)
+    near = np.argpartition(-cosines, np.arange(some), axis=1)[:, :some]
+    side = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    other = np.cross(directions, side)
+    far = np.empty((len(directions), count), dtype=np.int32)
+    away = np.deg2rad(FAR_DEG)
+    for k, angle in enumerate(2.0 * np.pi * np.arange(count) / count):
+        goal = np.cos(away) * directions + np.sin(away) * (np.cos(angle) * side + np.sin(angle) * other)
+        far[:, k] = np.argmax(goal @ directions.T, axis=1)
+    return near.astype(np.int32), far
 
 
 def _nearest_views(views: GuideViewSet, subdivisions: int) -> NDArray[np.intp]:
@@ -176,6 +214,7 @@ def make_bank(
         origins=-low,
         views=shown.astype(np.int32),
         rolls=rolls,
+        groups=outlines.groups[shown],
         gains=outlines.lines[shown] ** LINES_POWER,
     )
 
@@ -226,15 +265,35 @@ def _add_points(total, flat, source, shift, start, size, first, last):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def match_templates(phases, offsets, bins, gains, first_template, last_template, kept, lowest, votes):  # type: ignore[no-untyped-def]
-    """The matches that stand out most.
+def _bar(votes, kept):  # type: ignore[no-untyped-def]
+    """The key that about ``kept`` of the matches counted in ``votes`` (1024,) reach."""
+    above = 0
+    for level in range(len(votes) - 1, 0, -1):
+        above += votes[level]
+        if above >= kept:
+            return level * KEY_STEP
+    return 0.0
+
+
+@njit(cache=True, nogil=True)
+def _still_in(keys, groups, found, votes, kept):  # type: ignore[no-untyped-def]
+    """Indices of those of the first ``found`` matches that clear the bars of their groups by now."""
+    bars = np.array([_bar(votes[g], kept) for g in range(len(votes))])
+    return np.array([i for i in range(found) if keys[i] >= bars[groups[i]]], dtype=np.int64)
+
+
+@njit(cache=True, nogil=True)
+def match_templates(phases, offsets, bins, gains, groups, first_template, last_template, kept, lowest, votes):  # type: ignore[no-untyped-def]
+    """The matches that stand out most, of each group of templates.
 
     Args:
         phases: from `decimate`.
-        offsets, bins, gains: see `TemplateBank`; the templates from first to last are matched.
-        kept: about so many matches of all calls that share ``votes`` are returned, and some that later ones outdo.
+        offsets, bins, gains, groups: see `TemplateBank`; the templates from first to last are matched.
+        kept: about so many matches of each group are returned, over all calls that share ``votes``, and some that
+            later ones outdo.
         lowest: mean response below which a match is noise.
-        votes: (1024,) int64, how many matches have a key of so many `KEY_STEP`, over all calls that share it.
+        votes: (GROUPS, 1024) int64, how many matches of a group have a key of so many `KEY_STEP`, over all calls that
+            share it.
 
     Returns:
         keys (M,) by which matches compare, templates (M,), places (M,2) of the offsets' origin in full pixels.
@@ -246,14 +305,13 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
     total = np.empty(rows * columns + BLOCK, dtype=np.uint16)
     source = np.empty(points, dtype=np.int64)
     shift = np.empty(points, dtype=np.int64)
-    room = 4 * kept
+    room = 4 * kept * len(votes) + 4096
     keys = np.empty(room)
     templates = np.empty(room, dtype=np.int32)
     cells = np.empty(room, dtype=np.int32)
     found = 0
     full = 63.0 * points
     first_full = 63.0 * FIRST_POINTS
-    bar = 0.0
     for t in range(first_template, last_template):
         reach_x = 0
         reach_y = 0
@@ -282,14 +340,7 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
             count += size
         usual = USUAL_SHARE * sums / (count * first_full)
         gain = gains[t]
-        if t % 16 == 0:
-            above = 0
-            for level in range(len(votes) - 1, 0, -1):
-                above += votes[level]
-                if above >= kept:
-                    bar = max(bar, level * KEY_STEP)
-                    break
-        asked = max(lowest, usual + bar / gain)
+        asked = max(lowest, usual + _bar(votes[groups[t]], kept) / gain)
         if asked > 1.0:
             continue
         limit = np.uint16(max((asked - FIRST_MARGIN) * first_full, 1.0))
@@ -317,21 +368,19 @@ def match_templates(phases, offsets, bins, gains, first_template, last_template,
                 share = sum_all / full
                 if share < asked:
                     continue
-                key = (share - usual) * gain
-                keys[found] = key
+                if found == room:
+                    left = _still_in(keys, groups[templates], found, votes, kept)
+                    # So many of one group only if thousands compare alike: any of them will do.
+                    found = min(len(left), room // 2)
+                    keys[:found] = keys[left[:found]]
+                    templates[:found] = templates[left[:found]]
+                    cells[:found] = cells[left[:found]]
+                keys[found] = (share - usual) * gain
                 templates[found] = t
                 cells[found] = k
+                votes[groups[t], min(int(keys[found] / KEY_STEP), votes.shape[1] - 1)] += 1
                 found += 1
-                votes[min(int(key / KEY_STEP), len(votes) - 1)] += 1
-                if found == room:
-                    best = np.argsort(-keys)[:kept]
-                    bar = max(bar, keys[best[kept - 1]])
-                    keys[:kept] = keys[best]
-                    templates[:kept] = templates[best]
-                    cells[:kept] = cells[best]
-                    found = kept
-                    asked = max(asked, usual + bar / gain)
-    best = np.argsort(-keys[:found])[:kept]
+    best = _still_in(keys, groups[templates[:found]], found, votes, kept)
     places = np.empty((len(best), 2), dtype=np.int32)
     for n in range(len(best)):
         places[n, 0] = cells[best[n]] % columns * step
