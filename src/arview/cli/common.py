@@ -60,6 +60,7 @@ Examples:
   arview check bracket.step
   arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json
   arview reconstruct photos/ --part part.toml -o out/
+  arview live --part part.toml --inspection inspection.json
   arview evaluate bop/castle --init truth
 
 \b

@@ -223,18 +223,29 @@ async def _serve(
 
 
 def _print_welcome(server: LiveServer, place: Place) -> None:
+    certificates = place.certificates
     click.echo(f"page:  {server.link}")
-    if place.trust_link is not None and place.certificates is not None and place.certificates.authority_der:
+    if place.trust_link is not None and certificates is not None and certificates.authority_der is not None:
         from arview.live.trust_page import fingerprint
 
-        new = " (made just now: every phone has to trust it once)" if place.certificates.is_authority_new else ""
-        click.echo(f"first time on a phone:  {place.trust_link}{new}")
-        click.echo(f"fingerprint:  {fingerprint(place.certificates.authority_der)}")
-    if sys.stdout.isatty():
-        import segno
-
-        segno.make(server.link, error="l").terminal(compact=True)
+        click.echo(f"first time on a phone:  {place.trust_link}")
+        click.echo(f"fingerprint:  {fingerprint(certificates.authority_der)}")
+        if certificates.is_authority_new:
+            _print_code(
+                "made just now: every phone has to trust this station once, so scan this first:", place.trust_link
+            )
+    _print_code("the page, for phones that trust this station:", server.link)
     click.echo("Ctrl-C ends")
+
+
+def _print_code(caption: str, link: str) -> None:
+    """A QR code of an address, where there is a terminal to show it."""
+    if not sys.stdout.isatty():
+        return
+    import segno
+
+    click.echo(caption)
+    segno.make(link, error="l").terminal(compact=True)
 
 
 def _tell_logs() -> None:
