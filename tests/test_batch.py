@@ -103,7 +103,7 @@ def test_what_kills_every_worker_stops_only_itself(tmp_path: Path) -> None:
 
     found = run_batch(batch(tmp_path / "in", str(tmp_path / "out"), 3), TWO, Work(key, deadly, LIGHT.files))
     assert [one.verdict for one in found] == ["pass", "error", "pass"]
-    assert "workers died" in found[1].text and not (tmp_path / "out" / "P-01" / "result.json").exists()
+    assert "2 workers died" in found[1].text and not (tmp_path / "out" / "P-01" / "result.json").exists()
 
 
 def test_done_again_only_where_something_changed(tmp_path: Path) -> None:

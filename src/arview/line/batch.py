@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from arview.line.job import InspectJob
 
 RESULT = "result.json"
-RESTARTS = 3
 
 
 @dataclass(frozen=True)
@@ -187,8 +186,8 @@ def run_batch(
 ) -> list[JobResult]:  # fmt: skip
     """Do all jobs and return what became of them, in their order.
 
-    A job whose worker dies is given to another, at most ``RESTARTS`` times; one that fails by storage or memory is
-    tried again. Neither stops the others. Ctrl-C keeps what is finished.
+    A job whose worker dies is given to another, and one that fails by storage or memory is tried again, as often as the
+    options say. Neither stops the others. Ctrl-C keeps what is finished.
 
     Args:
         jobs: what is to be done.
@@ -222,7 +221,7 @@ def run_batch(
         try:
             for future in as_completed(futures):
                 job = futures[future]
-                result = _result(job, future)
+                result = _result(job, future, options.retries)
                 results[job.name] = result
                 if progress is not None:
                     progress(result)
@@ -232,7 +231,7 @@ def run_batch(
     return [results[one.name] for one in jobs]
 
 
-def _result(job: BatchJob, future: Any) -> JobResult:
+def _result(job: BatchJob, future: Any, retries: int) -> JobResult:
     """Of a future that is done, or what broke it off, in one line."""
     from distributed import KilledWorker
 
@@ -241,8 +240,8 @@ def _result(job: BatchJob, future: Any) -> JobResult:
         found: JobResult = future.result()
         return found
     if isinstance(error, KilledWorker):
-        text = (f"{RESTARTS + 1} workers died of it; it may need more memory than a worker has (--memory-limit), or it "
-                "crashes a library")  # fmt: skip
+        workers = f"{retries + 1} workers" if retries else "its worker"
+        text = f"{workers} died of it; it needs more memory than a worker has (--memory-limit), or crashes a library"
     elif isinstance(error, ArviewError):
         text = str(error)
     else:
@@ -257,7 +256,7 @@ def _client(options: BatchOptions, count: int) -> Iterator[Client]:
     from distributed import Client, LocalCluster
 
     settings = {
-        "distributed.scheduler.allowed-failures": RESTARTS,
+        "distributed.scheduler.allowed-failures": options.retries,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.pause": False,  # a job that waits for memory which only it holds would wait forever

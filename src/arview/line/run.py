@@ -168,10 +168,10 @@ class _Line:
             from arview.report import make_report
 
             try:
-                evidence = make_report(source, html, pdf if wants_pdf else None, part, self.folder, progress=self.tell)
+                evidence = make_report(source, html, pdf if wants_pdf else None, part, progress=self.tell)
             except MissingDependencyError as error:
                 self.warnings.append(f"no PDF: {error}")
-                evidence = make_report(source, html, None, part, self.folder, progress=self.tell)
+                evidence = make_report(source, html, None, part, progress=self.tell)
             self.warnings += evidence.absent.values()
             return "HTML and PDF" if pdf.is_file() else "HTML"
 
