@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import av
@@ -15,6 +16,7 @@ import pytest
 from PIL import Image as Pillow
 
 from arview.live.frames import from_jpeg, to_jpeg
+from arview.video import open_source
 from live_client import Http, Running, running
 from live_sample import (
     CAMERA,
@@ -317,3 +319,21 @@ def test_silent_pages_leave_by_themselves() -> None:
         page = server.session()
         page.join()
         wait(lambda: not server.hub.clients)
+
+
+def test_every_phone_is_recorded_from_its_first_picture(tmp_path: Path) -> None:
+    (tmp_path / "out-2.mp4").write_bytes(b"of another day")
+    chosen = options(record=tmp_path / "out.mp4", record_folder=tmp_path, max_age_s=None)
+    with running(chosen, loader(chosen)) as server:
+        pages = [server.session(), server.session()]
+        names = [page.join() for page in pages]
+        for index in range(3):
+            for page, name in zip(pages, names, strict=True):
+                assert send(page, name, index)[0] == 200
+            time.sleep(0.2)
+        assert pages[0].ask("DELETE", f"/api/clients/{names[0]}")[0] == 204
+        assert pages[1].json("GET", f"/api/clients/{names[1]}/status")[1]["recording"]["finished"] == [0]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out-2.mp4", "out-3.mp4", "out.mp4"]
+    assert (tmp_path / "out-2.mp4").read_bytes() == b"of another day"
+    for name in ("out.mp4", "out-3.mp4"):
+        assert 1 <= len(list(open_source(tmp_path / name))) <= 3
