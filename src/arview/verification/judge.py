@@ -19,7 +19,7 @@ FULL_TEST = 35
 """VDI/VDE 2634 part 1 asks for seven measuring lines with five lengths each."""
 COVERAGE = 0.9545
 """Of U with k = 2 and normal errors."""
-_DRAWS = 4000
+_DRAWS = 1000
 _WIDE = 0.5
 """Root mean square of error over standard uncertainty, below which U is called wide."""
 
@@ -222,7 +222,7 @@ def _expected(covariance: Any, is_shared: bool) -> tuple[int, int]:
         low, high = binom.interval(0.95, count, COVERAGE)
         return int(low), int(high)
     values, vectors = np.linalg.eigh(covariance)
-    draws = min(_DRAWS, max(500, 2_000_000 // count))
+    draws = min(_DRAWS, max(200, 500_000 // count))
     noise = np.random.default_rng(0).standard_normal((draws, count))
     errors = noise @ (np.sqrt(np.maximum(values, 0.0)) * vectors).T
     counts = np.sum(np.abs(errors) <= K * np.sqrt(np.diag(covariance)), axis=1)
