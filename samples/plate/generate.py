@@ -3,6 +3,8 @@
     generate.py step                    plate.step
     generate.py truth                   truth.json and camera.json
     generate.py photos [--first A --last B]   photos/img_000.jpg …; skips those that are there
+    generate.py clip --work DIR [--first A --last B]   frames of the clip into DIR; skips those that are there
+    generate.py encode --work DIR       clip.mp4 of them, and clip_truth.json
     generate.py as-built                as_built.ply: what was really rendered, weld beads included (not shipped)
     generate.py verify [--draw DIR]     how well the truth lies on the photos' edges, in px
     generate.py sfm                     pycolmap's defaults against the truth (in arview's environment)
@@ -108,6 +110,57 @@ def make_photos(out: Path, seed: int, first: int, last: int, quality: int) -> No
         print(f"{photo_name(index)}: {time.process_time() - begin:.1f} CPU-s", flush=True)
 
 
+def make_clip(work: Path, seed: int, first: int, last: int) -> None:
+    import cv2
+    import film
+
+    work.mkdir(parents=True, exist_ok=True)
+    missing = [i for i in range(first, min(last, film.FRAMES)) if not (work / f"{i:06d}.png").exists()]
+    if not missing:
+        return
+    shoot = film.Shoot(seed)
+    for index in missing:
+        begin = time.process_time()
+        part = work / f"{index:06d}.part.png"
+        cv2.imwrite(str(part), shoot.frame(index))
+        part.replace(work / f"{index:06d}.png")
+        print(f"frame {index}: {time.process_time() - begin:.1f} CPU-s", flush=True)
+
+
+def encode_clip(out: Path, work: Path, seed: int, crf: int) -> None:
+    import av
+    import cv2
+    import film
+
+    with av.open(str(out / "clip.mp4"), "w", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("libx264", rate=film.FPS)
+        stream.width, stream.height, stream.pix_fmt = film.WIDTH, film.HEIGHT, "yuv420p"
+        stream.options = {"crf": str(crf), "preset": "slow"}
+        context = stream.codec_context
+        context.color_range, context.colorspace = 1, 1
+        context.color_primaries, context.color_trc = 1, 1
+        for index in range(film.FRAMES):
+            picture = cv2.imread(str(work / f"{index:06d}.png"))
+            if picture is None:
+                raise SystemExit(f"frame {index} is missing in {work}; run: generate.py clip --work {work}")
+            frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+            frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
+            for packet in stream.encode(frame):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    head = {
+        "clip": "clip.mp4",
+        "fps": film.FPS,
+        "convention": "cam_from_model: 4x4 row-major, mm, OpenCV camera, at mid-exposure; a line for each frame",
+        "camera": film.camera(seed),
+    }
+    poses = [json.dumps(np.round(film.cam_from_model(index, seed), 9).tolist()) for index in range(film.FRAMES)]
+    text = json.dumps(head, indent=1)[:-2] + ',\n "cam_from_model": [\n  ' + ",\n  ".join(poses) + "\n ]\n}\n"
+    (out / "clip_truth.json").write_text(text)
+    print(f"{out / 'clip.mp4'}: {(out / 'clip.mp4').stat().st_size / 1e6:.2f} MB")
+
+
 def make_as_built(out: Path, seed: int) -> None:
     import scene
     import textures as tx
@@ -119,11 +172,13 @@ def make_as_built(out: Path, seed: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=("step", "truth", "photos", "as-built", "verify", "sfm"))
+    parser.add_argument("command", choices=("step", "truth", "photos", "clip", "encode", "as-built", "verify", "sfm"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--out", type=Path, help="default: this folder for seed 0, else /tmp/plate_SEED")
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--last", type=int, default=24, help="not itself")
+    parser.add_argument("--last", type=int, help="not itself; default: all")
+    parser.add_argument("--work", type=Path, default=Path("/tmp/plate_clip"), help="folder for the clip's frames")
+    parser.add_argument("--crf", type=int, default=20, help="of the clip")
     parser.add_argument("--quality", type=int, default=91, help="of the JPEGs")
     parser.add_argument("--draw", type=Path, help="folder for photos with the CAD's edges drawn in")
     arguments = parser.parse_args()
@@ -135,7 +190,11 @@ def main() -> None:
     elif arguments.command == "truth":
         make_truth(out, seed)
     elif arguments.command == "photos":
-        make_photos(out, seed, arguments.first, arguments.last, arguments.quality)
+        make_photos(out, seed, arguments.first, arguments.last or 24, arguments.quality)
+    elif arguments.command == "clip":
+        make_clip(arguments.work, seed, arguments.first, arguments.last or 10**6)
+    elif arguments.command == "encode":
+        encode_clip(out, arguments.work, seed, arguments.crf)
     elif arguments.command == "as-built":
         make_as_built(out, seed)
     elif arguments.command == "verify":

@@ -149,8 +149,8 @@ def _clutter(shapes, rng):
     add("cable", tx.sweep(cable, 4.0, 12), matte((0.03, 0.33, 0.09), 0.35), crease=60)
 
 
-def build(seed: int, camera: dict):
-    """The scene as a Mitsuba object; its sensor is placed by ``Studio``."""
+def build(seed: int, camera: dict, film: dict | None = None):
+    """The scene as a Mitsuba object with the photos' sensor, or another; it is placed by who renders."""
     rng = np.random.default_rng((seed, 5))
     shapes: dict[str, object] = {}
     _part(shapes, seed, rng)
@@ -162,7 +162,7 @@ def build(seed: int, camera: dict):
     )
     scene = {
         "type": "scene",
-        "sensor": sensor(FILM, camera["fx"], APERTURE_MM, 750.0),
+        "sensor": film or sensor(FILM, camera["fx"], APERTURE_MM, 750.0),
         "strip_1": lamp([-450 + x, 250, 1750], [-400 + x, 200, 0], (1500, 260), strip_1.tolist()),
         "strip_2": lamp([600, -250 + y, 1750], [550, -200 + y, 0], (1500, 260), strip_2.tolist()),
         "window": lamp([-1750, 300 + y, 900], [0, 0, 0], (1500, 1200), window.tolist()),

@@ -188,11 +188,10 @@ def line_bar(has_film: bool, is_from_video: bool, has_pdf: bool) -> Iterator[Cal
 
     from arview.line.clock import Clock, Moment, clock_text
 
-    with tqdm(total=100.0, disable=None, leave=False, bar_format="{desc} {percentage:3.0f} % |{bar}| {postfix}") as bar:
+    with tqdm(total=100.0, disable=None, leave=False, bar_format="{desc} {percentage:3.0f} % |{bar}|") as bar:
 
         def show(moment: Moment) -> None:
-            bar.set_description_str(f"{moment.step:18}", refresh=False)
-            bar.set_postfix_str(clock_text(moment), refresh=False)
+            bar.set_description_str(f"{moment.step:18}{clock_text(moment):>18}", refresh=False)
             bar.update(100.0 * moment.share - bar.n)
 
         yield Clock(show, is_from_video, has_film, has_pdf).tell
