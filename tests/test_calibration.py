@@ -204,7 +204,7 @@ def test_a_folder_of_photos(photos: Path) -> None:
     assert_near_truth(solution, focal=0.001, centre_px=0.6, pixel_px=0.06, corner_px=0.6)
     errors = numbers(solution.camera) - numbers(LENS)
     assert np.count_nonzero(np.abs(errors) <= 2.0 * solution.std) >= 7
-    assert solution.rms_px < 0.1
+    assert solution.rms_px < 0.15
     assert judged.grade in (Grade.GOOD, Grade.USABLE)
     assert judged.focal_u < 0.002
     assert judged.coverage > 0.9
@@ -215,19 +215,22 @@ def test_a_folder_of_photos(photos: Path) -> None:
 
 
 def test_blur_and_noise(pictures: list[np.ndarray]) -> None:
+    """Half the contrast, twice the noise, edges three times as soft: five times less exact, and U says so."""
     rng = np.random.default_rng(9)
     finder = BoardFinder(BOARD)
     found = []
-    for k, gray in enumerate(pictures[:14]):
-        soft = cv2.GaussianBlur(gray, (0, 0), 1.6).astype(float) * 0.6 + 20.0 + rng.normal(0.0, 6.0, gray.shape)
+    for k, gray in enumerate(pictures):
+        soft = cv2.GaussianBlur(gray, (0, 0), 1.4).astype(float) * 0.6 + 20.0 + rng.normal(0.0, 6.0, gray.shape)
         view = finder.find(str(k), np.clip(soft, 0, 255).astype(np.uint8))
         if isinstance(view, BoardView):
             found.append(view)
-    assert len(found) >= 10
+    assert len(found) >= 14
     solution = solve(found, 640, 480)
-    assert_near_truth(solution, focal=0.006, centre_px=5.0, pixel_px=0.3, corner_px=2.5)
+    assert_near_truth(solution, focal=0.006, centre_px=4.0, pixel_px=0.6, corner_px=3.0)
     errors = numbers(solution.camera) - numbers(LENS)
-    assert np.count_nonzero(np.abs(errors) <= 2.0 * solution.std) >= 7
+    assert np.count_nonzero(np.abs(errors) <= 2.0 * solution.std) >= 8
+    off = np.linalg.norm(pixel_difference(LENS, solution.camera, GRID), axis=1)
+    assert np.mean(off <= pixel_uncertainty(solution, GRID)) >= 0.8
 
 
 @pytest.mark.parametrize("together_px", [0.0, 0.1])

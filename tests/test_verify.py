@@ -49,7 +49,7 @@ APART = KNOWN[:0] + [
 def test_errors_and_limits() -> None:
     places = {"a": [0.0, 0, 0], "b": [100.059, 0, 0], "c": [0, 200.0, 0]}
     points = Measured("p", {k: Mark(np.array(v), 0.02**2 * np.eye(3)) for k, v in places.items()}, {}, 0.0, {})
-    known = [KnownLength("a", "b", 100.0, 0.02), KnownLength("a", "c", 200.1, 0.01), KnownLength("a", "d", 5.0)]
+    known = [KnownLength("a", "b", 100.0, 0.02), KnownLength("a", "c", 200.12, 0.01), KnownLength("a", "d", 5.0)]
     test = verify(points, known, "k", parse_limit("0.05 + L/5000"))
     first, second = test.lengths
     assert first.error_mm == pytest.approx(0.059)
@@ -57,8 +57,8 @@ def test_errors_and_limits() -> None:
     assert first.verdict is Verdict.UNDECIDED  # 0.059 ± 0.02 about 0.07
     assert first.uncertainty_mm == pytest.approx(2 * np.sqrt(2) * 0.02)
     assert first.is_within_u is True  # within 0.0566 and 0.02 together
-    assert second.error_mm == pytest.approx(-0.1)
-    assert second.limit_mm == pytest.approx(0.05 + 200.1 / 5000)
+    assert second.error_mm == pytest.approx(-0.12)
+    assert second.limit_mm == pytest.approx(0.05 + 200.12 / 5000)
     assert second.verdict is Verdict.FAIL
     assert second.is_within_u is False
     assert test.left_out == {"a to d": "d is not in p"}
