@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -30,15 +31,20 @@ from live_sample import CLIP, PART, SAMPLE
 CHROMIUM = os.environ.get("ARVIEW_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 START, STRIDE, COUNT = 21, 3, 14
 """Frames of the clip in which the part is in full view, every third: it moves 3 to 5 px from one to the next."""
+CLIP_SIZE = 1280, 720
 BITS, CELL_PX, EDGE_PX = 8, 12, 4
 """The counter in the upper left corner: the number of the frame and, below, the same inverted."""
 
 
 @cache
-def frames(width: int, height: int) -> list[Image]:
-    """(H,W,3) frames of the clip with their number drawn into the corner."""
-    source = open_source(CLIP, START, START + STRIDE * COUNT, STRIDE)
-    images = [cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA) for frame in source]
+def frames(width: int, height: int, stride: int = STRIDE, count: int = COUNT) -> list[Image]:
+    """(H,W,3) frames of the clip, their middle if the shape is another, with their number drawn into the corner."""
+    left, shown = _crop(width, height)
+    source = open_source(CLIP, START, START + stride * count, stride)
+    images = [
+        cv2.resize(frame.image[:, left : left + shown], (width, height), interpolation=cv2.INTER_AREA)
+        for frame in source
+    ]
     for number, image in enumerate(images):
         image[: 2 * (CELL_PX + EDGE_PX), : BITS * CELL_PX + 2 * EDGE_PX] = 128
         for bit in range(BITS):
@@ -47,6 +53,19 @@ def frames(width: int, height: int) -> list[Image]:
             image[EDGE_PX : EDGE_PX + CELL_PX, columns] = 255 * is_set
             image[EDGE_PX + CELL_PX : EDGE_PX + 2 * CELL_PX, columns] = 255 * (1 - is_set)
     return images
+
+
+def camera(width: int, height: int) -> Camera:
+    """Intrinsics of the frames."""
+    whole = load_camera(str(SAMPLE / "camera.json"), *CLIP_SIZE)
+    left, shown = _crop(width, height)
+    return replace(whole, width=shown, cx=whole.cx - left).scaled(width, height)
+
+
+def _crop(width: int, height: int) -> tuple[int, int]:
+    """First column, and number of columns, of the clip's frames that are shown in this shape."""
+    shown = min(CLIP_SIZE[0], round(CLIP_SIZE[1] * width / height))
+    return (CLIP_SIZE[0] - shown) // 2, shown
 
 
 def number_in(picture: Image, scale: float = 1.0) -> int | None:
@@ -71,14 +90,9 @@ def truth() -> list[Array]:
     return [np.array(described[START + STRIDE * k]["cam_from_model"]) for k in range(COUNT)]
 
 
-def camera(width: int, height: int) -> Camera:
-    """Intrinsics of the frames."""
-    return load_camera(str(SAMPLE / "camera.json"), width, height)
-
-
-def there_and_back() -> list[int]:
+def there_and_back(count: int = COUNT) -> list[int]:
     """Order in which the frames are played over and over, without a jump."""
-    return [*range(COUNT), *range(COUNT - 2, 0, -1)]
+    return [*range(count), *range(count - 2, 0, -1)]
 
 
 def write_y4m(path: Path, images: Sequence[Image], fps: int) -> None:
@@ -101,7 +115,7 @@ def browser(film: Path | None, *more: str) -> Iterator[Any]:
         pytest.skip("Chromium is not installed: apt-get install chromium")
     arguments = [
         "--no-sandbox", "--disable-dev-shm-usage", "--allow-loopback-in-peer-connection",
-        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb",
+        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing", "--force-color-profile=srgb",
         "--use-fake-ui-for-media-stream", "--autoplay-policy=no-user-gesture-required", *more,
     ]  # fmt: skip
     if film is not None:

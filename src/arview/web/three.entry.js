@@ -1,8 +1,8 @@
 // What arview's pages use of three.js. `tools/vendor-web` makes three.min.js of it; names may be added.
 export {
   AmbientLight, ArrowHelper, Box3, BufferAttribute, BufferGeometry, Camera, CanvasTexture, ClampToEdgeWrapping, Color,
-  ConeGeometry, CustomBlending, CylinderGeometry, DirectionalLight, DoubleSide, EdgesGeometry, Float32BufferAttribute,
-  FrontSide, GLSL3, Group, HemisphereLight, InstancedBufferAttribute, InstancedBufferGeometry, Line, LinearFilter,
+  ConeGeometry, CustomBlending, CylinderGeometry, DirectionalLight, DoubleSide, DynamicDrawUsage, EdgesGeometry,
+  Float32BufferAttribute, FrontSide, GLSL3, Group, HemisphereLight, Line, LinearFilter,
   LineBasicMaterial, LineSegments, Matrix4, Mesh, MeshBasicMaterial, MeshLambertMaterial, MeshStandardMaterial,
   NearestFilter, NoBlending, NoColorSpace, OneFactor, OneMinusSrcAlphaFactor, OrthographicCamera, PerspectiveCamera,
   Points, PointsMaterial, Quaternion, RawShaderMaterial, Raycaster, RGBAFormat, SRGBColorSpace, Scene, Sphere, Sprite,

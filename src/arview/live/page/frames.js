@@ -1,5 +1,6 @@
 // The last frames, each with its id, so that an answer that comes later finds the very picture it speaks of.
 
+import { CANVAS_OPTIONS } from "./graphics.js";
 import { isNewer } from "./stamp.js";
 
 export class FrameRing {
@@ -44,7 +45,7 @@ export class FrameRing {
   }
 
   #add() {
-    const canvas = document.createElement("canvas"), context = canvas.getContext("2d", { alpha: false });
+    const canvas = document.createElement("canvas"), context = canvas.getContext("2d", CANVAS_OPTIONS);
     const slot = { canvas, context, id: null, order: 0 };
     this.#slots.push(slot);
     return slot;

@@ -2,12 +2,13 @@
 //
 // The model is drawn as an ideal lens sees it into a texture, and the texture is bent like the lens over the picture.
 
-import { bend, eyeInModel, glProjection, glView } from "./projection.js";
-import { meshEdges } from "./mesh_edges.js";
+import { SAMPLES } from "./graphics.js";
+import { bend, eyeInModel, glProjection, glView, toCam } from "./projection.js";
+import { MeshEdges, welded } from "./mesh_edges.js";
 
 const THREE = globalThis.THREE;
 
-const SAMPLES = 4; // of antialiasing
+const BOX_MARGIN_PX = 8;
 const CELLS_ACROSS = 160; // of the map of who is seen where
 const CRITICAL_DIMMING = 0.55;
 const GUIDE_RGB = [1, 0.867, 0.341], HALO_RGB = [0.063, 0.078, 0.106];
@@ -15,59 +16,60 @@ const GUIDE_RGB = [1, 0.867, 0.341], HALO_RGB = [0.063, 0.078, 0.106];
 const SURFACE_VERTEX = `
 precision highp float;
 in vec3 position;
-in vec3 normal;
 uniform mat4 view, projection;
-out vec3 v_place, v_normal;
+out vec3 v_place;
 void main() {
   vec4 place = view * vec4(position, 1.0);
   v_place = place.xyz;
-  v_normal = mat3(view) * normal;
   gl_Position = projection * place;
 }`;
 // Grazing faces a little denser, like glass; faces towards the camera brighter.
 const SURFACE_FRAGMENT = `
 precision highp float;
-in vec3 v_place, v_normal;
+in vec3 v_place;
 uniform vec4 color;
 uniform float dimming;
 out vec4 result;
 void main() {
-  float facing = abs(dot(normalize(v_normal), normalize(v_place)));
+  float facing = abs(dot(normalize(cross(dFdx(v_place), dFdy(v_place))), normalize(v_place)));
   float alpha = min(1.0, color.a * dimming * (1.25 - 0.35 * facing));
   result = vec4(color.rgb * (0.45 + 0.55 * facing) * alpha, alpha);
 }`;
-// A line is a rectangle as long as the edge and as wide as asked for on the screen. It is drawn a thousandth of its
-// distance nearer than it is, or the faces beside it would cover it.
+// A line is a rectangle as long as the edge and as wide as asked for on the screen, and a pixel more, over which it
+// fades. It is drawn a thousandth of its distance nearer than it is, or the faces beside it would cover it.
 const LINE_VERTEX = `
 precision highp float;
-in vec2 position;
-in vec3 start, end, normal, otherNormal;
-in float kind;
+in vec3 position, otherEnd;
+in vec2 corner;
 uniform mat4 view, projection;
-uniform vec3 eye;
 uniform vec2 viewport;
 uniform float width;
+out float v_aside;
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-  if (kind < 0.5 && dot(normal, eye - start) * dot(otherNormal, eye - start) > 0.0) return;
-  vec3 a = (view * vec4(start, 1.0)).xyz, b = (view * vec4(end, 1.0)).xyz;
-  if (a.z > -1.0 && b.z > -1.0) return;
-  if (a.z > -1.0) a = mix(b, a, (-1.0 - b.z) / (a.z - b.z));
-  if (b.z > -1.0) b = mix(a, b, (-1.0 - a.z) / (b.z - a.z));
-  vec4 from = projection * vec4(0.999 * a, 1.0), to = projection * vec4(0.999 * b, 1.0);
-  vec2 along = (to.xy / to.w - from.xy / from.w) * viewport;
+  v_aside = 0.0;
+  vec3 here = (view * vec4(position, 1.0)).xyz, there = (view * vec4(otherEnd, 1.0)).xyz;
+  if (here.z > -1.0 && there.z > -1.0) return;
+  if (here.z > -1.0) here = mix(there, here, (-1.0 - there.z) / (here.z - there.z));
+  if (there.z > -1.0) there = mix(here, there, (-1.0 - here.z) / (there.z - here.z));
+  vec4 place = projection * vec4(0.999 * here, 1.0), other = projection * vec4(0.999 * there, 1.0);
+  vec2 along = (other.xy / other.w - place.xy / place.w) * viewport * corner.x;
   float length_px = length(along);
   along = length_px > 1e-4 ? along / length_px : vec2(1.0, 0.0);
-  vec4 place = position.x < 0.5 ? from : to;
-  vec2 aside = width * (vec2(-along.y, along.x) * position.y + along * (2.0 * position.x - 1.0) * 0.5);
-  gl_Position = place + vec4(aside / viewport * place.w, 0.0, 0.0);
+  v_aside = corner.y * 0.5 * (width + 1.0);
+  vec2 offset_px = vec2(-along.y, along.x) * v_aside - along * corner.x * 0.25 * width;
+  gl_Position = place + vec4(2.0 * offset_px / viewport * place.w, 0.0, 0.0);
 }`;
 const LINE_FRAGMENT = `
 precision highp float;
+in float v_aside;
 uniform vec4 color;
-uniform float dimming;
+uniform float dimming, width;
 out vec4 result;
-void main() { result = vec4(color.rgb, 1.0) * color.a * dimming; }`;
+void main() {
+  float cover = clamp(0.5 * (width + 1.0) - abs(v_aside), 0.0, 1.0);
+  result = vec4(color.rgb, 1.0) * color.a * dimming * cover;
+}`;
 const NUMBER_FRAGMENT = `
 precision highp float;
 uniform vec2 number;
@@ -101,13 +103,12 @@ export class Ghost {
     this.shared = {
       view: { value: new THREE.Matrix4() },
       projection: { value: new THREE.Matrix4() },
-      eye: { value: new THREE.Vector3() },
       viewport: { value: new THREE.Vector2(1, 1) },
       width: { value: 2 },
       dimming: { value: 1 },
     };
     this.nobody = new THREE.Camera(); // the shaders have their own matrices
-    this.components = []; // {surface, lines, number, center_in_model, corners_in_model}
+    this.components = []; // {surface, lines, number, edges, center_in_model, corners_in_model}
     this.model = new THREE.Scene();
     this.numbers = new THREE.Scene();
     this.picture = this.#quad();
@@ -148,7 +149,10 @@ export class Ghost {
       lines.material.uniforms.color.value.set(...edges);
       surface.visible = number.visible = isShown;
       lines.visible = isShown && edges[3] > 0;
+      // What has no colour of its own only hides; it comes first, so that nothing has to be taken back.
+      surface.material.colorWrite = ghost[3] > 0;
     });
+    this.model.children.sort((a, b) => Number(a.material.colorWrite) - Number(b.material.colorWrite));
   }
 
   /** Size of the canvas in device pixels. */
@@ -169,6 +173,7 @@ export class Ghost {
     if (shown) {
       this.#look(camera, shown, lineWidth);
       this.shared.dimming.value = pose && isCritical ? CRITICAL_DIMMING : 1;
+      this.target.scissor.set(...this.#box(camera, shown, this.bent.window, this.target.height, false));
       renderer.setRenderTarget(this.target);
       renderer.setClearColor(0x000000, 0);
       renderer.clear();
@@ -185,7 +190,12 @@ export class Ghost {
       this.texture.needsUpdate = true;
       renderer.render(this.picture.scene, this.nobody);
     }
-    if (shown) renderer.render(this.layer.scene, this.nobody);
+    if (!shown) return;
+    const whole = { left: 0, top: 0, width: camera.width, height: camera.height };
+    renderer.setScissorTest(true);
+    renderer.setScissor(...this.#box(camera, shown, whole, this.canvas.height, true));
+    renderer.render(this.layer.scene, this.nobody);
+    renderer.setScissorTest(false);
   }
 
   /**
@@ -225,6 +235,7 @@ export class Ghost {
     if (this.target?.width !== width || this.target?.height !== height) {
       this.target?.dispose();
       this.target = new THREE.WebGLRenderTarget(width, height, { samples: SAMPLES, colorSpace: THREE.NoColorSpace });
+      this.target.scissorTest = true;
       this.layer.material.uniforms.image.value = this.target.texture;
     }
     let [near, far] = [Infinity, 0];
@@ -238,9 +249,38 @@ export class Ghost {
     near = Math.max(1, 0.95 * near);
     this.shared.view.value.fromArray(glView(pose));
     this.shared.projection.value.fromArray(glProjection(camera, window, near, Math.max(1.05 * far, near + 1)));
-    this.shared.eye.value.set(...eyeInModel(pose));
+    const eye = eyeInModel(pose);
+    for (const { lines, edges } of this.components) if (lines.visible) chooseLines(lines.geometry, edges, eye);
     this.shared.viewport.value.set(width, height);
     this.shared.width.value = lineWidth;
+  }
+
+  /**
+   * Box [x, y, width, height] around the model in a drawing of a window of the image plane that is `height` rows high;
+   * y counts from below as in GL. Outside of it nothing is drawn.
+   */
+  #box(camera, pose, window, height, isBent) {
+    const scale = height / window.height, reach = { left: Infinity, top: Infinity, right: -Infinity, bottom: -Infinity };
+    const all = [0, 0, Math.ceil(window.width * scale), height];
+    for (const { corners_in_model: corners } of this.components) {
+      for (const corner of corners) {
+        const [x, y, z] = toCam(pose, corner);
+        const pixel = isBent ? camera.project([x, y, z]) : z > 1 && [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy];
+        if (!pixel) return all;
+        reach.left = Math.min(reach.left, pixel[0]);
+        reach.right = Math.max(reach.right, pixel[0]);
+        reach.top = Math.min(reach.top, pixel[1]);
+        reach.bottom = Math.max(reach.bottom, pixel[1]);
+      }
+    }
+    // A lens bends the sides of a box outwards by a few per cent at most.
+    const margin = BOX_MARGIN_PX + (isBent ? 0.03 * Math.max(reach.right - reach.left, reach.bottom - reach.top) : 0);
+    const clamp = (value, most) => Math.min(most, Math.max(0, value));
+    const left = clamp(Math.floor((reach.left - margin - window.left) * scale), all[2]);
+    const right = clamp(Math.ceil((reach.right + margin - window.left) * scale), all[2]);
+    const top = clamp(Math.floor((reach.top - margin - window.top) * scale), height);
+    const bottom = clamp(Math.ceil((reach.bottom + margin - window.top) * scale), height);
+    return [left, height - bottom, right - left, bottom - top];
   }
 
   #bendLike(camera) {
@@ -281,19 +321,24 @@ export class Ghost {
     }
   }
 
-  #component(geometry, index) {
-    const positions = geometry.attributes.position.array;
-    const indices = geometry.index?.array ?? Uint32Array.from({ length: positions.length / 3 }, (_, i) => i);
+  #component(given, index) {
+    const corners = given.attributes.position.array;
+    const order = given.index?.array ?? Uint32Array.from({ length: corners.length / 3 }, (_, i) => i);
+    const { positions, indices } = welded(corners, order);
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+    geometry.setIndex(new THREE.BufferAttribute(indices, 1));
     geometry.computeBoundingBox();
     const { min, max } = geometry.boundingBox;
     const surface = new THREE.Mesh(geometry, this.#surfaceMaterial());
-    const lines = new THREE.Mesh(lineGeometry(meshEdges(positions, indices)), this.#lineMaterial([1, 1, 1, 1]));
+    const edges = new MeshEdges(positions, indices);
+    const lines = new THREE.Mesh(lineGeometry(edges), this.#lineMaterial([1, 1, 1, 1]));
     const number = new THREE.Mesh(geometry, this.#numberMaterial(index + 1));
     for (const mesh of [surface, lines, number]) mesh.frustumCulled = false;
     this.model.add(surface, lines);
     this.numbers.add(number);
     return {
-      surface, lines, number,
+      surface, lines, number, edges,
       center_in_model: [(min.x + max.x) / 2, (min.y + max.y) / 2, (min.z + max.z) / 2],
       corners_in_model: [0, 1, 2, 3, 4, 5, 6, 7].map((k) => [
         (k & 1 ? max : min).x, (k & 2 ? max : min).y, (k & 4 ? max : min).z,
@@ -350,14 +395,34 @@ const OVER = {
   blendDstAlpha: THREE.OneMinusSrcAlphaFactor,
 };
 
-function lineGeometry({ starts, ends, normals, otherNormals, kinds }) {
-  const geometry = new THREE.InstancedBufferGeometry();
-  geometry.setAttribute("position", new THREE.Float32BufferAttribute([0, -1, 1, -1, 0, 1, 1, 1], 2));
-  geometry.setIndex([0, 1, 2, 2, 1, 3]);
-  for (const [name, values] of Object.entries({ start: starts, end: ends, normal: normals, otherNormal: otherNormals })) {
-    geometry.setAttribute(name, new THREE.InstancedBufferAttribute(values, 3));
+/** Four corners a line; `corner` is (1 at the start and -1 at the end, side). Which lines are drawn is said later. */
+function lineGeometry({ starts, ends, count }) {
+  const position = new Float32Array(12 * count), otherEnd = new Float32Array(12 * count), corner = new Float32Array(8 * count);
+  for (let line = 0; line < count; line++) {
+    const [start, end] = [starts.subarray(3 * line, 3 * line + 3), ends.subarray(3 * line, 3 * line + 3)];
+    for (let k = 0; k < 4; k++) {
+      position.set(k < 2 ? start : end, 3 * (4 * line + k));
+      otherEnd.set(k < 2 ? end : start, 3 * (4 * line + k));
+      corner.set([k < 2 ? 1 : -1, k % 2 ? 1 : -1], 2 * (4 * line + k));
+    }
   }
-  geometry.setAttribute("kind", new THREE.InstancedBufferAttribute(kinds, 1));
-  geometry.instanceCount = kinds.length;
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
+  geometry.setAttribute("otherEnd", new THREE.BufferAttribute(otherEnd, 3));
+  geometry.setAttribute("corner", new THREE.BufferAttribute(corner, 2));
+  geometry.setIndex(new THREE.BufferAttribute(new Uint32Array(6 * count), 1).setUsage(THREE.DynamicDrawUsage));
   return geometry;
+}
+
+/** Draw the lines that may be seen from a point of the model. */
+function chooseLines(geometry, edges, eye) {
+  const { index } = geometry, { array } = index;
+  let count = 0;
+  edges.forEachSeen(eye, (line) => {
+    for (const k of [0, 1, 2, 2, 1, 3]) array[count++] = 4 * line + k;
+  });
+  geometry.setDrawRange(0, count);
+  index.clearUpdateRanges();
+  index.addUpdateRange(0, count);
+  index.needsUpdate = true;
 }

@@ -1,5 +1,6 @@
 // The stage: where the picture lies on the screen, and what is drawn over it.
 
+import { CANVAS_OPTIONS } from "./graphics.js";
 import { Ghost } from "./ghost.js";
 import { Labels } from "./labels.js";
 
@@ -28,7 +29,7 @@ export class Stage {
       this.ghost = new Ghost(this.canvas);
     } catch {
       this.ghost = null;
-      this.context = this.canvas.getContext("2d", { alpha: false });
+      this.context = this.canvas.getContext("2d", CANVAS_OPTIONS);
     }
     this.part = null;
     this.labelBoxes = new Labels(this.labels, this.leaders, onPick);

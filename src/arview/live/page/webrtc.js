@@ -1,5 +1,6 @@
 // Transport by WebRTC: the camera goes up, poses come by a data channel, pictures of the server come as video.
 
+import { CANVAS_OPTIONS } from "./graphics.js";
 import { ask, join, leave } from "./api.js";
 import { watchFrames } from "./camera.js";
 import { drawStrip, readStamp, stripHeight } from "./stamp.js";
@@ -86,7 +87,7 @@ export class WebrtcLink {
     if (this.isPhone) {
       const canvas = document.createElement("canvas");
       [canvas.width, canvas.height] = [640, 500];
-      this.context = canvas.getContext("2d", { alpha: false });
+      this.context = canvas.getContext("2d", CANVAS_OPTIONS);
       const byHand = "requestFrame" in (globalThis.CanvasCaptureMediaStreamTrack?.prototype ?? {});
       [this.track] = (byHand ? canvas.captureStream(0) : canvas.captureStream()).getVideoTracks();
       this.track.contentHint = "detail"; // rather fewer pictures than smaller ones
