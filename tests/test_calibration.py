@@ -30,7 +30,8 @@ from arview.camera_write import FORMATS, write_camera
 from arview.cli import main
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.photo_exif import PhotoExif
+from arview.photo_exif import PhotoExif, read_exif
+from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.scale import Board, parse_board
 from arview.reconstruction.scale.targets import cv_board
 from board_scene import BOARD, LENS, photograph, pose
@@ -201,7 +202,7 @@ def test_a_folder_of_photos(photos: Path) -> None:
     assert "does not fit the others" in result.rejected["x_bent.jpg"]
     assert "800×600" in result.rejected["x_wide.jpg"]
     assert (solution.camera.width, solution.camera.height) == (640, 480)  # of portrait photos too
-    assert_near_truth(solution, focal=0.001, centre_px=0.6, pixel_px=0.06, corner_px=0.6)
+    assert_near_truth(solution, focal=0.001, centre_px=0.6, pixel_px=0.1, corner_px=0.6)
     errors = numbers(solution.camera) - numbers(LENS)
     assert np.count_nonzero(np.abs(errors) <= 2.0 * solution.std) >= 7
     assert solution.rms_px < 0.15
@@ -417,6 +418,11 @@ def test_profiles_are_found_by_what_pictures_say(photos: Path, tmp_path: Path, m
     # A portrait photo of this phone: the camera is found, and turned with it.
     upright = load_camera("profile", 480, 640, source=photos / "p01.jpg", quarter_turns_clockwise=1)
     assert np.allclose(numbers(upright), numbers(camera.rotated(1)))
+    lenses, _ = lenses_of([read_exif(photos / "p00.jpg"), read_exif(photos / "p01.jpg")], "profile")
+    for lens, turned in zip(lenses, (camera, camera.rotated(1)), strict=True):
+        assert isinstance(lens, Lens)
+        assert lens.is_calibrated
+        assert np.allclose(numbers(lens.camera), numbers(turned))
     write_photo(tmp_path / "other.jpg", np.zeros((480, 640), np.uint8), model="Pixel 3")
     with pytest.raises(InputError, match=r"none for google-pixel-3-6\.9mm-640x480; there are google-pixel-9"):
         load_camera("profile", 640, 480, source=tmp_path / "other.jpg")

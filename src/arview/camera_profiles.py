@@ -95,22 +95,20 @@ def find_profile(spec: str, source: str | Path | None = None, folder: Path | Non
         InputError: there is no such profile; the message names those there are.
     """
     folder = folder or profile_folder()
-    known = [profile.name for profile in list_profiles(folder)]
-    have = f"there are {', '.join(known[:8])}" if known else f"there are none in {folder}"
-    hint = f"{have}; `arview calibrate … --profile` makes one"
     name = spec.removeprefix("profile").removeprefix(":")
     if name:
         path = profile_path(name, folder)
         if not path.is_file():
-            raise InputError(f"camera 'profile:{name}': no such profile; {hint}")
+            raise InputError(f"camera 'profile:{name}': no such profile; {_which(folder)}")
         return path
     if source is None:
-        raise InputError(f"camera 'profile': no file to read make and model from; give profile:NAME ({have})")
-    wanted = lens_of_source(Path(source))
-    found = [profile for profile in list_profiles(folder) if same_lens(profile.lens, wanted)]
-    if not found:
-        raise InputError(f"camera 'profile': none for {profile_name(wanted)}; {hint}")
-    return found[0].path
+        raise InputError(f"camera 'profile': no file to read make and model from; give profile:NAME; {_which(folder)}")
+    return _profile_of_lens(lens_of_source(Path(source)), folder)
+
+
+def profile_of_photo(exif: PhotoExif, folder: Path | None = None) -> Path:
+    """The camera file kept for the lens and mode of a photo. Raises InputError when there is none."""
+    return _profile_of_lens(lens_record(exif, *_sensor_size(exif)), folder or profile_folder())
 
 
 def same_lens(a: dict[str, Any], b: dict[str, Any]) -> bool:
@@ -145,8 +143,7 @@ def lens_of_source(source: Path) -> dict[str, Any]:
         source = photos[0]
     if source.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES:
         exif = read_exif(source)
-        width, height = exif.upright_size
-        return lens_record(exif, *((height, width) if exif.quarter_turns_clockwise % 2 else (width, height)))
+        return lens_record(exif, *_sensor_size(exif))
     if not source.is_file():
         raise InputError(f"camera 'profile': {source} is no file that says its camera; give profile:NAME")
     from arview.video import open_source
@@ -173,3 +170,21 @@ def exif_of_video(path: Path, width: int, height: int) -> PhotoExif:
         return next((str(tags[key]).strip() for key in keys if tags.get(key)), "")
 
     return PhotoExif(width, height, make=first(_MAKE_KEYS), model=first(_MODEL_KEYS))
+
+
+def _profile_of_lens(lens: dict[str, Any], folder: Path) -> Path:
+    found = [profile.path for profile in list_profiles(folder) if same_lens(profile.lens, lens)]
+    if not found:
+        raise InputError(f"camera 'profile': none for {profile_name(lens)}; {_which(folder)}")
+    return found[0]
+
+
+def _which(folder: Path) -> str:
+    known = [profile.name for profile in list_profiles(folder)]
+    have = f"there are {', '.join(known[:8])}" if known else f"there are none in {folder}"
+    return f"{have}; `arview calibrate … --profile` makes one"
+
+
+def _sensor_size(exif: PhotoExif) -> tuple[int, int]:
+    width, height = exif.upright_size
+    return (height, width) if exif.quarter_turns_clockwise % 2 else (width, height)

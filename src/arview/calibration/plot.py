@@ -27,12 +27,12 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
     length = np.linalg.norm(residuals, axis=1)
     most = float(np.percentile(length, 99)) or 1.0
     scale = _ARROW * max(camera.width, camera.height) / most
-    height = 4.6 * min(1.6, max(0.5, camera.height / camera.width)) + 1.0
+    height = 4.6 * min(1.6, max(0.5, camera.height / camera.width)) + 0.7
     with figure(height, 10.0, has_grid=False, ncols=2) as (made, (left, right)):
         arrows = left.quiver(*pixels.T, *(residuals * scale).T, length, angles="xy", scale_units="xy", scale=1,
                              cmap="viridis", width=0.0022, clim=(0, most))  # fmt: skip
-        made.colorbar(arrows, ax=left, shrink=0.8, label="residual, px")
-        covered = f"{len(pixels)} corners of {len(solution.views)} views, {100 * judged.coverage:.0f} % of the picture"
+        made.colorbar(arrows, ax=left, orientation="horizontal", aspect=40, label="residual, px")
+        covered = f"{len(pixels)} corners, {len(solution.views)} views, {100 * judged.coverage:.0f} % of the picture"
         left.set_title(f"{covered}; residuals {solution.rms_px:.2f} px", loc="left", fontsize=9.5, color=INK)
         columns, rows = 33, 25
         grid = picture_grid(camera.width, camera.height, columns, rows)
@@ -42,9 +42,9 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
             top = max(float(np.percentile(uncertainty, 98)), 1e-6)
             levels = np.linspace(0.0, top, 9)
             filled = right.contourf(u, v, uncertainty, levels=levels, cmap="magma_r", extend="max")
-            made.colorbar(filled, ax=right, shrink=0.8, label="U (k = 2), px", format="%.2f")
+            made.colorbar(filled, ax=right, orientation="horizontal", aspect=40, label="U (k = 2), px", format="%.2f")
         median, worst = judged.pixel_u_px
-        title = f"uncertainty of a ray's place: median {median:.2f}, worst {worst:.2f} px"
+        title = f"U of a ray's place: median {median:.2f}, worst {worst:.2f} px"
         right.set_title(title, loc="left", fontsize=9.5, color=INK)
         for axes in (left, right):
             axes.set_xlim(-0.5, camera.width - 0.5)

@@ -131,7 +131,9 @@ class BoardFinder:
         drawn = cv_board(self.board)
         if is_legacy:
             drawn.setLegacyPattern(True)
-        return cv2.aruco.CharucoDetector(drawn, detectorParams=self._parameters)
+        details = cv2.aruco.CharucoParameters()
+        details.minMarkers = 1  # of the two beside a corner: nearer to the picture's edge, where the lens bends most
+        return cv2.aruco.CharucoDetector(drawn, details, self._parameters)
 
 
 def find_views(

@@ -50,7 +50,7 @@ reconstruction.json. A run that was interrupted goes on where it was; --force st
 @click.argument("source", metavar="PHOTOS|VIDEO")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file.")
 @click.option("-o", "--output", required=True, metavar="OUT", help="Folder for the files of all stages.")
-@click.option("--camera", metavar="CAMERA", help="Calibrated camera file, or fov:DEG as a first guess.")
+@click.option("--camera", metavar="CAMERA", help="Calibrated camera file, profile[:NAME], or fov:DEG as a first guess.")
 @click.option("--board", "boards", multiple=True, metavar="SPEC", help="Board of known size in view; see below.")
 @click.option("--tag", "tags", multiple=True, metavar="SPEC", help="Tags of known size in view; see below.")
 @click.option("--scale-bar", "bars", multiple=True, metavar="SPEC", help="Known distance of two tags; see below.")

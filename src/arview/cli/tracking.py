@@ -187,7 +187,8 @@ the same light. They only say where to look: what is found must fit the CAD as a
 
 \b
 CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt), fov:DEG
-(field of view along the longer side), or exif. Each line of a poses file is a JSON object: index, time_s,
+(field of view along the longer side), exif, or profile:NAME (of `arview calibrate --profile`; profile alone
+takes the one for what the source says of its camera). Each line of a poses file is a JSON object: index, time_s,
 state, quality, cam_from_model (4x4 row-major, mm), covariance (6x6), ms, reason (why not tracked),
 mismatches.
 Ctrl-C ends the run and finishes the files.""",

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from arview.camera import Camera
 from arview.camera_files import guess_camera, load_camera
+from arview.camera_profiles import profile_of_photo
 from arview.errors import MismatchError
 from arview.photo_exif import PhotoExif, focal_length_px
 
@@ -47,7 +48,7 @@ def lenses_of(exifs: Sequence[PhotoExif], camera: str | Path | None) -> tuple[li
 
     Args:
         exifs: of the photos.
-        camera: camera file or ``fov:DEG`` as for ``load_camera``; None or ``exif`` for what the photos say.
+        camera: camera file, ``profile`` or ``fov:DEG`` as for ``load_camera``; None or ``exif`` for what photos say.
 
     Raises:
         InputError: the camera file cannot be used at all.
@@ -102,6 +103,8 @@ def _new_lens(exif: PhotoExif, camera: str | Path | None, is_file: bool, taken: 
         return _lens_from_exif(key, exif)
     if not is_file:
         return Lens(key, load_camera(camera, width, height), False, f"the given {camera}")
+    if str(camera) == "profile":
+        camera = profile_of_photo(exif)
     turns = exif.quarter_turns_clockwise
     try:
         return Lens(key, load_camera(camera, width, height, quarter_turns_clockwise=turns), True, str(camera))
