@@ -20,6 +20,7 @@ from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.history import HistoryStore
 from arview.inspection import Inspection, Verdict, load_inspection
 from arview.line.clock import STEPS, Clock, Moment, clock_text
+from arview.line.lock import alone
 from arview.reconstruction.intake import Intake
 from arview.reconstruction.run import Reconstruction
 from arview.reconstruction.stages import Stages, content_key
@@ -214,6 +215,13 @@ def test_the_film_goes_with_the_measurement(bench: Bench) -> None:
     assert found.exit_code == 0 and "no film: clip.mp4: damaged" in found.stderr and not film.exists()
     bench.fails.clear()
     assert bench.inspect("--video", str(clip)).exit_code == 0 and bench.did == ["reconstruct", "measure", "film"]
+
+
+def test_two_do_not_work_in_one_folder(bench: Bench) -> None:
+    with alone(bench.folder / "out", ".lock", waits=False):
+        found = bench.inspect()
+    assert found.exit_code == 64 and "another arview works there" in found.stderr and not bench.did
+    assert bench.inspect().exit_code == 0
 
 
 def test_the_result_is_put_into_the_store(bench: Bench) -> None:

@@ -7,7 +7,6 @@ is done; and a worker has nothing in memory that could be lost with it.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from arview import __version__
 from arview.errors import ArviewError, InputError, MismatchError, MissingDependencyError
 from arview.line.jobs_file import PLACES, BatchJob
+from arview.line.lock import alone
 from arview.line.storage import fetched, is_url, read, sent
 from arview.reconstruction.stages import write_json
 
@@ -119,10 +119,8 @@ def carry_out(job: BatchJob, work: Work = INSPECTION, scratch: str | None = None
             local = _local(job.job, Path(temporary) / "in")
             if is_url(job.out):
                 return _done(job, local, Path(temporary) / "out", work)
-            folder = Path(job.out)
-            folder.mkdir(parents=True, exist_ok=True)
-            with _alone(folder):
-                return _done(job, local, folder, work)
+            with alone(Path(job.out), ".job.lock", waits=True):
+                return _done(job, local, Path(job.out), work)
         except (InputError, MismatchError, MissingDependencyError) as error:
             return JobResult(job.name, "error", str(error), job.out)
 
@@ -170,14 +168,6 @@ def finished(job: BatchJob, key: str) -> JobResult | None:
         not result.inspection_sha256 or hashlib.sha256(inspection).hexdigest() == result.inspection_sha256
     )
     return replace(result, name=job.name, out=job.out) if result.key == key and is_whole else None
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Wait until no other process works in the folder; a process that dies leaves it free."""
-    with (folder / ".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def run_batch(

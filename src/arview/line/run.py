@@ -24,6 +24,7 @@ from arview.inspection import Inspection, Verdict, load_inspection, save_inspect
 from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.line.film import camera_of_video, make_film
 from arview.line.job import InspectJob
+from arview.line.lock import alone
 from arview.line.prepare import Prepared, measurement_key, prepare
 from arview.reconstruction.run import Reconstruction, reconstruct
 from arview.reconstruction.stages import Stages, content_key, key_of
@@ -94,12 +95,15 @@ def inspect_part(
 
     Raises:
         CannotMeasureError: photos that do not fit together, do not show the part, or contradict its CAD.
-        InputError, MismatchError: an input is missing, unusable, or does not belong to the others.
+        InputError, MismatchError: an input is missing, unusable, or does not belong to the others; another process
+            works in the folder.
         OutputError: the folder cannot be written to.
         MissingDependencyError: a library is missing; the PDF alone is left out with a warning.
     """
     folder = Path(folder)
-    return _Line(prepare(job, folder), folder, progress or (lambda what, done, total: None)).all(starts_over)
+    prepared = prepare(job, folder)
+    with alone(folder, ".lock", waits=False):
+        return _Line(prepared, folder, progress or (lambda what, done, total: None)).all(starts_over)
 
 
 class _Line:
