@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from arview.cli.common import main, output_path, progress_bar, say, write_bytes
 from arview.errors import InputError, OutputError
@@ -153,7 +153,7 @@ def lens(
         write_bytes(picture, draw(result, picture.suffix.lower().removeprefix(".")))
         click.echo(f"wrote {picture}")
     not_enough = result.judgement.grade.value == "not enough"
-    if not_enough and not (anyway and np.isfinite(result.solution.covariance).all()):
+    if not_enough and not (anyway and math.isfinite(result.judgement.focal_u)):
         say("no camera was written; do as advised" + ("" if anyway else ", or take it --anyway"))
         click.get_current_context().exit(EXIT_NOT_ENOUGH)
     extra = record_of(result)
