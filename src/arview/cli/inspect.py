@@ -81,7 +81,8 @@ Exit codes: 0 pass, 1 fail, 2 undecided, 3 could not measure, 64 bad input or us
   0  every component passes, and nothing foreign is there
   1  a component fails or is missing
   2  none fails, but one is undecided or was not measured, or there is a foreign object (`measure` ends with 4 then)
-  3  no component could be measured: photos that do not fit together, do not show the part, or contradict its CAD
+  3  no component could be measured: photos that cannot be used, do not fit together, do not show the part, or
+     contradict its CAD
  64  a file is missing or damaged, an option is wrong, the store or OUT cannot be written to
 A film or PDF that cannot be made is a warning: the verdict stands without it.""",
 )
