@@ -57,6 +57,7 @@ def say(text: str) -> None:
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog="""\b
 Examples:
+  arview inspect --part part.toml --photos photos/ --video walk.mp4 -o out/
   arview check bracket.step
   arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json
   arview reconstruct photos/ --part part.toml -o out/
@@ -65,7 +66,8 @@ Examples:
 
 \b
 PART is a part file (part.toml; `arview check --help` shows one) or a CAD file (STEP, glTF, OBJ, STL,
-PLY, 3MF). Exit codes: 0 done, 2 bad input, 130 interrupted (files are finished), 1 a bug in arview.""",
+PLY, 3MF). Exit codes: 0 done, 2 bad input, 130 interrupted (files are finished), 1 a bug in
+arview; of inspect, batch and measure, the verdict: see there.""",
 )
 @click.version_option(__version__, prog_name="arview")
 def main() -> None:
