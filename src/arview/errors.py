@@ -17,5 +17,9 @@ class MissingDependencyError(ArviewError):
     """A library or system package is absent; the message holds the command that installs it."""
 
 
+class CannotMeasureError(ArviewError):
+    """The inputs can be read, but what they show cannot be measured."""
+
+
 class OutputError(ArviewError):
     """A result could not be written (read-only folder, full disk)."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from arview.cli.common import UNIT, main, say, say_bug
-from arview.errors import ArviewError
+from arview.errors import ArviewError, CannotMeasureError
 
 if TYPE_CHECKING:
     from arview.line.run import Outcome
@@ -33,8 +33,6 @@ class VerdictCommand(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run; errors are one line and a code."""
-        from arview.line.run import CannotMeasureError
-
         try:
             return super().invoke(ctx)
         except CannotMeasureError as error:

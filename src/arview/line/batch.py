@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arview import __version__
-from arview.errors import ArviewError, InputError, MismatchError, MissingDependencyError
+from arview.errors import ArviewError, CannotMeasureError, InputError, MismatchError, MissingDependencyError
 from arview.line.jobs_file import PLACES, BatchJob
 from arview.line.lock import alone
 from arview.line.storage import fetched, is_url, read, sent
@@ -89,7 +89,7 @@ def _inspect_key(job: InspectJob, folder: Path) -> str:
 
 
 def _inspect(job: InspectJob, folder: Path) -> tuple[str, str]:
-    from arview.line.run import CannotMeasureError, inspect_part
+    from arview.line.run import inspect_part
 
     try:
         outcome = inspect_part(job, folder)

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from arview import __version__
-from arview.errors import ArviewError, InputError, MismatchError, MissingDependencyError
+from arview.errors import CannotMeasureError, InputError, MismatchError, MissingDependencyError
 from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.line.film import camera_of_video, make_film
@@ -35,10 +35,6 @@ RESULTS = (
     "inspection_distances/distances.ply",
 )  # fmt: skip
 _RECONSTRUCTION = {"photos": "photos", "sparse": "camera poses", "scale": "scale and CAD frame", "dense": "dense cloud"}
-
-
-class CannotMeasureError(ArviewError):
-    """The inputs can be read, but what they show cannot be measured; the message says why and what to do."""
 
 
 @dataclass(frozen=True)
