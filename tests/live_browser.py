@@ -37,22 +37,32 @@ BITS, CELL_PX, EDGE_PX = 8, 12, 4
 
 
 @cache
-def frames(width: int, height: int, stride: int = STRIDE, count: int = COUNT) -> list[Image]:
-    """(H,W,3) frames of the clip, their middle if the shape is another, with their number drawn into the corner."""
+def frames(width: int, height: int) -> list[Image]:
+    """(H,W,3) frames of the clip with their number drawn into the corner."""
+    return numbered(plain_frames(width, height, STRIDE, COUNT))
+
+
+def plain_frames(width: int, height: int, stride: int, count: int) -> list[Image]:
+    """(H,W,3) frames of the clip; their middle, if the shape is another."""
     left, shown = _crop(width, height)
     source = open_source(CLIP, START, START + stride * count, stride)
-    images = [
+    return [
         cv2.resize(frame.image[:, left : left + shown], (width, height), interpolation=cv2.INTER_AREA)
         for frame in source
     ]
-    for number, image in enumerate(images):
+
+
+def numbered(images: Sequence[Image]) -> list[Image]:
+    """Copies of images with their number, from 0, drawn into the corner."""
+    copies = [image.copy() for image in images]
+    for number, image in enumerate(copies):
         image[: 2 * (CELL_PX + EDGE_PX), : BITS * CELL_PX + 2 * EDGE_PX] = 128
         for bit in range(BITS):
             is_set = number >> (BITS - 1 - bit) & 1
             columns = slice(EDGE_PX + bit * CELL_PX, EDGE_PX + (bit + 1) * CELL_PX)
             image[EDGE_PX : EDGE_PX + CELL_PX, columns] = 255 * is_set
             image[EDGE_PX + CELL_PX : EDGE_PX + 2 * CELL_PX, columns] = 255 * (1 - is_set)
-    return images
+    return copies
 
 
 def camera(width: int, height: int) -> Camera:
@@ -115,7 +125,9 @@ def browser(film: Path | None, *more: str) -> Iterator[Any]:
         pytest.skip("Chromium is not installed: apt-get install chromium")
     arguments = [
         "--no-sandbox", "--disable-dev-shm-usage", "--allow-loopback-in-peer-connection",
-        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing", "--force-color-profile=srgb",
+        # The processor stands in for a graphics card; it puts the page together faster by itself than through WebGL.
+        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing",
+        "--force-color-profile=srgb",
         "--use-fake-ui-for-media-stream", "--autoplay-policy=no-user-gesture-required", *more,
     ]  # fmt: skip
     if film is not None:

@@ -16,6 +16,8 @@ import pytest
 from PIL import Image as PilImage
 
 import live_browser
+from arview.live.stamp import Stamp, strip
+from arview.overlay.guide import GUIDE_RGB
 from arview.video import VideoSink
 from live_browser import difference_mask, number_in, outline_errors_px, screenshot, true_mask
 from live_client import Running, running
@@ -318,3 +320,57 @@ def test_inspection_changes(chromium: Any, tmp_path: Path) -> None:
         path.write_text("{ this is no JSON")
         until(page, "document.querySelector('.notice.strong.error') !== null")
         assert "0.50 mm" in row.text_content(), "the last good one stays"
+
+
+def test_outline_to_align_with(chromium: Any, inspection: Path) -> None:
+    chosen = options(inspection=inspection, guide="az-30_el60_d640")
+    with running(chosen, loader(chosen)) as one, opened(chromium, one, WATCH) as page:
+        until(page, "document.body.dataset.state === 'align'")
+        assert "yellow outline" in page.inner_text("#state")
+        page.wait_for_timeout(500)
+        shown = screenshot(page).astype(int)
+        is_yellow = (np.abs(shown - GUIDE_RGB) < 40).all(axis=2)
+        assert 800 < is_yellow.sum() < 0.2 * is_yellow.size
+
+
+def test_screen_that_watches(chromium: Any, server: Running) -> None:
+    with opened(chromium, server) as page:
+        until(page, "document.body.dataset.state === 'tracked'")
+        watching = page.context.new_page()
+        watching.goto(f"http://127.0.0.1:{server.port}/watch")
+        until(page, lambda: watching.evaluate("document.querySelector('#film').naturalWidth") == WIDTH)
+        assert not watching.is_visible("#message")
+
+
+def test_modules_agree_with_the_server(chromium: Any, server: Running) -> None:
+    """The page's stamp and lens are those of arview.live.stamp and arview.camera."""
+    lens = live_browser.camera(WIDTH, HEIGHT)
+    points = np.random.default_rng(1).uniform([-250, -140, 450], [250, 140, 650], (50, 3))
+    fields = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    with opened(chromium, server) as page:
+        for stamp in (Stamp(0, 640, 360, 0), Stamp(987654, 1280, 720, 3), Stamp((1 << 20) - 1, 404, 718, 1)):
+            drawn = page.evaluate(
+                """async ([id, width, height, turns]) => {
+                    const {drawStrip, readStamp, stripHeight} = await import("/static/stamp.js");
+                    const canvas = document.createElement("canvas");
+                    [canvas.width, canvas.height] = [width, height + stripHeight(width)];
+                    const context = canvas.getContext("2d");
+                    drawStrip(context, {id, width, height, turns});
+                    const {data} = context.getImageData(0, height, width, stripHeight(width));
+                    return [data.filter((_, i) => i % 4 === 0).join(), readStamp(canvas, width, canvas.height)]; }""",
+                [stamp.frame_id, stamp.width, stamp.height, stamp.quarter_turns_clockwise],
+            )
+            assert np.array_equal(np.array(drawn[0].split(","), dtype=int).reshape(-1, stamp.width), strip(stamp))
+            assert drawn[1]["id"] == stamp.frame_id
+            assert drawn[1]["turns"] == stamp.quarter_turns_clockwise
+        pixels = page.evaluate(
+            """async ([camera, points]) => {
+                const {Intrinsics} = await import("/static/projection.js");
+                const lens = new Intrinsics(camera);
+                return points.map((point) => {
+                    const pixel = lens.project(point);
+                    return [...pixel, ...lens.ideal(...pixel)]; }); }""",
+            [{**fields, "dist": lens.dist.tolist()}, points.tolist()],
+        )
+        assert np.allclose(np.array(pixels)[:, :2], lens.project(points), atol=1e-9)
+        assert np.allclose(np.array(pixels)[:, 2:], lens.without_distortion().project(points), atol=1e-6)

@@ -95,7 +95,8 @@ export function watchFrames(video, onFrame) {
 
 /** Quarter turns clockwise by which the browser has turned the sensor's picture to show it upright. */
 export function quarterTurns(orientation = screen.orientation) {
-  const angle = orientation?.angle ?? 0, isUpright = (orientation?.type ?? "landscape").startsWith("portrait");
-  const isPhone = isUpright === (angle % 180 === 0);
-  return ((isPhone ? 1 : 0) - angle / 90 + 8) % 4;
+  // Older iPhones say the angle elsewhere, and not the shape.
+  if (!orientation) return "orientation" in window ? (1 - window.orientation / 90 + 8) % 4 : 0;
+  const isUpright = orientation.type.startsWith("portrait"), isPhone = isUpright === (orientation.angle % 180 === 0);
+  return ((isPhone ? 1 : 0) - orientation.angle / 90 + 8) % 4;
 }

@@ -9,7 +9,7 @@ const NARROW_PX = 560, MOST_NARROW = 4; // on a phone held upright more would hi
 const LEAST_ROOM_PX = 200; // with less height only the component that is looked at alone has a label
 const CONTEXT_WEIGHT = 0.25; // how bad it is to cover a component that was not inspected, against one that was
 const SVG = "http://www.w3.org/2000/svg";
-const STUB_PX = 10, ARROW_HEAD_PX = 11;
+const STUB_PX = 10, SIGN_PX = 24, ARROW_HEAD_PX = 11;
 
 export class Labels {
   #layout = new LabelLayout();
@@ -110,9 +110,15 @@ export class Labels {
     const placed = this.#layout.place(area, requests, this.#extent(place, requests), covered, glides);
     const anchors = new Map(requests.map((one) => [one.key, one]));
     const names = new Set(placed.map((one) => one.key));
+    const taken = []; // signs do not cover each other; the more urgent one stays
     for (const [name, label] of this.#labels) {
       if (!names.has(name)) show(label, false);
       const sign = names.has(name) ? null : signs.get(name);
+      if (sign && taken.some((other) => Math.hypot(other[0] - sign[0], other[1] - sign[1]) < SIGN_PX)) {
+        label.sign.classList.add("off");
+        continue;
+      }
+      if (sign) taken.push(sign);
       label.sign.classList.toggle("off", !sign);
       if (sign) label.sign.style.transform = `translate(${sign[0].toFixed(1)}px, ${sign[1].toFixed(1)}px)`;
     }

@@ -112,18 +112,26 @@ let drawn = { frame: null };
 
 function draw() {
   if (!player) return;
-  const shown = player.choose(performance.now());
-  stage.draw(shown, player.isFrozen);
-  const nowMs = performance.now(), { frame, pose } = shown;
-  if (frame && frame !== drawn.frame && !player.isFrozen) {
+  const shown = player.choose(performance.now()), { frame, pose, guide } = shown;
+  const isSame = frame === drawn.frame && frame?.order === drawn.order && pose === drawn.pose && guide === drawn.guide;
+  if (!isSame || stage.isChanged) {
+    stage.draw(shown);
+    note(shown, isSame);
+  }
+  refreshState(shown);
+}
+
+/** Take down when a picture was shown, and tell whoever listens. */
+function note({ frame, pose, guide, isAnnotated }, isSame) {
+  const nowMs = performance.now();
+  if (frame && !isSame) {
     // A station's picture was on its way before this page had it.
     const before = player.isPhone ? 0 : (pose?.server_ms ?? 0) + (connection.link?.rttMs ?? 0) / 2;
-    state.latencies.push({ atMs: nowMs, ms: nowMs - frame.takenMs + before, hasPose: Boolean(pose) });
-    drawn = { frame, id: frame.id, takenMs: frame.takenMs - before };
+    state.latencies.push({ atMs: nowMs, ms: nowMs - frame.takenMs + before });
+    drawn = { frame, order: frame.order, pose, guide, takenMs: frame.takenMs - before };
   }
-  const detail = { id: frame?.id ?? null, pose, isAnnotated: shown.isAnnotated, takenMs: frame?.takenMs ?? null, drawnMs: nowMs };
+  const detail = { id: frame?.id ?? null, pose, isAnnotated, takenMs: frame?.takenMs ?? null, drawnMs: nowMs };
   document.dispatchEvent(new CustomEvent("arview:drawn", { detail }));
-  refreshState(shown);
 }
 
 // --- words and figures ------------------------------------------------------------------------------

@@ -32,6 +32,7 @@ export class Stage {
       this.context = this.canvas.getContext("2d", CANVAS_OPTIONS);
     }
     this.part = null;
+    this.isChanged = true; // something else than picture and pose: the look, the part, the window
     this.labelBoxes = new Labels(this.labels, this.leaders, onPick);
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
     new ResizeObserver(() => this.measure()).observe(this.stage);
@@ -59,6 +60,7 @@ export class Stage {
 
   setLook(look) {
     this.look = look;
+    this.isChanged = true;
     if (this.ghost?.components.length) this.ghost.style(this.#styles());
     this.#seenMs = -Infinity;
   }
@@ -66,12 +68,14 @@ export class Stage {
   /** The window has changed. */
   measure() {
     this.#free = null;
+    this.isChanged = true;
     this.labelBoxes.remeasure();
     this.onResize();
   }
 
   /** Draw what the player has chosen. */
   draw({ frame, pose, guide, isAnnotated }) {
+    this.isChanged = false;
     if (!frame) return this.labelBoxes.hide();
     this.#lay(frame);
     const isReady = this.ghost?.components.length > 0 && this.part !== null;
@@ -100,6 +104,7 @@ export class Stage {
   #drawn = null;
 
   #arrange() {
+    this.isChanged = true;
     this.labelBoxes.setPart(this.part, this.ghost?.components.map((one) => one.center_in_model) ?? []);
     this.ghost?.style(this.#styles());
   }
@@ -168,7 +173,8 @@ function freeOf(whole, obstacles) {
   let [left, top, right, bottom] = [0, 0, whole.width, whole.height];
   for (const one of obstacles) {
     const box = one.getBoundingClientRect();
-    const shown = box.width > 0 && box.height > 0 && getComputedStyle(one).visibility !== "hidden" && one.childElementCount > 0;
+    const covers = getComputedStyle(one).getPropertyValue("--covers").trim() !== "0"; // not its visibility: that takes its time
+    const shown = covers && box.width > 0 && box.height > 0 && one.childElementCount > 0;
     const x0 = box.left - whole.left, x1 = box.right - whole.left, y0 = box.top - whole.top, y1 = box.bottom - whole.top;
     if (!shown || x1 <= left || x0 >= right || y1 <= top || y0 >= bottom) continue;
     // What is cut off is the side that costs the least room.

@@ -45,6 +45,9 @@ export class WebrtcLink {
       await connected(peer, channel);
     } catch (error) {
       this.close();
+      if (error.code === "bad_offer" || error instanceof DOMException && error.name !== "AbortError") {
+        throw new NoWebrtc(`this browser and the station find no common WebRTC: ${error.message}`);
+      }
       throw error;
     }
     peer.addEventListener("connectionstatechange", () => {
