@@ -65,7 +65,7 @@ def write_inspection(path: Path, age: timedelta, **changes: Any) -> None:
 
 @pytest.fixture(scope="module")
 def server(inspection: Path) -> Iterator[Running]:
-    chosen = options(inspection=inspection, clients=1)
+    chosen = options(inspection=inspection, clients=1, record_folder=inspection.parent)
     with running(chosen, loader(chosen)) as one:
         yield one
 

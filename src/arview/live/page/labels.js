@@ -6,6 +6,7 @@ import { toCam } from "./projection.js";
 
 const MOST_LABELS = 12;
 const NARROW_PX = 560, MOST_NARROW = 4; // on a phone held upright more would hide the part
+const LABEL_ROOM_PX = 55; // of the height, for each
 const LEAST_ROOM_PX = 200; // with less height only the component that is looked at alone has a label
 const CONTEXT_WEIGHT = 0.25; // how bad it is to cover a component that was not inspected, against one that was
 const SVG = "http://www.w3.org/2000/svg";
@@ -95,7 +96,7 @@ export class Labels {
       this.box.classList.toggle("narrow", isNarrow);
       this.remeasure();
     }
-    const most = isCramped ? 0 : isNarrow ? MOST_NARROW : MOST_LABELS;
+    const most = isCramped ? 0 : isNarrow ? MOST_NARROW : Math.min(MOST_LABELS, Math.floor(area.height / LABEL_ROOM_PX));
     const requests = [], signs = new Map();
     for (const component of labels ? wanted : []) {
       const anchor = toScreen(component.anchor_in_model);

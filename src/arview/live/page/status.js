@@ -76,11 +76,12 @@ export class Notices {
     const shown = this.#isOpen ? this.notices : this.notices.slice(0, 1), more = this.notices.length - 1;
     this.box.replaceChildren(
       ...shown.map(({ code, level, text }, i) => {
-        const inside = [icon(level), make("span", "", [upper((STRONG[code] ?? "") + text)])];
+        const inside = [icon(level), make("span", "text", [upper((STRONG[code] ?? "") + text)])];
         if (i === 0 && more > 0) inside.push(make("span", "more", [this.#isOpen ? "less" : `+${more}`]));
-        const line = make("button", `notice ${level}${code in STRONG ? " strong" : ""}`, inside, more > 0 ? { "aria-expanded": String(this.#isOpen) } : {});
+        const classes = `notice ${level} ${code in STRONG ? "strong" : ""} ${this.#isOpen ? "open" : ""}`;
+        const line = make("button", classes, inside, { "aria-expanded": String(this.#isOpen) });
         line.addEventListener("click", () => {
-          this.#isOpen = !this.#isOpen && more > 0;
+          this.#isOpen = !this.#isOpen;
           this.#draw();
         });
         return line;
