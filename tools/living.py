@@ -64,8 +64,11 @@ document.addEventListener("arview:drawn", ({detail}) => {
 const ask = HTMLVideoElement.prototype.requestVideoFrameCallback;
 HTMLVideoElement.prototype.requestVideoFrameCallback = function (callback) {
   return ask.call(this, (now, about) => {
-    if (this.id === "camera") taken.set(number(this, this.videoWidth / WIDTH), about.captureTime ?? now);
     callback(now, about);
+    if (this.id !== "camera") return;
+    const seen = number(this, this.videoWidth / WIDTH);
+    taken.set(seen, about.captureTime ?? now);
+    for (let ahead = 1; ahead < FRAMES / 2; ahead++) taken.delete((seen + ahead) % FRAMES); // of the round before
   });
 };
 """
@@ -94,7 +97,9 @@ def _measure(page: Any, link: str, transport: str) -> dict[str, Any]:
     observer = OBSERVER
     for word in ("EDGE", "CELL"):
         observer = observer.replace(word, str(getattr(live_browser, f"{word}_PX")))
-    page.add_init_script("{" + observer.replace("BITS", str(live_browser.BITS)).replace("WIDTH", str(WIDTH)) + "}")
+    for word, value in (("BITS", live_browser.BITS), ("WIDTH", WIDTH), ("FRAMES", 2 * COUNT - 2)):
+        observer = observer.replace(word, str(value))
+    page.add_init_script("{" + observer + "}")
     page.goto(link)
     choice = page.locator(f"#transports input[value={transport}]")
     choice.evaluate("input => input.click()")
