@@ -42,8 +42,10 @@ def _coarse_stages(region_gain: float) -> tuple[Stage, ...]:
     )
 
 
-COARSE_STAGES: tuple[tuple[Stage, ...], ...] = ((), _coarse_stages(1.0), _coarse_stages(20.0))
-"""Tries from every start: it is near enough already; edges lead; colours lead, on plain and glossy parts."""
+COARSE_STAGES = (_coarse_stages(1.0), _coarse_stages(20.0))
+"""Tries from the likeliest starts: edges lead; colours lead, on plain and glossy parts."""
+TRIED = 16
+"""So many starts are tried."""
 HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
 SURE_QUALITY = 0.8
@@ -356,9 +358,10 @@ class Detector:
     def _settle(self, picture: Picture, starts: list[Candidate]) -> list[Hypothesis]:
         """Refine starts, keep the best, search around them; apart from each other, best first."""
         o = self.options
-        tries = [(start.cam_from_body, stages) for start in starts for stages in COARSE_STAGES]
-        tried = pool().map(lambda item: self._refined(picture, item[0], item[1], COARSE_TOLERANCE_PX), tries)
-        refined = self._ordered(tried, 3.0)
+        as_found = self._tried(picture, [start.cam_from_body for start in starts], ())
+        likely = [h.cam_from_body for h in sorted(as_found, key=lambda h: -h.logit)[:TRIED]]
+        tried = [h for stages in COARSE_STAGES for h in self._tried(picture, likely, stages)]
+        refined = self._ordered([*as_found, *tried], 3.0)
         # Besides the best, some for quite other poses: the lead over these says whether the best stands out.
         others = [h for h in refined[o.finalists :] if not self._same(h.cam_from_body, refined[0].cam_from_body, 25.0)]
         coarse = refined[: o.finalists] + self._ordered(others, 15.0, o.rivals)
@@ -366,6 +369,10 @@ class Detector:
         if finished and HOPELESS_WORTH <= finished[0].evidence.worth < RIGHT_WORTH:
             finished += self._finished(picture, _around(finished[0].cam_from_body, 0.05))
         return self._ordered(finished, 5.0)
+
+    def _tried(self, picture: Picture, starts: Sequence[Array], stages: tuple[Stage, ...]) -> list[Hypothesis]:
+        """Poses after some coarse stages from each start."""
+        return list(pool().map(lambda start: self._refined(picture, start, stages, COARSE_TOLERANCE_PX), starts))
 
     def _finished(self, picture: Picture, starts: Sequence[Array]) -> list[Hypothesis]:
         """Poses refined to the end, best first; those of which too little is in the picture are left out."""
