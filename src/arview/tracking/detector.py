@@ -48,7 +48,7 @@ TRIED = 16
 """So many starts are tried."""
 HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
-SURE_QUALITY = 0.8
+SURE_QUALITY = 0.7
 """A pose of this quality ends the search."""
 ALIKE_ASIDE, ALIKE_ALONG, ALIKE_DEG = 0.12, 0.15, 20.0
 """Hypotheses this near, across in diameters and along as a share of the distance, are no rivals of each other."""
@@ -290,7 +290,8 @@ class Detector:
         rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
         rivals = self._ordered([best, *self._finished(picture, starts), *rivals], 5.0)
         rivals = [h for h in rivals if h.evidence.worth > max(r.evidence.worth for r in rivals) - LEAD]
-        steps = {id(h): self.tracker.edge_steps(picture.gray, h.cam_from_body) for h in rivals}
+        seen = pool().map(lambda h: self.tracker.edge_steps(picture.gray, h.cam_from_body), rivals)
+        steps = {id(h): one for h, one in zip(rivals, seen, strict=True)}
         best = rivals[0]
         for rival in rivals[1:]:
             if telling(steps[id(rival)], steps[id(best)]) > 0.0:

@@ -72,21 +72,22 @@ class Effort:
     """How far a search goes.
 
     Attributes:
-        matches: of templates that are improved as outlines; skipped: the best of them, tried by the effort before.
+        matches: of templates that are improved as outlines.
         improved: of these, how many are improved in the last round too.
         starts: of these, how many poses are searched around.
         kept: hypotheses left after each level of that search.
+        scale_step: templates are matched at one of so many scales.
     """
 
     matches: int
-    skipped: int
     improved: int
     starts: int
     kept: tuple[int, ...]
+    scale_step: int
 
 
-QUICK = Effort(600, 0, 300, 40, (12, 5))
-WIDE = Effort(5000, QUICK.matches, 2500, 300, (100, 40))
+QUICK = Effort(600, 300, 40, (12, 5), 2)
+WIDE = Effort(5000, 2500, 300, (100, 40), 1)
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 
@@ -183,20 +184,21 @@ class FirstSearch:
 
     def starts(self, picture: Picture, effort: Effort = QUICK) -> list[Candidate]:
         """Poses for the best matches over the whole range, apart from each other, best first."""
-        picture.make(self._steps)
-        phases = list(pool().map(lambda step: decimate(picture.maps(step)[0], GRID_PX), self._steps))
+        scales = self._steps[:: effort.scale_step]
+        picture.make(scales)
+        phases = list(pool().map(lambda step: decimate(picture.maps(step)[0], GRID_PX), scales))
         count = len(next(iter(self.banks.values())).bins)
         halves = [0, count // 2, count]
-        votes = {step: np.zeros((GROUPS, 1024), dtype=np.int64) for step in self._steps}
+        votes = {step: np.zeros((GROUPS, 1024), dtype=np.int64) for step in scales}
         # Of each group of views at each scale as many; most that are found are alike.
-        kept = ALIKE * -(-effort.matches // (GROUPS * len(self._steps)))
-        levels = list(zip(self._steps, phases, strict=True))
+        kept = ALIKE * -(-effort.matches // (GROUPS * len(scales)))
+        levels = list(zip(scales, phases, strict=True))
         jobs = [(*level, first, last) for level in levels for first, last in pairwise(halves)]
         found = pool().map(lambda job: self._match(votes[job[0]], kept, picture, *job), jobs)
         raw = [m for m in found if m is not None]
         if not raw:
             return []
-        matches = self._distinct(_joined(raw), effort.matches, effort.skipped)
+        matches = self._distinct(_joined(raw), effort.matches)
         if not len(matches.keys):
             return []
         for growth in GROWTHS[:-1]:
@@ -247,8 +249,8 @@ class FirstSearch:
         reach = np.full(len(positions), reach_px / self._radius_px) * 0.5 * self._diameter_mm
         return matches.of(choose_apart(rotations, positions, reach / positions[:, 2], np.cos(angle_rad), ratio, most))
 
-    def _distinct(self, matches: Matches, most: int, skipped: int) -> Matches:
-        """The best, one for each cell of places, scales and rotations, but the first.
+    def _distinct(self, matches: Matches, most: int) -> Matches:
+        """The best, one for each cell of places, scales and rotations.
 
         The best of each group of views at each scale come first, then all second best, and so on.
         """
@@ -262,7 +264,7 @@ class FirstSearch:
         _, starts, counts = np.unique(groups[first][by_group], return_index=True, return_counts=True)
         rank = np.empty(len(first), dtype=np.int64)
         rank[by_group] = np.arange(len(first)) - np.repeat(starts, counts)
-        return matches.of(first[np.argsort(rank, kind="stable")[skipped:most]])
+        return matches.of(first[np.argsort(rank, kind="stable")[:most]])
 
     def _improved(self, picture: Picture, matches: Matches, growth: Growth) -> Matches:
         """The matches improved each by itself, on larger maps."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from arview.errors import InputError
 from arview.geometry import Array, rolls_between
@@ -157,10 +158,9 @@ def _lines_shown(views: GuideViewSet, directions: Array) -> Array:
 
 def _around(directions: Array, count: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Of unit vectors (V,3), indices (V,count) of the nearest others, and of some on all sides `FAR_DEG` away."""
-    cosines = directions @ directions.T
-    np.fill_diagonal(cosines, -2.0)
+    tree = KDTree(directions)
     some = min(count, len(directions) - 1)
-    near = np.argpartition(-cosines, np.arange(some), axis=1)[:, :some]
+    near = tree.query(directions, np.arange(1, some + 2))[1][:, 1:]  # the first is the direction itself
     side = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(directions, side)
@@ -168,7 +168,7 @@ def _around(directions: Array, count: int) -> tuple[NDArray[np.int32], NDArray[n
     away = np.deg2rad(FAR_DEG)
     for k, angle in enumerate(2.0 * np.pi * np.arange(count) / count):
         goal = np.cos(away) * directions + np.sin(away) * (np.cos(angle) * side + np.sin(angle) * other)
-        far[:, k] = np.argmax(goal @ directions.T, axis=1)
+        far[:, k] = tree.query(goal)[1]
     return near.astype(np.int32), far
 
 
