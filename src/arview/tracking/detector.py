@@ -56,13 +56,18 @@ HERE_ASIDE, HERE_ALONG = 0.35, 0.25
 """Rivals this near are at the same place."""
 COARSE_TOLERANCE_PX, FINE_TOLERANCE_PX = 3.5, 1.5
 """After the coarse and the fine stages edges are looked for this near."""
-FINE_STAGES = (
-    Stage(2, 12, 1.5, 5.0, 2),
-    Stage(2, 10, 1.0, 4.0, 2),
-    Stage(1, 8, 1.0, 2.5, 2),
-    Stage(1, 6, 1.0, 1.5, 2),
-    Stage(1, 5, 1.0, 1.0, 2),
-)
+
+
+def _fine_stages(spreads_px: tuple[float, ...], region_gain: float) -> tuple[Stage, ...]:
+    scales, reaches, steps_px = (2, 2, 1, 1, 1), (12, 10, 8, 6, 5), (1.5, 1.0, 1.0, 1.0, 1.0)
+    return tuple(
+        Stage(scale, reach, step_px, spread_px, 2, region_gain)
+        for scale, reach, step_px, spread_px in zip(scales, reaches, steps_px, spreads_px, strict=True)
+    )
+
+
+FINE_STAGES = (_fine_stages((5.0, 4.0, 2.5, 1.5, 1.0), 1.0), _fine_stages((3.0, 2.5, 2.0, 1.5, 1.0), 0.0))
+"""Both ways are gone: edges and colours; near edges alone, for what hides a part of the outline pulls the colours."""
 
 
 @dataclass(frozen=True)
@@ -377,7 +382,8 @@ class Detector:
 
     def _finished(self, picture: Picture, starts: Sequence[Array]) -> list[Hypothesis]:
         """Poses refined to the end, best first; those of which too little is in the picture are left out."""
-        found = pool().map(lambda start: self._refined(picture, start, FINE_STAGES, FINE_TOLERANCE_PX), starts)
+        ways = [(start, stages) for start in starts for stages in FINE_STAGES]
+        found = pool().map(lambda way: self._refined(picture, *way, FINE_TOLERANCE_PX), ways)
         low = self.options.min_in_picture
         return self._ordered((h for h in found if h.evidence.points_in_picture >= low and self._is_plausible(h)), 0.0)
 
