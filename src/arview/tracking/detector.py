@@ -383,7 +383,7 @@ class Detector:
     def _finished(self, picture: Picture, starts: Sequence[Array]) -> list[Hypothesis]:
         """Poses refined to the end, best first; those of which too little is in the picture are left out."""
         ways = [(start, stages) for start in starts for stages in FINE_STAGES]
-        found = pool().map(lambda way: self._refined(picture, *way, FINE_TOLERANCE_PX), ways)
+        found = pool().map(lambda way: self._refined(picture, way[0], way[1], FINE_TOLERANCE_PX), ways)
         low = self.options.min_in_picture
         return self._ordered((h for h in found if h.evidence.points_in_picture >= low and self._is_plausible(h)), 0.0)
 

@@ -72,6 +72,18 @@ TRACK_STAGES = (
     Stage(1, 5, 1.0, 1.0, 2, 0.1),
 )
 """Coarse to fine for the usual frame. Colours help to find the outline, the edges say where it is."""
+NEAR_STAGES = (
+    Stage(2, 12, 1.5, 3.0, 2, 0.0),
+    Stage(2, 10, 1.0, 2.5, 2, 0.0),
+    Stage(1, 8, 1.0, 2.0, 2, 0.0),
+    Stage(1, 6, 1.0, 1.5, 2, 0.0),
+    Stage(1, 5, 1.0, 1.0, 2, 0.0),
+)
+"""Edges nearby alone: colours mislead where something hides a part of the outline, or looks like the part."""
+PLAIN_SHARE = 0.05
+"""With fewer design edges than this the outline alone turns with the light: colours are needed."""
+LAST_STAGES = 2 * TRACK_STAGES[2:]
+"""For a pose that is nearly right: coarse stages can lead away from it, into an edge beside the outline."""
 
 STRANGE_TURN_RAD = 0.785
 """A turn away from the prediction that is as strange as a way of STRANGE_WAY diameters aside."""
@@ -96,6 +108,7 @@ class TrackerOptions:
         learning_rate: how quickly colour histograms follow the picture.
         correlated_points: how many neighbouring edge points err together.
         doubtful_quality: below it the part is searched for around the prediction and colours are not learned.
+        other_ways_share: other stages are tried, too, where a pose is worth less than this share of the usual.
         usual_share: it is searched for, too, where a pose is worth less than this share of the usual.
         surprise_share, surprise: the same for poses off the prediction, from such a `_strangeness` on (about 6°).
         rotation_sigma_rad, translation_sigma: expected error of the prediction, the latter in diameters.
@@ -116,6 +129,7 @@ class TrackerOptions:
     translation_sigma: float = 0.3
     stages: tuple[Stage, ...] = TRACK_STAGES
     doubtful_quality: float = 0.4
+    other_ways_share: float = 0.97
     usual_share: float = 0.8
     surprise_share: float = 0.95
     surprise: float = 0.02
@@ -391,6 +405,15 @@ class Tracker:
                 matches = None
         pose, information = self.refine(image, gray, start, o.stages, matches=matches or _NO_MATCHES)
         evidence = self.evidence(image, gray, pose)
+        if evidence.worth < o.other_ways_share * self._usual_worth:
+            ways: list[tuple[Array, tuple[Stage, ...]]] = [(start, LAST_STAGES)]
+            if o.use_edge and evidence.inner_share > PLAIN_SHARE:
+                ways += [(start, NEAR_STAGES), (pose, NEAR_STAGES)]
+            for begin, stages in ways:
+                other, other_information = self.refine(image, gray, begin, stages, matches=matches or _NO_MATCHES)
+                other_evidence = self.evidence(image, gray, other)
+                if other_evidence.worth > evidence.worth:
+                    pose, information, evidence = other, other_information, other_evidence
         strangeness = self._strangeness(pose, predicted)
         if self._is_suspicious(evidence, strangeness):
             _, gray = self._gray_around(image)
