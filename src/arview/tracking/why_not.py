@@ -27,7 +27,7 @@ BLURRED_PX = 2.5
 FEWEST_EDGES = 6
 STEP_SHARE, STEP_LEVELS = 0.12, 10.0
 """Edges lower than this share of the brightest grey, or so many grey levels, do not say how sharp a picture is."""
-LEAST_QUALITY = 0.06
+LEAST_QUALITY = 0.1
 """Hypotheses of less quality are found in any clutter."""
 FITTING_QUALITY = 0.5
 SMALLEST_PX = 36.0
