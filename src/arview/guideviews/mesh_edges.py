@@ -92,6 +92,18 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
 
 
 @njit(cache=True, nogil=True)
+def facing(eye, point, normals, first, second):  # type: ignore[no-untyped-def]
+    """How far the two faces at an edge through a point are turned to the eye: > 0 is seen; 0 without a second face."""
+    front0 = 0.0
+    front1 = 0.0
+    for k in range(3):
+        front0 += normals[first, k] * (eye[k] - point[k])
+        if second >= 0:
+            front1 += normals[second, k] * (eye[k] - point[k])
+    return front0, front1
+
+
+@njit(cache=True, nogil=True)
 def _sample_visible(  # type: ignore[no-untyped-def]
     vertices, ends, faces, is_crease, is_sharp, normals, component, cam_from_model, fx, fy, cx, cy, depth,
     spacing_px, depth_tolerance
@@ -115,12 +127,7 @@ def _sample_visible(  # type: ignore[no-untyped-def]
         a = vertices[ends[e, 0]]
         b = vertices[ends[e, 1]]
         f0, f1 = faces[e, 0], faces[e, 1]
-        front0 = 0.0
-        front1 = 0.0
-        for k in range(3):
-            front0 += normals[f0, k] * (eye[k] - a[k])
-            if f1 >= 0:
-                front1 += normals[f1, k] * (eye[k] - a[k])
+        front0, front1 = facing(eye, a, normals, f0, f1)
         silhouette = f1 < 0 or (front0 > 0) != (front1 > 0)
         crease = is_crease[e] and (front0 > 0 or front1 > 0)
         if not (silhouette or crease):

@@ -27,7 +27,7 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.geometry import Array, apply, rigid
 from arview.guideviews import GuideViewSet
-from arview.guideviews.mesh_edges import mesh_edges
+from arview.guideviews.mesh_edges import facing, mesh_edges
 from arview.render import ZBufferRenderer
 from arview.tracking.solver import project_lines
 from arview.tracking.tracker import intrinsics_of
@@ -168,12 +168,7 @@ def _sample_edges(  # type: ignore[no-untyped-def]
         a = vertices[ends[e, 0]]
         b = vertices[ends[e, 1]]
         f0, f1 = faces[e, 0], faces[e, 1]
-        front0 = 0.0
-        front1 = 0.0
-        for k in range(3):
-            front0 += normals[f0, k] * (eye[k] - a[k])
-            if f1 >= 0:
-                front1 += normals[f1, k] * (eye[k] - a[k])
+        front0, front1 = facing(eye, a, normals, f0, f1)
         silhouette = f1 < 0 or (front0 > 0) != (front1 > 0)
         if not (silhouette or (is_sharp[e] and front0 > 0)):
             continue
