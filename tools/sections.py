@@ -160,7 +160,9 @@ class Sections:
         looked = 0
         for number, name in enumerate(watched(parts, "false-alarms")):
             detector, camera = self._detector_of(name)
-            scenes = [self.scene(other, "regular") for other in self.shapes if other != name]
+            # Recorded parts are seen in the backgrounds of the semi-synthetic scenes.
+            others = [other for other in self.shapes if other != name] if name in self.shapes else []
+            scenes = [self.scene(other, "regular") for other in others]
             photos = all_photos(self.backgrounds, name)
             false[name] = []
             for origin, image in frames_without_part(photos, scenes, camera.width, camera.height, each, number):
