@@ -235,3 +235,9 @@ def part_box(
     left, top = np.floor(pixels.min(axis=0)).astype(int) - margin_px
     right, bottom = np.ceil(pixels.max(axis=0)).astype(int) + margin_px
     return max(left, 0), max(top, 0), min(right, camera.width), min(bottom, camera.height)
+
+
+def half_hidden(pose: Array) -> tuple[int, int, int, int]:
+    """The card, see `picture`, that hides the left half of the part."""
+    left, top, right, bottom = part_box(pose)
+    return left, top, (left + right) // 2, bottom

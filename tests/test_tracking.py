@@ -17,7 +17,19 @@ from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.pose import Pose, TrackingState
 from arview.tracking import Estimate, SessionOptions, Tracker, TrackerOptions, TrackingSession
 from arview.tracking.tracker import TRACK_STAGES, smoothed
-from synthetic import CAMERA, assembly, assembly_views, bracket, error, part_box, path, picture, pose_from, wrong
+from synthetic import (
+    CAMERA,
+    assembly,
+    assembly_views,
+    bracket,
+    error,
+    half_hidden,
+    part_box,
+    path,
+    picture,
+    pose_from,
+    wrong,
+)
 
 MODALITIES = {
     "all": TrackerOptions(),
@@ -33,11 +45,6 @@ REAL_CAMERA = Camera(640, 480, 720.6, 722.6, 318.35, 242.25)
 @cache
 def clip() -> list[NDArray[np.uint8]]:
     return [picture(pose, seed=i) for i, pose in enumerate(PATH)]
-
-
-def half_hidden(pose: Array) -> tuple[int, int, int, int]:
-    left, top, right, bottom = part_box(pose)
-    return left, top, (left + right) // 2, bottom
 
 
 def follow(
