@@ -29,7 +29,7 @@ from arview.tracking.picture import Picture
 from arview.tracking.quality import RIGHT_WORTH, Evidence, Leads, found_logit, found_probability
 from arview.tracking.templates import choose_apart
 from arview.tracking.threads import pool
-from arview.tracking.tracker import Stage, Tracker, TrackerOptions
+from arview.tracking.tracker import NEAR_STAGES, Stage, Tracker, TrackerOptions
 from arview.tracking.why_not import Rejected
 
 
@@ -56,17 +56,16 @@ HERE_ASIDE, HERE_ALONG = 0.35, 0.25
 """Rivals this near are at the same place."""
 COARSE_TOLERANCE_PX, FINE_TOLERANCE_PX = 3.5, 1.5
 """After the coarse and the fine stages edges are looked for this near."""
-
-
-def _fine_stages(spreads_px: tuple[float, ...], region_gain: float) -> tuple[Stage, ...]:
-    scales, reaches, steps_px = (2, 2, 1, 1, 1), (12, 10, 8, 6, 5), (1.5, 1.0, 1.0, 1.0, 1.0)
-    return tuple(
-        Stage(scale, reach, step_px, spread_px, 2, region_gain)
-        for scale, reach, step_px, spread_px in zip(scales, reaches, steps_px, spreads_px, strict=True)
-    )
-
-
-FINE_STAGES = (_fine_stages((5.0, 4.0, 2.5, 1.5, 1.0), 1.0), _fine_stages((3.0, 2.5, 2.0, 1.5, 1.0), 0.0))
+FINE_STAGES = (
+    (
+        Stage(2, 12, 1.5, 5.0, 2),
+        Stage(2, 10, 1.0, 4.0, 2),
+        Stage(1, 8, 1.0, 2.5, 2),
+        Stage(1, 6, 1.0, 1.5, 2),
+        Stage(1, 5, 1.0, 1.0, 2),
+    ),
+    NEAR_STAGES,
+)
 """Both ways are gone: edges and colours; near edges alone, for what hides a part of the outline pulls the colours."""
 
 
