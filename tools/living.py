@@ -8,9 +8,6 @@ the picture is on the screen when the next screen refresh begins.
 from __future__ import annotations
 
 import json
-import re
-import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from live_server import live_server
 from recordings import ROOT, SAMPLE, skip
 
 sys.path.insert(0, str(ROOT / "tests"))  # the browser and its film are those of the tests
@@ -138,17 +136,5 @@ def _server(folder: Path) -> Iterator[str]:
         "--part", SAMPLE / "part.toml", "--inspection", SAMPLE / "inspection.json", "--camera", folder / "camera.json",
         "--http", "--port", "0", "--size", f"{WIDTH}x{HEIGHT}", "--fps", FPS,
     ]  # fmt: skip
-    command = [sys.executable, "-m", "arview.cli", "live", *map(str, arguments)]
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=folder)
-    try:
-        assert server.stdout is not None
-        found = next((match for line in server.stdout if (match := re.search(r"http://\S+token=\S+", line))), None)
-        if found is None:
-            raise SystemExit("live: the server did not start")
-        yield found.group()
-    finally:
-        server.send_signal(signal.SIGINT)
-        try:
-            server.wait(20)
-        except subprocess.TimeoutExpired:
-            server.kill()
+    with live_server(arguments, folder) as (_, link):
+        yield link

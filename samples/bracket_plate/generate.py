@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -32,47 +31,17 @@ def make_step() -> None:
 
 
 def make_clip(first: int, last: int, work: Path) -> None:
-    import cv2
+    import clips
     import scene
 
-    work.mkdir(parents=True, exist_ok=True)
-    missing = [i for i in range(first, last) if not (work / f"{i:06d}.png").exists()]
-    if not missing:
-        return
-    shot = scene.Shot(scene.load_camera(FOLDER))
-    for index in missing:
-        begin = time.process_time()
-        picture = shot.frame(index)
-        # Written under another name first, so that a cut-off run leaves no half picture behind.
-        cv2.imwrite(str(work / "partial.png"), picture)
-        (work / "partial.png").replace(work / f"{index:06d}.png")
-        print(f"frame {index}: {time.process_time() - begin:.1f} CPU-s", flush=True)
+    clips.render(work, range(first, last), lambda: scene.Shot(scene.load_camera(FOLDER)).frame)
 
 
 def encode(work: Path, crf: int) -> None:
-    import av
-    import cv2
+    import clips
     import motion
 
-    target = FOLDER / "clip.mp4"
-    with av.open(str(target), "w", options={"movflags": "+faststart"}) as container:
-        stream = container.add_stream("libx264", rate=motion.FPS)
-        stream.width, stream.height, stream.pix_fmt = 1280, 720, "yuv420p"
-        stream.options = {"crf": str(crf), "preset": "slow"}
-        context = stream.codec_context
-        context.color_range, context.colorspace = 1, 1
-        context.color_primaries, context.color_trc = 1, 1
-        for index in range(motion.FRAMES):
-            picture = cv2.imread(str(work / f"{index:06d}.png"))
-            if picture is None:
-                raise SystemExit(f"frame {index} is missing in {work}; run: generate.py clip --work {work}")
-            frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
-            frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
-            for packet in stream.encode(frame):
-                container.mux(packet)
-        for packet in stream.encode():
-            container.mux(packet)
-    print(f"{target}: {target.stat().st_size / 1e6:.2f} MB")
+    clips.encode(work, FOLDER / "clip.mp4", motion.FRAMES, motion.FPS, (1280, 720), crf)
 
 
 def make_truth() -> None:

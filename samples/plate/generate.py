@@ -111,44 +111,17 @@ def make_photos(out: Path, seed: int, first: int, last: int, quality: int) -> No
 
 
 def make_clip(work: Path, seed: int, first: int, last: int) -> None:
-    import cv2
+    import clips
     import film
 
-    work.mkdir(parents=True, exist_ok=True)
-    missing = [i for i in range(first, min(last, film.FRAMES)) if not (work / f"{i:06d}.png").exists()]
-    if not missing:
-        return
-    shoot = film.Shoot(seed)
-    for index in missing:
-        begin = time.process_time()
-        part = work / f"{index:06d}.part.png"
-        cv2.imwrite(str(part), shoot.frame(index))
-        part.replace(work / f"{index:06d}.png")
-        print(f"frame {index}: {time.process_time() - begin:.1f} CPU-s", flush=True)
+    clips.render(work, range(first, min(last, film.FRAMES)), lambda: film.Shoot(seed).frame)
 
 
 def encode_clip(out: Path, work: Path, seed: int, crf: int) -> None:
-    import av
-    import cv2
+    import clips
     import film
 
-    with av.open(str(out / "clip.mp4"), "w", options={"movflags": "+faststart"}) as container:
-        stream = container.add_stream("libx264", rate=film.FPS)
-        stream.width, stream.height, stream.pix_fmt = film.WIDTH, film.HEIGHT, "yuv420p"
-        stream.options = {"crf": str(crf), "preset": "slow"}
-        context = stream.codec_context
-        context.color_range, context.colorspace = 1, 1
-        context.color_primaries, context.color_trc = 1, 1
-        for index in range(film.FRAMES):
-            picture = cv2.imread(str(work / f"{index:06d}.png"))
-            if picture is None:
-                raise SystemExit(f"frame {index} is missing in {work}; run: generate.py clip --work {work}")
-            frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
-            frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
-            for packet in stream.encode(frame):
-                container.mux(packet)
-        for packet in stream.encode():
-            container.mux(packet)
+    clips.encode(work, out / "clip.mp4", film.FRAMES, film.FPS, (film.WIDTH, film.HEIGHT), crf)
     head = {
         "clip": "clip.mp4",
         "fps": film.FPS,
@@ -158,7 +131,6 @@ def encode_clip(out: Path, work: Path, seed: int, crf: int) -> None:
     poses = [json.dumps(np.round(film.cam_from_model(index, seed), 9).tolist()) for index in range(film.FRAMES)]
     text = json.dumps(head, indent=1)[:-2] + ',\n "cam_from_model": [\n  ' + ",\n  ".join(poses) + "\n ]\n}\n"
     (out / "clip_truth.json").write_text(text)
-    print(f"{out / 'clip.mp4'}: {(out / 'clip.mp4').stat().st_size / 1e6:.2f} MB")
 
 
 def make_as_built(out: Path, seed: int) -> None:
