@@ -157,6 +157,9 @@ def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
     assert telling(steps(only_a, 0.6), steps(only_b, 0.0)) > TELLING
     assert telling(steps(only_b, 0.0), steps(only_a, 0.6)) < -TELLING
     assert abs(telling(steps(only_a, 0.6), steps(only_b, 0.55))) < TELLING
+    # Edges that are there although the other pose has none in their place tell, too.
+    assert telling(steps(only_a, 0.6), steps(shared[:30], 0.6)) > TELLING
+    assert telling(steps(only_a, 0.0), steps(shared[:30], 0.6)) < -TELLING
     # Nothing tells them apart where all edges are shared.
     assert telling(steps(shared[:30], 0.6), steps(shared[:30], 0.0)) == 0.0
 

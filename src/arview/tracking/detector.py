@@ -192,7 +192,8 @@ class Detector:
         )
         self._components = ComponentCheck(views, model, camera) if model and len(model.components) > 1 else None
         self.symmetries = find_symmetries(views)
-        self._turns = np.concatenate([self.symmetries.exact, self.symmetries.near])
+        self._same_turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
+        self._turns = np.concatenate([self._same_turns, self.symmetries.near])
 
     def detect(self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True) -> list[Detection]:
         """Poses of the part in a frame, best first; an empty list when it is not found.
@@ -285,8 +286,9 @@ class Detector:
     ) -> tuple[Hypothesis, list[Hypothesis]]:
         """The pose that is borne out best among the near symmetries of one found, and those that do as well.
 
-        What tells is the edges that only one of two poses has. Hypotheses at the same place from which these do not
-        part the best one are alternatives too, unless an exact symmetry makes them the same pose.
+        What tells is the edges that only one of two poses has; hypotheses at the same place that are no twins take the
+        best one's place only if these say so clearly. Those from which they do not part the best one are alternatives
+        too, unless an exact symmetry makes them the same pose.
         """
         pose = best.cam_from_body
         starts = [rigid(pose[:3, :3] @ turn, pose[:3, 3]) for turn in self.symmetries.near]
@@ -298,21 +300,21 @@ class Detector:
         steps = {id(h): one for h, one in zip(rivals, seen, strict=True)}
         best = rivals[0]
         for rival in rivals[1:]:
-            if telling(steps[id(rival)], steps[id(best)]) > 0.0:
+            is_twin = self._is_turned(rival, rivals[0], self.symmetries.near, ALIKE_DEG)
+            if telling(steps[id(rival)], steps[id(best)]) > (0.0 if is_twin else TELLING):
                 best = rival
         twins = [h for h in rivals if h is not best and telling(steps[id(best)], steps[id(h)]) < TELLING]
-        return best, [h for h in twins if not self._is_turned(h, best, self.symmetries.exact, ALIKE_DEG)]
+        return best, [h for h in twins if not self._is_turned(h, best, self._same_turns, ALIKE_DEG)]
 
     def _is_equal(self, a: Hypothesis, b: Hypothesis, turns: Array, reach: float = 0.08) -> bool:
-        """Whether two are the same pose, if need be by one of some turns (N,3,3); ``reach`` is in diameters."""
+        """Whether two are the same pose, by one of some turns (N,3,3); ``reach`` is in diameters."""
         apart_mm = np.linalg.norm(a.cam_from_body[:3, 3] - b.cam_from_body[:3, 3])
         return bool(apart_mm <= reach * self.views.diameter_mm) and self._is_turned(a, b, turns, 8.0)
 
     def _is_turned(self, a: Hypothesis, b: Hypothesis, turns: Array, angle_deg: float) -> bool:
-        """Whether two rotations are nearer than an angle, if need be by one of some turns (N,3,3)."""
-        turned = b.cam_from_body[:3, :3] @ np.concatenate([np.eye(3)[None], turns])
-        cosine = 0.5 * (np.einsum("ij,nij->n", a.cam_from_body[:3, :3], turned) - 1.0)
-        return bool(cosine.max() > np.cos(np.deg2rad(angle_deg)))
+        """Whether one of some turns (N,3,3) brings a rotation nearer to another than an angle."""
+        cosine = 0.5 * (np.einsum("ij,nij->n", a.cam_from_body[:3, :3], b.cam_from_body[:3, :3] @ turns) - 1.0)
+        return bool(np.any(cosine > np.cos(np.deg2rad(angle_deg))))
 
     def _picture(self, image: NDArray[np.uint8]) -> Picture:
         o = self.options
