@@ -22,11 +22,12 @@ from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
 from arview.tracking.ambiguity import LEAD, TELLING, find_symmetries, telling
+from arview.tracking.areas import look_at_areas
 from arview.tracking.climb import climb
 from arview.tracking.components import ComponentCheck
-from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch, weighed
+from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch, area_factors, weighed
 from arview.tracking.picture import Picture
-from arview.tracking.quality import RIGHT_WORTH, Evidence, Leads, found_logit, found_probability
+from arview.tracking.quality import RIGHT_WORTH, Areas, Evidence, Leads, found_logit, found_probability
 from arview.tracking.templates import choose_apart
 from arview.tracking.threads import pool
 from arview.tracking.tracker import NEAR_STAGES, Stage, Tracker, TrackerOptions
@@ -159,17 +160,18 @@ class Detection:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A refined pose about the model's centre, its evidence, the distinct lines that its view shows, and its size."""
+    """A refined pose about the model's centre, what speaks for it, the distinct lines that its view shows, its size."""
 
     cam_from_body: Array
     evidence: Evidence
+    areas: Areas
     lines: float
     radius_px: float
 
     @property
     def logit(self) -> float:
         """For comparing the hypotheses of one picture, see `found_logit`."""
-        return found_logit(self.evidence, self.lines, self.radius_px)
+        return found_logit(self.evidence, self.areas, self.lines, self.radius_px)
 
 
 class Detector:
@@ -187,9 +189,7 @@ class Detector:
         self.camera = camera
         self.best_rejected: Rejected | None = None
         self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
-        self.search = FirstSearch(
-            views, self.tracker.part.model_from_body, camera, o.radius_px, o.roll_step_deg, o.subdivisions
-        )
+        self.search = FirstSearch(views, self.tracker.part, camera, o.radius_px, o.roll_step_deg, o.subdivisions)
         self._components = ComponentCheck(views, model, camera) if model and len(model.components) > 1 else None
         self.symmetries = find_symmetries(views)
         self._same_turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
@@ -228,8 +228,8 @@ class Detector:
         for hypothesis, quality in zip(settled[1:], qualities[1:], strict=True):
             is_apart = all(not self._is_equal(hypothesis, h, self._turns, 0.25) for h in (best, *twins))
             if quality >= least and is_apart:
-                found.append(self._detection(picture, hypothesis, quality, []))
-        return found[:max_results]
+                found.append(self._detection(picture, hypothesis, min(quality, qualities[0]), []))
+        return sorted(found, key=lambda detection: -detection.quality)[:max_results]
 
     def _detection(
         self, picture: Picture, hypothesis: Hypothesis, quality: float, twins: list[Hypothesis]
@@ -253,6 +253,7 @@ class Detector:
         return [
             found_probability(
                 hypothesis.evidence,
+                hypothesis.areas,
                 hypothesis.lines,
                 hypothesis.radius_px,
                 self._leads(hypothesis, hypotheses[k + 1 :]),
@@ -353,6 +354,7 @@ class Detector:
             return []
         scores, poses = np.concatenate([r[0] for r in results]), np.concatenate([r[1] for r in results])
         scores = weighed(scores, np.array([self._view_lines(pose) for pose in poses]))
+        scores *= area_factors(look_at_areas(picture, self.tracker.part, poses))
         order = np.argsort(-scores, kind="stable")
         scores, poses = scores[order], poses[order]
         reach = np.full(len(poses), 0.01 * level.apart_deg * self.views.diameter_mm) / poses[:, 2, 3]
@@ -379,20 +381,30 @@ class Detector:
 
     def _tried(self, picture: Picture, starts: Sequence[Array], stages: tuple[Stage, ...]) -> list[Hypothesis]:
         """Poses after some coarse stages from each start."""
-        return list(pool().map(lambda start: self._refined(picture, start, stages, COARSE_TOLERANCE_PX), starts))
+        return self._refined(picture, [(start, stages) for start in starts], COARSE_TOLERANCE_PX)
 
     def _finished(self, picture: Picture, starts: Sequence[Array]) -> list[Hypothesis]:
         """Poses refined to the end, best first; those of which too little is in the picture are left out."""
-        ways = [(start, stages) for start in starts for stages in FINE_STAGES]
-        found = pool().map(lambda way: self._refined(picture, way[0], way[1], FINE_TOLERANCE_PX), ways)
+        found = self._refined(picture, [(s, stages) for s in starts for stages in FINE_STAGES], FINE_TOLERANCE_PX)
         low = self.options.min_in_picture
         return self._ordered((h for h in found if h.evidence.points_in_picture >= low and self._is_plausible(h)), 0.0)
 
-    def _refined(self, picture: Picture, start: Array, stages: tuple[Stage, ...], tolerance_px: float) -> Hypothesis:
-        pose = self.tracker.refine_fresh(picture.image, picture.gray, start, stages)
-        look = self.tracker.fresh_appearance(picture.image, pose)
-        evidence = self.tracker.evidence(picture.image, picture.gray, pose, tolerance_px, look)
-        return Hypothesis(pose, evidence, self._view_lines(pose), self.tracker.radius_px(pose))
+    def _refined(
+        self, picture: Picture, ways: Sequence[tuple[Array, tuple[Stage, ...]]], tolerance_px: float
+    ) -> list[Hypothesis]:
+        """Where some stages lead from each of some starts."""
+
+        def refine(way: tuple[Array, tuple[Stage, ...]]) -> tuple[Array, Evidence]:
+            pose = self.tracker.refine_fresh(picture.image, picture.gray, *way)
+            look = self.tracker.fresh_appearance(picture.image, pose)
+            return pose, self.tracker.evidence(picture.image, picture.gray, pose, tolerance_px, look)
+
+        refined = list(pool().map(refine, ways))
+        areas = look_at_areas(picture, self.tracker.part, np.array([pose for pose, _ in refined]).reshape(-1, 4, 4))
+        return [
+            Hypothesis(pose, evidence, Areas(*seen), self._view_lines(pose), self.tracker.radius_px(pose))
+            for (pose, evidence), seen in zip(refined, areas.tolist(), strict=True)
+        ]
 
     def _ordered(self, found: Iterable[Hypothesis], apart_deg: float, most: int = 1000) -> list[Hypothesis]:
         """Best first, without those near a better one."""
