@@ -47,8 +47,6 @@ COARSE_STAGES = (_coarse_stages(1.0), _coarse_stages(20.0))
 """Tries from the likeliest starts: edges lead; colours lead, on plain and glossy parts."""
 TRIED = 16
 """So many starts are tried."""
-LINES_POWER = 0.25
-"""Of the distinct lines of a view, by which a pose counts in the pattern search."""
 HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
 SURE_QUALITY = 0.7
@@ -355,7 +353,7 @@ class Detector:
         if not results:
             return []
         scores, poses = np.concatenate([r[0] for r in results]), np.concatenate([r[1] for r in results])
-        scores = weighed(scores, np.array([self._view_lines(pose) for pose in poses]), LINES_POWER)
+        scores = weighed(scores, np.array([self._view_lines(pose) for pose in poses]))
         scores *= area_factors(look_at_areas(picture, self.tracker.part, poses))
         order = np.argsort(-scores, kind="stable")
         scores, poses = scores[order], poses[order]

@@ -47,10 +47,6 @@ ALIKE = 5
 """So many matches are there for one that is left then."""
 
 
-LINES_POWER, MORE_LINES_POWERS = 0.06, (0.0, 0.19)
-"""Of the distinct lines of a view, by which its outline counts, and by which it counts beyond that in the choice of
-starts: where all are on plain ground views with many lines are right, in clutter they come before right ones of few (of
-108 hard semi-synthetic frames the starts held the right pose in 91 % with the first, in 82 % with the second alone)."""
 PARTING_WEIGHT, CLUTTER_WEIGHT = 0.25, -0.07
 """Of what areas say, against the logarithm of a score: conditional logistic regression on the matches of 116
 semi-synthetic frames."""
@@ -148,9 +144,9 @@ def area_factors(areas: Array) -> Array:
     return np.asarray(np.exp(PARTING_WEIGHT * areas[:, 0] + CLUTTER_WEIGHT * areas[:, 1]))
 
 
-def weighed(scores: Array, lines: Array, power: float) -> Array:
+def weighed(scores: Array, lines: Array) -> Array:
     """Scores by which poses of different views compare: one that shows few distinct lines often fits by chance."""
-    return np.asarray(scores * lines**power)
+    return np.asarray(scores * lines**0.25)
 
 
 class FirstSearch:
@@ -226,12 +222,7 @@ class FirstSearch:
         matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.looked_at)
         poses = np.stack([rigid(r, p) for r, p in zip(*self._posed(matches), strict=True)])
         keys = matches.keys * area_factors(look_at_areas(picture, self._part, poses))
-        lines = self.outlines.lines[matches.views]
-        # In turn the best by either weighing, each once.
-        orders = [np.argsort(-keys * lines**power, kind="stable") for power in MORE_LINES_POWERS]
-        _, first = np.unique(np.stack(orders, axis=1), return_index=True)
-        chosen = np.argsort(first)[: effort.starts]
-        return [Candidate(float(keys[k]), poses[k]) for k in chosen]
+        return [Candidate(float(keys[k]), poses[k]) for k in np.argsort(-keys, kind="stable")[: effort.starts]]
 
     def _match(
         self,
@@ -314,7 +305,7 @@ class FirstSearch:
                 some.radii_px * scale, places, focal_px, growth.roll_step_rad, growth.stretch_step, GROWTH_ROUNDS,
                 SHIFT_PX, SHIFT_PX,
             )  # fmt: skip
-            keys = weighed(scores, shapes.lines[views], LINES_POWER)
+            keys = weighed(scores, shapes.lines[views])
             return Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
 
         return _joined(list(pool().map(improve, jobs)))
