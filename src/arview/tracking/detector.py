@@ -22,12 +22,12 @@ from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
 from arview.tracking.ambiguity import LEAD, TELLING, find_symmetries, telling
-from arview.tracking.areas import look_at_areas
 from arview.tracking.climb import climb
 from arview.tracking.components import ComponentCheck
-from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch, area_factors, weighed
+from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch
+from arview.tracking.judge import FINE, judge
 from arview.tracking.picture import Picture
-from arview.tracking.quality import RIGHT_WORTH, Areas, Evidence, Leads, found_logit, found_probability
+from arview.tracking.quality import EVIDENCE_WEIGHT, RIGHT_WORTH, Evidence, Leads, found_logit, found_probability
 from arview.tracking.templates import choose_apart
 from arview.tracking.threads import pool
 from arview.tracking.tracker import NEAR_STAGES, Stage, Tracker, TrackerOptions
@@ -164,14 +164,19 @@ class Hypothesis:
 
     cam_from_body: Array
     evidence: Evidence
-    areas: Areas
+    judgement: float
     lines: float
     radius_px: float
 
     @property
+    def own_logit(self) -> float:
+        """The same without the judge, see `found_logit`."""
+        return found_logit(self.evidence, self.lines, self.radius_px)
+
+    @property
     def logit(self) -> float:
-        """For comparing the hypotheses of one picture, see `found_logit`."""
-        return found_logit(self.evidence, self.areas, self.lines, self.radius_px)
+        """For comparing the hypotheses of one picture."""
+        return EVIDENCE_WEIGHT * self.own_logit + self.judgement
 
 
 class Detector:
@@ -203,16 +208,16 @@ class Detector:
             max_results: at most so many, all above the quality threshold and apart from each other.
             is_thorough: search on among less likely matches when the likeliest come to nothing.
         """
-        picture = self._picture(image)
+        picture = self.picture(image)
         # With few rivals looked at, a lead says less.
         least = self.options.min_quality if is_thorough else max(SURE_QUALITY, self.options.min_quality)
         return self._found(picture, self.hypotheses(picture, is_thorough), max_results, least)
 
     def detect_near(self, image: NDArray[np.uint8], guesses: Sequence[Array]) -> list[Detection]:
         """The best pose (or none) that one of some rough poses (4,4) ``cam_from_model`` leads to."""
-        picture = self._picture(image)
+        picture = self.picture(image)
         starts = [Candidate(1.0, guess @ self.tracker.part.model_from_body) for guess in guesses]
-        return self._found(picture, self._settle(picture, self.climbed(picture, starts)), 1, self.options.min_quality)
+        return self._found(picture, self.settled(picture, self.climbed(picture, starts)), 1, self.options.min_quality)
 
     def _found(self, picture: Picture, settled: list[Hypothesis], max_results: int, least: float) -> list[Detection]:
         """The hypotheses of at least a quality, best first."""
@@ -243,7 +248,7 @@ class Detector:
         settled: list[Hypothesis] = []
         for effort in self.options.efforts if is_thorough else self.options.efforts[:1]:
             starts = self.climbed(picture, self.search.starts(picture, effort), effort)
-            settled = self._ordered([*settled, *self._settle(picture, starts)], 5.0)
+            settled = self._ordered([*settled, *self.settled(picture, starts)], 5.0)
             if settled and self.qualities(settled)[0] >= SURE_QUALITY:
                 break
         return settled
@@ -251,14 +256,8 @@ class Detector:
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
         return [
-            found_probability(
-                hypothesis.evidence,
-                hypothesis.areas,
-                hypothesis.lines,
-                hypothesis.radius_px,
-                self._leads(hypothesis, hypotheses[k + 1 :]),
-            )
-            for k, hypothesis in enumerate(hypotheses)
+            found_probability(h.own_logit, h.judgement, self._leads(h, hypotheses[k + 1 :]))
+            for k, h in enumerate(hypotheses)
         ]
 
     def _leads(self, best: Hypothesis, others: list[Hypothesis]) -> Leads:
@@ -317,7 +316,8 @@ class Detector:
         cosine = 0.5 * (np.einsum("ij,nij->n", a.cam_from_body[:3, :3], b.cam_from_body[:3, :3] @ turns) - 1.0)
         return bool(np.any(cosine > np.cos(np.deg2rad(angle_deg))))
 
-    def _picture(self, image: NDArray[np.uint8]) -> Picture:
+    def picture(self, image: NDArray[np.uint8]) -> Picture:
+        """A frame (H,W,3) as the searches take it."""
         o = self.options
         return Picture(image, self.camera, round(0.6 * o.radius_px))
 
@@ -340,21 +340,21 @@ class Detector:
             size = max(2, -(-len(group) // 4))
             jobs += [(step, np.stack(group[i : i + size])) for i in range(0, len(group), size)]
 
-        def search(job: tuple[int, Array]) -> tuple[Array, Array]:
+        def search(job: tuple[int, Array]) -> Array:
             maps, intrinsics = picture.maps(job[0])
-            scores, poses = climb(
+            _, poses = climb(
                 maps, self.tracker.part.arrays, job[1], intrinsics, 0.01 * self.views.diameter_mm,
                 np.deg2rad(level.turn_step_deg), level.stretch_step, level.rounds, level.halvings, 2, 2,
                 level.points, level.points,
             )  # fmt: skip
-            return scores, poses
+            return np.asarray(poses)
 
         results = list(pool().map(search, jobs))
         if not results:
             return []
-        scores, poses = np.concatenate([r[0] for r in results]), np.concatenate([r[1] for r in results])
-        scores = weighed(scores, np.array([self._view_lines(pose) for pose in poses]))
-        scores *= area_factors(look_at_areas(picture, self.tracker.part, poses))
+        poses = np.concatenate(results)
+        lines = np.array([self.view_lines(pose) for pose in poses])
+        scores = judge(picture, self.tracker.part, poses, lines)
         order = np.argsort(-scores, kind="stable")
         scores, poses = scores[order], poses[order]
         reach = np.full(len(poses), 0.01 * level.apart_deg * self.views.diameter_mm) / poses[:, 2, 3]
@@ -364,7 +364,7 @@ class Detector:
         )  # fmt: skip
         return [Candidate(float(scores[i]), poses[i]) for i in chosen]
 
-    def _settle(self, picture: Picture, starts: list[Candidate]) -> list[Hypothesis]:
+    def settled(self, picture: Picture, starts: list[Candidate]) -> list[Hypothesis]:
         """Refine starts, keep the best, search around them; apart from each other, best first."""
         o = self.options
         as_found = self._tried(picture, [start.cam_from_body for start in starts], ())
@@ -400,10 +400,12 @@ class Detector:
             return pose, self.tracker.evidence(picture.image, picture.gray, pose, tolerance_px, look)
 
         refined = list(pool().map(refine, ways))
-        areas = look_at_areas(picture, self.tracker.part, np.array([pose for pose, _ in refined]).reshape(-1, 4, 4))
+        poses = np.array([pose for pose, _ in refined]).reshape(-1, 4, 4)
+        lines = np.array([self.view_lines(pose) for pose in poses])
+        judgements = judge(picture, self.tracker.part, poses, lines, FINE)
         return [
-            Hypothesis(pose, evidence, Areas(*seen), self._view_lines(pose), self.tracker.radius_px(pose))
-            for (pose, evidence), seen in zip(refined, areas.tolist(), strict=True)
+            Hypothesis(pose, evidence, float(judgement), float(shown), self.tracker.radius_px(pose))
+            for (pose, evidence), judgement, shown in zip(refined, judgements, lines, strict=True)
         ]
 
     def _ordered(self, found: Iterable[Hypothesis], apart_deg: float, most: int = 1000) -> list[Hypothesis]:
@@ -416,7 +418,7 @@ class Detector:
                 result.append(hypothesis)
         return result
 
-    def _view_lines(self, cam_from_body: Array) -> float:
+    def view_lines(self, cam_from_body: Array) -> float:
         """Distinct lines of the view nearest to a pose."""
         ray = cam_from_body[:3, :3].T @ cam_from_body[:3, 3]
         outlines = self.search.outlines

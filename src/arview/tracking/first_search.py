@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
-from arview.tracking.areas import look_at_areas
 from arview.tracking.climb import climb_outlines
+from arview.tracking.judge import judge
 from arview.tracking.picture import STEPS_PER_OCTAVE, Picture
 from arview.tracking.templates import (
     GROUPS,
@@ -45,11 +45,6 @@ CELL_PX, CELL_ROLL = 4.0, 0.33
 """Of matches whose place and roll (rad) fall in one cell, of one scale and group of views, the best is enough."""
 ALIKE = 5
 """So many matches are there for one that is left then."""
-
-
-PARTING_WEIGHT, CLUTTER_WEIGHT = 0.25, -0.07
-"""Of what areas say, against the logarithm of a score: conditional logistic regression on the matches of 116
-semi-synthetic frames."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +76,7 @@ class Effort:
     Attributes:
         matches: of templates that are improved as outlines.
         improved: of these, how many are improved in the last round too.
-        looked_at: of these, how many are weighed by areas as well.
+        looked_at: of these, how many are judged.
         starts: of these, how many poses are searched around.
         kept: hypotheses left after each level of that search.
         scale_step: templates are matched at one of so many scales.
@@ -139,11 +134,6 @@ def _joined(parts: list[Matches]) -> Matches:
     return Matches(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Matches)))
 
 
-def area_factors(areas: Array) -> Array:
-    """By how much (N,) areas (N,2), see `Areas`, raise the scores of poses."""
-    return np.asarray(np.exp(PARTING_WEIGHT * areas[:, 0] + CLUTTER_WEIGHT * areas[:, 1]))
-
-
 def weighed(scores: Array, lines: Array) -> Array:
     """Scores by which poses of different views compare: one that shows few distinct lines often fits by chance."""
     return np.asarray(scores * lines**0.25)
@@ -199,6 +189,12 @@ class FirstSearch:
 
     def starts(self, picture: Picture, effort: Effort = QUICK) -> list[Candidate]:
         """Poses for the best matches over the whole range, apart from each other, best first."""
+        poses, lines = self.likely(picture, effort)
+        scores = judge(picture, self._part, poses, lines)
+        return [Candidate(float(scores[k]), poses[k]) for k in np.argsort(-scores, kind="stable")[: effort.starts]]
+
+    def likely(self, picture: Picture, effort: Effort = QUICK) -> tuple[Array, Array]:
+        """Poses (N,4,4) for the best matches by their responses, best first, and the lines (N,) of their views."""
         scales = self._steps[:: effort.scale_step]
         picture.make(scales)
         phases = list(pool().map(lambda step: decimate(picture.maps(step)[0], GRID_PX), scales))
@@ -212,17 +208,16 @@ class FirstSearch:
         found = pool().map(lambda job: self._match(votes[job[0]], kept, picture, *job), jobs)
         raw = [m for m in found if m is not None]
         if not raw:
-            return []
+            return np.empty((0, 4, 4)), np.empty(0)
         matches = self._distinct(_joined(raw), effort.matches)
         if not len(matches.keys):
-            return []
+            return np.empty((0, 4, 4)), np.empty(0)
         for growth in GROWTHS[:-1]:
             matches = self._improved(picture, matches, growth)
         matches = self._improved(picture, matches.best(effort.improved), GROWTHS[-1])
         matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.looked_at)
         poses = np.stack([rigid(r, p) for r, p in zip(*self._posed(matches), strict=True)])
-        keys = matches.keys * area_factors(look_at_areas(picture, self._part, poses))
-        return [Candidate(float(keys[k]), poses[k]) for k in np.argsort(-keys, kind="stable")[: effort.starts]]
+        return poses, self.outlines.lines[matches.views]
 
     def _match(
         self,

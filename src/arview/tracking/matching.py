@@ -18,6 +18,8 @@ from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.tracking.refine import nearest_view
 from arview.tracking.solver import project_lines
 
+Plane = NDArray[np.float32]
+
 ORIENTATIONS = 8
 """Bins over 180°."""
 
@@ -32,10 +34,7 @@ def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int, pool: i
     With ``pool`` the maps are so many times smaller than the picture; each of their pixels has the strongest edge of
     those it stands for: fine lines that lie close keep their directions. ``spread_px`` is in pixels of the maps.
     """
-    planes = cv2.split(cv2.GaussianBlur(image, (3, 3), 0))
-    gx = np.stack([cv2.Sobel(plane, cv2.CV_16S, 1, 0, ksize=3) for plane in planes])
-    gy = np.stack([cv2.Sobel(plane, cv2.CV_16S, 0, 1, ksize=3) for plane in planes])
-    x, y, magnitude = _strongest(gx, gy)
+    _, x, y, magnitude = colour_gradients(image)
     phase = cv2.phase(x, y, angleInDegrees=False)
     size = 20 * pool + 1
     around = cv2.boxFilter(magnitude, -1, (size, size), borderType=cv2.BORDER_REFLECT)
@@ -45,6 +44,16 @@ def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int, pool: i
     for plane in own:
         cv2.dilate(plane, kernel, dst=plane)
     return np.asarray(_without_common(own, pad_px))
+
+
+def colour_gradients(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Plane, Plane, Plane]:
+    """The smoothed picture, the gradient x, y of each pixel's strongest channel and its size, see `_strongest`."""
+    smooth = cv2.GaussianBlur(image, (3, 3), 0)
+    planes = cv2.split(smooth)
+    gx = np.stack([cv2.Sobel(plane, cv2.CV_16S, 1, 0, ksize=3) for plane in planes])
+    gy = np.stack([cv2.Sobel(plane, cv2.CV_16S, 0, 1, ksize=3) for plane in planes])
+    x, y, magnitude = _strongest(gx, gy)
+    return np.asarray(smooth), x, y, magnitude
 
 
 @njit(cache=True, nogil=True)

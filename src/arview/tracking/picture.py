@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array
-from arview.tracking.matching import response_maps
+from arview.tracking.matching import colour_gradients, response_maps
 from arview.tracking.threads import pool
 from arview.tracking.tracker import intrinsics_of, smoothed
 
@@ -21,36 +21,30 @@ SPREAD_PX = 1
 """How far edges may lie from where a pose has them, in pixels of the maps."""
 
 
-COLOUR_BITS = 3
-COLOURS = 1 << (3 * COLOUR_BITS)
-"""So many bits of each channel make so many colours."""
-
-
-class Surroundings(NamedTuple):
-    """A picture as the kernels take it.
+class Gradients(NamedTuple):
+    """A picture as the judge takes it, see `judge`.
 
     Attributes:
-        colours: (H,W) uint16, one of 512.
-        steps: (H,W) float32 gradient in grey levels per pixel.
+        across, down: (H,W) float32, of each pixel's channel with the strongest gradient, grey levels per pixel.
+        colours: (H,W,3) uint8, smoothed.
         intrinsics: (10,) of it.
     """
 
-    colours: NDArray[np.uint16]
-    steps: NDArray[np.float32]
+    across: NDArray[np.float32]
+    down: NDArray[np.float32]
+    colours: NDArray[np.uint8]
     intrinsics: Array
 
 
-def make_surroundings(image: NDArray[np.uint8], intrinsics: Array) -> Surroundings:
-    """The surroundings of an RGB picture."""
-    red, green, blue = (plane.astype(np.uint16) >> (8 - COLOUR_BITS) for plane in cv2.split(image))
-    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (3, 3), 0)
-    gx, gy = (cv2.Sobel(gray, cv2.CV_32F, 1 - along, along, ksize=3, scale=0.25) for along in (0, 1))
-    colours = (red << (2 * COLOUR_BITS)) | (green << COLOUR_BITS) | blue
-    return Surroundings(colours, np.asarray(cv2.magnitude(gx, gy), dtype=np.float32), intrinsics)
+def make_gradients(image: NDArray[np.uint8], intrinsics: Array) -> Gradients:
+    """The gradients of an RGB picture."""
+    smooth, across, down, _ = colour_gradients(image)
+    quarter = np.float32(0.25)  # of Sobel's sum
+    return Gradients(quarter * across, quarter * down, smooth, intrinsics)
 
 
 class Picture:
-    """A frame with what was made from it: response maps and surroundings by scale, kept until the frame is done with.
+    """A frame with what was made from it: response maps and gradients by scale, kept until the frame is done with.
 
     Args:
         image: (H,W,3) uint8 RGB.
@@ -65,7 +59,7 @@ class Picture:
         self.focal_px = 0.5 * (camera.fx + camera.fy)
         self._camera = camera
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
-        self._surroundings: dict[int, Surroundings] = {}
+        self._gradients: dict[int, Gradients] = {}
 
     def make(self, steps: Iterable[int]) -> None:
         """Make the maps of several scales at once."""
@@ -79,13 +73,16 @@ class Picture:
             self._maps[step] = self._make(step)
         return self._maps[step]
 
-    def surroundings(self, step: int) -> Surroundings:
-        """Colours and steps of the picture at a scale."""
-        if step not in self._surroundings:
-            width, height = self._size(step)
-            image = self._resized(width, height)
-            self._surroundings[step] = make_surroundings(image, intrinsics_of(self._camera.scaled(width, height)))
-        return self._surroundings[step]
+    def gradients(self, step: int) -> Gradients:
+        """Gradients and colours of the picture at a scale."""
+        if step not in self._gradients:
+            self._gradients[step] = make_gradients(*self._scaled(step))
+        return self._gradients[step]
+
+    def _scaled(self, step: int) -> tuple[NDArray[np.uint8], Array]:
+        """The picture at a scale, and its intrinsics (10,)."""
+        width, height = self._size(step)
+        return self._resized(width, height), intrinsics_of(self._camera.scaled(width, height))
 
     def _make(self, step: int) -> tuple[NDArray[np.uint8], Array]:
         width, height = self._size(step)

@@ -1,0 +1,157 @@
+"""Random solids of every kind, to fit on what holds for parts in general and for no part in particular."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arview.cad import Component, Model, make_model
+from arview.evaluation.semisynthetic.solids import (
+    Loop,
+    Mesh,
+    box,
+    circle,
+    cylinder,
+    lump,
+    moved,
+    prism,
+    rectangle,
+    tube,
+)
+from arview.geometry import Array, exp_so3, rigid
+
+Rng = np.random.Generator
+HALF_SIZE_MM = (36.0, 85.0)
+"""About half the size of the solids."""
+ONE_COLOUR = 0.5
+"""So many of them are of one colour."""
+
+
+def random_solid(seed: int) -> Model:
+    """A random solid: a plate with things on it, a smooth body, a stepped prism, a turned part or a frame.
+
+    The same seed gives the same solid.
+
+    Raises:
+        ValueError: this seed's outlines cross each other; take another.
+    """
+    rng = np.random.default_rng(seed)
+    size = rng.uniform(*HALF_SIZE_MM)
+    kinds = (_plate, _plate, _smooth, _stepped, _turned, _frame, _smooth_with_things)
+    meshes = kinds[seed % len(kinds)](size, rng)
+    whole, is_one = _colour(rng), rng.random() < ONE_COLOUR
+    parts = [
+        Component(f"body_{k}", vertices, faces.astype(np.int32), whole if is_one else _colour(rng))
+        for k, (vertices, faces) in enumerate(meshes)
+    ]
+    return make_model(f"random_{seed}", tuple(parts))
+
+
+def _plate(size: float, rng: Rng) -> list[Mesh]:
+    a, b, thick = size, size * rng.uniform(0.5, 1.0), size * rng.uniform(0.06, 0.25)
+    is_rectangle = rng.random() < 0.6
+    outline = rectangle((-a, -b), (a, b)) if is_rectangle else _polygon(a, b, rng)
+    holes: tuple[Loop, ...] = ()
+    if is_rectangle and rng.random() < 0.7:
+        centers = ((-0.75 * a, -0.7 * b), (0.7 * a, 0.65 * b))
+        holes = tuple(circle(center, size * rng.uniform(0.03, 0.1)) for center in centers)
+    meshes = [prism(outline, holes, 0.0, thick), *_things(2, 9, 0.65 * a, 0.65 * b, thick, size, rng)]
+    if rng.random() < 0.4:
+        upside_down = rigid(exp_so3([np.pi, 0, 0]), np.zeros(3))
+        below = _things(1, 4, 0.6 * a, 0.6 * b, 0.0, size, rng)
+        meshes += [moved(mesh, upside_down) for mesh in below]
+    return meshes
+
+
+def _smooth(size: float, rng: Rng) -> list[Mesh]:
+    bumps = []
+    for _ in range(rng.integers(2, 8)):
+        x, y, z = rng.normal(size=3)
+        bumps.append(((float(x), float(y), float(z)), size * rng.uniform(-0.2, 0.5), rng.uniform(0.3, 0.7)))
+    return [lump(size * rng.uniform((0.4, 0.3, 0.3), (1.0, 0.8, 0.7)), bumps, 4)]
+
+
+def _smooth_with_things(size: float, rng: Rng) -> list[Mesh]:
+    things = _things(1, 4, 0.3 * size, 0.3 * size, 0.2 * size, size, rng)
+    return [*_smooth(size, rng), *(_turned_about(mesh, rng) for mesh in things)]
+
+
+def _stepped(size: float, rng: Rng) -> list[Mesh]:
+    count = rng.integers(2, 5)
+    places = np.sort(rng.uniform(-size, size, count + 1))
+    places[0], places[-1] = -size, size
+    heights = size * rng.uniform(0.2, 1.1, count)
+    corners = [(-size, 0.0), (size, 0.0)]
+    for k in reversed(range(count)):
+        corners += [(places[k + 1], heights[k]), (places[k], heights[k])]
+    body = prism(np.array(corners), (), -size * rng.uniform(0.2, 0.5), size * rng.uniform(0.2, 0.5))
+    return [_turned_about(body, rng), *_things(0, 4, 0.4 * size, 0.4 * size, 0.0, size, rng)]
+
+
+def _turned(size: float, rng: Rng) -> list[Mesh]:
+    meshes, top = [], 0.0
+    for _ in range(rng.integers(2, 5)):
+        height, radius = size * rng.uniform(0.1, 0.6), size * rng.uniform(0.2, 0.9)
+        is_tube, inner = rng.random() < 0.4, radius * rng.uniform(0.3, 0.8)
+        new = tube((0, 0), radius, inner, top, top + height) if is_tube else cylinder((0, 0), radius, top, top + height)
+        meshes.append(new)
+        top += height
+    # Things at one side: a body of revolution has no orientation.
+    return meshes + _things(1, 4, 0.5 * size, 0.5 * size, top * rng.uniform(0.2, 0.9), size, rng)
+
+
+def _frame(size: float, rng: Rng) -> list[Mesh]:
+    w, d, h = size, size * rng.uniform(0.5, 1.0), size * rng.uniform(0.3, 1.0)
+    thick = size * rng.uniform(0.02, 0.1)
+    walls = [
+        box((-w, -d, 0), (w, -d + thick, h)),
+        box((-w, d - thick, 0), (w, d, h)),
+        box((-w, -d, 0), (-w + thick, d, h)),
+        box((w - thick, -d, 0), (w, d, h)),
+        box((-w, -d, 0), (w, d, thick)),
+    ]
+    kept = [wall for wall in walls if rng.random() < 0.8] or walls[:2]
+    return kept + _things(0, 5, 0.6 * w, 0.6 * d, thick, size, rng)
+
+
+def _things(fewest: int, below: int, reach_x: float, reach_y: float, low: float, size: float, rng: Rng) -> list[Mesh]:
+    """Boxes, posts, tubes, nuts, walls and odd prisms on a plane."""
+    made = []
+    for _ in range(rng.integers(fewest, below)):
+        x, y = rng.uniform(-reach_x, reach_x), rng.uniform(-reach_y, reach_y)
+        top, wide = low + size * rng.uniform(0.1, 0.7), size * rng.uniform(0.06, 0.22)
+        deep, inner = wide * rng.uniform(0.3, 1.0), wide * rng.uniform(0.4, 0.8)
+        kinds = (
+            lambda x=x, y=y, w=wide, d=deep, t=top: box((x - w, y - d, low), (x + w, y + d, t)),
+            lambda x=x, y=y, w=wide, t=top: cylinder((x, y), 0.7 * w, low, t),
+            lambda x=x, y=y, w=wide, i=inner, t=top: tube((x, y), w, i, low, t),
+            lambda x=x, y=y, w=wide, t=top: prism(circle((x, y), 0.8 * w, 6, rng.random()), (), low, 0.5 * (low + t)),
+            lambda x=x, y=y, w=wide, t=top: box((x - 0.02 * size, y - w, low), (x + 0.02 * size, y + w, t)),
+            lambda x=x, y=y, w=wide, d=deep, t=top: prism(np.array([x, y]) + _polygon(w, d, rng), (), low, t),
+        )
+        made.append(kinds[rng.integers(len(kinds))]())
+    return made
+
+
+def _polygon(radius_x: float, radius_y: float, rng: Rng) -> Loop:
+    """A convex polygon of 4 to 8 corners on an ellipse that holds the middle."""
+    while True:
+        angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, rng.integers(4, 9)))
+        if np.max(np.diff(np.append(angles, angles[0] + 2.0 * np.pi))) < 2.4:
+            return np.stack([radius_x * np.cos(angles), radius_y * np.sin(angles)], axis=1)
+
+
+def _turned_about(mesh: Mesh, rng: Rng) -> Mesh:
+    """The mesh turned by quarters about one of the axes."""
+    axis: Array = np.eye(3)[rng.integers(3)]
+    return moved(mesh, rigid(exp_so3(0.5 * np.pi * rng.integers(4) * axis), np.zeros(3)))
+
+
+def _colour(rng: Rng) -> tuple[float, float, float]:
+    """Mostly greys, some soft and a few strong colours."""
+    kind = rng.random()
+    if kind < 0.8:
+        grey, tint = (rng.uniform(0.1, 0.75), 0.02) if kind < 0.5 else (rng.uniform(0.2, 0.7), 0.12)
+        r, g, b = np.clip(grey + rng.normal(0.0, tint, 3), 0.03, 0.95)
+    else:
+        r, g, b = rng.uniform(0.03, 0.95, 3)
+    return float(r), float(g), float(b)

@@ -1,0 +1,92 @@
+"""The judge: right poses before wrong ones, whatever the part, and the kernel against plain numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from arview.geometry import Array, exp_so3, rigid
+from arview.guideviews import GuideViewSet
+from arview.tracking.judge import FINE, INNER_LINES, OUTLINE_LINES, RADII_PX, ROUGH, STRETCHES, describe, judge, network
+from arview.tracking.picture import Picture
+from arview.tracking.tracker import PartView
+from synthetic import CAMERA, assembly_views, pose_from
+from synthetic import picture as drawn
+
+VIEWS: GuideViewSet = assembly_views()
+PART = PartView(VIEWS)
+TRUTH = pose_from(30.0, 45.0, 520.0) @ PART.model_from_body
+NETWORKS = pytest.mark.parametrize("networks", [ROUGH, FINE], ids=["rough", "fine"])
+
+
+def picture(noise: float = 6.0) -> Picture:
+    """The assembly before clutter, with noise."""
+    return Picture(drawn(TRUTH @ PART.body_from_model, noise=noise), CAMERA, 12)
+
+
+def turned(angle_deg: float, count: int) -> Array:
+    """The true pose turned by an angle about random axes."""
+    axes = np.random.default_rng(2).normal(size=(count, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return np.stack([rigid(exp_so3(np.deg2rad(angle_deg) * axis) @ TRUTH[:3, :3], TRUTH[:3, 3]) for axis in axes])
+
+
+def elsewhere(count: int) -> Array:
+    """Random poses in the picture."""
+    rng = np.random.default_rng(3)
+    poses = []
+    for _ in range(count):
+        axis = rng.normal(size=3)
+        x, y, z = rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.2), rng.uniform(400.0, 800.0)
+        poses.append(rigid(exp_so3(axis / np.linalg.norm(axis) * rng.uniform(0.5, np.pi)), np.array([x * z, y * z, z])))
+    return np.stack(poses)
+
+
+def scores(seen: Picture, poses: Array, networks: tuple[str, ...]) -> Array:
+    return judge(seen, PART, poses, np.full(len(poses), 12.0), networks)
+
+
+@NETWORKS
+def test_the_true_pose_comes_before_all_others_in_noise_and_clutter(networks: tuple[str, ...]) -> None:
+    seen = picture()
+    true = scores(seen, TRUTH[None], networks)[0]
+    others = scores(seen, np.concatenate([turned(25.0, 40), elsewhere(160)]), networks)
+    assert true > others.max() + 1.0
+
+
+def test_refined_poses_are_told_to_a_few_degrees() -> None:
+    seen = picture()
+    by_angle = [float(np.mean(scores(seen, turned(angle, 60), FINE))) for angle in (0.0, 3.0, 6.0, 12.0)]
+    assert by_angle == sorted(by_angle, reverse=True)
+    assert by_angle[0] > by_angle[1] + 0.5
+
+
+@NETWORKS
+def test_the_kernel_scores_as_numpy_does(networks: tuple[str, ...]) -> None:
+    seen, poses = picture(), np.concatenate([TRUTH[None], turned(8.0, 20), elsewhere(40)])
+    expected = np.zeros(len(poses))
+    for name in networks:
+        lines, both = describe(seen, PART, poses, np.full(len(poses), 12.0), RADII_PX[name])
+        net = network(name)
+        counts = lines[..., -2:-1]
+        hidden = np.maximum(lines @ net.first + net.first_bias, 0)
+        hidden = np.maximum(hidden @ net.second + net.second_bias, 0) * counts
+        outline, inner = np.split(hidden, [OUTLINE_LINES], axis=1)
+        seen_outline, seen_inner = np.split(counts, [OUTLINE_LINES], axis=1)
+        means = [outline.sum(1) / (seen_outline.sum(1) + 1), inner.sum(1) / (seen_inner.sum(1) + 1)]
+        shape = (len(poses), STRETCHES, OUTLINE_LINES // STRETCHES, -1)
+        stretches = outline.reshape(shape).sum(2) / (seen_outline.reshape(shape).sum(2) + 0.5)
+        pooled = np.concatenate([*means, stretches.min(1), both], axis=1)
+        expected += (np.maximum(pooled @ net.third + net.third_bias, 0) @ net.last + net.last_bias)[:, 0]
+    assert scores(seen, poses, networks) == pytest.approx(expected, abs=1e-4)
+
+
+def test_lines_outside_the_picture_are_empty_and_still_give_a_score() -> None:
+    aside = TRUTH.copy()
+    aside[0, 3] += 2000.0
+    lines, both = describe(picture(), PART, aside[None], np.array([12.0]), 48.0)
+    assert lines.shape[1] == OUTLINE_LINES + INNER_LINES
+    assert not lines.any()
+    assert both[0, 2] == 0.0
+    assert np.isfinite(scores(picture(), aside[None], FINE)).all()
+    assert scores(picture(), aside[None], FINE)[0] < scores(picture(), TRUTH[None], FINE)[0]

@@ -1,0 +1,200 @@
+"""Examples for the judge: what the detector tries on random solids before photos, and which of it is right."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from arview.cad import Model
+from arview.evaluation.protocols import full_sphere_range
+from arview.evaluation.semisynthetic import (
+    CAMERA,
+    VARIANTS,
+    SequenceFrame,
+    SequenceOptions,
+    TrajectoryOptions,
+    Variant,
+    frames_without_part,
+    render_sequence,
+    trajectory,
+)
+from arview.evaluation.semisynthetic.backgrounds import read_photo
+from arview.evaluation.semisynthetic.random_solids import random_solid
+from arview.geometry import Array
+from arview.guideview_cache import cached_guide_views
+from arview.tracking import Detector
+from arview.tracking.detector import DetectorOptions, Hypothesis
+from arview.tracking.first_search import WIDE, Candidate, Effort
+from arview.tracking.judge import RADII_PX, describe
+from arview.tracking.picture import Picture
+
+FRAMES_EACH = 4
+"""Pictures of a solid in each variant, each with another pose."""
+WITHOUT_EACH = 4
+"""Photos without it; as many pictures show another solid."""
+ANYWHERE = TrajectoryOptions(turn_deg=90.0, step_mm=250.0, smooth_frames=1.0)
+"""Every frame has quite another pose."""
+PRINTED_SHARE = 0.3
+"""So many solids are printed on: a photo shines through them."""
+HARD, OTHERS, RIGHT = 60, 60, 40
+"""Of rough poses the likeliest, a choice of all and so many right ones are examples."""
+OTHER_SOLID, OCCLUDER = 3301, 7919
+"""Seeds further on."""
+ROUGH_NEAR, REFINED_NEAR = (15.0, 0.12), (5.0, 0.06)
+"""Nearer than this, deg and shares of the diameter and the distance, a pose is right."""
+ROUGH_APART, REFINED_APART = (25.0, 0.2), (10.0, 0.15)
+"""Further than this from the true pose and its twins it is wrong; those between are left out."""
+CLIMBED_SHARE = 0.6
+"""Poses after the climb are to be so much nearer than before."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Poses of one picture that compete.
+
+    Attributes:
+        solid: its seed.
+        stage: rough or refined.
+        lines, both: what each network is shown of them, by its name; the lines as 0–255.
+        logits: (N,) of the hand-made evidence of refined ones, else zero.
+        is_right: (N,) bool; none is where the solid is not in the picture.
+    """
+
+    solid: int
+    stage: str
+    lines: dict[str, NDArray[np.uint8]]
+    both: dict[str, NDArray[np.float32]]
+    logits: NDArray[np.float32]
+    is_right: NDArray[np.bool_]
+
+
+def collect_examples(seeds: range, photos: Sequence[Path], folder: Path) -> None:
+    """Write the groups of each solid to a file of its own, unless it is there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in tqdm(seeds, desc="solids", disable=None):
+        path = folder / f"solid_{seed}.pkl"
+        if path.exists():
+            continue
+        groups = [group for picture in pictures_of(seed, photos, (WIDE,)) for group in _groups(seed, *picture)]
+        part = path.with_suffix(".part")
+        part.write_bytes(pickle.dumps(groups))
+        part.replace(path)
+
+
+def pictures_of(
+    seed: int, photos: Sequence[Path], efforts: tuple[Effort, ...]
+) -> Iterator[tuple[Detector, NDArray[np.uint8], Array | None]]:
+    """A detector of a solid, and pictures of it with the true ``cam_from_body``, or without it and none."""
+    try:
+        solid, occluder, other = (random_solid(seed + k) for k in (0, OCCLUDER, OTHER_SOLID))
+    except ValueError:  # outlines that cross each other
+        return
+    rng = np.random.default_rng([seed, 2])
+    views = cached_guide_views(solid, full_sphere_range(*ANYWHERE.distance_mm))
+    detector = Detector(views, CAMERA, DetectorOptions(efforts=efforts))
+    for variant in VARIANTS:
+        for frame in _rendered(solid, occluder, variant, FRAMES_EACH, photos, rng):
+            if frame.visible >= 0.5:
+                image = _printed_on(frame, photos, rng) if rng.random() < PRINTED_SHARE else frame.image
+                yield detector, image, frame.cam_from_model @ detector.tracker.part.model_from_body
+        for frame in _rendered(other, occluder, variant, WITHOUT_EACH // len(VARIANTS), photos, rng):
+            yield detector, frame.image, None
+    for _, image in frames_without_part(photos, (), CAMERA.width, CAMERA.height, WITHOUT_EACH, seed):
+        yield detector, image, None
+
+
+def is_near(detector: Detector, poses: Array, truth: Array, turns: Array, angle_deg: float, share: float) -> Array:
+    """Which poses (N,4,4) are near a true one or what some turns (K,3,3) make of it, (N,) bool."""
+    turned = np.einsum("ij,kjl->kil", truth[:3, :3], turns)
+    cosine = 0.5 * (np.einsum("nij,kij->nk", poses[:, :3, :3], turned).max(axis=1) - 1.0)
+    offset, distance_mm = poses[:, :3, 3] - truth[:3, 3], np.linalg.norm(truth[:3, 3])
+    along = np.abs(offset @ truth[:3, 3]) / distance_mm
+    aside = np.sqrt(np.maximum((offset**2).sum(axis=1) - along**2, 0.0)) / detector.views.diameter_mm
+    return np.asarray((cosine > np.cos(np.deg2rad(angle_deg))) & (aside < share) & (along / distance_mm < share))
+
+
+def _rendered(
+    solid: Model, occluder: Model, variant: Variant, count: int, photos: Sequence[Path], rng: np.random.Generator
+) -> list[SequenceFrame]:
+    seed = int(rng.integers(1 << 30))
+    options = SequenceOptions(
+        variant, count, seed, noise=rng.uniform(3.0, 14.0), blur_px=rng.uniform(0.4, 1.3), motion=ANYWHERE
+    )
+    photo = read_photo(photos[rng.integers(len(photos))])
+    return list(render_sequence(solid, trajectory(solid, options), photo, options, CAMERA, occluder))
+
+
+def _printed_on(frame: SequenceFrame, photos: Sequence[Path], rng: np.random.Generator) -> NDArray[np.uint8]:
+    photo = cv2.resize(read_photo(photos[rng.integers(len(photos))]), frame.image.shape[1::-1])
+    share = rng.uniform(0.3, 1.0) * frame.mask[..., None]
+    printed = frame.image * (1.0 - share + share * photo / 110.0)
+    return np.asarray(np.clip(printed, 0, 255).astype(np.uint8))
+
+
+def _groups(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Array | None) -> Iterator[Group]:
+    picture = detector.picture(image)
+    likely, _ = detector.search.likely(picture, WIDE)
+    climbed = detector.climbed(picture, detector.search.starts(picture, WIDE), WIDE)
+    refined = detector.settled(picture, climbed)
+    if truth is None:
+        if refined:
+            yield _group(seed, "refined", detector, picture, refined, np.zeros(len(refined), bool))
+        return
+    rng = np.random.default_rng(len(likely))
+    for poses, share in ((likely, 1.0), (np.array([c.cam_from_body for c in climbed]), CLIMBED_SHARE)):
+        if not len(poses):
+            continue
+        right, known = _told(detector, poses, truth, ROUGH_NEAR, ROUGH_APART, share)
+        chosen = {*range(min(HARD, len(poses))), *rng.permutation(len(poses))[:OTHERS].tolist()}
+        index = np.array(sorted({*chosen, *np.flatnonzero(right)[:RIGHT].tolist()}))
+        index = index[known[index]]
+        if right[index].any():
+            yield _group(seed, "rough", detector, picture, poses[index], right[index])
+    refined += detector.settled(picture, [Candidate(0.0, truth)])
+    right, known = _told(
+        detector,
+        np.array([h.cam_from_body for h in refined]).reshape(-1, 4, 4),
+        truth,
+        REFINED_NEAR,
+        REFINED_APART,
+        1.0,
+    )
+    if right.any():
+        kept = [h for h, is_known in zip(refined, known, strict=True) if is_known]
+        yield _group(seed, "refined", detector, picture, kept, right[known])
+
+
+def _told(
+    detector: Detector, poses: Array, truth: Array, near: tuple[float, float], apart: tuple[float, float], share: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which poses are right, and of which that is known."""
+    same = np.concatenate([np.eye(3)[None], detector.symmetries.exact])
+    alike = np.concatenate([same, detector.symmetries.near])
+    right = is_near(detector, poses, truth, same, *(share * limit for limit in near))
+    return right, right | ~is_near(detector, poses, truth, alike, *(share * limit for limit in apart))
+
+
+def _group(
+    seed: int,
+    stage: str,
+    detector: Detector,
+    picture: Picture,
+    found: Array | list[Hypothesis],
+    is_right: NDArray[np.bool_],
+) -> Group:
+    hypotheses = found if isinstance(found, list) else []
+    poses = np.array([h.cam_from_body for h in hypotheses]) if isinstance(found, list) else found
+    view_lines = np.array([detector.view_lines(pose) for pose in poses])
+    lines, both = {}, {}
+    for name in ("fine", "close") if hypotheses else ("rough",):
+        seen, both[name] = describe(picture, detector.tracker.part, poses, view_lines, RADII_PX[name])
+        lines[name] = np.round(255.0 * seen).astype(np.uint8)
+    logits = np.array([h.own_logit for h in hypotheses] or np.zeros(len(poses)), dtype=np.float32)
+    return Group(seed, stage, lines, both, logits, is_right)

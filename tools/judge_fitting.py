@@ -1,0 +1,130 @@
+"""Fitting the networks of the judge to examples."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.errors import InputError
+from arview.tracking.judge import FEATURES, GLOBALS, OUTLINE_LINES, STRETCHES, Network
+from judge_examples import Group
+
+WIDTH, LAST_WIDTH = 16, 32
+"""Of the layers for each line, and of that for all together."""
+BATCH, WITHOUT_BATCH = 12, 8
+"""Pictures with and without the solid that a step looks at."""
+RATE, DECAY, DROPPED = 4e-3, 2e-2, 0.1
+CALIBRATION_WEIGHT, CALIBRATED = 0.5, 3
+"""Refined poses are to be told across pictures too: the best few of each are classified as well."""
+HELD_OUT = 10
+"""Every so manieth solid is not fitted to, but for telling how well others are judged."""
+
+
+def fit_networks(folder: Path, epochs: int) -> None:
+    """Fit all networks to the examples in a folder, write judge.npz there, and say how well they do.
+
+    Raises:
+        InputError: no examples, or no torch.
+    """
+    try:
+        import torch
+    except ImportError as error:
+        raise InputError("fit_judge: torch is not installed; pip install torch") from error
+    groups = [group for path in sorted(folder.glob("solid_*.pkl")) for group in pickle.loads(path.read_bytes())]
+    if not groups:
+        raise InputError(f"{folder}: no examples; run tools/fit_judge collect first")
+    torch.manual_seed(0)
+    stored: dict[str, NDArray[np.float32]] = {}
+    for stage, names in (("rough", ("rough",)), ("refined", ("fine", "close"))):
+        networks, weight = _fit([g for g in groups if g.stage == stage], names, epochs, torch)
+        print(f"{stage}: weight of the hand-made evidence {weight:.2f}")
+        for name, network in networks.items():
+            for field, layer in zip(Network._fields[::2], network.layers(), strict=True):
+                stored[f"{name}_{field}"] = layer.weight.detach().numpy().T.copy()
+                stored[f"{name}_{field}_bias"] = layer.bias.detach().numpy().copy()
+    np.savez_compressed(folder / "judge.npz", **stored)
+    print(f"wrote {folder / 'judge.npz'}")
+
+
+def _fit(groups: Sequence[Group], names: Sequence[str], epochs: int, torch: Any) -> tuple[dict[str, Any], float]:
+    """The networks, and the weight of the hand-made evidence beside them."""
+    solids = sorted({group.solid for group in groups})
+    held_out = set(solids[::HELD_OUT]) if len(solids) > 1 else set()
+    shown = [g for g in groups if g.is_right.any() and g.solid not in held_out]
+    without = [g for g in groups if not g.is_right.any() and g.solid not in held_out]
+    networks = {name: _network(torch) for name in names}
+    weight, bias = (torch.nn.Parameter(torch.tensor(value)) for value in (0.7, -3.0))
+    parameters = [weight, bias, *(p for network in networks.values() for p in network.parameters())]
+    optimiser = torch.optim.AdamW(parameters, RATE / 2, weight_decay=DECAY)
+    steps = max(1, len(shown) // BATCH)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * steps)
+    rng = np.random.default_rng(0)
+
+    def scores(group: Group) -> Any:
+        total = weight * torch.from_numpy(group.logits)
+        for name, network in networks.items():
+            total = total + network(torch.from_numpy(group.lines[name]) / 255.0, torch.from_numpy(group.both[name]))
+        return total
+
+    def calibration(found: Any, group: Group) -> Any:
+        best = found.detach().topk(min(CALIBRATED, len(found))).indices
+        truth = torch.from_numpy(group.is_right[best.numpy()].astype(np.float32))
+        return torch.nn.functional.binary_cross_entropy_with_logits(found[best] + bias, truth)
+
+    for epoch in range(epochs):
+        order = rng.permutation(len(shown))
+        for k in range(steps):
+            loss = torch.zeros(())
+            for i in order[k * BATCH : (k + 1) * BATCH]:
+                found = scores(shown[i])
+                right = torch.from_numpy(shown[i].is_right)
+                loss = loss + (found.logsumexp(0) - found[right].logsumexp(0)) / BATCH
+                loss = loss + CALIBRATION_WEIGHT / BATCH * calibration(found, shown[i])
+            for i in rng.integers(len(without), size=WITHOUT_BATCH if without else 0):
+                loss = loss + CALIBRATION_WEIGHT / BATCH * calibration(scores(without[i]), without[i])
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+        print(f"epoch {epoch + 1} of {epochs}: loss {float(loss):.3f}", flush=True)
+    for network in networks.values():
+        network.eval()
+    left = [g for g in groups if g.solid in held_out and g.is_right.any()]
+    with torch.no_grad():
+        first = sum(bool(g.is_right[int(scores(g).argmax())]) for g in left)
+    by_hand = sum(bool(g.is_right[int(g.logits.argmax())]) for g in left)
+    print(f"{len(left)} pictures of {len(held_out)} other solids: a right pose first in {first}, by hand in {by_hand}")
+    return networks, float(weight)
+
+
+def _network(torch: Any) -> Any:
+    """The network of `arview.tracking.judge` as torch fits it."""
+    nn = torch.nn
+
+    class _Network(nn.Module):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            self.first, self.second = nn.Linear(FEATURES, WIDTH), nn.Linear(WIDTH, WIDTH)
+            self.third, self.last = nn.Linear(3 * WIDTH + GLOBALS, LAST_WIDTH), nn.Linear(LAST_WIDTH, 1)
+            self.dropout = nn.Dropout(DROPPED)
+
+        def layers(self) -> tuple[Any, ...]:
+            return self.first, self.second, self.third, self.last
+
+        def forward(self, lines: Any, both: Any) -> Any:
+            seen = lines[..., FEATURES - 2 : FEATURES - 1]
+            hidden = torch.relu(self.second(torch.relu(self.first(lines)))) * seen
+            outline, counts = hidden[:, :OUTLINE_LINES], seen[:, :OUTLINE_LINES]
+            inner = hidden[:, OUTLINE_LINES:].sum(1) / (seen[:, OUTLINE_LINES:].sum(1) + 1.0)
+            stretches = outline.unflatten(1, (STRETCHES, -1)).sum(2) / (
+                counts.unflatten(1, (STRETCHES, -1)).sum(2) + 0.5
+            )
+            pooled = [outline.sum(1) / (counts.sum(1) + 1.0), inner, stretches.min(1).values, both]
+            return self.last(torch.relu(self.third(self.dropout(torch.cat(pooled, 1)))))[:, 0]
+
+    return _Network()
