@@ -295,7 +295,7 @@ class Detector:
         reach_mm = 0.25 * self.views.diameter_mm
         rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
         rivals = self._ordered([best, *self._finished(picture, starts), *rivals], 5.0)
-        rivals = [h for h in rivals if h.evidence.worth > max(r.evidence.worth for r in rivals) - LEAD]
+        rivals = [h for h in rivals if h is rivals[0] or h.logit > rivals[0].logit - LEAD]
         seen = pool().map(lambda h: self.tracker.edge_steps(picture.gray, h.cam_from_body), rivals)
         steps = {id(h): one for h, one in zip(rivals, seen, strict=True)}
         best = rivals[0]
