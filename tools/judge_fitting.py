@@ -77,7 +77,7 @@ def _fit(groups: Sequence[Group], names: Sequence[str], epochs: int, torch: Any)
         return torch.nn.functional.binary_cross_entropy_with_logits(found[best] + bias, truth)
 
     for epoch in range(epochs):
-        order = rng.permutation(len(shown))
+        order, losses = rng.permutation(len(shown)), []
         for k in range(steps):
             loss = torch.zeros(())
             for i in order[k * BATCH : (k + 1) * BATCH]:
@@ -91,7 +91,8 @@ def _fit(groups: Sequence[Group], names: Sequence[str], epochs: int, torch: Any)
             loss.backward()
             optimiser.step()
             schedule.step()
-        print(f"epoch {epoch + 1} of {epochs}: loss {float(loss):.3f}", flush=True)
+            losses.append(loss.item())
+        print(f"{', '.join(names)}, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
     for network in networks.values():
         network.eval()
     left = [g for g in groups if g.solid in held_out and g.is_right.any()]

@@ -256,11 +256,11 @@ class Detector:
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
         return [
-            found_probability(h.own_logit, h.judgement, self._leads(h, hypotheses[k + 1 :]))
+            found_probability(h.own_logit, h.judgement, h.evidence, self.leads(h, hypotheses[k + 1 :]))
             for k, h in enumerate(hypotheses)
         ]
 
-    def _leads(self, best: Hypothesis, others: list[Hypothesis]) -> Leads:
+    def leads(self, best: Hypothesis, others: list[Hypothesis]) -> Leads:
         """Leads of a hypothesis over others for other poses; one a little aside of it is the same, badly settled."""
         here = elsewhere = -math.inf
         place = best.cam_from_body[:3, 3]

@@ -91,7 +91,7 @@ class Effort:
 
 
 QUICK = Effort(600, 300, 150, 40, (12, 5), 2)
-WIDE = Effort(5000, 2500, 1500, 300, (100, 40), 1)
+WIDE = Effort(5000, 5000, 3000, 300, (100, 40), 1)
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 
