@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,8 @@ COARSE_STAGES = (_coarse_stages(1.0), _coarse_stages(20.0))
 """Tries from the likeliest starts: edges lead; colours lead, on plain and glossy parts."""
 TRIED = 16
 """So many starts are tried."""
+COPY_DEG = 5.0
+"""Refined poses this near to each other are copies of one."""
 HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
 SURE_QUALITY = 0.7
@@ -414,8 +416,12 @@ class Detector:
         for hypothesis in sorted(found, key=lambda h: -h.logit):
             if len(result) >= most:
                 break
-            if not any(self._same(hypothesis.cam_from_body, other.cam_from_body, apart_deg) for other in result):
+            near = [k for k, h in enumerate(result) if self._same(hypothesis.cam_from_body, h.cam_from_body, apart_deg)]
+            if not near:
                 result.append(hypothesis)
+            elif hypothesis.own_logit > result[near[0]].own_logit and apart_deg <= COPY_DEG:
+                # The judge tells poses that are degrees apart; between copies of one the evidence says which is best.
+                result[near[0]] = replace(hypothesis, judgement=result[near[0]].judgement)
         return result
 
     def view_lines(self, cam_from_body: Array) -> float:
