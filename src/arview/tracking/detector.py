@@ -3,7 +3,8 @@
 Coarse to fine: templates over all directions, rolls, distances and places, improved as outlines in the picture
 (`first_search`); pattern search around the best on response maps of growing resolution (`climb`); the tracker's edges
 and colours from the best of those; and the same evidence as for a tracked pose. At each level fewer hypotheses are
-left and each costs more. A quick search comes first; what it does not settle is looked for among many more matches.
+left and each costs more; which ones, the `judge` says. A quick search comes first; what it does not settle is looked
+for among many more matches.
 """
 
 from __future__ import annotations
@@ -162,7 +163,15 @@ class Detection:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A refined pose about the model's centre, what speaks for it, the distinct lines that its view shows, its size."""
+    """A refined pose about the model's centre, and what speaks for it.
+
+    Attributes:
+        cam_from_body: (4,4).
+        evidence: of it.
+        judgement: of the networks for refined poses, see `judge`.
+        lines: distinct lines that its view shows.
+        radius_px: half the part's diameter in the picture.
+    """
 
     cam_from_body: Array
     evidence: Evidence

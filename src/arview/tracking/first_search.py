@@ -4,7 +4,7 @@ Templates (`templates`) give thousands of rough matches. In clutter the right on
 them, but often among the first five thousand; and once each is improved as an outline in the picture
 (`climb_outlines`, some 30 µs), on maps of a finer and finer scale, it comes to the front: the larger the part in the
 picture, the fewer wrong poses fit by chance. This is what makes clutter tractable on a CPU; own here, measured on
-semi-synthetic sequences.
+semi-synthetic sequences. What their responses leave open, the `judge` decides.
 """
 
 from __future__ import annotations

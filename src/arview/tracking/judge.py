@@ -47,6 +47,8 @@ GLOBALS = 6
 WIDEST_PX, SIZE_PX = 16.0, 48.0
 HALF_STEP, HALF_COLOUR = 10.0, 40.0
 """Grey levels: the unit of the mean gradient; the difference of colours that counts half."""
+MOST = np.float32(1e30)
+"""More than any mean; fast arithmetic knows no infinity."""
 SIDE_PX = 2
 """The sides of a line begin so far from it."""
 LONGEST, LINES_WEIGHT = 400, 0.3
@@ -147,7 +149,7 @@ def judge_poses(gradients, part, poses, log_lines, diameter_mm, weights):  # typ
         hidden = np.maximum(np.dot(lines, first) + first_bias, zero)
         hidden = np.maximum(np.dot(hidden, second) + second_bias, zero)
         pooled[: 2 * width] = zero
-        pooled[2 * width : 3 * width] = np.float32(np.inf)
+        pooled[2 * width : 3 * width] = MOST
         counts = np.zeros(2, dtype=np.float32)
         stretch[:] = zero
         count = np.float32(0.5)
