@@ -74,7 +74,7 @@ def fit_probability(seeds: range, photos: Sequence[Path]) -> None:
     for most in FALSE:
         if most < len(others):
             found = int(np.sum(told[is_right] > others[most]))
-            print(f"  {found} found with {most} false alarms, bias {others[most]:+.2f} lower")
+            print(f"  {found} found with {most} false alarms with the bias lowered by {others[most]:.2f}")
 
 
 def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Outcome]:
