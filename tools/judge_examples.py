@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from arview.atomic import replacing
 from arview.cad import Model
 from arview.evaluation.protocols import full_sphere_range
 from arview.evaluation.semisynthetic import (
@@ -83,9 +84,8 @@ def collect_examples(seeds: range, photos: Sequence[Path], folder: Path) -> None
         if path.exists():
             continue
         groups = [group for picture in pictures_of(seed, photos, (WIDE,)) for group in _groups(seed, *picture)]
-        part = path.with_suffix(".part")
-        part.write_bytes(pickle.dumps(groups))
-        part.replace(path)
+        with replacing(path) as file:
+            pickle.dump(groups, file)
 
 
 def pictures_of(
@@ -140,8 +140,8 @@ def _printed_on(frame: SequenceFrame, photos: Sequence[Path], rng: np.random.Gen
 
 def _groups(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Array | None) -> Iterator[Group]:
     picture = detector.picture(image)
-    likely, _ = detector.search.likely(picture, WIDE)
-    climbed = detector.climbed(picture, detector.search.starts(picture, WIDE), WIDE)
+    likely, view_lines = detector.search.likely(picture, WIDE)
+    climbed = detector.climbed(picture, detector.search.judged(picture, likely, view_lines, WIDE), WIDE)
     refined = detector.settled(picture, climbed)
     if truth is None:
         if refined:
@@ -175,10 +175,8 @@ def _told(
     detector: Detector, poses: Array, truth: Array, near: tuple[float, float], apart: tuple[float, float], share: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which poses are right, and of which that is known."""
-    same = np.concatenate([np.eye(3)[None], detector.symmetries.exact])
-    alike = np.concatenate([same, detector.symmetries.near])
-    right = is_near(detector, poses, truth, same, *(share * limit for limit in near))
-    return right, right | ~is_near(detector, poses, truth, alike, *(share * limit for limit in apart))
+    right = is_near(detector, poses, truth, detector.same_turns, *(share * limit for limit in near))
+    return right, right | ~is_near(detector, poses, truth, detector.turns, *(share * limit for limit in apart))
 
 
 def _group(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.atomic import replacing
 from arview.errors import InputError
 from arview.tracking.judge import FEATURES, GLOBALS, OUTLINE_LINES, STRETCHES, Network
 from judge_examples import Group
@@ -47,7 +48,8 @@ def fit_networks(folder: Path, epochs: int) -> None:
             for field, layer in zip(Network._fields[::2], network.layers(), strict=True):
                 stored[f"{name}_{field}"] = layer.weight.detach().numpy().T.copy()
                 stored[f"{name}_{field}_bias"] = layer.bias.detach().numpy().copy()
-    np.savez_compressed(folder / "judge.npz", **stored)
+    with replacing(folder / "judge.npz") as file:
+        np.savez_compressed(file, **stored)
     print(f"wrote {folder / 'judge.npz'}")
 
 

@@ -87,8 +87,7 @@ def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Ou
         if truth is None:
             yield Outcome(terms, False, part, weight)
             continue
-        turns = np.concatenate([np.eye(3)[None], detector.symmetries.exact, detector.symmetries.near])
-        if is_near(detector, best.cam_from_body[None], truth, turns, *REFINED_NEAR)[0]:
+        if is_near(detector, best.cam_from_body[None], truth, detector.turns, *REFINED_NEAR)[0]:
             yield Outcome(terms, True, part, weight)
 
 

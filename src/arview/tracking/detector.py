@@ -181,7 +181,7 @@ class Hypothesis:
 
     @property
     def own_logit(self) -> float:
-        """The same without the judge, see `found_logit`."""
+        """By the evidence alone, see `found_logit`."""
         return found_logit(self.evidence, self.lines, self.radius_px)
 
     @property
@@ -194,7 +194,8 @@ class Detector:
     """Detection of one part with one camera over the declared range of its guide views.
 
     With the ``model`` too, detections say which components are not where expected. ``best_rejected`` is the best
-    hypothesis of the last frame when nothing was found, for `why_not`.
+    hypothesis of the last frame when nothing was found, for `why_not`. ``same_turns`` (N,3,3) are those that take the
+    part onto itself, with none at all; ``turns`` those that nearly do, too.
     """
 
     def __init__(
@@ -208,8 +209,8 @@ class Detector:
         self.search = FirstSearch(views, self.tracker.part, camera, o.radius_px, o.roll_step_deg, o.subdivisions)
         self._components = ComponentCheck(views, model, camera) if model and len(model.components) > 1 else None
         self.symmetries = find_symmetries(views)
-        self._same_turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
-        self._turns = np.concatenate([self._same_turns, self.symmetries.near])
+        self.same_turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
+        self.turns = np.concatenate([self.same_turns, self.symmetries.near])
 
     def detect(self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True) -> list[Detection]:
         """Poses of the part in a frame, best first; an empty list when it is not found.
@@ -242,7 +243,7 @@ class Detector:
         best, twins = self._told_apart(picture, settled[0], settled[1:])
         found = [self._detection(picture, best, qualities[0], twins)]
         for hypothesis, quality in zip(settled[1:], qualities[1:], strict=True):
-            is_apart = all(not self._is_equal(hypothesis, h, self._turns, 0.25) for h in (best, *twins))
+            is_apart = all(not self._is_equal(hypothesis, h, self.turns, 0.25) for h in (best, *twins))
             if quality >= least and is_apart:
                 found.append(self._detection(picture, hypothesis, min(quality, qualities[0]), []))
         return sorted(found, key=lambda detection: -detection.quality)[:max_results]
@@ -280,7 +281,7 @@ class Detector:
             offset = other.cam_from_body[:3, 3] - place
             along_mm = abs(float(offset @ place)) / distance_mm
             aside = math.sqrt(max(float(offset @ offset) - along_mm**2, 0.0)) / self.views.diameter_mm
-            is_alike = self._is_turned(best, other, self._turns, ALIKE_DEG)
+            is_alike = self._is_turned(best, other, self.turns, ALIKE_DEG)
             if aside < ALIKE_ASIDE and along_mm < ALIKE_ALONG * distance_mm and is_alike:
                 continue
             if aside < HERE_ASIDE and along_mm < HERE_ALONG * distance_mm:
@@ -315,7 +316,7 @@ class Detector:
             if telling(steps[id(rival)], steps[id(best)]) > (0.0 if is_twin else TELLING):
                 best = rival
         twins = [h for h in rivals if h is not best and telling(steps[id(best)], steps[id(h)]) < TELLING]
-        return best, [h for h in twins if not self._is_turned(h, best, self._same_turns, ALIKE_DEG)]
+        return best, [h for h in twins if not self._is_turned(h, best, self.same_turns, ALIKE_DEG)]
 
     def _is_equal(self, a: Hypothesis, b: Hypothesis, turns: Array, reach: float = 0.08) -> bool:
         """Whether two are the same pose, by one of some turns (N,3,3); ``reach`` is in diameters."""

@@ -189,7 +189,10 @@ class FirstSearch:
 
     def starts(self, picture: Picture, effort: Effort = QUICK) -> list[Candidate]:
         """Poses for the best matches over the whole range, apart from each other, best first."""
-        poses, lines = self.likely(picture, effort)
+        return self.judged(picture, *self.likely(picture, effort), effort)
+
+    def judged(self, picture: Picture, poses: Array, lines: Array, effort: Effort = QUICK) -> list[Candidate]:
+        """The starts among likely poses, best first."""
         scores = judge(picture, self._part, poses, lines)
         return [Candidate(float(scores[k]), poses[k]) for k in np.argsort(-scores, kind="stable")[: effort.starts]]
 
