@@ -1,4 +1,4 @@
-"""Examples for the judge: what the detector tries on random solids before photos, and which of it is right."""
+"""Examples for the judge and the verifier: what the detector tries on random solids, and which of it is right."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ from arview.evaluation.semisynthetic import (
 )
 from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.evaluation.semisynthetic.random_solids import random_solid
-from arview.geometry import Array
+from arview.geometry import Array, exp_so3, rigid
 from arview.guideview_cache import cached_guide_views
 from arview.tracking import Detector
 from arview.tracking.detector import DetectorOptions, Hypothesis
 from arview.tracking.first_search import WIDE, Candidate, Effort
 from arview.tracking.judge import RADII_PX, describe
 from arview.tracking.picture import Picture
+from arview.tracking.verifier import raw_look
 
 FRAMES_EACH = 4
 """Pictures of a solid in each variant, each with another pose."""
@@ -42,7 +43,7 @@ WITHOUT_EACH = 4
 """Photos without it; as many pictures show another solid."""
 ANYWHERE = TrajectoryOptions(turn_deg=90.0, step_mm=250.0, smooth_frames=1.0)
 """Every frame has quite another pose."""
-PRINTED_SHARE = 0.3
+PRINTED_SHARE = 0.5
 """So many solids are printed on: a photo shines through them."""
 HARD, OTHERS, RIGHT = 60, 60, 40
 """Of rough poses the likeliest, a choice of all and so many right ones are examples."""
@@ -54,6 +55,10 @@ ROUGH_APART, REFINED_APART = (25.0, 0.2), (10.0, 0.15)
 """Further than this from the true pose and its twins it is wrong; those between are left out."""
 CLIMBED_SHARE = 0.6
 """Poses after the climb are to be so much nearer than before."""
+LOOKED_AT, LOOKED_AT_WITHOUT = 15, 30
+"""So many of the poses after the climb the verifier sees too, of pictures with and without the solid."""
+NEARLY, ASIDE = 5, 9
+"""And so many poses a little and clearly off the true one."""
 
 
 @dataclass(frozen=True)
@@ -76,16 +81,42 @@ class Group:
     is_right: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Looks:
+    """What the verifier is shown of poses of one picture.
+
+    Attributes:
+        solid: its seed.
+        pixels: (N,S,S,4) uint8; lines: (N,2,S,S) int8, 127 for 1: see `verifier.raw_look`.
+        radii_px: (N,) half the diameter in the picture.
+        known: (N,3) what else the verifier is told of refined poses.
+        is_refined, is_right: (N,) bool.
+    """
+
+    solid: int
+    pixels: NDArray[np.uint8]
+    lines: NDArray[np.int8]
+    radii_px: Array
+    known: Array
+    is_refined: NDArray[np.bool_]
+    is_right: NDArray[np.bool_]
+
+
 def collect_examples(seeds: range, photos: Sequence[Path], folder: Path) -> None:
-    """Write the groups of each solid to a file of its own, unless it is there."""
+    """Write the groups and the looks of each solid to a file of its own, unless it is there."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed in tqdm(seeds, desc="solids", disable=None):
         path = folder / f"solid_{seed}.pkl"
         if path.exists():
             continue
-        groups = [group for picture in pictures_of(seed, photos, (WIDE,)) for group in _groups(seed, *picture)]
-        with replacing(path) as file:
-            pickle.dump(groups, file)
+        groups: list[Group] = []
+        looks: list[Looks] = []
+        for picture in pictures_of(seed, photos, (WIDE,)):
+            for example in _examples(seed, *picture):
+                (groups if isinstance(example, Group) else looks).append(example)  # type: ignore[arg-type]
+        for examples, name in ((looks, f"looks_{seed}.pkl"), (groups, path.name)):
+            with replacing(folder / name) as file:
+                pickle.dump(examples, file)
 
 
 def pictures_of(
@@ -138,17 +169,19 @@ def _printed_on(frame: SequenceFrame, photos: Sequence[Path], rng: np.random.Gen
     return np.asarray(np.clip(printed, 0, 255).astype(np.uint8))
 
 
-def _groups(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Array | None) -> Iterator[Group]:
+def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Array | None) -> Iterator[Group | Looks]:
     picture = detector.picture(image)
     likely, view_lines = detector.search.likely(picture, WIDE)
     climbed = detector.climbed(picture, detector.search.judged(picture, likely, view_lines, WIDE), WIDE)
     refined = detector.settled(picture, climbed)
+    climbed_poses = np.array([c.cam_from_body for c in climbed]).reshape(-1, 4, 4)
+    rng = np.random.default_rng(len(likely))
     if truth is None:
+        yield from _looks(seed, detector, picture, refined, climbed_poses, truth, rng)
         if refined:
             yield _group(seed, "refined", detector, picture, refined, np.zeros(len(refined), bool))
         return
-    rng = np.random.default_rng(len(likely))
-    for poses, share in ((likely, 1.0), (np.array([c.cam_from_body for c in climbed]), CLIMBED_SHARE)):
+    for poses, share in ((likely, 1.0), (climbed_poses, CLIMBED_SHARE)):
         if not len(poses):
             continue
         right, known = _told(detector, poses, truth, ROUGH_NEAR, ROUGH_APART, share)
@@ -158,6 +191,7 @@ def _groups(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Arra
         if right[index].any():
             yield _group(seed, "rough", detector, picture, poses[index], right[index])
     refined += detector.settled(picture, [Candidate(0.0, truth)])
+    yield from _looks(seed, detector, picture, refined, climbed_poses, truth, rng)
     right, known = _told(
         detector,
         np.array([h.cam_from_body for h in refined]).reshape(-1, 4, 4),
@@ -177,6 +211,52 @@ def _told(
     """Which poses are right, and of which that is known."""
     right = is_near(detector, poses, truth, detector.same_turns, *(share * limit for limit in near))
     return right, right | ~is_near(detector, poses, truth, detector.turns, *(share * limit for limit in apart))
+
+
+def _looks(
+    seed: int,
+    detector: Detector,
+    picture: Picture,
+    refined: list[Hypothesis],
+    climbed: Array,
+    truth: Array | None,
+    rng: np.random.Generator,
+) -> Iterator[Looks]:
+    """Refined poses, some that are not yet, and some around the true one."""
+    some = climbed[: LOOKED_AT_WITHOUT if truth is None else LOOKED_AT]
+    around = np.empty((0, 4, 4)) if truth is None else _around_truth(truth, detector.views.diameter_mm, rng)
+    poses = np.concatenate([np.array([h.cam_from_body for h in refined]).reshape(-1, 4, 4), some, around])
+    known = np.zeros((len(poses), 3))
+    known[: len(refined)] = [(h.own_logit, h.judgement, h.evidence.scatter_px) for h in refined] or np.empty((0, 3))
+    is_refined = np.arange(len(poses)) < len(refined)
+    right, is_told = np.zeros(len(poses), bool), np.ones(len(poses), bool)
+    if truth is not None:
+        right, is_told = _told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
+    index = np.flatnonzero(is_told & (poses[:, 2, 3] > 0))
+    if not len(index):
+        return
+    part = detector.tracker.part
+    pixels, lines = zip(*(raw_look(picture, part, poses[k]) for k in index), strict=True)
+    yield Looks(
+        seed, np.stack(pixels), np.round(127.0 * np.stack(lines)).astype(np.int8),
+        np.array([detector.tracker.radius_px(poses[k]) for k in index]), known[index], is_refined[index], right[index],
+    )  # fmt: skip
+
+
+def _around_truth(truth: Array, diameter_mm: float, rng: np.random.Generator) -> Array:
+    """Poses (N,4,4) a little off a true one, and clearly off it in rotation or in position."""
+    poses = []
+    for k in range(NEARLY + ASIDE):
+        if k < NEARLY:
+            angle_deg, aside, along = rng.uniform(0.0, 4.0), rng.uniform(0.0, 0.035), rng.uniform(-0.04, 0.04)
+        elif k % 3:
+            angle_deg, aside, along = rng.uniform(10.0, 45.0), rng.uniform(0.0, 0.1), rng.uniform(-0.15, 0.15)
+        else:
+            angle_deg, aside, along = rng.uniform(0.0, 10.0), rng.uniform(0.1, 0.5), rng.uniform(-0.5, 0.5)
+        axis, way = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
+        place = (truth[:3, 3] + aside * diameter_mm * way) * (1.0 + along)
+        poses.append(rigid(exp_so3(np.deg2rad(angle_deg) * axis) @ truth[:3, :3], place))
+    return np.stack(poses)
 
 
 def _group(

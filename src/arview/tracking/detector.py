@@ -32,6 +32,7 @@ from arview.tracking.quality import EVIDENCE_WEIGHT, RIGHT_WORTH, Evidence, Lead
 from arview.tracking.templates import choose_apart
 from arview.tracking.threads import pool
 from arview.tracking.tracker import NEAR_STAGES, Stage, Tracker, TrackerOptions
+from arview.tracking.verifier import Verifier
 from arview.tracking.why_not import Rejected
 
 
@@ -169,6 +170,7 @@ class Hypothesis:
         cam_from_body: (4,4).
         evidence: of it.
         judgement: of the networks for refined poses, see `judge`.
+        verification: of the `verifier`, once it has looked at it.
         lines: distinct lines that its view shows.
         radius_px: half the part's diameter in the picture.
     """
@@ -178,6 +180,7 @@ class Hypothesis:
     judgement: float
     lines: float
     radius_px: float
+    verification: float | None = None
 
     @property
     def own_logit(self) -> float:
@@ -186,7 +189,9 @@ class Hypothesis:
 
     @property
     def logit(self) -> float:
-        """For comparing the hypotheses of one picture."""
+        """For comparing the hypotheses of one picture, either all verified or none."""
+        if self.verification is not None:
+            return self.verification
         return EVIDENCE_WEIGHT * self.own_logit + self.judgement
 
 
@@ -207,6 +212,7 @@ class Detector:
         self.best_rejected: Rejected | None = None
         self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
         self.search = FirstSearch(views, self.tracker.part, camera, o.radius_px, o.roll_step_deg, o.subdivisions)
+        self._verifier = Verifier(self.tracker.part)
         self._components = ComponentCheck(views, model, camera) if model and len(model.components) > 1 else None
         self.symmetries = find_symmetries(views)
         self.same_turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
@@ -268,7 +274,7 @@ class Detector:
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
         return [
-            found_probability(h.own_logit, h.judgement, h.evidence, self.leads(h, hypotheses[k + 1 :]))
+            found_probability(h.logit, h.own_logit, h.judgement, self.leads(h, hypotheses[k + 1 :]))
             for k, h in enumerate(hypotheses)
         ]
 
@@ -306,7 +312,7 @@ class Detector:
         starts = [rigid(pose[:3, :3] @ turn, pose[:3, 3]) for turn in self.symmetries.near]
         reach_mm = 0.25 * self.views.diameter_mm
         rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
-        rivals = self._ordered([best, *self._finished(picture, starts), *rivals], 5.0)
+        rivals = self._ordered([best, *self._verified(picture, self._finished(picture, starts)), *rivals], 5.0)
         rivals = [h for h in rivals if h is rivals[0] or h.logit > rivals[0].logit - LEAD]
         seen = pool().map(lambda h: self.tracker.edge_steps(picture.gray, h.cam_from_body), rivals)
         steps = {id(h): one for h, one in zip(rivals, seen, strict=True)}
@@ -389,7 +395,16 @@ class Detector:
         finished = self._finished(picture, [found.cam_from_body for found in coarse])
         if finished and HOPELESS_WORTH <= finished[0].evidence.worth < RIGHT_WORTH:
             finished += self._finished(picture, _around(finished[0].cam_from_body, 0.05))
-        return self._ordered(finished, 5.0)
+        return self._verified(picture, self._ordered(finished, 5.0))
+
+    def _verified(self, picture: Picture, found: list[Hypothesis]) -> list[Hypothesis]:
+        """Refined poses after the verifier has looked at them, best first."""
+        if not found:
+            return []
+        known = np.array([(h.own_logit, h.judgement, h.evidence.scatter_px) for h in found])
+        scores = self._verifier.scores(picture, np.stack([h.cam_from_body for h in found]), known)
+        verified = [replace(h, verification=float(score)) for h, score in zip(found, scores, strict=True)]
+        return sorted(verified, key=lambda h: -h.logit)
 
     def _tried(self, picture: Picture, starts: Sequence[Array], stages: tuple[Stage, ...]) -> list[Hypothesis]:
         """Poses after some coarse stages from each start."""
@@ -421,18 +436,18 @@ class Detector:
         ]
 
     def _ordered(self, found: Iterable[Hypothesis], apart_deg: float, most: int = 1000) -> list[Hypothesis]:
-        """Best first, without those near a better one."""
-        result: list[Hypothesis] = []
+        """Best first, without those near a better one; of copies of one pose the evidence says which stays."""
+        copies: list[list[Hypothesis]] = []
         for hypothesis in sorted(found, key=lambda h: -h.logit):
-            if len(result) >= most:
-                break
-            near = [k for k, h in enumerate(result) if self._same(hypothesis.cam_from_body, h.cam_from_body, apart_deg)]
-            if not near:
-                result.append(hypothesis)
-            elif hypothesis.own_logit > result[near[0]].own_logit and apart_deg <= COPY_DEG:
-                # The judge tells poses that are degrees apart; between copies of one the evidence says which is best.
-                result[near[0]] = replace(hypothesis, judgement=result[near[0]].judgement)
-        return result
+            near = [some for some in copies if self._same(hypothesis.cam_from_body, some[0].cam_from_body, apart_deg)]
+            if near:
+                near[0].append(hypothesis)
+            elif len(copies) < most:
+                copies.append([hypothesis])
+        if apart_deg > COPY_DEG:
+            return [some[0] for some in copies]
+        chosen = [max(some, key=lambda h: h.own_logit) for some in copies]
+        return sorted(chosen, key=lambda h: -h.logit)
 
     def view_lines(self, cam_from_body: Array) -> float:
         """Distinct lines of the view nearest to a pose."""

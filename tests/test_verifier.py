@@ -1,0 +1,122 @@
+"""The verifier: right poses before wrong ones and before pictures without the part, and the lines it is shown."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from arview.geometry import Array, apply, exp_so3, rigid
+from arview.raster import rasterise
+from arview.tracking.picture import Picture
+from arview.tracking.tracker import PartView
+from arview.tracking.verifier import (
+    BAND_PX,
+    CHANNELS,
+    RADIUS_PX,
+    SIDE_PX,
+    Verifier,
+    contrasted,
+    raw_look,
+    with_gradients,
+)
+from synthetic import CAMERA, assembly, assembly_views, background, half_hidden, pose_from
+from synthetic import picture as drawn
+
+PART = PartView(assembly_views())
+TRUTH = pose_from(30.0, 45.0, 520.0) @ PART.model_from_body
+KNOWN = np.array([3.0, 1.0, 0.5])
+"""What evidence, judge and scatter say: the same of every pose here, so that the picture alone decides."""
+
+
+@cache
+def verifier() -> Verifier:
+    return Verifier(PART)
+
+
+def picture(noise: float = 6.0, is_hidden: bool = False) -> Picture:
+    pose = TRUTH @ PART.body_from_model
+    card = half_hidden(pose) if is_hidden else None
+    return Picture(drawn(pose, noise=noise, card=card), CAMERA, 12)
+
+
+def scores(seen: Picture, poses: Array) -> Array:
+    return verifier().scores(seen, poses, np.tile(KNOWN, (len(poses), 1)))
+
+
+def turned(angle_deg: float, count: int) -> Array:
+    """The true pose turned by an angle about random axes."""
+    axes = np.random.default_rng(2).normal(size=(count, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return np.stack([rigid(exp_so3(np.deg2rad(angle_deg) * axis) @ TRUTH[:3, :3], TRUTH[:3, 3]) for axis in axes])
+
+
+@pytest.mark.parametrize("noise", [3.0, 12.0])
+def test_the_true_pose_is_verified_and_poses_far_off_are_not(noise: float) -> None:
+    seen = picture(noise)
+    true, others = scores(seen, TRUTH[None])[0], scores(seen, turned(30.0, 60))
+    assert true > others.max() + 1.0
+    assert true > 0.0 > np.median(others)
+
+
+def test_the_further_off_the_less_is_a_pose_verified() -> None:
+    seen = picture()
+    by_angle = [float(np.mean(scores(seen, turned(angle, 40)))) for angle in (1.0, 6.0, 12.0, 25.0)]
+    assert by_angle == sorted(by_angle, reverse=True)
+
+
+def test_a_picture_without_the_part_verifies_no_pose() -> None:
+    clutter = [Picture(background(seed), CAMERA, 12) for seed in range(6)]
+    true = scores(picture(), TRUTH[None])[0]
+    assert max(scores(seen, turned(20.0, 20)).max() for seen in clutter) < true - 2.0
+
+
+def test_the_outline_that_is_shown_is_that_of_the_mesh() -> None:
+    pixels, lines = raw_look(picture(), PART, TRUTH)
+    zoom = RADIUS_PX / (0.5 * (CAMERA.fx + CAMERA.fy) * 0.5 * PART.views.diameter_mm / np.linalg.norm(TRUTH[:3, 3]))
+    center = CAMERA.project(TRUTH[None, :3, 3])[0]
+    columns, rows = np.meshgrid(*[(np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1)) / zoom + c for c in center])
+    mask = silhouette().astype(np.float32)
+    is_inside = cv2.remap(mask, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR) > 0.5
+    outside_px = cv2.distanceTransform((~is_inside).astype(np.uint8), cv2.DIST_L2, 5)
+    inside_px = cv2.distanceTransform(is_inside.astype(np.uint8), cv2.DIST_L2, 5)
+    expected = np.clip(np.where(is_inside, 0.5 - inside_px, outside_px - 0.5) / BAND_PX, -1.0, 1.0)
+    assert np.mean((lines[0] < 0) == is_inside) > 0.98
+    assert np.mean(np.abs(lines[0] - expected) * BAND_PX) < 0.5
+    assert 0.02 < np.mean(lines[1] > 0.5) < 0.3
+    assert np.mean(lines[0][lines[1] > 0.5] < 1.0 / BAND_PX) > 0.95
+    assert (pixels[..., 3] == 255).all()
+
+
+def silhouette() -> Array:
+    """(H,W) bool of the assembly at the true pose, by the rasteriser."""
+    vertices, faces, _ = assembly().mesh
+    seen_from = apply(TRUTH @ PART.body_from_model, vertices)
+    c = CAMERA
+    _, ids = rasterise(seen_from, faces, c.fx, c.fy, c.cx, c.cy, c.width, c.height)
+    return np.asarray(ids >= 0)
+
+
+def test_what_hides_a_part_of_the_part_does_not_turn_a_right_pose_into_a_wrong_one() -> None:
+    seen = picture(is_hidden=True)
+    assert scores(seen, TRUTH[None])[0] > scores(seen, turned(30.0, 60)).max()
+
+
+def test_a_pose_outside_the_picture_is_scored_without_a_picture() -> None:
+    aside = TRUTH.copy()
+    aside[0, 3] += 2000.0
+    plain, contrast = contrasted(*raw_look(picture(), PART, aside))
+    seen = with_gradients(plain)
+    assert seen.shape == (CHANNELS, SIDE_PX, SIDE_PX)
+    assert not seen[:4].any() and not seen[6:].any()
+    assert contrast < 0.01
+    assert scores(picture(), aside[None])[0] < scores(picture(), TRUTH[None])[0]
+
+
+def test_many_poses_are_scored_as_each_alone() -> None:
+    seen, poses = picture(), np.concatenate([TRUTH[None], turned(10.0, 20)])
+    together = scores(seen, poses)
+    alone = [scores(seen, pose[None])[0] for pose in poses]
+    assert together == pytest.approx(np.array(alone), abs=1e-3)

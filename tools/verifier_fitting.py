@@ -1,0 +1,202 @@
+"""Fitting the network of the verifier to examples."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.atomic import replacing
+from arview.errors import InputError
+from arview.tracking.verifier import CHANNELS, GLOBALS, MEANS, SIDE_PX, contrasted, overall, with_gradients
+from judge_examples import Looks
+
+WIDTHS = (24, 24, 48, 48, 64, 64)
+"""Of the convolutions, every other one halves the picture."""
+LAST_WIDTH = 48
+PICTURES, POSES = 6, 20
+"""A step looks at so many poses of so many pictures, a third of them right where there are any."""
+REFINED_WEIGHT = 3.0
+"""Refined poses are taken so much oftener than others."""
+LISTWISE_WEIGHT = 0.3
+"""Beside telling right from wrong in all pictures, the right pose of each is to be told from its others."""
+RATE, DECAY, DROPPED = 2e-3, 2e-2, 0.2
+HELD_OUT = 8
+"""Every so manieth solid is not fitted to, but for telling how well others are verified."""
+FALSE_SHARES = (0.0, 0.02, 0.05, 0.1)
+"""Shares of false alarms to say the found ones for."""
+
+
+def fit_verifier(folder: Path, epochs: int) -> None:
+    """Fit the network to the looks in a folder, write verifier.onnx there, and say how well it does.
+
+    Raises:
+        InputError: no examples, or no torch or onnx.
+    """
+    try:
+        import onnx  # noqa: F401  torch writes with it
+        import torch
+    except ImportError as error:
+        raise InputError(f"fit_judge: {error.name} is not installed; pip install torch onnx") from error
+    looks = [look for path in sorted(folder.glob("looks_*.pkl")) for look in pickle.loads(path.read_bytes())]
+    if not looks:
+        raise InputError(f"{folder}: no examples; run tools/fit_judge collect first")
+    solids = sorted({look.solid for look in looks})
+    held_out = set(solids[::HELD_OUT]) if len(solids) > 1 else set()
+    torch.manual_seed(0)
+    network = _network(torch)
+    _fit(network, [look for look in looks if look.solid not in held_out], epochs, torch)
+    network.eval()
+    _report(network, [look for look in looks if look.solid in held_out], torch)
+    with replacing(folder / "verifier.onnx") as file:
+        torch.onnx.export(
+            network, (torch.zeros(2, CHANNELS, SIDE_PX, SIDE_PX), torch.zeros(2, GLOBALS)), file,
+            input_names=["seen", "both"], output_names=["score"], dynamo=False,
+            dynamic_axes={"seen": {0: "poses"}, "both": {0: "poses"}, "score": {0: "poses"}},
+        )  # fmt: skip
+    print(f"wrote {folder / 'verifier.onnx'}")
+
+
+def _fit(network: Any, looks: Sequence[Looks], epochs: int, torch: Any) -> None:
+    rng = np.random.default_rng(0)
+    network.to(memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    steps = max(1, len(looks) // PICTURES)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * steps, pct_start=0.05)
+    functional = torch.nn.functional
+    for epoch in range(epochs):
+        order, losses = rng.permutation(len(looks)), []
+        for k in range(steps):
+            chosen = [(i, _chosen(looks[i], rng)) for i in order[k * PICTURES : (k + 1) * PICTURES]]
+            shown = [_inputs(looks[i], index, rng) for i, index in chosen]
+            seen, both = (torch.from_numpy(np.concatenate([part[n] for part in shown])) for n in range(2))
+            truth = [torch.from_numpy(looks[i].is_right[index]) for i, index in chosen]
+            with torch.autocast("cpu", torch.bfloat16):
+                found = network(seen.contiguous(memory_format=torch.channels_last), both)
+            found = found.float()
+            loss = functional.binary_cross_entropy_with_logits(found, torch.cat(truth).float())
+            for scores, right in zip(found.split([len(part) for part in truth]), truth, strict=True):
+                if right.any():
+                    loss = loss + LISTWISE_WEIGHT / PICTURES * (scores.logsumexp(0) - scores[right].logsumexp(0))
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            losses.append(loss.item())
+        print(f"verifier, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
+
+
+def _chosen(look: Looks, rng: np.random.Generator) -> list[int]:
+    """Some poses of a picture."""
+    weights = np.where(look.is_refined, REFINED_WEIGHT, 1.0)
+    index: list[int] = []
+    for group, most in ((look.is_right, POSES // 3), (~look.is_right, POSES)):
+        some = np.flatnonzero(group)
+        count = min(len(some), most - len(index))
+        if count > 0:
+            index += rng.choice(some, count, replace=False, p=weights[some] / weights[some].sum()).tolist()
+    return index
+
+
+def _inputs(
+    look: Looks, index: Sequence[int], rng: np.random.Generator | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Poses of a picture as the network takes them; with random numbers altered, all of them alike."""
+    plain, contrasts = zip(
+        *(contrasted(look.pixels[k], look.lines[k].astype(np.float32) / 127.0) for k in index), strict=True
+    )
+    seen = np.stack(plain)
+    if rng is not None:
+        seen = _augmented(seen, rng)
+    both = []
+    for k, contrast in zip(index, contrasts, strict=True):
+        # What is known of refined poses only is the mean for the others.
+        known = look.known[k] if look.is_refined[k] else MEANS
+        both.append(overall(float(look.radii_px[k]), contrast, known))
+    return np.stack([with_gradients(one) for one in seen]), np.stack(both).astype(np.float32)
+
+
+def _augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """The poses of one picture mirrored, turned, recoloured, shaded, blurred, noisier, or with something in front."""
+    if rng.random() < 0.5:
+        seen = seen[..., ::-1]
+    if rng.random() < 0.5:
+        seen = seen[..., ::-1, :]
+    if rng.random() < 0.5:
+        seen = seen.swapaxes(2, 3)
+    seen = np.concatenate([seen[:, rng.permutation(3)], seen[:, 3:]], axis=1)
+    if rng.random() < 0.25:
+        share = rng.uniform(0.5, 1.0)
+        seen[:, :3] += share * (seen[:, :3].mean(axis=1, keepdims=True) - seen[:, :3])
+    if rng.random() < 0.3:
+        shade = 1.0 + rng.normal(0.0, rng.uniform(0.0, 0.3), (5, 5)).astype(np.float32)
+        shift = rng.normal(size=(3, 1, 1)).astype(np.float32)
+        seen[:, :3] = ((seen[:, :3] + shift) * cv2.resize(shade, (SIDE_PX, SIDE_PX)) - shift) * seen[:, 3:4]
+    if rng.random() < 0.25:
+        width_px = rng.uniform(0.4, 0.8)
+        for one in seen:
+            one[:3] = [cv2.GaussianBlur(np.ascontiguousarray(plane), (3, 3), width_px) for plane in one[:3]]
+    if rng.random() < 0.4:
+        seen[:, :3] += rng.uniform(0.0, 0.25) * rng.standard_normal(seen[:, :3].shape, dtype=np.float32)
+    if rng.random() < 0.3:
+        width, height = rng.integers(6, 22, 2)
+        left, top = rng.integers(0, SIDE_PX - width), rng.integers(0, SIDE_PX - height)
+        seen[:, :3, top : top + height, left : left + width] = rng.normal(size=(1, 3, 1, 1))
+    return np.ascontiguousarray(seen)
+
+
+def _report(network: Any, looks: Sequence[Looks], torch: Any) -> None:
+    """Say how many pictures' right refined poses come before those of pictures without the solid, and before others."""
+    with_it, without, first, first_of = [], [], 0, 0
+    for look in looks:
+        refined = np.flatnonzero(look.is_refined)
+        if not len(refined):
+            continue
+        with torch.no_grad():
+            scores = network(*map(torch.from_numpy, _inputs(look, refined.tolist()))).numpy()
+        right = look.is_right[refined]
+        if not look.is_right.any():
+            without.append(scores.max())
+        elif right.any():
+            with_it.append(scores[right].max())
+            first += bool(right[np.argmax(scores)])
+            first_of += 1
+    print(f"other solids: a right pose first in {first} of {first_of} pictures")
+    highest = np.sort(without)[::-1]
+    for share in FALSE_SHARES if len(highest) else ():
+        found = np.mean(np.array(with_it) > highest[int(share * len(highest))])
+        print(f"  {100 * found:.0f} % found with {100 * share:.0f} % false alarms, of {len(highest)} without it")
+
+
+def _network(torch: Any) -> Any:
+    """The network of `arview.tracking.verifier`."""
+    nn = torch.nn
+
+    class _Network(nn.Module):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            layers: list[Any] = []
+            before = CHANNELS
+            for k, width in enumerate(WIDTHS):
+                size = 5 if k == 0 else 3
+                layers += [
+                    nn.Conv2d(before, width, size, 2 - k % 2, size // 2, bias=False),
+                    nn.BatchNorm2d(width),
+                    nn.ReLU(),
+                ]
+                before = width
+            self.convolutions = nn.Sequential(*layers)
+            self.together = nn.Sequential(
+                nn.Linear(2 * before + GLOBALS, LAST_WIDTH), nn.ReLU(), nn.Dropout(DROPPED), nn.Linear(LAST_WIDTH, 1)
+            )
+
+        def forward(self, seen: Any, both: Any) -> Any:
+            hidden = self.convolutions(seen)
+            return self.together(torch.cat([hidden.mean((2, 3)), hidden.amax((2, 3)), both], 1))[:, 0]
+
+    return _Network()
