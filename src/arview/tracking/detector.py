@@ -367,10 +367,10 @@ class Detector:
             )  # fmt: skip
             return np.asarray(poses)
 
-        results = list(pool().map(search, jobs))
-        if not results:
+        poses = np.concatenate([np.empty((0, 4, 4)), *pool().map(search, jobs)])
+        poses = poses[self.search.are_in_range(poses)]
+        if not len(poses):
             return []
-        poses = np.concatenate(results)
         lines = np.array([self.view_lines(pose) for pose in poses])
         scores = judge(picture, self.tracker.part, poses, lines)
         order = np.argsort(-scores, kind="stable")
@@ -413,8 +413,10 @@ class Detector:
     def _finished(self, picture: Picture, starts: Sequence[Array]) -> list[Hypothesis]:
         """Poses refined to the end, best first; those of which too little is in the picture are left out."""
         found = self._refined(picture, [(s, stages) for s in starts for stages in FINE_STAGES], FINE_TOLERANCE_PX)
+        is_in_range = self.search.are_in_range(np.array([h.cam_from_body for h in found]).reshape(-1, 4, 4))
         low = self.options.min_in_picture
-        return self._ordered((h for h in found if h.evidence.points_in_picture >= low and self._is_plausible(h)), 0.0)
+        kept = [h for h, is_ok in zip(found, is_in_range, strict=True) if is_ok and h.evidence.points_in_picture >= low]
+        return self._ordered(kept, 0.0)
 
     def _refined(
         self, picture: Picture, ways: Sequence[tuple[Array, tuple[Stage, ...]]], tolerance_px: float
@@ -457,12 +459,6 @@ class Detector:
 
     def _same(self, a: Array, b: Array, angle_deg: float) -> bool:
         return are_near(a, b, 0.01 * angle_deg * self.views.diameter_mm, angle_deg)
-
-    def _is_plausible(self, hypothesis: Hypothesis) -> bool:
-        """Within a margin of the declared distances and in front of the camera."""
-        low, high = self.views.view_range.distance_mm
-        distance = float(np.linalg.norm(hypothesis.cam_from_body[:3, 3]))
-        return bool(0.85 * low <= distance <= 1.18 * high and hypothesis.cam_from_body[2, 3] > 0)
 
 
 def _around(cam_from_body: Array, angle_rad: float) -> list[Array]:

@@ -41,6 +41,8 @@ LARGEST_SCALE = 1.5
 """The picture is not enlarged more than this."""
 LOWEST_SCORE = 0.3
 """Template matches below this are noise."""
+NEARER, FARTHER = 0.85, 1.18
+"""Poses are looked for so far beyond the declared distances, as shares of them."""
 CELL_PX, CELL_ROLL = 4.0, 0.33
 """Of matches whose place and roll (rad) fall in one cell, of one scale and group of views, the best is enough."""
 ALIKE = 5
@@ -171,6 +173,7 @@ class FirstSearch:
         self.outlines = make_outlines(views, part.model_from_body, POINTS)
         # Scale steps of the templates, large distances (large pictures) first.
         low, high = views.view_range.distance_mm
+        self._reach_mm = NEARER * low, FARTHER * high
         near, far = self.step_at(low), self.step_at(high)
         top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
@@ -190,6 +193,12 @@ class FirstSearch:
     def starts(self, picture: Picture, effort: Effort = QUICK) -> list[Candidate]:
         """Poses for the best matches over the whole range, apart from each other, best first."""
         return self.judged(picture, *self.likely(picture, effort), effort)
+
+    def are_in_range(self, poses: Array) -> NDArray[np.bool_]:
+        """Which poses (N,4,4) about the centre are in front of the camera and at a declared distance, or nearly so."""
+        low, high = self._reach_mm
+        distances_mm = np.linalg.norm(poses[:, :3, 3], axis=1)
+        return np.asarray((low <= distances_mm) & (distances_mm <= high) & (poses[:, 2, 3] > 0))
 
     def judged(self, picture: Picture, poses: Array, lines: Array, effort: Effort = QUICK) -> list[Candidate]:
         """The starts among likely poses, best first."""
@@ -250,11 +259,16 @@ class FirstSearch:
         scales = 2.0 ** (matches.steps / STEPS_PER_OCTAVE)
         rays = self.camera.unproject((matches.places + 0.5) / scales[:, None] - 0.5)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        distances_mm = self._focal_px * 0.5 * self._diameter_mm * scales / matches.radii_px
+        distances_mm = self._distances_mm(matches)
         c, s, zero = np.cos(matches.rolls), np.sin(matches.rolls), np.zeros(len(matches.rolls))
         turns = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], axis=1).reshape(-1, 3, 3)
         rotations = turns @ self.outlines.rotations[matches.views]
         return turns_to_rays(rays) @ rotations, rays * distances_mm[:, None]
+
+    def _distances_mm(self, matches: Matches) -> Array:
+        """(M,) of the part's centre."""
+        scales = 2.0 ** (matches.steps / STEPS_PER_OCTAVE)
+        return np.asarray(self._focal_px * 0.5 * self._diameter_mm * scales / matches.radii_px)
 
     def _best_apart(self, matches: Matches, reach_px: float, angle_rad: float, ratio: float, most: int) -> Matches:
         """The best, none near a better one."""
@@ -304,6 +318,9 @@ class FirstSearch:
                 SHIFT_PX, SHIFT_PX,
             )  # fmt: skip
             keys = weighed(scores, shapes.lines[views])
-            return Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
+            improved = Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
+            low, high = self._reach_mm
+            distances_mm = self._distances_mm(improved)
+            return improved.of(np.flatnonzero((low <= distances_mm) & (distances_mm <= high)))
 
         return _joined(list(pool().map(improve, jobs)))
