@@ -10,12 +10,13 @@ import pytest
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.errors import InputError
-from arview.geometry import apply
+from arview.geometry import apply, are_near
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.pose import TrackingState
 from arview.tracking import Detector, DetectorOptions, TrackingSession
 from arview.tracking.ambiguity import TELLING, EdgeSteps, find_symmetries, telling
 from arview.tracking.detector import Hypothesis
+from arview.tracking.first_search import FARTHER, NEARER, WIDE
 from arview.tracking.quality import Evidence
 from cad_files import box
 from synthetic import (
@@ -238,3 +239,26 @@ def test_results_are_apart_and_no_more_than_asked_for() -> None:
 def test_options_without_sense_are_refused() -> None:
     with pytest.raises(InputError, match="radius_px"):
         DetectorOptions(radius_px=2.0)
+
+
+def test_no_search_looks_beyond_the_declared_distances() -> None:
+    seen = detector().picture(picture(None, seed=3, scene=3))
+    low, high = detector().views.view_range.distance_mm
+    likely, _ = detector().search.likely(seen, WIDE)
+    climbed = detector().climbed(seen, detector().search.starts(seen, WIDE), WIDE)
+    poses = np.concatenate([likely, [candidate.cam_from_body for candidate in climbed]])
+    distances_mm = np.linalg.norm(poses[:, :3, 3], axis=1)
+    assert len(likely) > 100 and climbed
+    assert distances_mm.min() >= NEARER * low and distances_mm.max() <= FARTHER * high
+
+
+def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
+    rng = np.random.default_rng(5)
+    for k in range(4):
+        found = detector().hypotheses(detector().picture(picture(anywhere(rng), seed=k, scene=k, noise=12.0)))
+        logits = [hypothesis.logit for hypothesis in found]
+        assert logits == sorted(logits, reverse=True)
+        for i, a in enumerate(found):
+            assert a.verification is not None
+            for b in found[i + 1 :]:
+                assert not are_near(a.cam_from_body, b.cam_from_body, 0.04 * detector().views.diameter_mm, 4.0)
