@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Component, Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
-from arview.geometry import Array, apply, exp_se3, look_at, rotation_angle_rad
+from arview.geometry import Array, apply, exp_se3, exp_so3, look_at, rigid, rotation_angle_rad
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.raster import rasterise
 from cad_files import box
@@ -93,6 +93,13 @@ def pose_from(
     a, e = np.deg2rad([azimuth_deg, elevation_deg])
     eye = center + distance_mm * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     return exp_se3([0, 0, np.deg2rad(roll_deg), 0, 0, 0]) @ look_at(eye, center, [0.0, 0.0, 1.0])
+
+
+def turned_about(pose: Array, angle_deg: float, count: int) -> Array:
+    """A pose (4,4) turned by an angle about random axes through its origin, (count,4,4)."""
+    axes = np.random.default_rng(2).normal(size=(count, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return np.stack([rigid(exp_so3(np.deg2rad(angle_deg) * axis) @ pose[:3, :3], pose[:3, 3]) for axis in axes])
 
 
 def path(count: int, seed: int = 0, model: Model | None = None) -> list[Array]:

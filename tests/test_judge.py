@@ -10,7 +10,7 @@ from arview.guideviews import GuideViewSet
 from arview.tracking.judge import FINE, INNER_LINES, OUTLINE_LINES, RADII_PX, ROUGH, STRETCHES, describe, judge, network
 from arview.tracking.picture import Picture
 from arview.tracking.tracker import PartView
-from synthetic import CAMERA, assembly_views, pose_from
+from synthetic import CAMERA, assembly_views, pose_from, turned_about
 from synthetic import picture as drawn
 
 VIEWS: GuideViewSet = assembly_views()
@@ -25,10 +25,7 @@ def picture(noise: float = 6.0) -> Picture:
 
 
 def turned(angle_deg: float, count: int) -> Array:
-    """The true pose turned by an angle about random axes."""
-    axes = np.random.default_rng(2).normal(size=(count, 3))
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    return np.stack([rigid(exp_so3(np.deg2rad(angle_deg) * axis) @ TRUTH[:3, :3], TRUTH[:3, 3]) for axis in axes])
+    return turned_about(TRUTH, angle_deg, count)
 
 
 def elsewhere(count: int) -> Array:

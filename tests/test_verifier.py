@@ -7,8 +7,9 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from arview.geometry import Array, apply, exp_so3, rigid
+from arview.geometry import Array, apply
 from arview.raster import rasterise
 from arview.tracking.picture import Picture
 from arview.tracking.tracker import PartView
@@ -22,7 +23,7 @@ from arview.tracking.verifier import (
     raw_look,
     with_gradients,
 )
-from synthetic import CAMERA, assembly, assembly_views, background, half_hidden, pose_from
+from synthetic import CAMERA, assembly, assembly_views, background, half_hidden, pose_from, turned_about
 from synthetic import picture as drawn
 
 PART = PartView(assembly_views())
@@ -46,11 +47,13 @@ def scores(seen: Picture, poses: Array) -> Array:
     return verifier().scores(seen, poses, np.tile(KNOWN, (len(poses), 1)))
 
 
+def shown(pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    seen = picture()
+    return raw_look(seen, PART, pose, float(seen.radii_px(PART.views.diameter_mm, pose[None])[0]))
+
+
 def turned(angle_deg: float, count: int) -> Array:
-    """The true pose turned by an angle about random axes."""
-    axes = np.random.default_rng(2).normal(size=(count, 3))
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    return np.stack([rigid(exp_so3(np.deg2rad(angle_deg) * axis) @ TRUTH[:3, :3], TRUTH[:3, 3]) for axis in axes])
+    return turned_about(TRUTH, angle_deg, count)
 
 
 @pytest.mark.parametrize("noise", [3.0, 12.0])
@@ -74,7 +77,7 @@ def test_a_picture_without_the_part_verifies_no_pose() -> None:
 
 
 def test_the_outline_that_is_shown_is_that_of_the_mesh() -> None:
-    pixels, lines = raw_look(picture(), PART, TRUTH)
+    pixels, lines = shown(TRUTH)
     zoom = RADIUS_PX / (0.5 * (CAMERA.fx + CAMERA.fy) * 0.5 * PART.views.diameter_mm / np.linalg.norm(TRUTH[:3, 3]))
     center = CAMERA.project(TRUTH[None, :3, 3])[0]
     columns, rows = np.meshgrid(*[(np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1)) / zoom + c for c in center])
@@ -107,7 +110,7 @@ def test_what_hides_a_part_of_the_part_does_not_turn_a_right_pose_into_a_wrong_o
 def test_a_pose_outside_the_picture_is_scored_without_a_picture() -> None:
     aside = TRUTH.copy()
     aside[0, 3] += 2000.0
-    plain, contrast = contrasted(*raw_look(picture(), PART, aside))
+    plain, contrast = contrasted(*shown(aside))
     seen = with_gradients(plain)
     assert seen.shape == (CHANNELS, SIDE_PX, SIDE_PX)
     assert not seen[:4].any() and not seen[6:].any()

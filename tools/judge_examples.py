@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from tqdm import tqdm
 
 from arview.atomic import replacing
 from arview.cad import Model
+from arview.errors import InputError
 from arview.evaluation.protocols import full_sphere_range
 from arview.evaluation.semisynthetic import (
     CAMERA,
@@ -109,14 +111,23 @@ def collect_examples(seeds: range, photos: Sequence[Path], folder: Path) -> None
         path = folder / f"solid_{seed}.pkl"
         if path.exists():
             continue
-        groups: list[Group] = []
-        looks: list[Looks] = []
-        for picture in pictures_of(seed, photos, (WIDE,)):
-            for example in _examples(seed, *picture):
-                (groups if isinstance(example, Group) else looks).append(example)  # type: ignore[arg-type]
-        for examples, name in ((looks, f"looks_{seed}.pkl"), (groups, path.name)):
+        examples = [e for picture in pictures_of(seed, photos, (WIDE,)) for e in _examples(seed, *picture)]
+        for kind, name in ((Looks, f"looks_{seed}.pkl"), (Group, path.name)):
             with replacing(folder / name) as file:
-                pickle.dump(examples, file)
+                pickle.dump([example for example in examples if isinstance(example, kind)], file)
+
+
+def read_examples(folder: Path, pattern: str, every: int) -> tuple[list[Any], set[int]]:
+    """The examples in a folder's files of a pattern, and the solids, one of so many, that are not to be fitted to.
+
+    Raises:
+        InputError: no examples.
+    """
+    examples = [example for path in sorted(folder.glob(pattern)) for example in pickle.loads(path.read_bytes())]
+    if not examples:
+        raise InputError(f"{folder}: no examples; run tools/fit_judge collect first")
+    solids = sorted({example.solid for example in examples})
+    return examples, set(solids[::every]) if len(solids) > 1 else set()
 
 
 def pictures_of(
@@ -236,10 +247,14 @@ def _looks(
     if not len(index):
         return
     part = detector.tracker.part
-    pixels, lines = zip(*(raw_look(picture, part, poses[k]) for k in index), strict=True)
+    poses = poses[index]
+    radii_px = picture.radii_px(part.views.diameter_mm, poses)
+    pixels, lines = zip(
+        *(raw_look(picture, part, *of) for of in zip(poses, radii_px.tolist(), strict=True)), strict=True
+    )
     yield Looks(
         seed, np.stack(pixels), np.round(127.0 * np.stack(lines)).astype(np.int8),
-        np.array([detector.tracker.radius_px(poses[k]) for k in index]), known[index], is_refined[index], right[index],
+        radii_px, known[index], is_refined[index], right[index],
     )  # fmt: skip
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from arview.atomic import replacing
 from arview.errors import InputError
 from arview.tracking.judge import FEATURES, GLOBALS, OUTLINE_LINES, STRETCHES, Network
-from judge_examples import Group
+from judge_examples import Group, read_examples
 
 WIDTH, LAST_WIDTH = 16, 32
 """Of the layers for each line, and of that for all together."""
@@ -36,13 +35,11 @@ def fit_networks(folder: Path, epochs: int) -> None:
         import torch
     except ImportError as error:
         raise InputError("fit_judge: torch is not installed; pip install torch") from error
-    groups = [group for path in sorted(folder.glob("solid_*.pkl")) for group in pickle.loads(path.read_bytes())]
-    if not groups:
-        raise InputError(f"{folder}: no examples; run tools/fit_judge collect first")
+    groups, held_out = read_examples(folder, "solid_*.pkl", HELD_OUT)
     torch.manual_seed(0)
     stored: dict[str, NDArray[np.float32]] = {}
     for stage, names in (("rough", ("rough",)), ("refined", ("fine", "close"))):
-        networks, weight = _fit([g for g in groups if g.stage == stage], names, epochs, torch)
+        networks, weight = _fit([g for g in groups if g.stage == stage], held_out, names, epochs, torch)
         print(f"{stage}: weight of the hand-made evidence {weight:.2f}")
         for name, network in networks.items():
             for field, layer in zip(Network._fields[::2], network.layers(), strict=True):
@@ -53,10 +50,10 @@ def fit_networks(folder: Path, epochs: int) -> None:
     print(f"wrote {folder / 'judge.npz'}")
 
 
-def _fit(groups: Sequence[Group], names: Sequence[str], epochs: int, torch: Any) -> tuple[dict[str, Any], float]:
+def _fit(
+    groups: Sequence[Group], held_out: set[int], names: Sequence[str], epochs: int, torch: Any
+) -> tuple[dict[str, Any], float]:
     """The networks, and the weight of the hand-made evidence beside them."""
-    solids = sorted({group.solid for group in groups})
-    held_out = set(solids[::HELD_OUT]) if len(solids) > 1 else set()
     shown = [g for g in groups if g.is_right.any() and g.solid not in held_out]
     without = [g for g in groups if not g.is_right.any() and g.solid not in held_out]
     networks = {name: _network(torch) for name in names}

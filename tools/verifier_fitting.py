@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from arview.atomic import replacing
 from arview.errors import InputError
 from arview.tracking.verifier import CHANNELS, GLOBALS, MEANS, SIDE_PX, contrasted, overall, with_gradients
-from judge_examples import Looks
+from judge_examples import Looks, read_examples
 
 WIDTHS = (24, 24, 48, 48, 64, 64)
 """Of the convolutions, every other one halves the picture."""
@@ -43,11 +42,7 @@ def fit_verifier(folder: Path, epochs: int) -> None:
         import torch
     except ImportError as error:
         raise InputError(f"fit_judge: {error.name} is not installed; pip install torch onnx") from error
-    looks = [look for path in sorted(folder.glob("looks_*.pkl")) for look in pickle.loads(path.read_bytes())]
-    if not looks:
-        raise InputError(f"{folder}: no examples; run tools/fit_judge collect first")
-    solids = sorted({look.solid for look in looks})
-    held_out = set(solids[::HELD_OUT]) if len(solids) > 1 else set()
+    looks, held_out = read_examples(folder, "looks_*.pkl", HELD_OUT)
     torch.manual_seed(0)
     network = _network(torch)
     _fit(network, [look for look in looks if look.solid not in held_out], epochs, torch)
@@ -118,7 +113,7 @@ def _inputs(
         # What is known of refined poses only is the mean for the others.
         known = look.known[k] if look.is_refined[k] else MEANS
         both.append(overall(float(look.radii_px[k]), contrast, known))
-    return np.stack([with_gradients(one) for one in seen]), np.stack(both).astype(np.float32)
+    return np.stack([with_gradients(one) for one in seen]), np.stack(both)
 
 
 def _augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:

@@ -196,9 +196,11 @@ class FirstSearch:
 
     def are_in_range(self, poses: Array) -> NDArray[np.bool_]:
         """Which poses (N,4,4) about the centre are in front of the camera and at a declared distance, or nearly so."""
+        return self._are_in_reach(np.linalg.norm(poses[:, :3, 3], axis=1)) & (poses[:, 2, 3] > 0)
+
+    def _are_in_reach(self, distances_mm: Array) -> NDArray[np.bool_]:
         low, high = self._reach_mm
-        distances_mm = np.linalg.norm(poses[:, :3, 3], axis=1)
-        return np.asarray((low <= distances_mm) & (distances_mm <= high) & (poses[:, 2, 3] > 0))
+        return np.asarray((low <= distances_mm) & (distances_mm <= high))
 
     def judged(self, picture: Picture, poses: Array, lines: Array, effort: Effort = QUICK) -> list[Candidate]:
         """The starts among likely poses, best first."""
@@ -319,8 +321,6 @@ class FirstSearch:
             )  # fmt: skip
             keys = weighed(scores, shapes.lines[views])
             improved = Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
-            low, high = self._reach_mm
-            distances_mm = self._distances_mm(improved)
-            return improved.of(np.flatnonzero((low <= distances_mm) & (distances_mm <= high)))
+            return improved.of(np.flatnonzero(self._are_in_reach(self._distances_mm(improved))))
 
         return _joined(list(pool().map(improve, jobs)))

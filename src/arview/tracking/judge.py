@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.tracking.picture import STEPS_PER_OCTAVE, Picture
+from arview.tracking.picture import Picture, steps_to
 from arview.tracking.refine import nearest_view
 from arview.tracking.solver import project_lines
 from arview.tracking.threads import pool
@@ -124,10 +124,7 @@ def describe(
 
 def _looks(picture: Picture, part: PartView, poses: Array, radius_px: float) -> list[tuple[int, NDArray[np.intp]]]:
     """Scale steps with the poses to be looked at there, in halves."""
-    radii_px = picture.focal_px * 0.5 * part.views.diameter_mm / np.linalg.norm(poses[:, :3, 3], axis=1)
-    # Half octaves are near enough.
-    half = STEPS_PER_OCTAVE // 2
-    steps = half * np.minimum(np.round(STEPS_PER_OCTAVE / half * np.log2(radius_px / radii_px)), 0).astype(int)
+    steps = steps_to(radius_px, picture.radii_px(part.views.diameter_mm, poses))
     halves = [
         (int(step), some) for step in np.unique(steps) for some in np.array_split(np.flatnonzero(steps == step), 2)
     ]

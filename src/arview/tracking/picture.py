@@ -36,6 +36,12 @@ class Gradients(NamedTuple):
     intrinsics: Array
 
 
+def steps_to(radius_px: float, radii_px: Array) -> NDArray[np.int64]:
+    """Scale steps (N,) that bring sizes (N,) to about another: half octaves are near enough, nothing is enlarged."""
+    half = STEPS_PER_OCTAVE // 2
+    return half * np.minimum(np.round(STEPS_PER_OCTAVE / half * np.log2(radius_px / radii_px)), 0).astype(np.int64)
+
+
 def make_gradients(image: NDArray[np.uint8], intrinsics: Array) -> Gradients:
     """The gradients of an RGB picture."""
     smooth, across, down, _ = colour_gradients(image)
@@ -60,6 +66,10 @@ class Picture:
         self._camera = camera
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
         self._gradients: dict[int, Gradients] = {}
+
+    def radii_px(self, diameter_mm: float, poses: Array) -> Array:
+        """Half the diameter (N,) of a part in the picture at poses (N,4,4) about its centre."""
+        return np.asarray(self.focal_px * 0.5 * diameter_mm / np.linalg.norm(poses[:, :3, 3], axis=1))
 
     def make(self, steps: Iterable[int]) -> None:
         """Make the maps of several scales at once."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.tracking.picture import STEPS_PER_OCTAVE, Picture
+from arview.tracking.picture import Picture, steps_to
 from arview.tracking.refine import nearest_view
 from arview.tracking.solver import project_lines
 from arview.tracking.threads import pool
@@ -70,14 +70,14 @@ class Verifier:
         Returns:
             (N,) scores.
         """
-        steps = {_step(picture, self._part, pose) for pose in poses}
-        list(pool().map(picture.gradients, steps))
+        radii_px = picture.radii_px(self._part.views.diameter_mm, poses)
+        list(pool().map(picture.gradients, set(steps_to(RADIUS_PX, radii_px).tolist())))
 
-        def look(pose: Array, of_it: Array) -> tuple[NDArray[np.float32], Array]:
-            plain, contrast = contrasted(*raw_look(picture, self._part, pose))
-            return with_gradients(plain), overall(_radius_px(picture, self._part, pose), contrast, of_it)
+        def look(pose: Array, radius_px: float, of_it: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            plain, contrast = contrasted(*raw_look(picture, self._part, pose, radius_px))
+            return with_gradients(plain), overall(radius_px, contrast, of_it)
 
-        looks = list(pool().map(look, poses, known))
+        looks = list(pool().map(look, poses, radii_px.tolist(), known))
         scores = np.empty(len(poses))
         for first in range(0, len(poses), MOST_AT_ONCE):
             some = slice(first, first + MOST_AT_ONCE)
@@ -88,13 +88,21 @@ class Verifier:
         return scores
 
 
-def raw_look(picture: Picture, part: PartView, pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The picture around a pose (S,S,4), RGB and 255 inside of it, and the part's lines (2,S,S), see CHANNELS."""
-    gradients = picture.gradients(_step(picture, part, pose))
+def raw_look(
+    picture: Picture, part: PartView, pose: Array, radius_px: float
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The picture around a pose (S,S,4), RGB and 255 inside of it, and the part's lines (2,S,S), see CHANNELS.
+
+    Args:
+        picture, part: what is looked for, and where.
+        pose: (4,4) ``cam_from_body``.
+        radius_px: half the part's diameter in the picture there, see `Picture.radii_px`.
+    """
+    gradients = picture.gradients(int(steps_to(RADIUS_PX, np.array([radius_px]))[0]))
     intrinsics = gradients.intrinsics
     height, width = gradients.colours.shape[:2]
     center = project_lines(_ORIGIN, _ANY_DIRECTION, True, pose, intrinsics, 1.0)[0][0]
-    zoom = RADIUS_PX * picture.focal_px / (intrinsics[0] * _radius_px(picture, part, pose))
+    zoom = RADIUS_PX / radius_px * picture.focal_px / intrinsics[0]
     middle = 0.5 * (SIDE_PX - 1)
     way = np.array([[zoom, 0.0, middle - zoom * center[0]], [0.0, zoom, middle - zoom * center[1]]])
     crop = cv2.warpAffine(gradients.colours, way, (SIDE_PX, SIDE_PX), flags=cv2.INTER_LINEAR)
@@ -139,7 +147,7 @@ def with_gradients(plain: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.concatenate([plain, gradients, gradients[:1] * lines[1:]]).astype(np.float32, copy=False)
 
 
-def overall(radius_px: float, contrast: float, known: Array) -> Array:
+def overall(radius_px: float, contrast: float, known: Array) -> NDArray[np.float32]:
     """What the network is told of a pose as a whole (GLOBALS,): see there."""
     both = [np.log(radius_px / TYPICAL_RADIUS_PX), 0.5 * np.log(contrast / TYPICAL_CONTRAST + 0.05)]
     return np.concatenate([both, (known - MEANS) / DEVIATIONS]).astype(np.float32)
@@ -212,14 +220,3 @@ def draw_lines(part, pose, intrinsics, step_mm, zoom, shift, drawn):  # type: ig
             for u in range(max(0, column - EDGE_PX), min(side, column + EDGE_PX + 1)):
                 near = np.exp(-((u - x) ** 2 + (v - y) ** 2) / EDGE_SQUARE)
                 drawn[1, v, u] = max(drawn[1, v, u], near)
-
-
-def _radius_px(picture: Picture, part: PartView, pose: Array) -> float:
-    """Half the part's diameter in the picture."""
-    return picture.focal_px * 0.5 * part.views.diameter_mm / float(np.linalg.norm(pose[:3, 3]))
-
-
-def _step(picture: Picture, part: PartView, pose: Array) -> int:
-    """Scale step of the picture that a pose is looked at in: half octaves are near enough, nothing is enlarged."""
-    half = STEPS_PER_OCTAVE // 2
-    return half * min(round(STEPS_PER_OCTAVE / half * float(np.log2(RADIUS_PX / _radius_px(picture, part, pose)))), 0)
