@@ -27,6 +27,7 @@ from arview.tracking.climb import climb
 from arview.tracking.components import ComponentCheck
 from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch
 from arview.tracking.judge import FINE, judge
+from arview.tracking.line_network import LineNetwork
 from arview.tracking.picture import Picture
 from arview.tracking.quality import EVIDENCE_WEIGHT, RIGHT_WORTH, Evidence, Leads, found_logit, found_probability
 from arview.tracking.templates import choose_apart
@@ -212,6 +213,7 @@ class Detector:
         self.best_rejected: Rejected | None = None
         self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
         self.search = FirstSearch(views, self.tracker.part, camera, o.radius_px, o.roll_step_deg, o.subdivisions)
+        self._line_network = LineNetwork()
         self._verifier = Verifier(self.tracker.part)
         self._components = ComponentCheck(views, model, camera) if model and len(model.components) > 1 else None
         self.symmetries = find_symmetries(views)
@@ -337,7 +339,7 @@ class Detector:
     def picture(self, image: NDArray[np.uint8]) -> Picture:
         """A frame (H,W,3) as the searches take it."""
         o = self.options
-        return Picture(image, self.camera, round(0.6 * o.radius_px))
+        return Picture(image, self.camera, round(0.6 * o.radius_px), self._line_network)
 
     def climbed(self, picture: Picture, starts: list[Candidate], effort: Effort = QUICK) -> list[Candidate]:
         """The likeliest hypotheses after all levels of the search from some starts, best first."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array
+from arview.tracking.line_network import LineNetwork, lines_at
 from arview.tracking.matching import colour_gradients, response_maps
 from arview.tracking.threads import pool
 from arview.tracking.tracker import intrinsics_of, smoothed
@@ -56,14 +57,20 @@ class Picture:
         image: (H,W,3) uint8 RGB.
         camera: of it.
         pad_px: empty rim of the maps.
+        network: the lines that it sees count in the maps as much as gradients; None: these alone count.
     """
 
-    def __init__(self, image: NDArray[np.uint8], camera: Camera, pad_px: int) -> None:
+    def __init__(
+        self, image: NDArray[np.uint8], camera: Camera, pad_px: int, network: LineNetwork | None = None
+    ) -> None:
         self.image = image
         self.gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         self.pad_px = pad_px
         self.focal_px = 0.5 * (camera.fx + camera.fy)
         self._camera = camera
+        self._network = network
+        self._lines: NDArray[np.uint8] | None = None
+        self._spread_lines: tuple[NDArray[np.uint8], Array] | None = None
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
         self._gradients: dict[int, Gradients] = {}
 
@@ -75,13 +82,32 @@ class Picture:
         """Make the maps of several scales at once."""
         # The large ones first: they take longest.
         missing = sorted({step for step in steps if step not in self._maps}, reverse=True)
+        if missing:
+            self._see_lines()
         self._maps.update(zip(missing, pool().map(self._make, missing), strict=True))
 
     def maps(self, step: int) -> tuple[NDArray[np.uint8], Array]:
         """Response maps (8,H,W) at a scale, padded, and the intrinsics (10,) that belong to them."""
         if step not in self._maps:
+            self._see_lines()
             self._maps[step] = self._make(step)
         return self._maps[step]
+
+    def lines(self) -> tuple[NDArray[np.uint8], Array] | None:
+        """What the network alone sees, spread, as in `maps` but without a rim; None without a network."""
+        self._see_lines()
+        if self._lines is None:
+            return None
+        if self._spread_lines is None:
+            height, width = self._lines.shape[1:]
+            share = width / self._camera.width
+            shown = self._camera.scaled(width, round(self._camera.height * share))
+            self._spread_lines = lines_at(self._lines, width, height, SPREAD_PX), intrinsics_of(shown)
+        return self._spread_lines
+
+    def _see_lines(self) -> None:
+        if self._network is not None and self._lines is None:
+            self._lines = self._network.lines(self.image)
 
     def gradients(self, step: int) -> Gradients:
         """Gradients and colours of the picture at a scale."""
@@ -100,9 +126,12 @@ class Picture:
         per_map = 2 if 2.0 ** (step / STEPS_PER_OCTAVE) <= 0.5 else 1
         intrinsics = intrinsics_of(self._camera.scaled(width, height))
         intrinsics[2:4] += self.pad_px
-        return response_maps(
-            self._resized(per_map * width, per_map * height), SPREAD_PX, self.pad_px, per_map
-        ), intrinsics
+        maps = response_maps(self._resized(per_map * width, per_map * height), SPREAD_PX, self.pad_px, per_map)
+        if self._lines is not None:
+            inside = maps[:, self.pad_px : self.pad_px + height, self.pad_px : self.pad_px + width]
+            for plane, lines in zip(inside, lines_at(self._lines, width, height, SPREAD_PX), strict=True):
+                plane[:] = cv2.addWeighted(plane, 0.5, lines, 0.5, 0.0)
+        return maps, intrinsics
 
     def _size(self, step: int) -> tuple[int, int]:
         scale = 2.0 ** (step / STEPS_PER_OCTAVE)

@@ -175,14 +175,14 @@ def _drawn(part: ShadedModel, poses: list[Array], camera: Camera, light: Light) 
             continue
         pixels += float(layer.coverage.sum()) / len(poses)
         stacked = np.dstack([layer.color, layer.coverage])
-        _paste(cv2.GaussianBlur(stacked, (0, 0), JOIN_BLUR_PX, borderType=cv2.BORDER_CONSTANT), layer, both)
-        _paste(layer.coverage, layer, coverage)
+        paste(cv2.GaussianBlur(stacked, (0, 0), JOIN_BLUR_PX, borderType=cv2.BORDER_CONSTANT), layer, both)
+        paste(layer.coverage, layer, coverage)
     both /= len(poses)
     coverage /= len(poses)
     return _Drawn(both[..., :3], both[..., 3], coverage, pixels)
 
 
-def _paste(window: NDArray[np.float32], layer: Layer, picture: NDArray[np.float32]) -> None:
+def paste(window: NDArray[np.float32], layer: Layer, picture: NDArray[np.float32]) -> None:
     """Add a layer's window to the picture, as far as it lies inside."""
     height, width = picture.shape[:2]
     left, top = max(layer.left, 0), max(layer.top, 0)

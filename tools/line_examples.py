@@ -1,0 +1,214 @@
+"""Examples for the line network: random solids before photos, with the lines of them that are seen."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from arview.atomic import replacing
+from arview.cad.model import Model, make_model
+from arview.evaluation.semisynthetic import CAMERA
+from arview.evaluation.semisynthetic.backgrounds import read_photo, surroundings
+from arview.evaluation.semisynthetic.random_solids import random_solid
+from arview.evaluation.semisynthetic.sequence import FILL_LIGHT, JOIN_BLUR_PX, KEY_LIGHT, paste
+from arview.evaluation.semisynthetic.shading import Light, ShadedModel, Surface
+from arview.geometry import Array, apply, rigid
+from arview.raster import rasterise
+from arview.video import Image
+
+SOLIDS_EACH, PICTURES_EACH = 14, 60
+"""A file holds so many pictures of so many solids."""
+RADIUS_PX, OTHER_RADIUS_PX = (38.0, 300.0), (30.0, 120.0)
+"""Half diameters of the first solid in a picture and of those beside it."""
+ALONE, NOT_ALONE = (0.55, 0.3, 0.15), (1, 2, 3)
+"""Shares of pictures with so many solids."""
+LEAST_DISTANCE = 0.75
+"""No nearer than this, in diameters."""
+RECOLOURED, PLAIN, PRINTED = 0.5, 0.4, 0.35
+"""Shares of solids in other colours, of the surface that sequences have, with a photo that shines through them."""
+PHOTO_SCALE = 0.35, 1.2
+"""Smallest and largest zoom of a photo, as far as it fills the picture."""
+FINE = 2
+"""Lines are found on a grid so many times as fine as the picture."""
+JUMP = 0.035
+"""A jump in depth, in diameters, is a line."""
+CREASE_DEG = 38.0
+"""So is an edge at which faces meet at more than this: hardly less than where shading is smooth."""
+RIDGE_PX = 2.0
+"""Scale at which a line's direction is found."""
+JPEG_QUALITY = 97
+
+
+@dataclass(frozen=True)
+class LinedPicture:
+    """A picture without noise, and the lines of the solids in it.
+
+    Attributes:
+        jpeg: of it.
+        lines: (N,3) uint16: row and column on the fine grid, direction of the normal, 256 to the half turn.
+        inside: PNG of the share of each pixel that solids cover, 0–255.
+    """
+
+    jpeg: bytes
+    lines: NDArray[np.uint16]
+    inside: bytes
+
+
+def collect_lined_pictures(seeds: range, photos: Sequence[Path], folder: Path) -> None:
+    """Write some pictures of some solids to a file for each seed, unless it is there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in tqdm(seeds, desc="pictures with lines", disable=None):
+        path = folder / f"lines_{seed}.pkl"
+        if path.exists():
+            continue
+        rng = np.random.default_rng([seed, 3])
+        solids = []
+        for k in range(SOLIDS_EACH):
+            try:
+                solids.append(random_solid(SOLIDS_EACH * seed + k))
+            except ValueError:  # outlines that cross each other
+                continue
+        pictures = [_lined_picture(solids, photos, rng) for _ in range(PICTURES_EACH if solids else 0)]
+        with replacing(path) as file:
+            pickle.dump(pictures, file)
+
+
+def _lined_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.random.Generator) -> LinedPicture:
+    photo = read_photo(photos[rng.integers(len(photos))])
+    picture = _crop(photo, rng).astype(np.float32)
+    key = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
+    if rng.random() < 0.6:
+        key = Rotation.from_rotvec(rng.normal(0.0, 0.8, 3)).apply(key)
+    toward = np.stack([key, FILL_LIGHT / np.linalg.norm(FILL_LIGHT)])
+    light = Light(toward, np.array([rng.uniform(0.25, 1.4), 0.25]), rng.uniform(0.15, 0.45), surroundings(photo))
+    height, width = FINE * CAMERA.height, FINE * CAMERA.width
+    depth = np.zeros((height, width), np.float32)
+    normals = np.zeros((height, width, 3), np.float32)
+    owners = np.zeros((height, width), np.int16)
+    inside = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    placed = _placed(solids, rng)
+    # The far ones first.
+    for number, (solid, pose) in enumerate(sorted(placed, key=lambda of: -apply(of[1], of[0].center_in_model)[2]), 1):
+        surface = Surface()
+        if rng.random() > PLAIN:
+            surface = Surface(*(rng.uniform(*of) for of in ((0.4, 0.95), (0.0, 0.7), (0.0, 0.45), (6.0, 60.0))))
+        layer = ShadedModel(solid, surface).draw(pose, CAMERA, light)
+        if layer is None:
+            continue
+        both, coverage = np.zeros((*inside.shape, 4), np.float32), np.zeros_like(inside)
+        stacked = np.dstack([layer.color, layer.coverage])
+        paste(cv2.GaussianBlur(stacked, (0, 0), JOIN_BLUR_PX, borderType=cv2.BORDER_CONSTANT), layer, both)
+        paste(layer.coverage, layer, coverage)
+        if rng.random() < PRINTED:
+            share = rng.uniform(0.2, 1.0)
+            print_on = _crop(read_photo(photos[rng.integers(len(photos))]), rng).astype(np.float32) / 110.0
+            both[..., :3] *= 1.0 - share + share * print_on
+        picture = picture * (1.0 - both[..., 3:]) + 255.0 * np.clip(both[..., :3], 0.0, 1.0)
+        inside = np.maximum(inside, coverage)
+        _draw_geometry(solid, pose, number, depth, normals, owners)
+    lines = _lines(depth, normals, owners, max(solid.diameter_mm for solid, _ in placed))
+    image = np.clip(np.round(picture), 0, 255).astype(np.uint8)[..., ::-1]
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    return LinedPicture(jpeg, lines, cv2.imencode(".png", (255.0 * inside).astype(np.uint8))[1].tobytes())
+
+
+def _placed(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Model, Array]]:
+    """Some solids and their poses: one anywhere, others near it or anywhere."""
+    size = np.array([CAMERA.width, CAMERA.height])
+    placed: list[tuple[Model, Array]] = []
+    first_px, first_radius_px = np.zeros(2), 0.0
+    for number in range(rng.choice(NOT_ALONE, p=ALONE)):
+        solid = solids[rng.integers(len(solids))]
+        if rng.random() < RECOLOURED:
+            solid = _recoloured(solid, rng)
+        radius_px = float(np.exp(rng.uniform(*np.log(OTHER_RADIUS_PX if number else RADIUS_PX))))
+        center_px = rng.uniform(-20.0, size + 20.0)
+        if number and rng.random() < 0.7:
+            center_px = first_px + 0.9 * first_radius_px * rng.normal(size=2)
+        center_px = np.clip(center_px, 0.08 * size, 0.92 * size)
+        if not number:
+            first_px, first_radius_px = center_px, radius_px
+        distance_mm = max(0.5 * CAMERA.fx * solid.diameter_mm / radius_px, LEAST_DISTANCE * solid.diameter_mm)
+        rotation = Rotation.random(random_state=rng).as_matrix()
+        center = CAMERA.unproject(center_px[None])[0] * distance_mm
+        placed.append((solid, rigid(rotation, center - rotation @ solid.center_in_model)))
+    return placed
+
+
+def _recoloured(solid: Model, rng: np.random.Generator) -> Model:
+    base, gray = rng.uniform(0.15, 0.9, 3), rng.uniform()
+    base = gray * base.mean() + (1.0 - gray) * base
+    components = []
+    for component in solid.components:
+        color = base if rng.random() < 0.5 else rng.uniform(0.1, 0.9) + rng.normal(0.0, 0.1, 3)
+        components.append(replace(component, color=tuple(np.clip(color, 0.03, 0.97).tolist())))
+    return make_model(solid.name, tuple(components))
+
+
+def _crop(photo: Image, rng: np.random.Generator) -> Image:
+    """A part of a photo, of the picture's size, at some zoom, perhaps mirrored or in other colours."""
+    fill = max(CAMERA.width / photo.shape[1], CAMERA.height / photo.shape[0])
+    zoom = np.exp(rng.uniform(np.log(max(1.01 * fill, PHOTO_SCALE[0])), np.log(max(1.06 * fill, PHOTO_SCALE[1]))))
+    size = int(np.ceil(photo.shape[1] * zoom)), int(np.ceil(photo.shape[0] * zoom))
+    photo = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA if zoom < 1.0 else cv2.INTER_LINEAR))
+    top = rng.integers(photo.shape[0] - CAMERA.height + 1)
+    left = rng.integers(photo.shape[1] - CAMERA.width + 1)
+    part = photo[top : top + CAMERA.height, left : left + CAMERA.width]
+    if rng.random() < 0.5:
+        part = part[:, ::-1]
+    if rng.random() < 0.15:
+        part = part[::-1]
+    return part[..., rng.permutation(3)] if rng.random() < 0.3 else part
+
+
+def _draw_geometry(
+    solid: Model,
+    pose: Array,
+    number: int,
+    depth: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    owners: NDArray[np.int16],
+) -> None:
+    """Depth (H,W) mm, flat normals (H,W,3) and owners (H,W) on the fine grid, where a solid is drawn."""
+    vertices, faces, _ = solid.mesh
+    points = apply(pose, vertices)
+    height, width = depth.shape
+    fine = CAMERA.scaled(width, height)
+    inverse_depth, face_ids = rasterise(points, faces, fine.fx, fine.fy, fine.cx, fine.cy, width, height)
+    a, b, c = points[faces].transpose(1, 0, 2)
+    flat = np.cross(b - a, c - a)
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+    flat[np.sum(flat * a, axis=1) > 0] *= -1.0
+    is_on = face_ids >= 0
+    depth[is_on] = 1.0 / inverse_depth[is_on]
+    normals[is_on] = flat[face_ids[is_on]]
+    owners[is_on] = number
+
+
+def _lines(
+    depth: NDArray[np.float32], normals: NDArray[np.float32], owners: NDArray[np.int16], diameter_mm: float
+) -> NDArray[np.uint16]:
+    """The lines of `LinedPicture`: where the owner changes, depth jumps or normals turn, with ridge directions."""
+    drawn = np.zeros(depth.shape, np.float32)
+    for before, after in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        are_both = (owners[before] > 0) & (owners[after] > 0)
+        jumps = np.abs(depth[before] - depth[after]) > JUMP * diameter_mm
+        turns = np.sum(normals[before] * normals[after], axis=2) < np.cos(np.deg2rad(CREASE_DEG))
+        is_line = (owners[before] != owners[after]) | (are_both & (jumps | turns))
+        drawn[before] = np.maximum(drawn[before], is_line)
+        drawn[after] = np.maximum(drawn[after], is_line)
+    smooth = cv2.GaussianBlur(drawn, (0, 0), RIDGE_PX)
+    xx, yy, xy = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=5) for order in ((2, 0), (0, 2), (1, 1)))
+    # Across a ridge the curvature is most negative.
+    across = 0.5 * np.arctan2(2.0 * xy, xx - yy) + 0.5 * np.pi
+    bins = np.round(np.mod(across, np.pi) / np.pi * 256.0).astype(np.uint16) % 256
+    rows, columns = np.nonzero(drawn)
+    return np.stack([rows, columns, bins[rows, columns]], axis=1).astype(np.uint16)

@@ -1,0 +1,198 @@
+"""Fitting the line network to pictures of random solids."""
+
+from __future__ import annotations
+
+import pickle
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.atomic import replacing
+from arview.errors import InputError
+from arview.tracking.line_network import CONTRAST, SHRINK
+from arview.tracking.matching import ORIENTATIONS
+from line_examples import FINE, LinedPicture
+
+WIDTHS = (16, 24, 40, 56, 64)
+"""Of the levels, each half as large as that before."""
+CROP_PX, CROPS = 256, 8
+"""A step looks at so many squares of pictures."""
+AROUND_LINES, AROUND_PX = 0.75, 110
+"""So many of them about a line, so far off it at most."""
+LINE_WEIGHT, LINES_WEIGHT, INSIDE_WEIGHT = 5.0, 4.0, 0.2
+"""Of places with a line against those without; of lines; of the solids' inside, which is told for their sake only."""
+RATE, DECAY, WARM_UP = 2.5e-3, 1e-2, 0.01
+HELD_OUT = 20
+"""Every so manieth picture is not fitted to."""
+FALSE_SHARES = (0.05, 0.02, 0.01)
+"""Shares of places without a line to say the lines seen for."""
+TURNED = {
+    "mirrored": [0, 7, 6, 5, 4, 3, 2, 1, 8],
+    "transposed": [4, 3, 2, 1, 0, 7, 6, 5, 8],
+}
+"""What becomes of orientations and inside."""
+
+
+def fit_lines(folder: Path, epochs: int) -> None:
+    """Fit the network to the pictures in a folder, write lines.onnx there, and say how many lines it sees.
+
+    Raises:
+        InputError: no pictures, or no torch or onnx.
+    """
+    try:
+        import onnx  # noqa: F401  torch writes with it
+        import torch
+    except ImportError as error:
+        raise InputError(f"fit_judge: {error.name} is not installed; pip install torch onnx") from error
+    pictures = [picture for path in sorted(folder.glob("lines_*.pkl")) for picture in pickle.loads(path.read_bytes())]
+    if len(pictures) < HELD_OUT:
+        raise InputError(f"{folder}: too few pictures; run tools/fit_judge pictures first")
+    torch.manual_seed(0)
+    network = _network(torch)
+    _fit(network, [p for k, p in enumerate(pictures) if k % HELD_OUT], epochs, torch)
+    network.eval()
+    _report(network, pictures[::HELD_OUT], torch)
+    with replacing(folder / "lines.onnx") as file:
+        torch.onnx.export(
+            torch.nn.Sequential(network, torch.nn.Sigmoid()), (torch.zeros(1, 3, 512, 640),), file,
+            input_names=["picture"], output_names=["lines"], dynamo=False,
+        )  # fmt: skip
+    print(f"wrote {folder / 'lines.onnx'}")
+
+
+def _fit(network: Any, pictures: list[LinedPicture], epochs: int, torch: Any) -> None:
+    rng = np.random.default_rng(0)
+    network.to(memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    steps = max(1, len(pictures) // CROPS)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * steps, pct_start=WARM_UP)
+    for epoch in range(epochs):
+        losses = []
+        for _ in range(steps):
+            crops = [_example(pictures[k], rng) for k in rng.integers(len(pictures), size=CROPS)]
+            shown, truth = (torch.from_numpy(np.stack(part)) for part in zip(*crops, strict=True))
+            with torch.autocast("cpu", torch.bfloat16):
+                seen = network(shown.contiguous(memory_format=torch.channels_last))
+            loss = _loss(seen.float(), truth, torch)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            losses.append(loss.item())
+        print(f"lines, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.4f}", flush=True)
+
+
+def _loss(seen: Any, truth: Any, torch: Any) -> Any:
+    entropy = torch.nn.functional.binary_cross_entropy_with_logits
+    lines = slice(0, ORIENTATIONS)
+    weights = 1.0 + (LINE_WEIGHT - 1.0) * (truth[:, lines] > 0.1)
+    inside = entropy(seen[:, ORIENTATIONS], truth[:, ORIENTATIONS])
+    return LINES_WEIGHT * (entropy(seen[:, lines], truth[:, lines], weight=weights)) + INSIDE_WEIGHT * inside
+
+
+def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A square of a picture as the network takes it (3,S,S), and what it should see, lines and inside (9,S/2,S/2)."""
+    image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    inside = cv2.imdecode(np.frombuffer(picture.inside, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert image is not None and inside is not None
+    size = np.array(image.shape[:2])
+    middle = rng.integers(size)
+    if len(picture.lines) and rng.random() < AROUND_LINES:
+        line = picture.lines[rng.integers(len(picture.lines)), :2].astype(np.int64)
+        middle = line // FINE + rng.integers(-AROUND_PX, AROUND_PX, 2)
+    top, left = (np.clip(middle - CROP_PX // 2, 0, size - CROP_PX) // SHRINK * SHRINK).tolist()
+    square = np.s_[top : top + CROP_PX, left : left + CROP_PX]
+    side = CROP_PX // SHRINK
+    truth = np.zeros((ORIENTATIONS + 1, side, side), np.float32)
+    lines = picture.lines.astype(np.int64)
+    rows, columns = ((lines[:, k] - FINE * low) // (FINE * SHRINK) for k, low in enumerate((top, left)))
+    is_in = (rows >= 0) & (rows < side) & (columns >= 0) & (columns < side)
+    rows, columns, position = rows[is_in], columns[is_in], lines[is_in, 2] / 256.0 * ORIENTATIONS
+    low = np.floor(position).astype(np.int64)
+    # A line between two orientations counts for both, as in `matching`.
+    for bins, share in ((low, 1.0 - position + low), (low + 1, position - low)):
+        np.maximum.at(truth, (bins % ORIENTATIONS, rows, columns), np.minimum(1.0, 2.0 * share).astype(np.float32))
+    truth[ORIENTATIONS] = cv2.resize(inside[square], (side, side), interpolation=cv2.INTER_AREA) / 255.0
+    shown = _spoilt(image[square].astype(np.float32), rng)
+    if rng.random() < 0.5:
+        shown, truth = shown[:, ::-1], truth[TURNED["mirrored"], :, ::-1]
+    if rng.random() < 0.5:
+        shown, truth = shown[::-1], truth[TURNED["mirrored"], ::-1]
+    if rng.random() < 0.5:
+        shown, truth = shown.swapaxes(0, 1), truth[TURNED["transposed"]].swapaxes(1, 2)
+    as_shown = (shown.astype(np.float32) - np.float32(shown.mean())) / np.float32(CONTRAST)
+    return np.ascontiguousarray(as_shown.transpose(2, 0, 1)), np.ascontiguousarray(truth)
+
+
+def _spoilt(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Paler, darker, blurred, noisy, compressed: each now and then."""
+    if rng.random() < 0.5:
+        share = rng.uniform()
+        image = share * image.mean(axis=2, keepdims=True) + (1.0 - share) * image
+    if rng.random() < 0.5:
+        image = 255.0 * (np.clip(image, 0.0, 255.0) / 255.0) ** rng.uniform(0.6, 1.6)
+    if rng.random() < 0.4:
+        image = image * rng.uniform(0.5, 1.1)
+    if rng.random() < 0.5:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.5)))
+    noise = rng.uniform(1.0, 4.0) if rng.random() < 0.5 else rng.uniform(4.0, 22.0)
+    image = image + noise * rng.standard_normal(image.shape)
+    spoilt = np.clip(np.round(image), 0, 255).astype(np.uint8)
+    if rng.random() < 0.3:
+        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(50, 95))]
+        decoded = cv2.imdecode(cv2.imencode(".jpg", spoilt, quality)[1], cv2.IMREAD_COLOR)
+        assert decoded is not None
+        return np.asarray(decoded, dtype=np.uint8)
+    return spoilt
+
+
+def _report(network: Any, pictures: list[LinedPicture], torch: Any) -> None:
+    """Say how many places on lines are answered to more than most of those without one nearby."""
+    rng = np.random.default_rng(1)
+    on_lines, elsewhere = [], []
+    for picture in pictures:
+        shown, truth = _example(picture, rng)
+        with torch.no_grad():
+            seen = network(torch.from_numpy(shown[None]))[0, :ORIENTATIONS].amax(0).numpy()
+        is_line = truth[:ORIENTATIONS].max(axis=0) > 0.3
+        is_near = cv2.dilate(is_line.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        on_lines.append(cv2.dilate(seen, np.ones((3, 3), np.uint8))[is_line])
+        elsewhere.append(seen[~is_near])
+    lines, others = np.concatenate(on_lines), np.concatenate(elsewhere)
+    for share in FALSE_SHARES:
+        found = np.mean(lines > np.quantile(others, 1.0 - share))
+        print(f"  {100 * found:.0f} % of the lines seen with {100 * share:.0f} % of other places")
+
+
+def _network(torch: Any) -> Any:
+    """The network of `arview.tracking.line_network`: down level by level, and up again with what each level saw."""
+    nn = torch.nn
+
+    def convolution(before: int, after: int, size: int = 3, step: int = 1) -> Any:
+        layer = nn.Conv2d(before, after, size, step, size // 2, bias=False)
+        return nn.Sequential(layer, nn.BatchNorm2d(after), nn.ReLU())
+
+    class _Network(nn.Module):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            pairs = list(pairwise(WIDTHS))
+            self.first = convolution(3, WIDTHS[0], 5, 2)
+            self.down = nn.ModuleList(nn.Sequential(convolution(a, b, 3, 2), convolution(b, b)) for a, b in pairs)
+            self.narrow = nn.ModuleList(convolution(b, a, 1) for a, b in pairs)
+            self.up = nn.ModuleList(convolution(a, a) for a, _ in pairs)
+            self.last = nn.Conv2d(WIDTHS[0], ORIENTATIONS + 1, 1)
+
+        def forward(self, shown: Any) -> Any:
+            levels = [self.first(shown)]
+            for down in self.down:
+                levels.append(down(levels[-1]))
+            seen = levels.pop()
+            for level, narrow, up in zip(reversed(levels), reversed(self.narrow), reversed(self.up), strict=True):
+                seen = up(level + nn.functional.interpolate(narrow(seen), scale_factor=2, mode="nearest"))
+            return self.last(seen)
+
+    return _Network()
