@@ -83,7 +83,8 @@ def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Ou
         if not found:
             continue
         best = found[0]
-        terms = found_terms(best.logit, best.own_logit, best.judgement, detector.leads(best, found[1:]))
+        leads = detector.leads(best, found[1:])
+        terms = found_terms(best.logit, best.own_logit, best.judgement, best.line_support, leads)
         if truth is None:
             yield Outcome(terms, False, part, weight)
             continue

@@ -25,6 +25,8 @@ AROUND_LINES, AROUND_PX = 0.75, 110
 """So many of them about a line, so far off it at most."""
 LINE_WEIGHT, LINES_WEIGHT, INSIDE_WEIGHT = 5.0, 4.0, 0.2
 """Of places with a line against those without; of lines; of the solids' inside, which is told for their sake only."""
+MOTTLED = 0.45
+"""So many solids have a grain."""
 RATE, DECAY, WARM_UP = 2.5e-3, 1e-2, 0.01
 HELD_OUT = 20
 """Every so manieth picture is not fitted to."""
@@ -117,7 +119,10 @@ def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[n
     for bins, share in ((low, 1.0 - position + low), (low + 1, position - low)):
         np.maximum.at(truth, (bins % ORIENTATIONS, rows, columns), np.minimum(1.0, 2.0 * share).astype(np.float32))
     truth[ORIENTATIONS] = cv2.resize(inside[square], (side, side), interpolation=cv2.INTER_AREA) / 255.0
-    shown = _spoilt(image[square].astype(np.float32), rng)
+    plain = image[square].astype(np.float32)
+    if rng.random() < MOTTLED:
+        plain *= _mottles(rng) ** (inside[square] / 255.0)[..., None]
+    shown = _spoilt(plain, rng)
     if rng.random() < 0.5:
         shown, truth = shown[:, ::-1], truth[TURNED["mirrored"], :, ::-1]
     if rng.random() < 0.5:
@@ -126,6 +131,16 @@ def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[n
         shown, truth = shown.swapaxes(0, 1), truth[TURNED["transposed"]].swapaxes(1, 2)
     as_shown = (shown.astype(np.float32) - np.float32(shown.mean())) / np.float32(CONTRAST)
     return np.ascontiguousarray(as_shown.transpose(2, 0, 1)), np.ascontiguousarray(truth)
+
+
+def _mottles(rng: np.random.Generator) -> NDArray[np.float32]:
+    """Factors (S,S,1) as of a cast, ground or painted surface, of one grain or of two."""
+    grains = []
+    for scale_px in (rng.uniform(0.6, 4.0), rng.uniform(3.0, 14.0)):
+        grain = cv2.GaussianBlur(rng.standard_normal((CROP_PX, CROP_PX), dtype=np.float32), (0, 0), scale_px)
+        grains.append(grain / grain.std())
+    mixed = grains[0] if rng.random() < 0.5 else 0.7 * (grains[0] + grains[1])
+    return np.clip(1.0 + rng.uniform(0.04, 0.35) * mixed, 0.1, 2.5)[..., None]
 
 
 def _spoilt(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -27,9 +27,17 @@ from arview.tracking.climb import climb
 from arview.tracking.components import ComponentCheck
 from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch
 from arview.tracking.judge import FINE, judge
-from arview.tracking.line_network import LineNetwork
+from arview.tracking.line_network import LineNetwork, line_support
 from arview.tracking.picture import Picture
-from arview.tracking.quality import EVIDENCE_WEIGHT, RIGHT_WORTH, Evidence, Leads, found_logit, found_probability
+from arview.tracking.quality import (
+    EVIDENCE_WEIGHT,
+    LINE_WEIGHT,
+    RIGHT_WORTH,
+    Evidence,
+    Leads,
+    found_logit,
+    found_probability,
+)
 from arview.tracking.templates import choose_apart
 from arview.tracking.threads import pool
 from arview.tracking.tracker import NEAR_STAGES, Stage, Tracker, TrackerOptions
@@ -172,6 +180,7 @@ class Hypothesis:
         evidence: of it.
         judgement: of the networks for refined poses, see `judge`.
         verification: of the `verifier`, once it has looked at it.
+        line_support: what the line network sees along its lines, see there; once verified.
         lines: distinct lines that its view shows.
         radius_px: half the part's diameter in the picture.
     """
@@ -182,6 +191,7 @@ class Hypothesis:
     lines: float
     radius_px: float
     verification: float | None = None
+    line_support: float = 0.0
 
     @property
     def own_logit(self) -> float:
@@ -192,7 +202,7 @@ class Hypothesis:
     def logit(self) -> float:
         """For comparing the hypotheses of one picture, either all verified or none."""
         if self.verification is not None:
-            return self.verification
+            return self.verification + LINE_WEIGHT * self.line_support
         return EVIDENCE_WEIGHT * self.own_logit + self.judgement
 
 
@@ -276,7 +286,7 @@ class Detector:
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
         return [
-            found_probability(h.logit, h.own_logit, h.judgement, self.leads(h, hypotheses[k + 1 :]))
+            found_probability(h.logit, h.own_logit, h.judgement, h.line_support, self.leads(h, hypotheses[k + 1 :]))
             for k, h in enumerate(hypotheses)
         ]
 
@@ -405,8 +415,17 @@ class Detector:
             return []
         known = np.array([(h.own_logit, h.judgement, h.evidence.scatter_px) for h in found])
         scores = self._verifier.scores(picture, np.stack([h.cam_from_body for h in found]), known)
-        verified = [replace(h, verification=float(score)) for h, score in zip(found, scores, strict=True)]
+        supports = self._line_supports(picture, found)
+        verified = [
+            replace(h, verification=float(score), line_support=support)
+            for h, score, support in zip(found, scores, supports, strict=True)
+        ]
         return sorted(verified, key=lambda h: -h.logit)
+
+    def _line_supports(self, picture: Picture, found: list[Hypothesis]) -> list[float]:
+        maps, intrinsics = picture.lines()
+        part, step_mm = self.tracker.part.arrays, 0.01 * self.views.diameter_mm
+        return [float(line_support(maps, part, h.cam_from_body, intrinsics, step_mm)) for h in found]
 
     def _tried(self, picture: Picture, starts: Sequence[Array], stages: tuple[Stage, ...]) -> list[Hypothesis]:
         """Poses after some coarse stages from each start."""

@@ -13,9 +13,13 @@ from importlib.resources import files
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.tracking.matching import ORIENTATIONS
+from arview.tracking.refine import nearest_view
+from arview.tracking.solver import project_lines
 
 LONGEST_SIDE_PX = 640
 """Larger pictures are shrunk to this. In pictures of this size it was fitted to half diameters of 30 to 300 px."""
@@ -64,3 +68,45 @@ def lines_at(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) 
         strongest = cv2.dilate(plane, merged) if side > 1 else plane
         cv2.dilate(cv2.resize(strongest, (width, height), interpolation=way), spread, dst=out)
     return sized
+
+
+@njit(cache=True, nogil=True)
+def line_support(maps, part, pose, intrinsics, step_mm):  # type: ignore[no-untyped-def]
+    """Mean answer 0–1 of the network under the outline and the design edges of a part; these count half at most.
+
+    Args:
+        maps: (8,H,W) uint8, see `Picture.lines`; intrinsics: (10,) that belong to them.
+        part: arrays of all guide views, see `PartView.arrays`; pose: (4,4) ``cam_from_body``.
+        step_mm: length over which directions are projected.
+    """
+    directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
+    height, width = maps.shape[1], maps.shape[2]
+    view = nearest_view(directions, pose)
+    sums = np.zeros(2)
+    counts = np.zeros(2)
+    for group in range(2):
+        starts = c_start if group == 0 else e_start
+        first, last = starts[view], starts[view + 1]
+        if group == 0:
+            px, normals, depths = project_lines(
+                c_points[first:last], c_normals[first:last], False, pose, intrinsics, step_mm
+            )
+        else:
+            px, normals, depths = project_lines(
+                e_points[first:last], e_tangents[first:last], True, pose, intrinsics, step_mm
+            )
+        for i in range(px.shape[0]):
+            if group == 1:
+                kind = e_kinds[first + i]
+                if (kind & EDGE_CONTOUR) > 0 or (kind & EDGE_SHARP) == 0:
+                    continue
+            if depths[i] <= 0.0:
+                continue
+            column, row = int(np.round(px[i, 0])), int(np.round(px[i, 1]))
+            if 0 <= column < width and 0 <= row < height:
+                turn = np.arctan2(normals[i, 1], normals[i, 0]) / np.pi * ORIENTATIONS
+                sums[group] += maps[int(np.round(turn)) % ORIENTATIONS, row, column] / 255.0
+                counts[group] += 1.0
+    means = sums / np.maximum(counts, 1.0)
+    share = min(0.5, counts[1] / max(counts[0] + counts[1], 1.0))
+    return (1.0 - share) * means[0] + share * means[1]

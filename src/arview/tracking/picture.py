@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.geometry import Array
 from arview.tracking.line_network import LineNetwork, lines_at
-from arview.tracking.matching import colour_gradients, response_maps
+from arview.tracking.matching import ORIENTATIONS, colour_gradients, response_maps
 from arview.tracking.threads import pool
 from arview.tracking.tracker import intrinsics_of, smoothed
 
@@ -93,16 +93,16 @@ class Picture:
             self._maps[step] = self._make(step)
         return self._maps[step]
 
-    def lines(self) -> tuple[NDArray[np.uint8], Array] | None:
-        """What the network alone sees, spread, as in `maps` but without a rim; None without a network."""
+    def lines(self) -> tuple[NDArray[np.uint8], Array]:
+        """What the network alone sees, spread, as in `maps` but without a rim; nothing without a network."""
         self._see_lines()
-        if self._lines is None:
-            return None
         if self._spread_lines is None:
-            height, width = self._lines.shape[1:]
-            share = width / self._camera.width
-            shown = self._camera.scaled(width, round(self._camera.height * share))
-            self._spread_lines = lines_at(self._lines, width, height, SPREAD_PX), intrinsics_of(shown)
+            seen = self._lines
+            if seen is None:
+                seen = np.zeros((ORIENTATIONS, self._camera.height // 2, self._camera.width // 2), dtype=np.uint8)
+            height, width = seen.shape[1:]
+            intrinsics = intrinsics_of(self._camera.scaled(width, height))
+            self._spread_lines = lines_at(seen, width, height, SPREAD_PX), intrinsics
         return self._spread_lines
 
     def _see_lines(self) -> None:
