@@ -252,6 +252,15 @@ def test_no_search_looks_beyond_the_declared_distances() -> None:
     assert distances_mm.min() >= NEARER * low and distances_mm.max() <= FARTHER * high
 
 
+def test_matches_that_all_leave_the_declared_distances_are_no_detection(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = detector().search
+    monkeypatch.setattr(search, "_reach_mm", (1.0, 2.0))
+    seen = detector().picture(picture(pose_from(30, 40, 500.0)))
+    likely, lines = search.likely(seen, WIDE)
+    assert likely.shape == (0, 4, 4) and lines.shape == (0,)
+    assert detector().detect(seen.image) == []
+
+
 def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
     rng = np.random.default_rng(5)
     for k in range(4):

@@ -286,7 +286,7 @@ class Detector:
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
         return [
-            found_probability(h.logit, h.own_logit, h.judgement, h.line_support, self.leads(h, hypotheses[k + 1 :]))
+            found_probability(h.logit, h.own_logit, h.judgement, self.leads(h, hypotheses[k + 1 :]))
             for k, h in enumerate(hypotheses)
         ]
 
@@ -415,17 +415,12 @@ class Detector:
             return []
         known = np.array([(h.own_logit, h.judgement, h.evidence.scatter_px) for h in found])
         scores = self._verifier.scores(picture, np.stack([h.cam_from_body for h in found]), known)
-        supports = self._line_supports(picture, found)
-        verified = [
-            replace(h, verification=float(score), line_support=support)
-            for h, score, support in zip(found, scores, supports, strict=True)
-        ]
+        seen, part, step_mm = picture.lines(), self.tracker.part.arrays, 0.01 * self.views.diameter_mm
+        verified = []
+        for h, score in zip(found, scores.tolist(), strict=True):
+            support = float(line_support(seen.answers, part, h.cam_from_body, seen.intrinsics, step_mm))
+            verified.append(replace(h, verification=score, line_support=support))
         return sorted(verified, key=lambda h: -h.logit)
-
-    def _line_supports(self, picture: Picture, found: list[Hypothesis]) -> list[float]:
-        maps, intrinsics = picture.lines()
-        part, step_mm = self.tracker.part.arrays, 0.01 * self.views.diameter_mm
-        return [float(line_support(maps, part, h.cam_from_body, intrinsics, step_mm)) for h in found]
 
     def _tried(self, picture: Picture, starts: Sequence[Array], stages: tuple[Stage, ...]) -> list[Hypothesis]:
         """Poses after some coarse stages from each start."""

@@ -229,6 +229,8 @@ class FirstSearch:
         for growth in GROWTHS[:-1]:
             matches = self._improved(picture, matches, growth)
         matches = self._improved(picture, matches.best(effort.improved), GROWTHS[-1])
+        if not len(matches.keys):
+            return np.empty((0, 4, 4)), np.empty(0)
         matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.looked_at)
         poses = np.stack([rigid(r, p) for r, p in zip(*self._posed(matches), strict=True)])
         return poses, self.outlines.lines[matches.views]
@@ -298,7 +300,9 @@ class FirstSearch:
         return matches.of(first[np.argsort(rank, kind="stable")[:most]])
 
     def _improved(self, picture: Picture, matches: Matches, growth: Growth) -> Matches:
-        """The matches improved each by itself, on larger maps."""
+        """The matches improved each by itself, on larger maps; those that leave the declared distances are dropped."""
+        if not len(matches.keys):
+            return matches
         shapes = self.outlines
         around = shapes.near if growth.is_fine else shapes.far
         jobs = []

@@ -27,6 +27,8 @@ SHRINK = 2
 """The network's maps are so many times smaller than what it is shown."""
 CELL_PX = 32
 """It takes pictures of multiples of this."""
+STRONG_SHARE, LEAST_CLEAR = 0.005, 0.25
+"""The strongest answers, at so many of all places, are taken for clear lines, if they are not all weaker than this."""
 CONTRAST = 64.0
 """Grey levels less their mean are shown in units of this."""
 
@@ -41,6 +43,8 @@ class LineNetwork:
     def lines(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """How likely a line of each orientation runs through each place of an RGB picture (H,W,3).
 
+        A picture in which it is sure of little, as of materials that it does not know, is brought up to the others.
+
         Returns:
             (8,h,w) 0–255, of half the picture's size, or of half of `LONGEST_SIDE_PX`.
         """
@@ -53,7 +57,10 @@ class LineNetwork:
         shown = cv2.copyMakeBorder(shown, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REPLICATE)
         self._network.setInput(np.ascontiguousarray(shown.transpose(2, 0, 1))[None])
         seen = self._network.forward()[0, :ORIENTATIONS, : -(-height // SHRINK), : -(-width // SHRINK)]
-        return np.asarray(np.round(255.0 * seen).astype(np.uint8))
+        strongest = seen.max(axis=0).ravel()
+        rank = int(STRONG_SHARE * len(strongest))
+        clear = max(LEAST_CLEAR, float(np.partition(strongest, -rank - 1)[-rank - 1]))
+        return np.asarray(np.round(255.0 * np.minimum(seen / clear, 1.0)).astype(np.uint8))
 
 
 def lines_at(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) -> NDArray[np.uint8]:
@@ -75,7 +82,7 @@ def line_support(maps, part, pose, intrinsics, step_mm):  # type: ignore[no-unty
     """Mean answer 0–1 of the network under the outline and the design edges of a part; these count half at most.
 
     Args:
-        maps: (8,H,W) uint8, see `Picture.lines`; intrinsics: (10,) that belong to them.
+        maps: (8,H,W) uint8, see `SeenLines`; intrinsics: (10,) that belong to them.
         part: arrays of all guide views, see `PartView.arrays`; pose: (4,4) ``cam_from_body``.
         step_mm: length over which directions are projected.
     """

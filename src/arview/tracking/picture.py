@@ -37,6 +37,18 @@ class Gradients(NamedTuple):
     intrinsics: Array
 
 
+class SeenLines(NamedTuple):
+    """What the line network sees in a picture.
+
+    Attributes:
+        answers: (8,h,w) uint8, spread as the response maps are, but without a rim.
+        intrinsics: (10,) of them.
+    """
+
+    answers: NDArray[np.uint8]
+    intrinsics: Array
+
+
 def steps_to(radius_px: float, radii_px: Array) -> NDArray[np.int64]:
     """Scale steps (N,) that bring sizes (N,) to about another: half octaves are near enough, nothing is enlarged."""
     half = STEPS_PER_OCTAVE // 2
@@ -70,7 +82,7 @@ class Picture:
         self._camera = camera
         self._network = network
         self._lines: NDArray[np.uint8] | None = None
-        self._spread_lines: tuple[NDArray[np.uint8], Array] | None = None
+        self._seen: SeenLines | None = None
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
         self._gradients: dict[int, Gradients] = {}
 
@@ -93,17 +105,17 @@ class Picture:
             self._maps[step] = self._make(step)
         return self._maps[step]
 
-    def lines(self) -> tuple[NDArray[np.uint8], Array]:
-        """What the network alone sees, spread, as in `maps` but without a rim; nothing without a network."""
+    def lines(self) -> SeenLines:
+        """What the network alone sees; nothing without a network."""
         self._see_lines()
-        if self._spread_lines is None:
-            seen = self._lines
-            if seen is None:
-                seen = np.zeros((ORIENTATIONS, self._camera.height // 2, self._camera.width // 2), dtype=np.uint8)
-            height, width = seen.shape[1:]
+        if self._seen is None:
+            lines = self._lines
+            if lines is None:
+                lines = np.zeros((ORIENTATIONS, self._camera.height // 2, self._camera.width // 2), dtype=np.uint8)
+            height, width = lines.shape[1:]
             intrinsics = intrinsics_of(self._camera.scaled(width, height))
-            self._spread_lines = lines_at(seen, width, height, SPREAD_PX), intrinsics
-        return self._spread_lines
+            self._seen = SeenLines(lines_at(lines, width, height, SPREAD_PX), intrinsics)
+        return self._seen
 
     def _see_lines(self) -> None:
         if self._network is not None and self._lines is None:
