@@ -245,7 +245,7 @@ def test_options_without_sense_are_refused() -> None:
 def test_no_search_looks_beyond_the_declared_distances() -> None:
     seen = detector().picture(picture(None, seed=3, scene=3))
     low, high = detector().views.view_range.distance_mm
-    likely, _ = detector().search.likely(seen, WIDE)
+    likely = detector().search.likely(seen, WIDE).poses
     climbed = detector().climbed(seen, detector().search.starts(seen, WIDE), WIDE)
     poses = np.concatenate([likely, [candidate.cam_from_body for candidate in climbed]])
     distances_mm = np.linalg.norm(poses[:, :3, 3], axis=1)
@@ -257,7 +257,7 @@ def test_matches_that_all_leave_the_declared_distances_are_no_detection(monkeypa
     search = detector().search
     monkeypatch.setattr(search, "_reach_mm", (1.0, 2.0))
     seen = detector().picture(picture(pose_from(30, 40, 500.0)))
-    likely, lines = search.likely(seen, WIDE)
+    likely, lines, _ = search.likely(seen, WIDE)
     assert likely.shape == (0, 4, 4) and lines.shape == (0,)
     assert detector().detect(seen.image) == []
 

@@ -182,17 +182,17 @@ def _printed_on(frame: SequenceFrame, photos: Sequence[Path], rng: np.random.Gen
 
 def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Array | None) -> Iterator[Group | Looks]:
     picture = detector.picture(image)
-    likely, view_lines = detector.search.likely(picture, WIDE)
-    climbed = detector.climbed(picture, detector.search.judged(picture, likely, view_lines, WIDE), WIDE)
+    likely = detector.search.likely(picture, WIDE)
+    climbed = detector.climbed(picture, detector.search.judged(picture, likely, WIDE), WIDE)
     refined = detector.settled(picture, climbed)
     climbed_poses = np.array([c.cam_from_body for c in climbed]).reshape(-1, 4, 4)
-    rng = np.random.default_rng(len(likely))
+    rng = np.random.default_rng(len(likely.poses))
     if truth is None:
         yield from _looks(seed, detector, picture, refined, climbed_poses, truth, rng)
         if refined:
             yield _group(seed, "refined", detector, picture, refined, np.zeros(len(refined), bool))
         return
-    for poses, share in ((likely, 1.0), (climbed_poses, CLIMBED_SHARE)):
+    for poses, share in ((likely.poses, 1.0), (climbed_poses, CLIMBED_SHARE)):
         if not len(poses):
             continue
         right, known = _told(detector, poses, truth, ROUGH_NEAR, ROUGH_APART, share)

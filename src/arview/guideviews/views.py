@@ -93,7 +93,6 @@ class GuideViewSet:
     poses: Array
     directions: Array
     arrays: dict[str, NDArray[Any]] = field(repr=False)
-    _cache: dict[int, GuideView] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -102,10 +101,7 @@ class GuideViewSet:
         return (self.view(index) for index in range(len(self)))
 
     def view(self, index: int) -> GuideView:
-        """The view of that index, decoded once and kept."""
-        cached = self._cache.get(index)
-        if cached is not None:
-            return cached
+        """The view of that index, decoded anew: all of a full sphere would take 80 MB if they were kept."""
         arrays = self.arrays
         c0, c1 = arrays["contour_start"][index : index + 2]
         e0, e1 = arrays["edge_start"][index : index + 2]
@@ -119,9 +115,7 @@ class GuideViewSet:
             edge_kinds=np.array(arrays["edge_kinds"][e0:e1]),
             edge_component=arrays["edge_component"][e0:e1].astype(np.int32),
         )
-        view = GuideView(index=index, cam_from_model=self.poses[index], features=features)
-        self._cache[index] = view
-        return view
+        return GuideView(index=index, cam_from_model=self.poses[index], features=features)
 
     def nearest(self, cam_from_model: Array) -> GuideView:
         """The view whose direction is nearest to that of the camera at this pose."""

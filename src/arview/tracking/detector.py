@@ -25,7 +25,7 @@ from arview.guideviews.sphere import icosphere_directions
 from arview.tracking.ambiguity import LEAD, TELLING, find_symmetries, telling
 from arview.tracking.climb import climb
 from arview.tracking.components import ComponentCheck
-from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch
+from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch, weighed
 from arview.tracking.judge import FINE, judge
 from arview.tracking.line_network import LineNetwork, line_support
 from arview.tracking.picture import Picture
@@ -68,6 +68,9 @@ ALIKE_ASIDE, ALIKE_ALONG, ALIKE_DEG = 0.12, 0.15, 20.0
 """Hypotheses this near, across in diameters and along as a share of the distance, are no rivals of each other."""
 HERE_ASIDE, HERE_ALONG = 0.35, 0.25
 """Rivals this near are at the same place."""
+CLIMBED_WORTH = 12.0
+"""A weighed response of 1 more after the pattern search is worth as much of what the judge says: in pictures of random
+solids a right pose is among the first ten of its end in 75 with it, in 71 without, of 88 that have one at all."""
 COARSE_TOLERANCE_PX, FINE_TOLERANCE_PX = 3.5, 1.5
 """After the coarse and the fine stages edges are looked for this near."""
 FINE_STAGES = (
@@ -370,21 +373,23 @@ class Detector:
             size = max(2, -(-len(group) // 4))
             jobs += [(step, np.stack(group[i : i + size])) for i in range(0, len(group), size)]
 
-        def search(job: tuple[int, Array]) -> Array:
+        def search(job: tuple[int, Array]) -> tuple[Array, Array]:
             maps, intrinsics = picture.maps(job[0])
-            _, poses = climb(
+            found: tuple[Array, Array] = climb(
                 maps, self.tracker.part.arrays, job[1], intrinsics, 0.01 * self.views.diameter_mm,
                 np.deg2rad(level.turn_step_deg), level.stretch_step, level.rounds, level.halvings, 2, 2,
                 level.points, level.points,
             )  # fmt: skip
-            return np.asarray(poses)
+            return found
 
-        poses = np.concatenate([np.empty((0, 4, 4)), *pool().map(search, jobs)])
-        poses = poses[self.search.are_in_range(poses)]
+        found = [(np.empty(0), np.empty((0, 4, 4))), *pool().map(search, jobs)]
+        responses, poses = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        is_in_range = self.search.are_in_range(poses)
+        responses, poses = responses[is_in_range], poses[is_in_range]
         if not len(poses):
             return []
         lines = np.array([self.view_lines(pose) for pose in poses])
-        scores = judge(picture, self.tracker.part, poses, lines)
+        scores = judge(picture, self.tracker.part, poses, lines) + CLIMBED_WORTH * weighed(responses, lines)
         order = np.argsort(-scores, kind="stable")
         scores, poses = scores[order], poses[order]
         reach = np.full(len(poses), 0.01 * level.apart_deg * self.views.diameter_mm) / poses[:, 2, 3]

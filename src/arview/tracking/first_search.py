@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,9 @@ LARGEST_SCALE = 1.5
 """The picture is not enlarged more than this."""
 LOWEST_SCORE = 0.3
 """Template matches below this are noise."""
+RESPONSE_WORTH = 10.0
+"""A mean response of 1 more is worth as much of what the judge says: it knows gradients only. In 96 pictures of random
+solids a right start is first in 55 with it, in 47 without."""
 NEARER, FARTHER = 0.85, 1.18
 """Poses are looked for so far beyond the declared distances, as shares of them."""
 CELL_PX, CELL_ROLL = 4.0, 0.33
@@ -132,6 +136,17 @@ class Matches:
         return Matches(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
+class Likely(NamedTuple):
+    """Poses (N,4,4) about the model's centre, best first by ``responses`` (N,) 0–1 and the ``lines`` (N,) they show."""
+
+    poses: Array
+    lines: Array
+    responses: Array
+
+
+NOTHING_LIKELY = Likely(np.empty((0, 4, 4)), np.empty(0), np.empty(0))
+
+
 def _joined(parts: list[Matches]) -> Matches:
     return Matches(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Matches)))
 
@@ -192,7 +207,7 @@ class FirstSearch:
 
     def starts(self, picture: Picture, effort: Effort = QUICK) -> list[Candidate]:
         """Poses for the best matches over the whole range, apart from each other, best first."""
-        return self.judged(picture, *self.likely(picture, effort), effort)
+        return self.judged(picture, self.likely(picture, effort), effort)
 
     def are_in_range(self, poses: Array) -> NDArray[np.bool_]:
         """Which poses (N,4,4) about the centre are in front of the camera and at a declared distance, or nearly so."""
@@ -202,13 +217,14 @@ class FirstSearch:
         low, high = self._reach_mm
         return np.asarray((low <= distances_mm) & (distances_mm <= high))
 
-    def judged(self, picture: Picture, poses: Array, lines: Array, effort: Effort = QUICK) -> list[Candidate]:
+    def judged(self, picture: Picture, likely: Likely, effort: Effort = QUICK) -> list[Candidate]:
         """The starts among likely poses, best first."""
-        scores = judge(picture, self._part, poses, lines)
-        return [Candidate(float(scores[k]), poses[k]) for k in np.argsort(-scores, kind="stable")[: effort.starts]]
+        scores = judge(picture, self._part, likely.poses, likely.lines) + RESPONSE_WORTH * likely.responses
+        best = np.argsort(-scores, kind="stable")[: effort.starts]
+        return [Candidate(float(scores[k]), likely.poses[k]) for k in best]
 
-    def likely(self, picture: Picture, effort: Effort = QUICK) -> tuple[Array, Array]:
-        """Poses (N,4,4) for the best matches by their responses, best first, and the lines (N,) of their views."""
+    def likely(self, picture: Picture, effort: Effort = QUICK) -> Likely:
+        """Poses for the best matches by their responses."""
         scales = self._steps[:: effort.scale_step]
         picture.make(scales)
         phases = list(pool().map(lambda step: decimate(picture.maps(step)[0], GRID_PX), scales))
@@ -222,18 +238,19 @@ class FirstSearch:
         found = pool().map(lambda job: self._match(votes[job[0]], kept, picture, *job), jobs)
         raw = [m for m in found if m is not None]
         if not raw:
-            return np.empty((0, 4, 4)), np.empty(0)
+            return NOTHING_LIKELY
         matches = self._distinct(_joined(raw), effort.matches)
         if not len(matches.keys):
-            return np.empty((0, 4, 4)), np.empty(0)
+            return NOTHING_LIKELY
         for growth in GROWTHS[:-1]:
             matches = self._improved(picture, matches, growth)
         matches = self._improved(picture, matches.best(effort.improved), GROWTHS[-1])
         if not len(matches.keys):
-            return np.empty((0, 4, 4)), np.empty(0)
+            return NOTHING_LIKELY
         matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.looked_at)
         poses = np.stack([rigid(r, p) for r, p in zip(*self._posed(matches), strict=True)])
-        return poses, self.outlines.lines[matches.views]
+        lines = self.outlines.lines[matches.views]
+        return Likely(poses, lines, matches.keys / weighed(np.ones(len(lines)), lines))
 
     def _match(
         self,

@@ -27,8 +27,9 @@ SHRINK = 2
 """The network's maps are so many times smaller than what it is shown."""
 CELL_PX = 32
 """It takes pictures of multiples of this."""
-STRONG_SHARE, LEAST_CLEAR = 0.005, 0.25
-"""The strongest answers, at so many of all places, are taken for clear lines, if they are not all weaker than this."""
+AROUND_PX, CLEAR_SHARE, LEAST_CLEAR = 49, 0.9, 0.05
+"""Answers count relative to such a share of the strongest one this near (side of a square of the maps, smoothed), if
+that is not weaker than the last."""
 CONTRAST = 64.0
 """Grey levels less their mean are shown in units of this."""
 
@@ -43,7 +44,8 @@ class LineNetwork:
     def lines(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """How likely a line of each orientation runs through each place of an RGB picture (H,W,3).
 
-        A picture in which it is sure of little, as of materials that it does not know, is brought up to the others.
+        Where it is sure of little, as of materials that it does not know or before some textures, its answers are
+        brought up to those elsewhere.
 
         Returns:
             (8,h,w) 0–255, of half the picture's size, or of half of `LONGEST_SIDE_PX`.
@@ -57,10 +59,19 @@ class LineNetwork:
         shown = cv2.copyMakeBorder(shown, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REPLICATE)
         self._network.setInput(np.ascontiguousarray(shown.transpose(2, 0, 1))[None])
         seen = self._network.forward()[0, :ORIENTATIONS, : -(-height // SHRINK), : -(-width // SHRINK)]
-        strongest = seen.max(axis=0).ravel()
-        rank = int(STRONG_SHARE * len(strongest))
-        clear = max(LEAST_CLEAR, float(np.partition(strongest, -rank - 1)[-rank - 1]))
+        around = cv2.dilate(seen.max(axis=0), np.ones((AROUND_PX, AROUND_PX), dtype=np.uint8))
+        clear = np.maximum(CLEAR_SHARE * cv2.blur(around, (AROUND_PX // 2, AROUND_PX // 2)), LEAST_CLEAR)
         return np.asarray(np.round(255.0 * np.minimum(seen / clear, 1.0)).astype(np.uint8))
+
+
+def halved_lines(lines: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    """Maps (8,h,w), and again at half the size and so on as long as that is even; the strongest of four pixels."""
+    levels = [lines]
+    block = np.ones((2, 2), dtype=np.uint8)
+    while levels[-1].shape[1] % 2 == 0 and levels[-1].shape[2] % 2 == 0:
+        # Each place has the strongest of itself and of what is above and to the left of it.
+        levels.append(np.stack([cv2.dilate(plane, block)[1::2, 1::2] for plane in levels[-1]]))
+    return levels
 
 
 def lines_at(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) -> NDArray[np.uint8]:
@@ -69,7 +80,7 @@ def lines_at(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) 
     side = max(1, int(shrunk + 0.5))
     merged = np.ones((side, side), dtype=np.uint8)
     spread = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * spread_px + 1, 2 * spread_px + 1))
-    way = cv2.INTER_AREA if shrunk > 1.0 else cv2.INTER_LINEAR
+    way = cv2.INTER_AREA if shrunk > 1.6 else cv2.INTER_LINEAR
     sized = np.empty((len(lines), height, width), dtype=np.uint8)
     for plane, out in zip(lines, sized, strict=True):
         strongest = cv2.dilate(plane, merged) if side > 1 else plane

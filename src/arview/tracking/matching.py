@@ -127,15 +127,17 @@ def _without_common(spread, pad):  # type: ignore[no-untyped-def]
     for y in range(height):
         common[:] = 0
         for o in range(count):
+            line = spread[o, y]
             for x in range(width):
-                common[x] += np.int32(spread[o, y, x])
+                common[x] += np.int32(line[x])
         for x in range(width):
-            common[x] = (common[x] * part) >> 8
+            common[x] = np.int32(common[x] * part) >> np.int32(8)
         for o in range(count):
-            line = maps[o, y + pad]
+            # Slices and 32 bits throughout, or the loop is not done several pixels at a time.
+            line, out = spread[o, y], maps[o, y + pad, pad : pad + width]
             for x in range(width):
-                value = ((np.int32(spread[o, y, x]) - common[x]) * stretch) >> 8
-                line[x + pad] = np.uint8(min(max(value, np.int32(0)), np.int32(255)))
+                value = np.int32((np.int32(line[x]) - common[x]) * stretch) >> np.int32(8)
+                out[x] = np.uint8(min(max(value, np.int32(0)), np.int32(255)))
     return maps
 
 

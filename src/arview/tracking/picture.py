@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array
-from arview.tracking.line_network import LineNetwork, lines_at
+from arview.tracking.line_network import LineNetwork, halved_lines, lines_at
 from arview.tracking.matching import ORIENTATIONS, colour_gradients, response_maps
 from arview.tracking.threads import pool
 from arview.tracking.tracker import intrinsics_of, smoothed
@@ -81,7 +81,8 @@ class Picture:
         self.focal_px = 0.5 * (camera.fx + camera.fy)
         self._camera = camera
         self._network = network
-        self._lines: NDArray[np.uint8] | None = None
+        self._halved = _halved(image)
+        self._lines: list[NDArray[np.uint8]] = []
         self._seen: SeenLines | None = None
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
         self._gradients: dict[int, Gradients] = {}
@@ -109,17 +110,22 @@ class Picture:
         """What the network alone sees; nothing without a network."""
         self._see_lines()
         if self._seen is None:
-            lines = self._lines
-            if lines is None:
-                lines = np.zeros((ORIENTATIONS, self._camera.height // 2, self._camera.width // 2), dtype=np.uint8)
-            height, width = lines.shape[1:]
+            height, width = self._camera.height // 2, self._camera.width // 2
+            if self._lines:
+                height, width = self._lines[0].shape[1:]
             intrinsics = intrinsics_of(self._camera.scaled(width, height))
-            self._seen = SeenLines(lines_at(lines, width, height, SPREAD_PX), intrinsics)
+            self._seen = SeenLines(self._lines_at(width, height), intrinsics)
         return self._seen
 
     def _see_lines(self) -> None:
-        if self._network is not None and self._lines is None:
-            self._lines = self._network.lines(self.image)
+        if self._network is not None and not self._lines:
+            self._lines = halved_lines(self._network.lines(self.image))
+
+    def _lines_at(self, width: int, height: int) -> NDArray[np.uint8]:
+        """What the network sees, spread (8,H,W)."""
+        if not self._lines:
+            return np.zeros((ORIENTATIONS, height, width), dtype=np.uint8)
+        return lines_at(_smallest(self._lines, width, 2), width, height, SPREAD_PX)
 
     def gradients(self, step: int) -> Gradients:
         """Gradients and colours of the picture at a scale."""
@@ -139,10 +145,10 @@ class Picture:
         intrinsics = intrinsics_of(self._camera.scaled(width, height))
         intrinsics[2:4] += self.pad_px
         maps = response_maps(self._resized(per_map * width, per_map * height), SPREAD_PX, self.pad_px, per_map)
-        if self._lines is not None:
+        if self._lines:
             inside = maps[:, self.pad_px : self.pad_px + height, self.pad_px : self.pad_px + width]
-            for plane, lines in zip(inside, lines_at(self._lines, width, height, SPREAD_PX), strict=True):
-                plane[:] = cv2.addWeighted(plane, 0.5, lines, 0.5, 0.0)
+            for plane, lines in zip(inside, self._lines_at(width, height), strict=True):
+                cv2.addWeighted(plane, 0.5, lines, 0.5, 0.0, dst=plane)
         return maps, intrinsics
 
     def _size(self, step: int) -> tuple[int, int]:
@@ -150,7 +156,21 @@ class Picture:
         return max(8, round(self._camera.width * scale)), max(8, round(self._camera.height * scale))
 
     def _resized(self, width: int, height: int) -> NDArray[np.uint8]:
-        if (width, height) == (self._camera.width, self._camera.height):
-            return self.image
-        way = cv2.INTER_AREA if width < 0.6 * self._camera.width else cv2.INTER_LINEAR
-        return np.asarray(cv2.resize(self.image, (width, height), interpolation=way))
+        image = _smallest(self._halved, width, 1)
+        if (width, height) == image.shape[1::-1]:
+            return image
+        way = cv2.INTER_AREA if width < 0.6 * image.shape[1] else cv2.INTER_LINEAR
+        return np.asarray(cv2.resize(image, (width, height), interpolation=way))
+
+
+def _halved(image: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    """A picture, and again at half the size and so on as long as that is even: what smaller ones are made from."""
+    levels = [image]
+    while levels[-1].shape[0] % 2 == 0 and levels[-1].shape[1] % 2 == 0:
+        levels.append(np.asarray(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)))
+    return levels
+
+
+def _smallest(levels: list[NDArray[np.uint8]], width: int, axis: int) -> NDArray[np.uint8]:
+    """Of smaller and smaller arrays the last that need not be enlarged to a width, if there is one."""
+    return next((level for level in reversed(levels) if level.shape[axis] >= width), levels[0])

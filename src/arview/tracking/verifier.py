@@ -115,50 +115,84 @@ def raw_look(
     return np.dstack([crop, 255 * is_inside.astype(np.uint8)]), lines
 
 
-def contrasted(pixels: NDArray[np.uint8], lines: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+@njit(cache=True, nogil=True, fastmath=True)
+def contrasted(pixels, lines):  # type: ignore[no-untyped-def]
     """A raw look with colours less their mean, in units of their deviation (6,S,S), and that deviation."""
-    is_inside = (pixels[..., 3] > 0).astype(np.float32)
-    count = float(is_inside.sum()) + 1.0
-    colours = pixels[..., :3].transpose(2, 0, 1).astype(np.float32)
-    colours = (colours - (colours * is_inside).sum(axis=(1, 2), keepdims=True) / count) * is_inside
-    contrast = float(np.sqrt((colours**2).sum() / (3.0 * count) + 1e-6))
-    return np.concatenate([colours / (contrast + LEAST_CONTRAST), is_inside[None], lines]), contrast
+    rows, columns = pixels.shape[:2]
+    plain = np.zeros((6, rows, columns), dtype=np.float32)
+    sums = np.zeros(3)
+    count = 1.0
+    for v in range(rows):
+        for u in range(columns):
+            if pixels[v, u, 3] > 0:
+                count += 1.0
+                for c in range(3):
+                    sums[c] += pixels[v, u, c]
+    square = 0.0
+    for v in range(rows):
+        for u in range(columns):
+            plain[4, v, u], plain[5, v, u] = lines[0, v, u], lines[1, v, u]
+            if pixels[v, u, 3] > 0:
+                plain[3, v, u] = 1.0
+                for c in range(3):
+                    value = pixels[v, u, c] - sums[c] / count
+                    plain[c, v, u] = value
+                    square += value * value
+    contrast = np.sqrt(square / (3.0 * count) + 1e-6)
+    plain[:3] /= np.float32(contrast + LEAST_CONTRAST)
+    return plain, contrast
 
 
-def with_gradients(plain: NDArray[np.float32]) -> NDArray[np.float32]:
+@njit(cache=True, nogil=True, fastmath=True)
+def with_gradients(plain):  # type: ignore[no-untyped-def]
     """All that the network is shown (CHANNELS,S,S) from the first six of it; gradients relative to their mean."""
-    is_inside, lines = plain[3], plain[4:6]
-    across, down = (
-        is_inside[..., None] * slope for slope in _slopes(np.ascontiguousarray(plain[:3].transpose(1, 2, 0)))
-    )
-    strongest = np.argmax(across**2 + down**2, axis=2)[..., None]
-    across, down = (np.take_along_axis(slope, strongest, axis=2)[..., 0] for slope in (across, down))
-    normal_x, normal_y = _slopes(np.ascontiguousarray(lines[0]))
-    beside = (np.abs(lines[0]) < BESIDE) / (np.sqrt(normal_x**2 + normal_y**2) + 1e-3)
-    size = np.sqrt(across**2 + down**2)
-    gradients = np.stack(
-        [
-            size,
-            np.abs(across * normal_x + down * normal_y) * beside,
-            np.abs(across * normal_y - down * normal_x) * beside,
-        ]
-    )
-    gradients /= gradients + (size.mean() + LEAST_GRADIENT)
-    return np.concatenate([plain, gradients, gradients[:1] * lines[1:]]).astype(np.float32, copy=False)
+    rows, columns = plain.shape[1:]
+    shown = np.zeros((CHANNELS, rows, columns), dtype=np.float32)
+    shown[:6] = plain
+    slope = np.empty(2, dtype=np.float32)
+    normal = np.empty(2, dtype=np.float32)
+    total = 0.0
+    for v in range(rows):
+        for u in range(columns):
+            if plain[3, v, u] == 0.0:
+                continue
+            across, down, most = np.float32(0.0), np.float32(0.0), np.float32(-1.0)
+            for c in range(3):
+                _slope_at(plain[c], v, u, slope)
+                square = slope[0] * slope[0] + slope[1] * slope[1]
+                if square > most:
+                    across, down, most = slope[0], slope[1], square
+            _slope_at(plain[4], v, u, normal)
+            size = np.sqrt(most)
+            total += size
+            shown[6, v, u] = size
+            if abs(plain[4, v, u]) < BESIDE:
+                steep = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1]) + np.float32(1e-3)
+                shown[7, v, u] = abs(across * normal[0] + down * normal[1]) / steep
+                shown[8, v, u] = abs(across * normal[1] - down * normal[0]) / steep
+    mean = np.float32(total / (rows * columns) + LEAST_GRADIENT)
+    for channel in range(6, 9):
+        for v in range(rows):
+            for u in range(columns):
+                shown[channel, v, u] /= shown[channel, v, u] + mean
+    shown[9] = shown[6] * plain[5]
+    return shown
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _slope_at(plane, v, u, slope):  # type: ignore[no-untyped-def]
+    """Slopes of a plane at a pixel by Sobel's weights, to the right and down; beyond the rim it goes on as there."""
+    up, low = max(v - 1, 0), min(v + 1, plane.shape[0] - 1)
+    left, right = max(u - 1, 0), min(u + 1, plane.shape[1] - 1)
+    a, b, c, d = plane[up, left], plane[up, right], plane[low, left], plane[low, right]
+    slope[0] = np.float32(0.125) * (b - a + d - c + np.float32(2.0) * (plane[v, right] - plane[v, left]))
+    slope[1] = np.float32(0.125) * (c - a + d - b + np.float32(2.0) * (plane[low, u] - plane[up, u]))
 
 
 def overall(radius_px: float, contrast: float, known: Array) -> NDArray[np.float32]:
     """What the network is told of a pose as a whole (GLOBALS,): see there."""
     both = [np.log(radius_px / TYPICAL_RADIUS_PX), 0.5 * np.log(contrast / TYPICAL_CONTRAST + 0.05)]
     return np.concatenate([both, (known - MEANS) / DEVIATIONS]).astype(np.float32)
-
-
-def _slopes(plane: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Slopes of a plane or of several, to the right and down."""
-    kind, border = cv2.CV_32F, cv2.BORDER_REPLICATE
-    right = cv2.Sobel(plane, kind, 1, 0, ksize=3, scale=0.125, borderType=border)
-    down = cv2.Sobel(plane, kind, 0, 1, ksize=3, scale=0.125, borderType=border)
-    return np.asarray(right), np.asarray(down)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
