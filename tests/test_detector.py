@@ -16,7 +16,7 @@ from arview.pose import TrackingState
 from arview.tracking import Detector, DetectorOptions, TrackingSession
 from arview.tracking.ambiguity import TELLING, EdgeSteps, find_symmetries, telling
 from arview.tracking.detector import Hypothesis
-from arview.tracking.first_search import FARTHER, NEARER, WIDE
+from arview.tracking.first_search import FARTHER, NEARER, RESPONSE_WORTH, WIDE, Likely
 from arview.tracking.quality import Evidence
 from cad_files import box
 from synthetic import (
@@ -251,6 +251,16 @@ def test_no_search_looks_beyond_the_declared_distances() -> None:
     distances_mm = np.linalg.norm(poses[:, :3, 3], axis=1)
     assert len(likely) > 100 and climbed
     assert distances_mm.min() >= NEARER * low and distances_mm.max() <= FARTHER * high
+
+
+def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None:
+    seen = detector().picture(picture(pose_from(30, 40, 500.0)))
+    pose = pose_from(10, 20, 480.0) @ detector().tracker.part.model_from_body
+    responses = np.array([0.2, 0.7, 0.4])
+    alike = Likely(np.stack([pose] * 3), np.full(3, 12.0), responses)
+    found = detector().search.judged(seen, alike)
+    scores = [candidate.score for candidate in found]
+    assert scores[0] - scores[1] == pytest.approx(0.3 * RESPONSE_WORTH) and scores[1] > scores[2]
 
 
 def test_matches_that_all_leave_the_declared_distances_are_no_detection(monkeypatch: pytest.MonkeyPatch) -> None:

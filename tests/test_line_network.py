@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from arview.geometry import Array
-from arview.tracking.line_network import LONGEST_SIDE_PX, LineNetwork, lines_at
+from arview.tracking.line_network import LONGEST_SIDE_PX, LineNetwork, halved_lines, lines_at
 from arview.tracking.matching import ORIENTATIONS, orientation_bins, response_maps
 from arview.tracking.picture import Picture
 from arview.tracking.solver import project_lines
@@ -58,7 +59,44 @@ def test_it_hardly_answers_to_noise() -> None:
     rng = np.random.default_rng(0)
     noise = np.clip(110 + 14 * rng.standard_normal((480, 640, 3)), 0, 255).astype(np.uint8)
     seen = network().lines(noise)
-    assert np.mean(seen.max(axis=0) > 64) < 0.01
+    assert np.mean(seen.max(axis=0) > 128) < 0.01
+
+
+class Answers:
+    """Stands in for the network: these answers, whatever it is shown."""
+
+    def __init__(self, seen: NDArray[np.float32]) -> None:
+        self._seen = seen[None]
+
+    def setInput(self, blob: NDArray[np.float32]) -> None:
+        assert blob.shape == (1, 3, 320, 640)
+
+    def forward(self) -> NDArray[np.float32]:
+        return self._seen
+
+
+def test_answers_count_relative_to_the_clearest_nearby_but_hardly_any_stay_so() -> None:
+    seen = np.zeros((ORIENTATIONS + 1, 160, 320), dtype=np.float32)
+    seen[3, :, 20], seen[5, 40, 200:], seen[1, 120, 200:] = 0.9, 0.3, 0.02
+    seen[0, :, 30] = 0.3  # beside a clear one
+    lines = LineNetwork()
+    lines._network = Answers(seen)
+    found = lines.lines(np.zeros((320, 640, 3), dtype=np.uint8)).astype(float) / 255.0
+    assert found[3, 60:100, 20].min() == 1.0
+    assert found[5, 40, 240:280].min() == 1.0  # as clear as any around
+    assert found[1, 120, 240:280].max() < 0.15
+    assert 0.3 < found[0, 60:100, 30].max() < 0.4
+
+
+def test_smaller_maps_keep_the_strongest_of_four() -> None:
+    rng = np.random.default_rng(0)
+    lines = rng.integers(0, 256, (ORIENTATIONS, 24, 40)).astype(np.uint8)
+    levels = halved_lines(lines)
+    assert [level.shape[1:] for level in levels] == [(24, 40), (12, 20), (6, 10), (3, 5)]
+    for level, half in pairwise(levels):
+        _, rows, columns = half.shape
+        blocks = level.reshape(ORIENTATIONS, rows, 2, columns, 2)
+        np.testing.assert_array_equal(half, blocks.max(axis=(2, 4)))
 
 
 @pytest.mark.parametrize(("height", "width"), [(480, 640), (257, 331), (720, 1280), (40, 30)])

@@ -19,14 +19,20 @@ from line_examples import FINE, LinedPicture
 
 WIDTHS = (16, 24, 40, 56, 64)
 """Of the levels, each half as large as that before."""
+DEEPER = (0, 0, 2, 2)
+"""So many residual blocks (He et al., CVPR 2016) on the levels after the first: they cost little on the small ones."""
 CROP_PX, CROPS = 256, 8
 """A step looks at so many squares of pictures."""
 AROUND_LINES, AROUND_PX = 0.75, 110
 """So many of them about a line, so far off it at most."""
 LINE_WEIGHT, LINES_WEIGHT, INSIDE_WEIGHT = 5.0, 4.0, 0.2
 """Of places with a line against those without; of lines; of the solids' inside, which is told for their sake only."""
-MOTTLED = 0.45
-"""So many solids have a grain."""
+RESIZED, SIZES = 0.5, (0.62, 1.3)
+"""So many squares are shown at another size."""
+MOTTLED, CLUTTERED = 0.45, 0.3
+"""So many solids have a grain; before so many squares flat things are drawn where no solid is."""
+FEWEST_THINGS, MOST_THINGS = 1, 6
+"""Drawn there."""
 RATE, DECAY, WARM_UP = 2.5e-3, 1e-2, 0.01
 HELD_OUT = 20
 """Every so manieth picture is not fitted to."""
@@ -106,22 +112,32 @@ def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[n
     if len(picture.lines) and rng.random() < AROUND_LINES:
         line = picture.lines[rng.integers(len(picture.lines)), :2].astype(np.int64)
         middle = line // FINE + rng.integers(-AROUND_PX, AROUND_PX, 2)
-    top, left = (np.clip(middle - CROP_PX // 2, 0, size - CROP_PX) // SHRINK * SHRINK).tolist()
-    square = np.s_[top : top + CROP_PX, left : left + CROP_PX]
+    scale = rng.uniform(*SIZES) if rng.random() < RESIZED else 1.0
+    taken_px = min(round(CROP_PX / scale), int(size.min())) // SHRINK * SHRINK
+    top, left = (np.clip(middle - taken_px // 2, 0, size - taken_px) // SHRINK * SHRINK).tolist()
+    square = np.s_[top : top + taken_px, left : left + taken_px]
+    way = cv2.INTER_AREA if taken_px > CROP_PX else cv2.INTER_LINEAR
+    image, inside = (cv2.resize(plane[square], (CROP_PX, CROP_PX), interpolation=way) for plane in (image, inside))
     side = CROP_PX // SHRINK
     truth = np.zeros((ORIENTATIONS + 1, side, side), np.float32)
-    lines = picture.lines.astype(np.int64)
-    rows, columns = ((lines[:, k] - FINE * low) // (FINE * SHRINK) for k, low in enumerate((top, left)))
+    per_fine = CROP_PX / taken_px / (FINE * SHRINK)
+    rows, columns = (
+        np.floor((picture.lines[:, k].astype(float) - FINE * low) * per_fine).astype(np.int64)
+        for k, low in enumerate((top, left))
+    )
     is_in = (rows >= 0) & (rows < side) & (columns >= 0) & (columns < side)
-    rows, columns, position = rows[is_in], columns[is_in], lines[is_in, 2] / 256.0 * ORIENTATIONS
+    rows, columns, position = rows[is_in], columns[is_in], picture.lines[is_in, 2] / 256.0 * ORIENTATIONS
     low = np.floor(position).astype(np.int64)
     # A line between two orientations counts for both, as in `matching`.
     for bins, share in ((low, 1.0 - position + low), (low + 1, position - low)):
         np.maximum.at(truth, (bins % ORIENTATIONS, rows, columns), np.minimum(1.0, 2.0 * share).astype(np.float32))
-    truth[ORIENTATIONS] = cv2.resize(inside[square], (side, side), interpolation=cv2.INTER_AREA) / 255.0
-    plain = image[square].astype(np.float32)
+    truth[ORIENTATIONS] = cv2.resize(inside, (side, side), interpolation=cv2.INTER_AREA) / 255.0
+    covered = (inside / np.float32(255.0))[..., None]
+    plain = np.asarray(image, dtype=np.float32)
+    if rng.random() < CLUTTERED:
+        plain = covered * plain + (1.0 - covered) * _with_flat_things(image, rng)
     if rng.random() < MOTTLED:
-        plain *= _mottles(rng) ** (inside[square] / 255.0)[..., None]
+        plain = plain * _mottles(rng) ** covered
     shown = _spoilt(plain, rng)
     if rng.random() < 0.5:
         shown, truth = shown[:, ::-1], truth[TURNED["mirrored"], :, ::-1]
@@ -143,17 +159,63 @@ def _mottles(rng: np.random.Generator) -> NDArray[np.float32]:
     return np.clip(1.0 + rng.uniform(0.04, 0.35) * mixed, 0.1, 2.5)[..., None]
 
 
+def _with_flat_things(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A copy with lines, discs, cards and letters drawn on it: things that have edges and are no solids."""
+    drawn = image.copy()
+    for _ in range(rng.integers(FEWEST_THINGS, MOST_THINGS + 1)):
+        colour = tuple(rng.integers(0, 256, 3).tolist())
+        kind, width = rng.choice(4, p=(0.3, 0.2, 0.25, 0.25)), int(rng.integers(1, 6))
+        at, to = (tuple(rng.integers(-20, CROP_PX + 20, 2).tolist()) for _ in range(2))
+        if kind == 0:
+            cv2.line(drawn, at, to, colour, width, cv2.LINE_AA)
+        elif kind == 1:
+            cv2.circle(drawn, at, int(rng.integers(4, 70)), colour, width if rng.random() < 0.6 else -1, cv2.LINE_AA)
+        elif kind == 2:
+            card = (tuple(map(float, at)), tuple(rng.uniform(10, 140, 2).tolist()), float(rng.uniform(0, 90)))
+            corners = cv2.boxPoints(card).astype(np.int32)
+            if rng.random() < 0.5:
+                cv2.polylines(drawn, [corners], True, colour, width, cv2.LINE_AA)
+            else:
+                cv2.fillPoly(drawn, [corners], colour, cv2.LINE_AA)
+        else:
+            text = "".join(map(chr, rng.integers(48, 123, rng.integers(1, 9))))
+            cv2.putText(
+                drawn, text, at, int(rng.integers(0, 8)), rng.uniform(0.4, 2.5), colour, 1 + width // 2, cv2.LINE_AA
+            )
+    return drawn
+
+
+def _moved(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """As blurred by motion."""
+    way, middle = rng.uniform(0.0, np.pi), 6
+    half = 0.5 * rng.uniform(2.0, 9.0) * np.array([np.cos(way), np.sin(way)])
+    kernel = np.zeros((2 * middle + 1, 2 * middle + 1), np.float32)
+    ends = [tuple(np.round(middle + sign * half).astype(int).tolist()) for sign in (-1, 1)]
+    cv2.line(kernel, ends[0], ends[1], (1.0,))
+    return np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum()))
+
+
 def _spoilt(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Paler, darker, blurred, noisy, compressed: each now and then."""
+    """Paler, more saturated, tinted, darker, lit from a side, blurred, noisy, compressed: each now and then."""
+    if rng.random() < 0.6:
+        grey = rng.uniform(-1.5, 1.0) if rng.random() < 0.5 else rng.uniform()
+        image = grey * image.mean(axis=2, keepdims=True) + (1.0 - grey) * image
+    if rng.random() < 0.25:
+        image = image * rng.uniform(0.55, 1.35, 3)
+    image = np.clip(image, 0.0, 255.0).astype(np.float32)
     if rng.random() < 0.5:
-        share = rng.uniform()
-        image = share * image.mean(axis=2, keepdims=True) + (1.0 - share) * image
-    if rng.random() < 0.5:
-        image = 255.0 * (np.clip(image, 0.0, 255.0) / 255.0) ** rng.uniform(0.6, 1.6)
+        image = 255.0 * (image / 255.0) ** rng.uniform(0.6, 1.6)
     if rng.random() < 0.4:
         image = image * rng.uniform(0.5, 1.1)
-    if rng.random() < 0.5:
+    if rng.random() < 0.45:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.5)))
+    elif rng.random() < 0.25:
+        image = _moved(image, rng)
+    if rng.random() < 0.15:
+        way = rng.uniform(0.0, 2.0 * np.pi)
+        down, right = np.mgrid[:CROP_PX, :CROP_PX] / CROP_PX - 0.5
+        slope = rng.uniform(0.2, 1.0) * (right * np.cos(way) + down * np.sin(way))
+        image = image * np.clip(1.0 + slope, 0.2, 1.8)[..., None]
     noise = rng.uniform(1.0, 4.0) if rng.random() < 0.5 else rng.uniform(4.0, 22.0)
     image = image + noise * rng.standard_normal(image.shape)
     spoilt = np.clip(np.round(image), 0, 255).astype(np.uint8)
@@ -191,20 +253,35 @@ def _network(torch: Any) -> Any:
         layer = nn.Conv2d(before, after, size, step, size // 2, bias=False)
         return nn.Sequential(layer, nn.BatchNorm2d(after), nn.ReLU())
 
+    class _Residual(nn.Module):  # type: ignore[misc, name-defined]
+        def __init__(self, width: int) -> None:
+            super().__init__()
+            self.one = convolution(width, width)
+            self.other = nn.Conv2d(width, width, 3, padding=1, bias=False)
+            self.norm = nn.BatchNorm2d(width)
+            nn.init.zeros_(self.norm.weight)
+
+        def forward(self, before: Any) -> Any:
+            return nn.functional.relu(before + self.norm(self.other(self.one(before))))
+
+    def down(before: int, after: int, blocks: int) -> Any:
+        residuals = [_Residual(after) for _ in range(blocks)]
+        return nn.Sequential(convolution(before, after, 3, 2), convolution(after, after), *residuals)
+
     class _Network(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
             pairs = list(pairwise(WIDTHS))
             self.first = convolution(3, WIDTHS[0], 5, 2)
-            self.down = nn.ModuleList(nn.Sequential(convolution(a, b, 3, 2), convolution(b, b)) for a, b in pairs)
+            self.down = nn.ModuleList(down(a, b, n) for (a, b), n in zip(pairs, DEEPER, strict=True))
             self.narrow = nn.ModuleList(convolution(b, a, 1) for a, b in pairs)
             self.up = nn.ModuleList(convolution(a, a) for a, _ in pairs)
             self.last = nn.Conv2d(WIDTHS[0], ORIENTATIONS + 1, 1)
 
         def forward(self, shown: Any) -> Any:
             levels = [self.first(shown)]
-            for down in self.down:
-                levels.append(down(levels[-1]))
+            for level in self.down:
+                levels.append(level(levels[-1]))
             seen = levels.pop()
             for level, narrow, up in zip(reversed(levels), reversed(self.narrow), reversed(self.up), strict=True):
                 seen = up(level + nn.functional.interpolate(narrow(seen), scale_factor=2, mode="nearest"))

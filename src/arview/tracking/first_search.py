@@ -96,8 +96,8 @@ class Effort:
     scale_step: int
 
 
-QUICK = Effort(600, 300, 150, 40, (12, 5), 2)
-WIDE = Effort(5000, 5000, 3000, 300, (100, 40), 1)
+QUICK = Effort(400, 200, 100, 16, (6, 4), 2)
+WIDE = Effort(3500, 2000, 1000, 100, (40, 20), 1)
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 

@@ -27,7 +27,7 @@ SHRINK = 2
 """The network's maps are so many times smaller than what it is shown."""
 CELL_PX = 32
 """It takes pictures of multiples of this."""
-AROUND_PX, CLEAR_SHARE, LEAST_CLEAR = 49, 0.9, 0.05
+AROUND_PX, CLEAR_SHARE, LEAST_CLEAR = 49, 0.9, 0.15
 """Answers count relative to such a share of the strongest one this near (side of a square of the maps, smoothed), if
 that is not weaker than the last."""
 CONTRAST = 64.0
