@@ -23,7 +23,7 @@ NEAR_MM, EXACT_MM = 0.025, 0.012
 NEAR_SHARE, EXACT_SHARE = 0.9, 0.997
 """Shares of the edges that a near and an exact symmetry take onto others."""
 LOOKED_AT_VIEWS, LOOKED_AT_POINTS = 60, 6000
-LEAD = 3.0
+LEAD = 3.4
 """A pose whose logit is so much higher than a twin's is the right one without a closer look."""
 TELLING = 1.0
 """It is, too, when the edges that only it has are borne out better by so many deviations, see `telling`: of 213 pairs

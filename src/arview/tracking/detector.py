@@ -31,8 +31,10 @@ from arview.tracking.line_network import LineNetwork, line_support
 from arview.tracking.picture import Picture
 from arview.tracking.quality import (
     EVIDENCE_WEIGHT,
-    LINE_WEIGHT,
     RIGHT_WORTH,
+    VERIFIED_EVIDENCE,
+    VERIFIED_JUDGEMENT,
+    VERIFIED_LINES,
     Evidence,
     Leads,
     found_logit,
@@ -205,7 +207,8 @@ class Hypothesis:
     def logit(self) -> float:
         """For comparing the hypotheses of one picture, either all verified or none."""
         if self.verification is not None:
-            return self.verification + LINE_WEIGHT * self.line_support
+            others = VERIFIED_EVIDENCE * self.own_logit + VERIFIED_JUDGEMENT * self.judgement
+            return self.verification + others + VERIFIED_LINES * self.line_support
         return EVIDENCE_WEIGHT * self.own_logit + self.judgement
 
 
