@@ -31,6 +31,7 @@ from arview.tracking.line_network import LineNetwork, line_support
 from arview.tracking.picture import Picture
 from arview.tracking.quality import (
     EVIDENCE_WEIGHT,
+    FOUND_LINES,
     RIGHT_WORTH,
     VERIFIED_EVIDENCE,
     VERIFIED_JUDGEMENT,
@@ -204,6 +205,11 @@ class Hypothesis:
         return found_logit(self.evidence, self.lines, self.radius_px)
 
     @property
+    def seen(self) -> float:
+        """What verifier and line network say of it, once verified: for `found_probability`."""
+        return (self.verification or 0.0) + FOUND_LINES * self.line_support
+
+    @property
     def logit(self) -> float:
         """For comparing the hypotheses of one picture, either all verified or none."""
         if self.verification is not None:
@@ -292,7 +298,7 @@ class Detector:
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
         return [
-            found_probability(h.logit, h.own_logit, h.judgement, self.leads(h, hypotheses[k + 1 :]))
+            found_probability(h.seen, h.own_logit, h.judgement, self.leads(h, hypotheses[k + 1 :]))
             for k, h in enumerate(hypotheses)
         ]
 
