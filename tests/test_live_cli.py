@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import random
 import re
 import signal
 import subprocess
@@ -18,6 +19,7 @@ import pytest
 from click.testing import CliRunner
 
 from arview.cli import main
+from arview.errors import InputError
 from arview.live.addresses import LOOPBACK, bind
 from arview.video import open_source
 from live_client import Http
@@ -56,10 +58,14 @@ def link(process: subprocess.Popen[str]) -> tuple[str, int, str]:
 
 
 def free_port() -> int:
-    taken = bind(LOOPBACK, 0)
-    port = int(taken.getsockname()[1])
-    taken.close()
-    return port
+    """A port that is free now, and that nobody is given who asks for any free one, as tests beside this one do."""
+    while True:
+        port = random.randrange(20000, 30000)
+        try:
+            bind(LOOPBACK, port).close()
+        except InputError:
+            continue
+        return port
 
 
 def test_it_serves_until_ctrl_c_and_finishes_the_recording(tmp_path: Path) -> None:
