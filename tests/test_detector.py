@@ -182,7 +182,7 @@ def test_a_small_part_and_a_close_rival_are_doubted_and_a_pose_a_little_aside_is
     alone = quality(500.0, None, 0.0)
     assert alone > 0.5
     assert quality(500.0, 5.0, 8.0) == alone
-    assert quality(500.0, 5.0, 60.0) < 0.5 * alone and quality(500.0, 300.0, 8.0) < 0.7 * alone
+    assert quality(500.0, 5.0, 60.0) < 0.5 * alone and quality(500.0, 300.0, 8.0) < 0.5 * alone
     assert quality(2000.0, None, 0.0) < 0.5
 
 
