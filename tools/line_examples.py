@@ -14,12 +14,13 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from arview.atomic import replacing
-from arview.cad.model import Model, make_model
+from arview.cad.model import Component, Model, make_model
 from arview.evaluation.semisynthetic import CAMERA
 from arview.evaluation.semisynthetic.backgrounds import read_photo, surroundings
 from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.evaluation.semisynthetic.sequence import FILL_LIGHT, JOIN_BLUR_PX, KEY_LIGHT, paste
 from arview.evaluation.semisynthetic.shading import Light, ShadedModel, Surface
+from arview.evaluation.semisynthetic.solids import box
 from arview.geometry import Array, apply, rigid
 from arview.raster import rasterise
 from arview.video import Image
@@ -30,6 +31,18 @@ RADIUS_PX, OTHER_RADIUS_PX = (38.0, 300.0), (30.0, 120.0)
 """Half diameters of the first solid in a picture and of those beside it."""
 ALONE, NOT_ALONE = (0.55, 0.3, 0.15), (1, 2, 3)
 """Shares of pictures with so many solids."""
+CROWDED = 0.45
+"""Share of pictures with a crowd of solids, as on a bench: one that knows lone ones only is sure of nothing there."""
+CROWD, CROWD_RADIUS_PX, MEMBER_RADIUS_PX = (4, 11), (45.0, 180.0), (14.0, 75.0)
+"""So many are there, and half diameters of the first and of the others."""
+ON_BOARD, BOARD_RADIUS_PX = 0.6, (180.0, 330.0)
+"""Share of crowds before a board, and half its diameter."""
+OF_STEEL = 0.5
+"""Share of crowds of which most are of about one grey."""
+PATTERNED = 0.35
+"""Share of crowds before a surface with dots or stripes, which are no lines of solids."""
+PATTERN_SIZE = 1200, 900
+"""Of such a surface, px."""
 LEAST_DISTANCE = 0.75
 """No nearer than this, in diameters."""
 RECOLOURED, PLAIN, PRINTED = 0.5, 0.4, 0.35
@@ -84,6 +97,9 @@ def collect_lined_pictures(seeds: range, photos: Sequence[Path], folder: Path) -
 def _lined_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.random.Generator) -> LinedPicture:
     photo = read_photo(photos[rng.integers(len(photos))])
     picture = _crop(photo, rng).astype(np.float32)
+    is_crowded = rng.random() < CROWDED
+    if is_crowded and rng.random() < PATTERNED:
+        picture = _patterned(picture, rng)
     key = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
     if rng.random() < 0.6:
         key = Rotation.from_rotvec(rng.normal(0.0, 0.8, 3)).apply(key)
@@ -94,9 +110,8 @@ def _lined_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.rand
     normals = np.zeros((height, width, 3), np.float32)
     owners = np.zeros((height, width), np.int16)
     inside = np.zeros((CAMERA.height, CAMERA.width), np.float32)
-    placed = _placed(solids, rng)
-    # The far ones first.
-    for number, (solid, pose) in enumerate(sorted(placed, key=lambda of: -apply(of[1], of[0].center_in_model)[2]), 1):
+    placed = _crowd(solids, rng) if is_crowded else _placed(solids, rng)
+    for number, (solid, pose) in enumerate(placed, 1):
         surface = Surface()
         if rng.random() > PLAIN:
             surface = Surface(*(rng.uniform(*of) for of in ((0.4, 0.95), (0.0, 0.7), (0.0, 0.45), (6.0, 60.0))))
@@ -121,7 +136,7 @@ def _lined_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.rand
 
 
 def _placed(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Model, Array]]:
-    """Some solids and their poses: one anywhere, others near it or anywhere."""
+    """Some solids and their poses, the far ones first: one anywhere, others near it or anywhere."""
     size = np.array([CAMERA.width, CAMERA.height])
     placed: list[tuple[Model, Array]] = []
     first_px, first_radius_px = np.zeros(2), 0.0
@@ -136,21 +151,89 @@ def _placed(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Mod
         center_px = np.clip(center_px, 0.08 * size, 0.92 * size)
         if not number:
             first_px, first_radius_px = center_px, radius_px
-        distance_mm = max(0.5 * CAMERA.fx * solid.diameter_mm / radius_px, LEAST_DISTANCE * solid.diameter_mm)
-        rotation = Rotation.random(random_state=rng).as_matrix()
-        center = CAMERA.unproject(center_px[None])[0] * distance_mm
-        placed.append((solid, rigid(rotation, center - rotation @ solid.center_in_model)))
-    return placed
+        placed.append((solid, _pose_at(solid, center_px, radius_px, rng)))
+    return _far_first(placed)
+
+
+def _crowd(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Model, Array]]:
+    """Many solids and their poses, the far ones first, about one place; perhaps before a board."""
+    size = np.array([CAMERA.width, CAMERA.height])
+    has_board = rng.random() < ON_BOARD
+    middle_px = rng.uniform(0.25, 0.75, 2) * size
+    spread_px = rng.uniform(45.0, 110.0) if has_board else rng.uniform(60.0, 190.0)
+    steel = rng.uniform(0.15, 0.8) if rng.random() < OF_STEEL else None
+    placed = []
+    for number in range(rng.integers(*CROWD)):
+        solid = solids[rng.integers(len(solids))]
+        if steel is not None and rng.random() < 0.7:
+            colors = steel * rng.uniform(0.7, 1.3, (len(solid.components), 1)) + rng.normal(0.0, 0.03, 3)
+            solid = _coloured(solid, colors)
+        elif rng.random() < RECOLOURED:
+            solid = _recoloured(solid, rng)
+        radius_px = float(np.exp(rng.uniform(*np.log(MEMBER_RADIUS_PX if number else CROWD_RADIUS_PX))))
+        center_px = np.clip(rng.normal(middle_px, spread_px), 0.08 * size, 0.92 * size)
+        placed.append((solid, _pose_at(solid, center_px, radius_px, rng)))
+    placed = _far_first(placed)
+    if not has_board:
+        return placed
+    half = np.array([rng.uniform(120.0, 190.0), rng.uniform(80.0, 160.0), 8.0])
+    vertices, faces = box(-half, half)
+    color = tuple(np.clip(rng.uniform(0.2, 0.8) + rng.normal(0.0, 0.05, 3), 0.03, 0.97).tolist())
+    board = make_model("board", (Component("board", vertices, faces.astype(np.int32), color),))
+    # Drawn first, wherever it is.
+    return [(board, _pose_at(board, middle_px, rng.uniform(*BOARD_RADIUS_PX), rng)), *placed]
+
+
+def _pose_at(solid: Model, center_px: Array, radius_px: float, rng: np.random.Generator) -> Array:
+    """A random ``cam_from_model`` that shows a solid at a place, so large or, if that is too near, smaller."""
+    distance_mm = max(0.5 * CAMERA.fx * solid.diameter_mm / radius_px, LEAST_DISTANCE * solid.diameter_mm)
+    rotation = Rotation.random(random_state=rng).as_matrix()
+    center = CAMERA.unproject(center_px[None])[0] * distance_mm
+    return rigid(rotation, center - rotation @ solid.center_in_model)
+
+
+def _far_first(placed: list[tuple[Model, Array]]) -> list[tuple[Model, Array]]:
+    return sorted(placed, key=lambda of: -apply(of[1], of[0].center_in_model)[2])
+
+
+def _patterned(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """A picture with a surface before it, seen at a slant, that is dotted, striped or chequered."""
+    width, height = PATTERN_SIZE
+    surface = np.full((height, width, 3), rng.uniform(60.0, 230.0), np.float32)
+    pitch, color = int(rng.integers(18, 60)), (float(rng.uniform(0.0, 255.0)),) * 3
+    thick = max(1, int(pitch * rng.uniform(0.08, 0.38)))
+    if rng.random() < 0.75:
+        for y in range(0, height, pitch):
+            for x in range(0, width, pitch):
+                cv2.circle(surface, (x, y), thick, color, -1, cv2.LINE_AA)
+    else:
+        for x in range(0, width, pitch):
+            cv2.line(surface, (x, 0), (x, height), color, thick, cv2.LINE_AA)
+        for y in range(0, height, pitch) if rng.random() < 0.5 else ():
+            cv2.line(surface, (0, y), (width, y), color, thick, cv2.LINE_AA)
+    grain = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), rng.uniform(1.0, 8.0))
+    surface *= 1.0 + rng.uniform(0.02, 0.15) * (grain / grain.std())[..., None]
+    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    inward = 1.0 - 2.0 * corners
+    seen = corners * (CAMERA.width, CAMERA.height) + inward * rng.uniform(-240.0, -5.0, (4, 2))
+    way = cv2.getPerspectiveTransform(corners * np.float32(PATTERN_SIZE), seen.astype(np.float32))
+    size = CAMERA.width, CAMERA.height
+    share = cv2.warpPerspective(np.ones((height, width), np.float32), way, size)[..., None]
+    return np.asarray(picture * (1.0 - share) + cv2.warpPerspective(surface, way, size) * share)
 
 
 def _recoloured(solid: Model, rng: np.random.Generator) -> Model:
     base, gray = rng.uniform(0.15, 0.9, 3), rng.uniform()
     base = gray * base.mean() + (1.0 - gray) * base
-    components = []
-    for component in solid.components:
-        color = base if rng.random() < 0.5 else rng.uniform(0.1, 0.9) + rng.normal(0.0, 0.1, 3)
-        components.append(replace(component, color=tuple(np.clip(color, 0.03, 0.97).tolist())))
-    return make_model(solid.name, tuple(components))
+    others = [rng.uniform(0.1, 0.9) + rng.normal(0.0, 0.1, 3) for _ in solid.components]
+    return _coloured(solid, np.stack([base if rng.random() < 0.5 else other for other in others]))
+
+
+def _coloured(solid: Model, colors: Array) -> Model:
+    """A solid with other colours (C,3) of its components."""
+    limited = [tuple(color) for color in np.clip(colors, 0.03, 0.97).tolist()]
+    components = zip(solid.components, limited, strict=True)
+    return make_model(solid.name, tuple(replace(component, color=color) for component, color in components))
 
 
 def _crop(photo: Image, rng: np.random.Generator) -> Image:
