@@ -109,13 +109,15 @@ FAR_STAGES = (
 colours show it leads past them. Of 720 pairs of semi-synthetic frames one or two steps apart, without a prediction,
 the usual ones and those nearby bring 362 within 5 cm and 5°, with these 591."""
 
+IN_PICTURE_SHARE = 0.9
+"""With less of the outline in the picture no texture is remembered."""
 STRANGE_TURN_RAD = 0.785
 """A turn away from the prediction that is as strange as a way of STRANGE_WAY diameters aside."""
 STRANGE_WAY = 0.35
 STRANGE_WORTH = 0.15
 """What a pose must be worth more for each such way from the prediction: turned parts often look alike."""
 CLEARLY_MORE = 0.02
-"""A pose found by the search is worth so much more than that of the usual stages, or is not taken."""
+"""A pose found far off is worth so much more than that of the usual stages, or is not taken."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +135,7 @@ class TrackerOptions:
         correlated_points: how many neighbouring edge points err together.
         doubtful_quality: below it the part is searched for around the prediction and colours are not learned.
         other_ways_share: other stages are tried, too, where a pose is worth less than this share of the usual.
+        far_share: so are those for a part that moved far, where the others leave it worth less than this share.
         usual_share: it is searched for, too, where a pose is worth less than this share of the usual.
         surprise_share, surprise: the same for poses off the prediction, from such a `_strangeness` on (about 6°).
         rotation_sigma_rad, translation_sigma: expected error of the prediction, the latter in diameters.
@@ -154,6 +157,7 @@ class TrackerOptions:
     stages: tuple[Stage, ...] = TRACK_STAGES
     doubtful_quality: float = 0.4
     other_ways_share: float = 0.97
+    far_share: float = 0.9
     usual_share: float = 0.8
     surprise_share: float = 0.95
     surprise: float = 0.02
@@ -430,15 +434,15 @@ class Tracker:
         pose, information = self.refine(image, gray, start, o.stages, matches=matches or _NO_MATCHES)
         evidence = self.evidence(image, gray, pose)
         if evidence.worth < o.other_ways_share * self._usual_worth:
-            near: list[tuple[Array, tuple[Stage, ...]]] = [(start, LAST_STAGES)]
+            ways: list[tuple[Array, tuple[Stage, ...], float]] = [(start, LAST_STAGES, 0.0)]
             if o.use_edge and evidence.inner_share > PLAIN_SHARE:
-                near += [(start, NEAR_STAGES), (pose, NEAR_STAGES)]
-            for count, (begin, stages) in enumerate([*near, *((start, stages) for stages in FAR_STAGES)]):
-                if count >= len(near) and evidence.worth >= o.other_ways_share * self._usual_worth:
+                ways += [(start, NEAR_STAGES, 0.0), (pose, NEAR_STAGES, 0.0)]
+            for begin, stages, more in [*ways, *((start, stages, CLEARLY_MORE) for stages in FAR_STAGES)]:
+                if more and evidence.worth >= o.far_share * self._usual_worth:
                     break
                 other, other_information = self.refine(image, gray, begin, stages, matches=matches or _NO_MATCHES)
                 other_evidence = self.evidence(image, gray, other)
-                if other_evidence.worth > evidence.worth:
+                if other_evidence.worth > evidence.worth + more:
                     pose, information, evidence = other, other_information, other_evidence
         strangeness = self._strangeness(pose, predicted)
         if self._is_suspicious(evidence, strangeness):
@@ -512,6 +516,8 @@ class Tracker:
             self._features.settle(cam_from_body)
         self._best_contour_support = max(0.99 * self._best_contour_support, evidence.contour_support)
         unhidden = evidence.contour_support > 0.85 * self._best_contour_support
+        # What enters the picture is placed badly yet, and so would be all that is measured against it.
+        unhidden &= evidence.points_in_picture > IN_PICTURE_SHARE
         tracked_count = 0 if matches is None else len(matches.weights)
         if unhidden and evidence.quality > 0.6 and self._features.wants_keyframe(cam_from_body, tracked_count):
             self._features.add_keyframe(pyramid, cam_from_body)
