@@ -65,7 +65,7 @@ COPY_DEG = 5.0
 """Refined poses this near to each other are copies of one."""
 HOPELESS_WORTH = 0.35
 """A pose worth less is not searched around: the part is not there."""
-SURE_QUALITY = 0.7
+SURE_QUALITY = 0.6
 """A pose of this quality ends the search."""
 ALIKE_ASIDE, ALIKE_ALONG, ALIKE_DEG = 0.12, 0.15, 20.0
 """Hypotheses this near, across in diameters and along as a share of the distance, are no rivals of each other."""
