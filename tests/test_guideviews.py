@@ -7,8 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
-from arview.cad.model import Model
+from arview.cad.model import Component, Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, invert
@@ -17,6 +18,7 @@ from arview.guideviews.findings import most_confusable, uniqueness_findings
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_CREASE, EDGE_SHARP, EDGE_SILHOUETTE
 from arview.guideviews.sheet import CONFUSABLE_COLOR, CONTOUR_COLOR, PLAIN_COLOR, contact_sheet
 from arview.guideviews.sphere import icosphere_directions, view_poses
+from arview.guideviews.surface import MOST_FACES, reduced_surface
 from arview.guideviews.uniqueness import assess
 from arview.guideviews.views import guide_camera
 from arview.render import ZBufferRenderer
@@ -232,6 +234,26 @@ def test_hidden_edges_are_left_out() -> None:
     assert not any((hidden & (ends > 4.0)).any() for hidden in behind)
     seen = [(y > 59.9) & (z > 39.9), (x > 79.9) & (z > 39.9), (x > 79.9) & (y > 59.9), (y < 0.1) & (z > 39.9)]
     assert all(edge.sum() > 10 for edge in seen)
+
+
+def test_the_surface_of_a_small_mesh_is_kept_as_it_is() -> None:
+    model = block()
+    points, faces, component = reduced_surface(model)
+    vertices, all_faces, owners = model.mesh
+    assert (component == owners).all()
+    assert points[faces] == pytest.approx(vertices[all_faces], abs=1e-4)
+
+
+def test_a_fine_mesh_is_reduced_and_stays_where_it_was() -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=6, radius=50.0)
+    model = make_model("ball", (Component("ball", sphere.vertices + 20.0, sphere.faces.astype(np.int32)),))
+    assert len(sphere.faces) > 3 * MOST_FACES
+    points, faces, component = reduced_surface(model)
+    assert len(component) == len(faces)
+    assert 1000 < len(faces) <= MOST_FACES
+    assert np.linalg.norm(points - 20.0, axis=1) == pytest.approx(50.0, abs=0.2)
+    reduced = trimesh.Trimesh(points, faces, process=False)
+    assert reduced.area == pytest.approx(sphere.area, rel=0.01)
 
 
 def test_nearest_view_is_the_nearest(views: GuideViewSet) -> None:

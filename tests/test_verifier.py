@@ -16,6 +16,7 @@ from arview.tracking.tracker import PartView
 from arview.tracking.verifier import (
     BAND_PX,
     CHANNELS,
+    PLAIN,
     RADIUS_PX,
     SIDE_PX,
     Verifier,
@@ -78,11 +79,7 @@ def test_a_picture_without_the_part_verifies_no_pose() -> None:
 
 def test_the_outline_that_is_shown_is_that_of_the_mesh() -> None:
     pixels, lines = shown(TRUTH)
-    zoom = RADIUS_PX / (0.5 * (CAMERA.fx + CAMERA.fy) * 0.5 * PART.views.diameter_mm / np.linalg.norm(TRUTH[:3, 3]))
-    center = CAMERA.project(TRUTH[None, :3, 3])[0]
-    columns, rows = np.meshgrid(*[(np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1)) / zoom + c for c in center])
-    mask = silhouette().astype(np.float32)
-    is_inside = cv2.remap(mask, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR) > 0.5
+    is_inside = around_truth(rendered()[1] >= 0) > 0.5
     outside_px = cv2.distanceTransform((~is_inside).astype(np.uint8), cv2.DIST_L2, 5)
     inside_px = cv2.distanceTransform(is_inside.astype(np.uint8), cv2.DIST_L2, 5)
     expected = np.clip(np.where(is_inside, 0.5 - inside_px, outside_px - 0.5) / BAND_PX, -1.0, 1.0)
@@ -93,13 +90,63 @@ def test_the_outline_that_is_shown_is_that_of_the_mesh() -> None:
     assert (pixels[..., 3] == 255).all()
 
 
-def silhouette() -> Array:
-    """(H,W) bool of the assembly at the true pose, by the rasteriser."""
+def test_the_surface_that_is_shown_is_that_of_the_mesh() -> None:
+    _, drawn_part = shown(TRUTH)
+    normals, depth = drawn_part[2:5], drawn_part[5]
+    inverse_depth, face_ids = rendered()
+    is_inside = cv2.erode(around_truth(face_ids >= 0), np.ones((3, 3))) > 0.99
+    assert np.mean((drawn_part[4] != 0.0) == (around_truth(face_ids >= 0) > 0.5)) > 0.98
+    assert np.linalg.norm(normals, axis=0)[is_inside] == pytest.approx(1.0, abs=0.02)
+    assert (normals[2] > 0.0)[is_inside].mean() > 0.98
+    depth_mm = around_truth(np.where(face_ids >= 0, 1.0 / np.maximum(inverse_depth, 1e-9), 0.0))
+    expected = (depth_mm - TRUTH[2, 3]) / (0.5 * PART.views.diameter_mm)
+    assert np.median(np.abs(depth - expected)[is_inside]) < 0.02
+    vertices, faces, _ = assembly().mesh
+    a, b, c = apply(TRUTH @ PART.body_from_model, vertices)[faces].transpose(1, 0, 2)
+    flat = np.cross(b - a, c - a)
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    flat[np.sum(flat * a, axis=1) > 0.0] *= -1.0
+    for axis, sign in ((0, 1.0), (1, 1.0), (2, -1.0)):
+        true = around_truth(np.where(face_ids >= 0, sign * flat[face_ids, axis], 0.0))
+        assert np.median(np.abs(normals[axis] - true)[is_inside]) < 0.05
+
+
+def rendered() -> tuple[Array, NDArray[np.int32]]:
+    """Inverse depth and face ids (H,W) of the assembly at the true pose, by the rasteriser."""
     vertices, faces, _ = assembly().mesh
     seen_from = apply(TRUTH @ PART.body_from_model, vertices)
     c = CAMERA
-    _, ids = rasterise(seen_from, faces, c.fx, c.fy, c.cx, c.cy, c.width, c.height)
-    return np.asarray(ids >= 0)
+    return rasterise(seen_from, faces, c.fx, c.fy, c.cx, c.cy, c.width, c.height)
+
+
+def around_truth(values: Array) -> Array:
+    """What the picture (H,W) has around the true pose, (S,S)."""
+    zoom = RADIUS_PX / (0.5 * (CAMERA.fx + CAMERA.fy) * 0.5 * PART.views.diameter_mm / np.linalg.norm(TRUTH[:3, 3]))
+    center = CAMERA.project(TRUTH[None, :3, 3])[0]
+    columns, rows = np.meshgrid(*[(np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1)) / zoom + c for c in center])
+    maps = columns.astype(np.float32), rows.astype(np.float32)
+    return np.asarray(cv2.remap(values.astype(np.float32), *maps, cv2.INTER_LINEAR))
+
+
+def shaded(strength: float, noise: float) -> tuple[Array, float]:
+    """The shading found on the true pose's surface when it has some, (S,S), and the share that it explains."""
+    pixels, drawn_part = shown(TRUTH)
+    light = 0.3 + np.maximum(np.tensordot([0.4, -0.5, 0.77], drawn_part[2:5], axes=1), 0.0)
+    rng = np.random.default_rng(4)
+    grays = 60.0 + strength * light + rng.normal(0.0, noise, light.shape)
+    pixels[..., :3] = np.clip(grays, 0, 255)[..., None]
+    seen, explained = with_gradients(contrasted(pixels, drawn_part)[0])
+    return seen[PLAIN + 4 :], float(explained)
+
+
+def test_the_brightness_that_a_light_gives_the_surface_is_explained_and_noise_is_not() -> None:
+    _, drawn_part = shown(TRUTH)
+    is_surface = drawn_part[4] != 0.0
+    (shading, rest), explained = shaded(100.0, 2.0)
+    assert explained > 0.9
+    assert not shading[~is_surface].any() and not rest[~is_surface].any()
+    assert np.std(rest[is_surface]) < 0.3 * np.std(shading[is_surface])
+    assert abs(shaded(0.0, 20.0)[1]) < 0.1
 
 
 def test_what_hides_a_part_of_the_part_does_not_turn_a_right_pose_into_a_wrong_one() -> None:
@@ -111,9 +158,10 @@ def test_a_pose_outside_the_picture_is_scored_without_a_picture() -> None:
     aside = TRUTH.copy()
     aside[0, 3] += 2000.0
     plain, contrast = contrasted(*shown(aside))
-    seen = with_gradients(plain)
+    seen, explained = with_gradients(plain)
     assert seen.shape == (CHANNELS, SIDE_PX, SIDE_PX)
-    assert not seen[:4].any() and not seen[6:].any()
+    assert not seen[:4].any() and not seen[PLAIN:].any()
+    assert explained == 0.0
     assert contrast < 0.01
     assert scores(picture(), aside[None])[0] < scores(picture(), TRUTH[None])[0]
 

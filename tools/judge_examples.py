@@ -38,6 +38,7 @@ from arview.tracking.first_search import WIDE, Candidate, Effort
 from arview.tracking.judge import RADII_PX, describe
 from arview.tracking.picture import Picture
 from arview.tracking.verifier import raw_look
+from line_examples import crowded_picture
 
 FRAMES_EACH = 4
 """Pictures of a solid in each variant, each with another pose."""
@@ -45,6 +46,10 @@ WITHOUT_EACH = 4
 """Photos without it; as many pictures show another solid."""
 ANYWHERE = TrajectoryOptions(turn_deg=90.0, step_mm=250.0, smooth_frames=1.0)
 """Every frame has quite another pose."""
+CROWDS_EACH, CROWDS_WITHOUT_EACH = 6, 4
+"""Crowds of other solids with and without it, as on a bench."""
+OTHERS_EACH = 8
+"""Solids that crowds are made of."""
 PRINTED_SHARE = 0.5
 """So many solids are printed on: a photo shines through them."""
 HARD, OTHERS, RIGHT = 60, 60, 40
@@ -53,11 +58,11 @@ OTHER_SOLID, OCCLUDER = 3301, 7919
 """Seeds further on."""
 ROUGH_NEAR, REFINED_NEAR = (15.0, 0.12), (5.0, 0.06)
 """Nearer than this, deg and shares of the diameter and the distance, a pose is right."""
-ROUGH_APART, REFINED_APART = (25.0, 0.2), (10.0, 0.15)
+ROUGH_APART, REFINED_APART = (25.0, 0.2), (7.0, 0.12)
 """Further than this from the true pose and its twins it is wrong; those between are left out."""
 CLIMBED_SHARE = 0.6
 """Poses after the climb are to be so much nearer than before."""
-LOOKED_AT, LOOKED_AT_WITHOUT = 15, 30
+LOOKED_AT, LOOKED_AT_WITHOUT = 8, 12
 """So many of the poses after the climb the verifier sees too, of pictures with and without the solid."""
 NEARLY, ASIDE = 5, 9
 """And so many poses a little and clearly off the true one."""
@@ -89,7 +94,7 @@ class Looks:
 
     Attributes:
         solid: its seed.
-        pixels: (N,S,S,4) uint8; lines: (N,2,S,S) int8, 127 for 1: see `verifier.raw_look`.
+        pixels: (N,S,S,4) uint8; drawn: (N,6,S,S) int8, 127 for 1: see `verifier.raw_look`.
         radii_px: (N,) half the diameter in the picture.
         known: (N,3) what else the verifier is told of refined poses.
         is_refined, is_right: (N,) bool.
@@ -97,7 +102,7 @@ class Looks:
 
     solid: int
     pixels: NDArray[np.uint8]
-    lines: NDArray[np.int8]
+    drawn: NDArray[np.int8]
     radii_px: Array
     known: Array
     is_refined: NDArray[np.bool_]
@@ -148,8 +153,36 @@ def pictures_of(
                 yield detector, image, frame.cam_from_model @ detector.tracker.part.model_from_body
         for frame in _rendered(other, occluder, variant, WITHOUT_EACH // len(VARIANTS), photos, rng):
             yield detector, frame.image, None
+    others = some_solids(seed)
+    for k in range(CROWDS_EACH + CROWDS_WITHOUT_EACH):
+        options = SequenceOptions("regular", 1, int(rng.integers(1 << 30)), motion=ANYWHERE)
+        pose = trajectory(solid, options)[0] if k < CROWDS_EACH else None
+        clean, visible = crowded_picture(others, None if pose is None else (solid, pose), photos, rng)
+        if pose is None or visible >= 0.5:
+            truth = None if pose is None else pose @ detector.tracker.part.model_from_body
+            yield detector, noisy(clean, rng), truth
     for _, image in frames_without_part(photos, (), CAMERA.width, CAMERA.height, WITHOUT_EACH, seed):
         yield detector, image, None
+
+
+def some_solids(seed: int) -> list[Model]:
+    """Solids for crowds around that of a seed."""
+    solids = []
+    for k in range(OTHERS_EACH):
+        try:
+            solids.append(random_solid(OTHER_SOLID + OCCLUDER + OTHERS_EACH * seed + k))
+        except ValueError:  # outlines that cross each other
+            continue
+    return solids
+
+
+def noisy(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
+    noise, blur_px = 2.0, 0.0
+    if rng.random() < 1.0 / len(VARIANTS):
+        noise, blur_px = rng.uniform(3.0, 14.0), rng.uniform(0.4, 1.3)
+    if blur_px:
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur_px))
+    return np.clip(np.round(picture + noise * rng.standard_normal(picture.shape)), 0, 255).astype(np.uint8)
 
 
 def is_near(detector: Detector, poses: Array, truth: Array, turns: Array, angle_deg: float, share: float) -> Array:
@@ -249,11 +282,11 @@ def _looks(
     part = detector.tracker.part
     poses = poses[index]
     radii_px = picture.radii_px(part.views.diameter_mm, poses)
-    pixels, lines = zip(
+    pixels, drawn = zip(
         *(raw_look(picture, part, *of) for of in zip(poses, radii_px.tolist(), strict=True)), strict=True
     )
     yield Looks(
-        seed, np.stack(pixels), np.round(127.0 * np.stack(lines)).astype(np.int8),
+        seed, np.stack(pixels), np.round(127.0 * np.stack(drawn)).astype(np.int8),
         radii_px, known[index], is_refined[index], right[index],
     )  # fmt: skip
 

@@ -39,6 +39,8 @@ ON_BOARD, BOARD_RADIUS_PX = 0.6, (180.0, 330.0)
 """Share of crowds before a board, and half its diameter."""
 OF_STEEL = 0.5
 """Share of crowds of which most are of about one grey."""
+UNHIDDEN = 0.5
+"""Share of pictures in which a certain solid is in front of the crowd."""
 PATTERNED = 0.35
 """Share of crowds before a surface with dots or stripes, which are no lines of solids."""
 PATTERN_SIZE = 1200, 900
@@ -100,39 +102,87 @@ def _lined_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.rand
     is_crowded = rng.random() < CROWDED
     if is_crowded and rng.random() < PATTERNED:
         picture = _patterned(picture, rng)
+    placed = _crowd(solids, rng) if is_crowded else _placed(solids, rng)
+    picture, covers = drawn_before(picture, photo, placed, photos, rng)
+    height, width = FINE * CAMERA.height, FINE * CAMERA.width
+    depth = np.zeros((height, width), np.float32)
+    normals = np.zeros((height, width, 3), np.float32)
+    owners = np.zeros((height, width), np.int16)
+    for number, ((solid, pose), cover) in enumerate(zip(placed, covers, strict=True), 1):
+        if cover.any():
+            _draw_geometry(solid, pose, number, depth, normals, owners)
+    lines = _lines(depth, normals, owners, max(solid.diameter_mm for solid, _ in placed))
+    image = np.clip(np.round(picture), 0, 255).astype(np.uint8)[..., ::-1]
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    inside = np.max(covers, axis=0)
+    return LinedPicture(jpeg, lines, cv2.imencode(".png", (255.0 * inside).astype(np.uint8))[1].tobytes())
+
+
+def crowded_picture(
+    solids: Sequence[Model], among: tuple[Model, Array] | None, photos: Sequence[Path], rng: np.random.Generator
+) -> tuple[NDArray[np.float32], float]:
+    """A picture (H,W,3), without noise, of a crowd of solids, and which share of a certain one is seen in it.
+
+    Args:
+        solids: to choose from.
+        among: a solid that stands among them at a ``cam_from_model``, as it is; None for none.
+        photos: to stand behind them.
+        rng: random numbers.
+    """
+    photo = read_photo(photos[rng.integers(len(photos))])
+    picture = _crop(photo, rng).astype(np.float32)
+    if rng.random() < PATTERNED:
+        picture = _patterned(picture, rng)
+    if among is None:
+        return drawn_before(picture, photo, _crowd(solids, rng), photos, rng)[0], 0.0
+    center = apply(among[1], among[0].center_in_model)
+    placed = _crowd(solids, rng, CAMERA.project(center[None])[0] + rng.normal(0.0, 40.0, 2))
+    # A board may be the first; some of the others stand in front.
+    place = len(placed) if rng.random() < UNHIDDEN else int(rng.integers(1, len(placed) + 1))
+    picture, covers = drawn_before(picture, photo, [*placed[:place], among, *placed[place:]], photos, rng)
+    seen = covers[place]
+    for cover in covers[place + 1 :]:
+        seen = seen * (1.0 - cover)
+    return picture, float(seen.sum() / max(covers[place].sum(), 1.0))
+
+
+def _distance_mm(solid: Model, pose: Array) -> float:
+    return float(apply(pose, solid.center_in_model)[2])
+
+
+def drawn_before(
+    picture: NDArray[np.float32],
+    photo: Image,
+    placed: Sequence[tuple[Model, Array]],
+    photos: Sequence[Path],
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
+    """A picture with solids drawn over it in their order, in some light; and what each covers (H,W), 0–1."""
     key = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
     if rng.random() < 0.6:
         key = Rotation.from_rotvec(rng.normal(0.0, 0.8, 3)).apply(key)
     toward = np.stack([key, FILL_LIGHT / np.linalg.norm(FILL_LIGHT)])
     light = Light(toward, np.array([rng.uniform(0.25, 1.4), 0.25]), rng.uniform(0.15, 0.45), surroundings(photo))
-    height, width = FINE * CAMERA.height, FINE * CAMERA.width
-    depth = np.zeros((height, width), np.float32)
-    normals = np.zeros((height, width, 3), np.float32)
-    owners = np.zeros((height, width), np.int16)
-    inside = np.zeros((CAMERA.height, CAMERA.width), np.float32)
-    placed = _crowd(solids, rng) if is_crowded else _placed(solids, rng)
-    for number, (solid, pose) in enumerate(placed, 1):
+    covers = []
+    for solid, pose in placed:
         surface = Surface()
         if rng.random() > PLAIN:
             surface = Surface(*(rng.uniform(*of) for of in ((0.4, 0.95), (0.0, 0.7), (0.0, 0.45), (6.0, 60.0))))
         layer = ShadedModel(solid, surface).draw(pose, CAMERA, light)
+        cover = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+        covers.append(cover)
         if layer is None:
             continue
-        both, coverage = np.zeros((*inside.shape, 4), np.float32), np.zeros_like(inside)
+        both = np.zeros((*cover.shape, 4), np.float32)
         stacked = np.dstack([layer.color, layer.coverage])
         paste(cv2.GaussianBlur(stacked, (0, 0), JOIN_BLUR_PX, borderType=cv2.BORDER_CONSTANT), layer, both)
-        paste(layer.coverage, layer, coverage)
+        paste(layer.coverage, layer, cover)
         if rng.random() < PRINTED:
             share = rng.uniform(0.2, 1.0)
             print_on = _crop(read_photo(photos[rng.integers(len(photos))]), rng).astype(np.float32) / 110.0
             both[..., :3] *= 1.0 - share + share * print_on
         picture = picture * (1.0 - both[..., 3:]) + 255.0 * np.clip(both[..., :3], 0.0, 1.0)
-        inside = np.maximum(inside, coverage)
-        _draw_geometry(solid, pose, number, depth, normals, owners)
-    lines = _lines(depth, normals, owners, max(solid.diameter_mm for solid, _ in placed))
-    image = np.clip(np.round(picture), 0, 255).astype(np.uint8)[..., ::-1]
-    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-    return LinedPicture(jpeg, lines, cv2.imencode(".png", (255.0 * inside).astype(np.uint8))[1].tobytes())
+    return picture, covers
 
 
 def _placed(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Model, Array]]:
@@ -155,11 +205,14 @@ def _placed(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Mod
     return _far_first(placed)
 
 
-def _crowd(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Model, Array]]:
-    """Many solids and their poses, the far ones first, about one place; perhaps before a board."""
+def _crowd(
+    solids: Sequence[Model], rng: np.random.Generator, middle_px: Array | None = None
+) -> list[tuple[Model, Array]]:
+    """Many solids and their poses, the far ones first, about one place, anywhere if none; perhaps before a board."""
     size = np.array([CAMERA.width, CAMERA.height])
     has_board = rng.random() < ON_BOARD
-    middle_px = rng.uniform(0.25, 0.75, 2) * size
+    if middle_px is None:
+        middle_px = rng.uniform(0.25, 0.75, 2) * size
     spread_px = rng.uniform(45.0, 110.0) if has_board else rng.uniform(60.0, 190.0)
     steel = rng.uniform(0.15, 0.8) if rng.random() < OF_STEEL else None
     placed = []
@@ -193,7 +246,7 @@ def _pose_at(solid: Model, center_px: Array, radius_px: float, rng: np.random.Ge
 
 
 def _far_first(placed: list[tuple[Model, Array]]) -> list[tuple[Model, Array]]:
-    return sorted(placed, key=lambda of: -apply(of[1], of[0].center_in_model)[2])
+    return sorted(placed, key=lambda of: -_distance_mm(*of))
 
 
 def _patterned(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:

@@ -25,10 +25,22 @@ REFINED_WEIGHT = 3.0
 LISTWISE_WEIGHT = 0.3
 """Beside telling right from wrong in all pictures, the right pose of each is to be told from its others."""
 RATE, DECAY, DROPPED = 2e-3, 2e-2, 0.2
+NORMALS = 6, 7
+"""Channels with the normals' parts to the right and down."""
 HELD_OUT = 8
 """Every so manieth solid is not fitted to, but for telling how well others are verified."""
 FALSE_SHARES = (0.0, 0.02, 0.05, 0.1)
 """Shares of false alarms to say the found ones for."""
+
+
+def torch_with_onnx() -> Any:
+    """The module, or an InputError that says what to install."""
+    try:
+        import onnx  # noqa: F401  torch writes with it
+        import torch
+    except ImportError as error:
+        raise InputError(f"fit_judge: {error.name} is not installed; pip install torch onnx") from error
+    return torch
 
 
 def fit_verifier(folder: Path, epochs: int) -> None:
@@ -37,24 +49,25 @@ def fit_verifier(folder: Path, epochs: int) -> None:
     Raises:
         InputError: no examples, or no torch or onnx.
     """
-    try:
-        import onnx  # noqa: F401  torch writes with it
-        import torch
-    except ImportError as error:
-        raise InputError(f"fit_judge: {error.name} is not installed; pip install torch onnx") from error
+    torch = torch_with_onnx()
     looks, held_out = read_examples(folder, "looks_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    network = _network(torch)
+    network = score_network(torch, GLOBALS)
     _fit(network, [look for look in looks if look.solid not in held_out], epochs, torch)
     network.eval()
     _report(network, [look for look in looks if look.solid in held_out], torch)
-    with replacing(folder / "verifier.onnx") as file:
+    write_network(network, folder / "verifier.onnx", SIDE_PX, GLOBALS, torch)
+
+
+def write_network(network: Any, path: Path, side: int, told: int, torch: Any) -> None:
+    """Write a network as `cv2.dnn` reads it."""
+    with replacing(path) as file:
         torch.onnx.export(
-            network, (torch.zeros(2, CHANNELS, SIDE_PX, SIDE_PX), torch.zeros(2, GLOBALS)), file,
+            network, (torch.zeros(2, CHANNELS, side, side), torch.zeros(2, told)), file,
             input_names=["seen", "both"], output_names=["score"], dynamo=False,
             dynamic_axes={"seen": {0: "poses"}, "both": {0: "poses"}, "score": {0: "poses"}},
         )  # fmt: skip
-    print(f"wrote {folder / 'verifier.onnx'}")
+    print(f"wrote {path}")
 
 
 def _fit(network: Any, looks: Sequence[Looks], epochs: int, torch: Any) -> None:
@@ -103,27 +116,32 @@ def _inputs(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Poses of a picture as the network takes them; with random numbers altered, all of them alike."""
     plain, contrasts = zip(
-        *(contrasted(look.pixels[k], look.lines[k].astype(np.float32) / 127.0) for k in index), strict=True
+        *(contrasted(look.pixels[k], look.drawn[k].astype(np.float32) / 127.0) for k in index), strict=True
     )
     seen = np.stack(plain)
     if rng is not None:
-        seen = _augmented(seen, rng)
+        seen = augmented(seen, rng)
+    shown, explained = zip(*map(with_gradients, seen), strict=True)
     both = []
-    for k, contrast in zip(index, contrasts, strict=True):
+    for k, contrast, share in zip(index, contrasts, explained, strict=True):
         # What is known of refined poses only is the mean for the others.
         known = look.known[k] if look.is_refined[k] else MEANS
-        both.append(overall(float(look.radii_px[k]), contrast, known))
-    return np.stack([with_gradients(one) for one in seen]), np.stack(both)
+        both.append(overall(float(look.radii_px[k]), contrast, known, share))
+    return np.stack(shown), np.stack(both)
 
 
-def _augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """The poses of one picture mirrored, turned, recoloured, shaded, blurred, noisier, or with something in front."""
+    right, down = NORMALS
     if rng.random() < 0.5:
-        seen = seen[..., ::-1]
+        seen = seen[..., ::-1].copy()
+        seen[:, right] *= -1.0
     if rng.random() < 0.5:
-        seen = seen[..., ::-1, :]
+        seen = seen[..., ::-1, :].copy()
+        seen[:, down] *= -1.0
     if rng.random() < 0.5:
-        seen = seen.swapaxes(2, 3)
+        seen = seen.swapaxes(2, 3).copy()
+        seen[:, [right, down]] = seen[:, [down, right]]
     seen = np.concatenate([seen[:, rng.permutation(3)], seen[:, 3:]], axis=1)
     if rng.random() < 0.25:
         share = rng.uniform(0.5, 1.0)
@@ -131,7 +149,7 @@ def _augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[n
     if rng.random() < 0.3:
         shade = 1.0 + rng.normal(0.0, rng.uniform(0.0, 0.3), (5, 5)).astype(np.float32)
         shift = rng.normal(size=(3, 1, 1)).astype(np.float32)
-        seen[:, :3] = ((seen[:, :3] + shift) * cv2.resize(shade, (SIDE_PX, SIDE_PX)) - shift) * seen[:, 3:4]
+        seen[:, :3] = ((seen[:, :3] + shift) * cv2.resize(shade, seen.shape[2:]) - shift) * seen[:, 3:4]
     if rng.random() < 0.25:
         width_px = rng.uniform(0.4, 0.8)
         for one in seen:
@@ -139,8 +157,9 @@ def _augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[n
     if rng.random() < 0.4:
         seen[:, :3] += rng.uniform(0.0, 0.25) * rng.standard_normal(seen[:, :3].shape, dtype=np.float32)
     if rng.random() < 0.3:
-        width, height = rng.integers(6, 22, 2)
-        left, top = rng.integers(0, SIDE_PX - width), rng.integers(0, SIDE_PX - height)
+        side = seen.shape[-1]
+        width, height = rng.integers(side // 10, side // 3, 2)
+        left, top = rng.integers(0, side - width), rng.integers(0, side - height)
         seen[:, :3, top : top + height, left : left + width] = rng.normal(size=(1, 3, 1, 1))
     return np.ascontiguousarray(seen)
 
@@ -168,8 +187,8 @@ def _report(network: Any, looks: Sequence[Looks], torch: Any) -> None:
         print(f"  {100 * found:.0f} % found with {100 * share:.0f} % false alarms, of {len(highest)} without it")
 
 
-def _network(torch: Any) -> Any:
-    """The network of `arview.tracking.verifier`."""
+def score_network(torch: Any, told: int) -> Any:
+    """The network of `arview.tracking.verifier`, and of others that are told of so many things as a whole."""
     nn = torch.nn
 
     class _Network(nn.Module):  # type: ignore[misc, name-defined]
@@ -187,7 +206,7 @@ def _network(torch: Any) -> Any:
                 before = width
             self.convolutions = nn.Sequential(*layers)
             self.together = nn.Sequential(
-                nn.Linear(2 * before + GLOBALS, LAST_WIDTH), nn.ReLU(), nn.Dropout(DROPPED), nn.Linear(LAST_WIDTH, 1)
+                nn.Linear(2 * before + told, LAST_WIDTH), nn.ReLU(), nn.Dropout(DROPPED), nn.Linear(LAST_WIDTH, 1)
             )
 
         def forward(self, seen: Any, both: Any) -> Any:

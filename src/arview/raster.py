@@ -53,7 +53,8 @@ def _fill(u0, v0, w0, u1, v1, w1, u2, v2, w2, face, x_low, y_low, inverse_depth,
 
 
 @njit(cache=True, nogil=True)
-def _rasterise(points, faces, fx, fy, cx, cy, near, x_low, y_low, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
+def fill_buffers(points, faces, fx, fy, cx, cy, near, x_low, y_low, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
+    """The kernel of `rasterise`: see there; the buffers (H,W), zero and -1 before, become what it returns."""
     height, width = inverse_depth.shape
     count = points.shape[0]
     u = np.empty(count)
@@ -150,7 +151,7 @@ def rasterise(
     """
     inverse_depth = np.zeros((height, width))
     face_ids = np.full((height, width), -1, dtype=np.int32)
-    _rasterise(
+    fill_buffers(
         np.ascontiguousarray(points_in_cam, dtype=np.float64),
         faces, fx, fy, cx, cy, near_mm, origin[0], origin[1], inverse_depth, face_ids,
     )  # fmt: skip

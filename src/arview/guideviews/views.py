@@ -21,9 +21,10 @@ from arview.guideviews.extract import ViewFeatures, extract_features
 from arview.guideviews.mesh_edges import mesh_edges
 from arview.guideviews.sphere import directions_in_range, view_poses
 from arview.guideviews.store import read_arrays, write_arrays
+from arview.guideviews.surface import Surface, reduced_surface, surface_about
 from arview.render import PyrenderRenderer, ZBufferRenderer, open_renderer
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _UNIT16 = 32767.0
 
 
@@ -116,6 +117,14 @@ class GuideViewSet:
             edge_component=arrays["edge_component"][e0:e1].astype(np.int32),
         )
         return GuideView(index=index, cam_from_model=self.poses[index], features=features)
+
+    @property
+    def surface(self) -> Surface:
+        """The surface of the model, perhaps of fewer faces, about its centre."""
+        points, faces, component = (
+            np.array(self.arrays[f"surface_{name}"]) for name in ("points", "faces", "component")
+        )
+        return surface_about(points, faces, component, self.center_in_model)
 
     def nearest(self, cam_from_model: Array) -> GuideView:
         """The view whose direction is nearest to that of the camera at this pose."""
@@ -268,7 +277,11 @@ def make_guide_views(
     def starts(counts: list[int]) -> NDArray[np.int64]:
         return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
+    surface_points, surface_faces, surface_component = reduced_surface(model)
     arrays: dict[str, NDArray[Any]] = {
+        "surface_points": surface_points,
+        "surface_faces": surface_faces,
+        "surface_component": surface_component,
         "contour_start": starts([len(f.contour_points) for f in found]),
         "contour_points": np.concatenate([f.contour_points for f in found]).astype(np.float32),
         "contour_normals": np.round(np.concatenate([f.contour_normals for f in found]) * _UNIT16).astype(np.int16),

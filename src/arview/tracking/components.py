@@ -29,6 +29,7 @@ from arview.geometry import Array, apply, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import facing, mesh_edges
 from arview.render import ZBufferRenderer
+from arview.tracking.component_network import ComponentNetwork, component_looks
 from arview.tracking.solver import project_lines
 from arview.tracking.tracker import intrinsics_of
 
@@ -63,6 +64,10 @@ HIDDEN_SHARE, CLEAR_SHARE = 0.42, 0.67
 """Shares of the surroundings, and of the whole part, that are borne out where it is hidden and where it is not."""
 MODEL = (14.3, -11.5, -13.9, -1.29)
 """Log-likelihood ratio: constant; share borne out; that less the best elsewhere; colour contrast up to 6."""
+SETTLED = -6.0
+"""A component with a ratio below is as expected: the network is not asked."""
+BOTH = (0.0, 0.5, 1.0)
+"""Log-likelihood ratio by edges and network: constant, what each counts."""
 MOST_CONTRAST, USUAL_CONTRAST = 6.0, 5.0
 """The latter stands for components without an outline of their own."""
 SUSPECTS = 2
@@ -540,6 +545,15 @@ def measure_components(  # type: ignore[no-untyped-def]
     return found
 
 
+def said_by_edges(found: Array) -> Array:
+    """Log-likelihood ratios (C,) of "not where expected" to "as expected" by what was measured (C,6)."""
+    borne_out, elsewhere, contrast, _, _, spread = found.T
+    constant, per_share, per_lead, per_contrast = MODEL
+    ratio = constant + per_share * borne_out + per_lead * (borne_out - elsewhere)
+    ratio += per_contrast * np.where(contrast < 0.0, USUAL_CONTRAST, np.minimum(contrast, MOST_CONTRAST))
+    return np.asarray(ratio * np.maximum(spread, 0.0) / (np.maximum(spread, 0.0) + HALF_LAMBDA))
+
+
 class ComponentCheck:
     """Watches whether the components of one part are where the CAD has them, for one camera.
 
@@ -554,6 +568,8 @@ class ComponentCheck:
         self._renderer = ZBufferRenderer(model, views.camera)
         self._edges = mesh_edges(model, views.options.crease_angle_deg)
         self._model_from_body = rigid(np.eye(3), views.center_in_model)
+        self._surface = views.surface
+        self._network = ComponentNetwork()
         low, high = model.bounds_in_model
         self._corners_in_model = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
         self._sheets: dict[int, ComponentSheet] = {}
@@ -621,13 +637,10 @@ class ComponentCheck:
             image: (H,W,3) uint8 RGB of the camera's size.
             cam_from_model: (4,4) mm, right to a pixel or two.
         """
-        found = self._measure(image, cam_from_model)
-        borne_out, elsewhere, contrast, around, others, spread = found.T
+        found = self._measured(image, cam_from_model)
+        borne_out, elsewhere, contrast, around, others, _ = found.T
         is_shown = borne_out >= 0.0
-        constant, per_share, per_lead, per_contrast = MODEL
-        ratio = constant + per_share * borne_out + per_lead * (borne_out - elsewhere)
-        ratio += per_contrast * np.where(contrast < 0.0, USUAL_CONTRAST, np.minimum(contrast, MOST_CONTRAST))
-        ratio *= np.maximum(spread, 0.0) / (np.maximum(spread, 0.0) + HALF_LAMBDA)
+        ratio = self._with_network(image, cam_from_model, said_by_edges(found), is_shown)
         is_suspect = is_shown & (ratio > SUSPECT)
         more_suspects = max(0, int(np.count_nonzero(is_suspect)) - SUSPECTS)
         # Where the surroundings are not seen either, something hides it, or the picture is blurred.
@@ -636,8 +649,26 @@ class ComponentCheck:
         against = np.where(is_shown, np.clip(ratio, -LARGEST_RATIO, LARGEST_RATIO), 0.0)
         return Look(against, is_suspect, is_shown, borne_out, elsewhere, contrast, around)
 
-    def _measure(self, image: NDArray[np.uint8], cam_from_model: Array) -> Array:
-        """(C,6), see `measure_components`."""
+    def _with_network(
+        self, image: NDArray[np.uint8], cam_from_model: Array, by_edges: Array, is_shown: NDArray[np.bool_]
+    ) -> Array:
+        """The ratios (C,) with what the network says, of those that the edges leave open."""
+        asked = np.flatnonzero(is_shown & (by_edges > SETTLED))
+        if not len(asked):
+            return by_edges
+        window, intrinsics, _ = self._window(image, cam_from_model)
+        cam_from_body = cam_from_model @ self._model_from_body
+        looks = component_looks(
+            window, intrinsics, self._surface, self.views.diameter_mm, cam_from_body, asked.tolist()
+        )
+        index = [look.index for look in looks]
+        constant, per_edges, per_network = BOTH
+        ratio = by_edges.copy()
+        ratio[index] = constant + per_edges * by_edges[index] + per_network * self._network.ratios(looks)
+        return ratio
+
+    def _window(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[NDArray[np.uint8], Array, float]:
+        """The picture around the part (H,W,3), perhaps shrunk, its intrinsics (10,), and px per mm in it."""
         camera, diameter_mm = self.camera, self.views.diameter_mm
         cam_from_body = cam_from_model @ self._model_from_body
         scale = camera.fx / max(float(cam_from_body[2, 3]), 1.0)
@@ -654,7 +685,12 @@ class ComponentCheck:
         intrinsics = intrinsics_of(camera)
         intrinsics[:2] /= shrink
         intrinsics[2:4] = (intrinsics[2:4] - low + 0.5) / shrink - 0.5
-        scale /= shrink
+        return window, intrinsics, scale / shrink
+
+    def _measured(self, image: NDArray[np.uint8], cam_from_model: Array) -> Array:
+        """(C,6), see `measure_components`."""
+        diameter_mm, cam_from_body = self.views.diameter_mm, cam_from_model @ self._model_from_body
+        window, intrinsics, scale = self._window(image, cam_from_model)
         allowed = min(DISPLACED_MM, DISPLACED_SHARE * diameter_mm) * scale + POSE_PX
         searched = min(SEARCHED_MM * scale, SEARCHED_SHARE * diameter_mm * scale, SEARCHED_PX)
         near, far = _disc(0.0, allowed, 1), _disc(allowed + 2.0, max(searched, allowed + 6.0), 3)

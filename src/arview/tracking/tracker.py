@@ -192,7 +192,7 @@ class PartView:
     """A guide-view set as the kernels need it: flat float32 arrays about the model's centre.
 
     ``arrays`` holds directions (N,3), contour starts (N+1), points, normals, runs, edge starts (N+1), points,
-    tangents, kinds.
+    tangents, kinds; ``surface`` is its mesh.
     """
 
     def __init__(self, views: GuideViewSet) -> None:
@@ -213,6 +213,7 @@ class PartView:
             raw["edge_tangents"] * unit16,
             np.array(raw["edge_kinds"]),
         )
+        self.surface = views.surface
 
 
 def intrinsics_of(camera: Camera) -> Array:

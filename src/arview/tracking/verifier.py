@@ -3,9 +3,10 @@
 The evidence and the judge ask each line for itself. What they cannot see is the whole: whether the surface inside the
 outline is one thing and what lies around it another, whether strong edges run where the part has none, whether what
 hides a stretch of the outline is something in front of it. A small convolutional network sees it: it is given the
-picture around the pose beside what the CAD says is there, the distance to the outline and the design edges (as Labbé
-et al., "MegaPose", CoRL 2022, score poses by rendered views; here from the lines of the guide views, so that nothing is
-rendered). It knows nothing of a part: it was fitted on random solids before photos, see ``tools/fit_judge``.
+picture around the pose beside what the CAD says is there: the distance to the outline, the design edges, the normals
+and depth of the surface, and what of the brightness the normals explain (as Labbé et al., "MegaPose", CoRL 2022, score
+poses by rendered normals). It knows nothing of a part: it was fitted on random solids before photos, see
+``tools/fit_judge``.
 """
 
 from __future__ import annotations
@@ -19,23 +20,38 @@ from numpy.typing import NDArray
 
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.guideviews.surface import draw_surface
 from arview.tracking.picture import Picture, steps_to
 from arview.tracking.refine import nearest_view
 from arview.tracking.solver import project_lines
 from arview.tracking.threads import pool
 from arview.tracking.tracker import PartView
 
-SIDE_PX, RADIUS_PX = 64, 28.0
+SIDE_PX, RADIUS_PX = 80, 35.0
 """Side of the picture around a pose, and half the part's diameter in it."""
 BAND_PX = 6.0
 """Distances to the outline are told up to this."""
 EDGE_PX, EDGE_SQUARE = 2, 1.4
 """Design edges are drawn so wide, and fade out with this square of the distance."""
-CHANNELS = 10
-"""Red, green, blue, 1 inside the picture; distance to the outline (-1 inside, 1 outside), nearness of design edges;
-the gradient: all of it, across the outline, along it, under design edges."""
-GLOBALS = 5
-"""The part's size in the picture, the contrast around the pose; what evidence, judge and scatter say of the pose."""
+DRAWN = 6
+"""Drawn of the part: distance to the outline (-1 inside, 1 outside), nearness of design edges; of its surface the
+normal, right, down and towards the camera, and the depth beyond the centre's in half diameters; 0 beside it."""
+PLAIN = 4 + DRAWN
+"""Red, green, blue, 1 inside the picture; what is drawn."""
+CHANNELS = PLAIN + 6
+"""What is plain; the gradient: all of it, across the outline, along it, under design edges; the shading that the
+normals explain, and the rest of the brightness."""
+GLOBALS = 6
+"""The part's size in the picture, the contrast around the pose; what evidence, judge and scatter say of the pose; the
+share of the brightness of the surface that its normals explain."""
+SHADES = 9
+"""Shading is made of so many functions of the normal: spherical harmonics up to the second order, of which all but
+0.2 % of what far lights do to a matt surface is made (Basri and Jacobs, "Lambertian reflectance and linear subspaces",
+PAMI 2003)."""
+SHADE_PRIOR = 0.01
+"""Of every pixel so much speaks for no shading, for few faces leave some of it open."""
+LEAST_SHADED = 20
+"""Pixels of the surface; of fewer no shading is told."""
 LEAST_CONTRAST = 6.0
 """Grey levels that are added to the deviation that colours are divided by."""
 LEAST_GRADIENT = 0.02
@@ -75,7 +91,8 @@ class Verifier:
 
         def look(pose: Array, radius_px: float, of_it: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
             plain, contrast = contrasted(*raw_look(picture, self._part, pose, radius_px))
-            return with_gradients(plain), overall(radius_px, contrast, of_it)
+            shown, explained = with_gradients(plain)
+            return shown, overall(radius_px, contrast, of_it, explained)
 
         looks = list(pool().map(look, poses, radii_px.tolist(), known))
         scores = np.empty(len(poses))
@@ -91,7 +108,7 @@ class Verifier:
 def raw_look(
     picture: Picture, part: PartView, pose: Array, radius_px: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The picture around a pose (S,S,4), RGB and 255 inside of it, and the part's lines (2,S,S), see CHANNELS.
+    """The picture around a pose (S,S,4), RGB and 255 inside of it, and the part (6,S,S), see DRAWN.
 
     Args:
         picture, part: what is looked for, and where.
@@ -110,16 +127,22 @@ def raw_look(
     is_inside = np.outer(
         np.abs(rows - 0.5 * (height - 1)) <= 0.5 * height, np.abs(columns - 0.5 * (width - 1)) <= 0.5 * width
     )
-    lines = np.empty((2, SIDE_PX, SIDE_PX), dtype=np.float32)
-    draw_lines(part.arrays, pose, intrinsics, 0.01 * part.views.diameter_mm, zoom, way[:, 2], lines)
-    return np.dstack([crop, 255 * is_inside.astype(np.uint8)]), lines
+    diameter_mm = part.views.diameter_mm
+    drawn = np.empty((DRAWN, SIDE_PX, SIDE_PX), dtype=np.float32)
+    draw_lines(part.arrays, pose, intrinsics, 0.01 * diameter_mm, zoom, way[:, 2], drawn[:2])
+    face_ids = np.empty((SIDE_PX, SIDE_PX), dtype=np.int32)
+    draw_surface(part.surface, pose, zoom * intrinsics[:2], np.full(2, middle), diameter_mm, drawn[2:], face_ids)
+    is_far = drawn[0] > 1.0
+    drawn[0][is_far] = np.where(face_ids[is_far] >= 0, -1.0, 1.0)
+    return np.dstack([crop, 255 * is_inside.astype(np.uint8)]), drawn
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def contrasted(pixels, lines):  # type: ignore[no-untyped-def]
-    """A raw look with colours less their mean, in units of their deviation (6,S,S), and that deviation."""
+def contrasted(pixels, drawn):  # type: ignore[no-untyped-def]
+    """A raw look with colours less their mean, in units of their deviation (PLAIN,S,S), and that deviation."""
     rows, columns = pixels.shape[:2]
-    plain = np.zeros((6, rows, columns), dtype=np.float32)
+    plain = np.zeros((PLAIN, rows, columns), dtype=np.float32)
+    plain[4:] = drawn
     sums = np.zeros(3)
     count = 1.0
     for v in range(rows):
@@ -131,7 +154,6 @@ def contrasted(pixels, lines):  # type: ignore[no-untyped-def]
     square = 0.0
     for v in range(rows):
         for u in range(columns):
-            plain[4, v, u], plain[5, v, u] = lines[0, v, u], lines[1, v, u]
             if pixels[v, u, 3] > 0:
                 plain[3, v, u] = 1.0
                 for c in range(3):
@@ -145,10 +167,14 @@ def contrasted(pixels, lines):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=True)
 def with_gradients(plain):  # type: ignore[no-untyped-def]
-    """All that the network is shown (CHANNELS,S,S) from the first six of it; gradients relative to their mean."""
+    """All that the network is shown (CHANNELS,S,S) from what is plain, and the share of brightness that is explained.
+
+    Gradients are relative to their mean.
+    """
     rows, columns = plain.shape[1:]
     shown = np.zeros((CHANNELS, rows, columns), dtype=np.float32)
-    shown[:6] = plain
+    shown[:PLAIN] = plain
+    all_of_it, across_it, along_it, at_edges = PLAIN, PLAIN + 1, PLAIN + 2, PLAIN + 3
     slope = np.empty(2, dtype=np.float32)
     normal = np.empty(2, dtype=np.float32)
     total = 0.0
@@ -165,18 +191,70 @@ def with_gradients(plain):  # type: ignore[no-untyped-def]
             _slope_at(plain[4], v, u, normal)
             size = np.sqrt(most)
             total += size
-            shown[6, v, u] = size
+            shown[all_of_it, v, u] = size
             if abs(plain[4, v, u]) < BESIDE:
                 steep = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1]) + np.float32(1e-3)
-                shown[7, v, u] = abs(across * normal[0] + down * normal[1]) / steep
-                shown[8, v, u] = abs(across * normal[1] - down * normal[0]) / steep
+                shown[across_it, v, u] = abs(across * normal[0] + down * normal[1]) / steep
+                shown[along_it, v, u] = abs(across * normal[1] - down * normal[0]) / steep
     mean = np.float32(total / (rows * columns) + LEAST_GRADIENT)
-    for channel in range(6, 9):
+    for channel in range(all_of_it, at_edges):
         for v in range(rows):
             for u in range(columns):
                 shown[channel, v, u] /= shown[channel, v, u] + mean
-    shown[9] = shown[6] * plain[5]
-    return shown
+    shown[at_edges] = shown[all_of_it] * plain[5]
+    return shown, _explain(plain, shown[PLAIN + 4], shown[PLAIN + 5])
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _explain(plain, shading, rest):  # type: ignore[no-untyped-def]
+    """Write the shading (S,S) that the normals explain, and the rest of the brightness; the share explained.
+
+    Least squares, twice: what the first shading leaves most of counts little in the second, for it may be hidden,
+    shiny or printed.
+    """
+    rows, columns = plain.shape[1:]
+    products, values = np.zeros((SHADES, SHADES)), np.zeros(SHADES)
+    f, shades = np.empty(SHADES), np.zeros(SHADES)
+    scale = 1e9
+    for turn in range(3):
+        is_last = turn == 2
+        products[:], values[:] = 0.0, 0.0
+        pixels, count, total, square, left = 0, 0.0, 0.0, 0.0, 0.0
+        for v in range(rows):
+            for u in range(columns):
+                x, y, z = plain[6, v, u], plain[7, v, u], plain[8, v, u]
+                if plain[3, v, u] == 0.0 or z == 0.0:
+                    continue
+                f[0], f[1], f[2], f[3] = 1.0, x, y, z
+                f[4], f[5], f[6], f[7], f[8] = x * y, x * z, y * z, x * x - y * y, 3.0 * z * z - 1.0
+                value = (plain[0, v, u] + plain[1, v, u] + plain[2, v, u]) / 3.0
+                fitted = 0.0
+                for i in range(SHADES):
+                    fitted += shades[i] * f[i]
+                off = value - fitted
+                if is_last:
+                    shading[v, u], rest[v, u] = fitted, off
+                weight = 1.0 if is_last else 1.0 / (1.0 + off * off / scale)
+                pixels += 1
+                count += weight
+                total += weight * value
+                square += weight * value * value
+                left += weight * off * off
+                for i in range(SHADES):
+                    values[i] += weight * f[i] * value
+                    for j in range(i + 1):
+                        products[i, j] += weight * f[i] * f[j]
+        if pixels < LEAST_SHADED:
+            return 0.0
+        if is_last:
+            return max(1.0 - left / (square - total * total / count + 1e-3 * count), -1.0)
+        for i in range(SHADES):
+            products[i, i] += (SHADE_PRIOR if i > 0 else 1e-6) * count
+            for j in range(i):
+                products[j, i] = products[i, j]
+        shades[:] = np.linalg.solve(products, values)
+        scale = max(square - (shades * values).sum(), 0.0) / count + 1e-3
+    return 0.0
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -189,21 +267,21 @@ def _slope_at(plane, v, u, slope):  # type: ignore[no-untyped-def]
     slope[1] = np.float32(0.125) * (c - a + d - b + np.float32(2.0) * (plane[low, u] - plane[up, u]))
 
 
-def overall(radius_px: float, contrast: float, known: Array) -> NDArray[np.float32]:
+def overall(radius_px: float, contrast: float, known: Array, explained: float) -> NDArray[np.float32]:
     """What the network is told of a pose as a whole (GLOBALS,): see there."""
     both = [np.log(radius_px / TYPICAL_RADIUS_PX), 0.5 * np.log(contrast / TYPICAL_CONTRAST + 0.05)]
-    return np.concatenate([both, (known - MEANS) / DEVIATIONS]).astype(np.float32)
+    return np.concatenate([both, (known - MEANS) / DEVIATIONS, [explained]]).astype(np.float32)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def draw_lines(part, pose, intrinsics, step_mm, zoom, shift, drawn):  # type: ignore[no-untyped-def]
-    """Draw the lines of the part at a pose: see CHANNELS.
+    """Draw the lines of the part at a pose: see DRAWN.
 
     Args:
         part: as in `PartView.arrays`; pose: (4,4) ``cam_from_body``.
         intrinsics: (10,) of the picture; step_mm: length over which directions are projected.
         zoom, shift: (2,) what brings the picture's pixels to those drawn.
-        drawn: (2,S,S) float32, becomes them.
+        drawn: (2,S,S) float32, becomes them; more than 1 where the outline is far.
     """
     directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
     side = drawn.shape[1]
@@ -231,14 +309,6 @@ def draw_lines(part, pose, intrinsics, step_mm, zoom, shift, drawn):  # type: ig
                 if abs(across) < 0.5 * distance:
                     across = distance if across > 0.0 else -distance
                 drawn[0, v, u] = min(max(across / BAND_PX, -1.0), 1.0)
-    for v in range(side):
-        # Far from the outline the side is that of the last place near it.
-        beyond = np.float32(1.0)
-        for u in range(side):
-            if drawn[0, v, u] > 1.0:
-                drawn[0, v, u] = beyond
-            else:
-                beyond = np.float32(1.0) if drawn[0, v, u] > 0.0 else np.float32(-1.0)
     drawn[1] = 0.0
     first, last = e_start[view], e_start[view + 1]
     pixels, normals, depths = project_lines(

@@ -1,0 +1,99 @@
+"""Fitting the component network to examples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.tracking.component_network import GLOBALS, SIDE_PX, overall
+from arview.tracking.verifier import contrasted, with_gradients
+from component_examples import Looked
+from judge_examples import read_examples
+from verifier_fitting import augmented, score_network, torch_with_onnx, write_network
+
+BATCH = 128
+RATE, DECAY = 2e-3, 2e-2
+HELD_OUT = 8
+"""Every so manieth assembly is not fitted to, but for telling how well others are seen."""
+FALSE_SHARES = (0.002, 0.005, 0.01, 0.03)
+"""Shares of right components that are said to be wrong, to say the wrong ones that are for."""
+
+
+def fit_components(folder: Path, epochs: int) -> None:
+    """Fit the network to the looks in a folder, write components.onnx there, and say how well it does.
+
+    Wrong and right ones count alike in all, so that the score is a log-likelihood ratio.
+
+    Raises:
+        InputError: no examples, or no torch or onnx.
+    """
+    torch = torch_with_onnx()
+    examples, held_out = read_examples(folder, "components_*.pkl", HELD_OUT)
+    torch.manual_seed(0)
+    network = score_network(torch, GLOBALS)
+    _fit(network, [one for one in examples if one.solid not in held_out], epochs, torch)
+    network.eval()
+    _report(network, [one for one in examples if one.solid in held_out], torch)
+    write_network(network, folder / "components.onnx", SIDE_PX, GLOBALS, torch)
+
+
+def _fit(network: Any, examples: Sequence[Looked], epochs: int, torch: Any) -> None:
+    rng = np.random.default_rng(0)
+    network.train().to(memory_format=torch.channels_last)
+    places = [(one, k) for one in examples for k in range(len(one.is_wrong))]
+    share = float(np.mean([one.is_wrong[k] for one, k in places]))
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    steps = max(1, len(places) // BATCH)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * steps, pct_start=0.05)
+    for epoch in range(epochs):
+        order, losses = rng.permutation(len(places)), []
+        for k in range(steps):
+            chosen = [places[i] for i in order[k * BATCH : (k + 1) * BATCH]]
+            shown = [_inputs(one, [index], rng) for one, index in chosen]
+            seen, both = (torch.from_numpy(np.concatenate([part[n] for part in shown])) for n in range(2))
+            wrong = torch.tensor([float(one.is_wrong[index]) for one, index in chosen])
+            weight = torch.where(wrong > 0, 0.5 / share, 0.5 / (1.0 - share))
+            with torch.autocast("cpu", torch.bfloat16):
+                found = network(seen.contiguous(memory_format=torch.channels_last), both)
+            loss = torch.nn.functional.binary_cross_entropy_with_logits(found.float(), wrong, weight)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            losses.append(loss.item())
+        print(f"components, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
+
+
+def _inputs(
+    one: Looked, index: Sequence[int], rng: np.random.Generator | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Looks as the network takes them; with random numbers altered."""
+    plain, contrasts = zip(
+        *(contrasted(one.pixels[k], one.drawn[k].astype(np.float32) / 127.0) for k in index), strict=True
+    )
+    seen = np.stack(plain)
+    if rng is not None:
+        seen = augmented(seen, rng)
+    shown, explained = zip(*map(with_gradients, seen), strict=True)
+    sizes_px = [float(one.sizes_px[k]) for k in index]
+    return np.stack(shown), np.stack([overall(*of) for of in zip(sizes_px, contrasts, explained, strict=True)])
+
+
+def _report(network: Any, examples: Sequence[Looked], torch: Any) -> None:
+    """Say how many wrong components score higher than all but a share of the right ones."""
+    scores, wrong = [np.zeros(0)], [np.zeros(0, dtype=bool)]
+    for one in examples:
+        with torch.no_grad():
+            scores.append(network(*map(torch.from_numpy, _inputs(one, range(len(one.is_wrong))))).numpy())
+        wrong.append(one.is_wrong)
+    score, is_wrong = np.concatenate(scores), np.concatenate(wrong)
+    if is_wrong.all() or not is_wrong.any():
+        return
+    print(f"other assemblies: {is_wrong.sum()} wrong and {(~is_wrong).sum()} right components")
+    for share in FALSE_SHARES:
+        least = np.quantile(score[~is_wrong], 1.0 - share)
+        print(f"  {np.mean(score[is_wrong] > least):.0%} of the wrong ones score above {1.0 - share:.1%} of the right")
