@@ -317,7 +317,7 @@ def test_garbage_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "header", ["[]", "{}", '{"meta": {}, "arrays": 3}', '{"meta": {"format_version": 1}, "arrays": {}}']
+    "header", ["[]", "{}", '{"meta": {}, "arrays": 3}', '{"meta": {"format_version": 2}, "arrays": {}}']
 )
 def test_a_header_without_sense_is_refused(tmp_path: Path, header: str) -> None:
     path = tmp_path / "x.guideviews"
@@ -328,9 +328,9 @@ def test_a_header_without_sense_is_refused(tmp_path: Path, header: str) -> None:
 
 def test_an_older_version_is_refused(saved: Path) -> None:
     content = saved.read_bytes()
-    assert content.count(b'"format_version": 1,') == 1
-    saved.write_bytes(content.replace(b'"format_version": 1,', b'"format_version": 0,'))
-    with pytest.raises(InputError, match=r"format 0, this arview reads 1.*again"):
+    assert content.count(b'"format_version": 2,') == 1
+    saved.write_bytes(content.replace(b'"format_version": 2,', b'"format_version": 1,'))
+    with pytest.raises(InputError, match=r"format 1, this arview reads 2.*again"):
         load_guide_views(saved)
 
 
