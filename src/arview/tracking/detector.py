@@ -69,6 +69,9 @@ SURE_QUALITY = 0.6
 """A pose of this quality ends the search."""
 ALIKE_ASIDE, ALIKE_ALONG, ALIKE_DEG = 0.12, 0.15, 20.0
 """Hypotheses this near, across in diameters and along as a share of the distance, are no rivals of each other."""
+LEAD_TELLS = 0.4
+"""A lead of 1 counts so much beside what edges tell of twins: of 56 semi-synthetic frames with twins the right one is
+ahead of all in 45 with it, in 40 without; of 25 pictures of near-symmetric random solids in 7 and 3."""
 HERE_ASIDE, HERE_ALONG = 0.35, 0.25
 """Rivals this near are at the same place."""
 CLIMBED_WORTH = 12.0
@@ -328,8 +331,8 @@ class Detector:
     ) -> tuple[Hypothesis, list[Hypothesis]]:
         """The pose that is borne out best among the near symmetries of one found, and those that do as well.
 
-        What tells is the edges that only one of two poses has; hypotheses at the same place that are no twins take the
-        best one's place only if these say so clearly. Those from which they do not part the best one are alternatives
+        What tells is the edges that only one of two poses has, and all that speaks for either; hypotheses at the same
+        place that are no twins take the best one's place only if these say so clearly. Those from which they do not part the best one are alternatives
         too, unless an exact symmetry makes them the same pose.
         """
         pose = best.cam_from_body
@@ -340,12 +343,16 @@ class Detector:
         rivals = [h for h in rivals if h is rivals[0] or h.logit > rivals[0].logit - LEAD]
         seen = pool().map(lambda h: self.tracker.edge_steps(picture.gray, h.cam_from_body), rivals)
         steps = {id(h): one for h, one in zip(rivals, seen, strict=True)}
+
+        def ahead(a: Hypothesis, b: Hypothesis) -> float:
+            return telling(steps[id(a)], steps[id(b)]) + LEAD_TELLS * (a.logit - b.logit)
+
         best = rivals[0]
         for rival in rivals[1:]:
             is_twin = self._is_turned(rival, rivals[0], self.symmetries.near, ALIKE_DEG)
-            if telling(steps[id(rival)], steps[id(best)]) > (0.0 if is_twin else TELLING):
+            if ahead(rival, best) > (0.0 if is_twin else TELLING):
                 best = rival
-        twins = [h for h in rivals if h is not best and telling(steps[id(best)], steps[id(h)]) < TELLING]
+        twins = [h for h in rivals if h is not best and ahead(best, h) < TELLING]
         return best, [h for h in twins if not self._is_turned(h, best, self.same_turns, ALIKE_DEG)]
 
     def _is_equal(self, a: Hypothesis, b: Hypothesis, turns: Array, reach: float = 0.08) -> bool:
