@@ -93,6 +93,9 @@ FINE_STAGES = (
     NEAR_STAGES,
 )
 """Both ways are gone: edges and colours; near edges alone, for what hides a part of the outline pulls the colours."""
+LAST_STAGE = FINE_STAGES[0][-1:]
+LARGEST_LOSS = 3.0
+"""Shading may cost so much of what outline and edges say of a pose."""
 
 
 @dataclass(frozen=True)
@@ -334,8 +337,8 @@ class Detector:
         """The pose that is borne out best among the near symmetries of one found, and those that do as well.
 
         What tells is the edges that only one of two poses has, and all that speaks for either; hypotheses at the same
-        place that are no twins take the best one's place only if these say so clearly. Those from which they do not part the best one are alternatives
-        too, unless an exact symmetry makes them the same pose.
+        place that are no twins take the best one's place only if these say so clearly. Those from which they do not
+        part the best one are alternatives too, unless an exact symmetry makes them the same pose.
         """
         pose = best.cam_from_body
         starts = [rigid(pose[:3, :3] @ turn, pose[:3, 3]) for turn in self.symmetries.near]
@@ -433,9 +436,11 @@ class Detector:
         return self._verified(picture, self._ordered(finished, 5.0, VERIFIED))
 
     def _verified(self, picture: Picture, found: list[Hypothesis]) -> list[Hypothesis]:
-        """Refined poses after the verifier has looked at them, best first."""
+        """Refined poses after shading was heard, too, and the verifier has looked at them, best first."""
         if not found:
             return []
+        if self.tracker.part.is_curved:
+            found = self._shaded(picture, found)
         known = np.array([(h.own_logit, h.judgement, h.evidence.scatter_px) for h in found])
         scores = self._verifier.scores(picture, np.stack([h.cam_from_body for h in found]), known)
         seen, part, step_mm = picture.lines(), self.tracker.part.arrays, 0.01 * self.views.diameter_mm
@@ -444,6 +449,18 @@ class Detector:
             support = float(line_support(seen.answers, part, h.cam_from_body, seen.intrinsics, step_mm))
             verified.append(replace(h, verification=score, line_support=support))
         return sorted(verified, key=lambda h: -h.logit)
+
+    def _shaded(self, picture: Picture, found: list[Hypothesis]) -> list[Hypothesis]:
+        """Refined poses after the shading of the surface was heard, too, unless the outline says no to it."""
+
+        def shaded(h: Hypothesis) -> tuple[Array, tuple[Stage, ...]]:
+            tracker = self.tracker
+            look = tracker.fresh_appearance(picture.image, h.cam_from_body)
+            pose, information = tracker.refine(picture.image, picture.gray, h.cam_from_body, LAST_STAGE, look)
+            return tracker.shaded(picture.gray, pose, information)[0], ()
+
+        after = self._refined(picture, list(pool().map(shaded, found)), FINE_TOLERANCE_PX)
+        return [new if new.logit > old.logit - LARGEST_LOSS else old for old, new in zip(found, after, strict=True)]
 
     def _tried(self, picture: Picture, starts: Sequence[Array], stages: tuple[Stage, ...]) -> list[Hypothesis]:
         """Poses after some coarse stages from each start."""

@@ -26,6 +26,7 @@ from arview.tracking.patch import Pyramid
 from arview.tracking.quality import Evidence, quality_of
 from arview.tracking.refine import count_colours, median_brightness_ratio, run_edge_steps, run_evidence, run_stages
 from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
+from arview.tracking.shading import GAIN, LEAST_CURVED, curved_share, look_at, shade
 from arview.tracking.solver import apply_twist, relative_twist
 
 
@@ -125,7 +126,7 @@ class TrackerOptions:
     """Options of the tracker.
 
     Attributes:
-        use_region, use_edge, use_feature: modalities to use.
+        use_region, use_edge, use_feature, use_shading: modalities to use; the last two beside one of the first.
         region_weight, edge_weight: relative trust; neighbours along an outline are not independent.
         edge_sigma_px: how far a good step lies from the CAD's edge.
         edge_threshold: weakest step in grey levels over two pixels.
@@ -144,6 +145,7 @@ class TrackerOptions:
     use_region: bool = True
     use_edge: bool = True
     use_feature: bool = True
+    use_shading: bool = True
     region_weight: float = 0.5
     edge_weight: float = 1.0
     edge_sigma_px: float = 0.7
@@ -192,7 +194,7 @@ class PartView:
     """A guide-view set as the kernels need it: flat float32 arrays about the model's centre.
 
     ``arrays`` holds directions (N,3), contour starts (N+1), points, normals, runs, edge starts (N+1), points,
-    tangents, kinds; ``surface`` is its mesh.
+    tangents, kinds; ``surface`` is its mesh, of which enough may be curved for `shading`.
     """
 
     def __init__(self, views: GuideViewSet) -> None:
@@ -214,6 +216,7 @@ class PartView:
             np.array(raw["edge_kinds"]),
         )
         self.surface = views.surface
+        self.is_curved = curved_share(self.surface) >= LEAST_CURVED
 
 
 def intrinsics_of(camera: Camera) -> Array:
@@ -447,7 +450,7 @@ class Tracker:
                     pose, information, evidence = other, other_information, other_evidence
         strangeness = self._strangeness(pose, predicted)
         if self._is_suspicious(evidence, strangeness):
-            _, gray = self._gray_around(image)
+            plain_gray, gray = self._gray_around(image)
             best = evidence.worth - STRANGE_WORTH * strangeness
             for start in self._search.find(image, (self._bin_of, self.appearance.odds), predicted):
                 other, other_information = self.refine(image, gray, start, o.stages)
@@ -458,6 +461,11 @@ class Tracker:
                     best = worth
             # What was looked for everywhere and found no better is usual from now on.
             self._usual_worth = evidence.worth
+        if o.use_shading and self.part.is_curved:
+            shaded, shaded_information = self.shaded(plain_gray, pose, information)
+            shaded_evidence = self.evidence(image, gray, shaded)
+            if shaded_evidence.worth > evidence.worth - CLEARLY_MORE:
+                pose, information, evidence = shaded, shaded_information, shaded_evidence
         self._usual_worth += 0.1 * (evidence.worth - self._usual_worth)
         self._velocity = 0.9 * relative_twist(before, pose)
         self._cam_from_body = pose
@@ -471,6 +479,19 @@ class Tracker:
             if self._features is not None:
                 self._remember_texture(pyramid, pose, matches, evidence)
         return Estimate(pose @ self.part.body_from_model, information, quality, evidence)
+
+    def shaded(self, gray: NDArray[np.uint8], cam_from_body: Array, information: Array) -> tuple[Array, Array]:
+        """Pose and information after the shading of the surface under an unknown light was heard, too; see `shading`.
+
+        Args:
+            gray: (H,W), not smoothed.
+            cam_from_body: (4,4), the best by outline and edges; information: (6,6) of these.
+        """
+        look = look_at(gray, self.camera, self.diameter_mm, cam_from_body)
+        if look is None:
+            return cam_from_body, information
+        pose, more, _ = shade(*look, self.part.surface, self.diameter_mm, cam_from_body, information, GAIN)
+        return pose, more
 
     def _strangeness(self, cam_from_body: Array, predicted: Array) -> float:
         """How far a pose is from the predicted one: 1 at 45°, at a third of the diameter aside or two along."""
