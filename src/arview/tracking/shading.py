@@ -35,10 +35,12 @@ SMOOTH_COS = 0.2
 """Nor where the surface turns by more over that way: beside an edge brightness says less than the edge itself."""
 FEWEST_PIXELS = 60
 """Of fewer nothing is told."""
-GAIN = 4.0
+GAIN = 5.0
 """Of the system beside those of edges and colours, by the variance of what is left of the brightness."""
 PRIOR = 1e-4
 """Of every pixel so much speaks for no shading: few normals leave some of a light open."""
+OUTLYING = 2.0
+"""Median deviations at which a pixel counts a quarter."""
 ROUNDS, FITS = 4, 3
 """Of the pose; of the light before each, with what it does not explain counting less and less."""
 LARGEST_TURN_RAD = 0.12
@@ -47,9 +49,11 @@ LEAST_DEVIATION = 1.0
 """Grey levels: nothing is explained better than this."""
 
 
-LEAST_CURVED, CURVED_DEG = 0.2, (0.5, 60.0)
-"""With less of its surface curved, by such angles from face to face, a part's shading is not looked at: flat faces
-tell nothing that the light could not be the reason of."""
+CREASE_DEG = 40.0
+"""Surfaces that meet at more than this have an edge between them."""
+LEAST_CURVED, FLAT_DEG = 0.2, 0.5
+"""With less of its surface curved, by more than that angle from face to face, a part's shading is not looked at: flat
+faces tell nothing that the light could not be the reason of."""
 
 
 class LookedAt(NamedTuple):
@@ -76,12 +80,48 @@ def curved_share(surface: Surface) -> float:
     joined = np.flatnonzero(np.all(edges[1:] == edges[:-1], axis=1))
     one, other = owners[joined], owners[joined + 1]
     cosine = np.abs(np.sum(normals[one] * normals[other], axis=1))
-    low, high = np.cos(np.deg2rad(CURVED_DEG))
-    is_curved = (cosine < low) & (cosine > high)
+    is_curved = (cosine < np.cos(np.deg2rad(FLAT_DEG))) & (cosine > np.cos(np.deg2rad(CREASE_DEG)))
     curved = np.unique(np.concatenate([one[is_curved], other[is_curved]]))
     a, b, c = points[corners].transpose(1, 0, 2)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return float(areas[curved].sum() / max(areas.sum(), 1e-12))
+
+
+@njit(cache=True, nogil=True)
+def corner_normals(surface):  # type: ignore[no-untyped-def]
+    """Unit normals (F,3,3) float32 at the corners of a surface's faces: the mean of those around that go on smoothly.
+
+    Weighted by area; faces that meet at more than CREASE_DEG do not count as one surface.
+    """
+    points, faces, normals, _ = surface
+    count = len(faces)
+    areas = np.empty(count)
+    starts = np.zeros(len(points) + 1, dtype=np.int64)
+    for i in range(count):
+        areas[i] = np.linalg.norm(
+            np.cross(points[faces[i, 1]] - points[faces[i, 0]], points[faces[i, 2]] - points[faces[i, 0]])
+        )
+        for k in range(3):
+            starts[faces[i, k] + 1] += 1
+    starts = np.cumsum(starts)
+    filled = starts[:-1].copy()
+    around = np.empty(3 * count, dtype=np.int64)
+    for i in range(count):
+        for k in range(3):
+            around[filled[faces[i, k]]] = i
+            filled[faces[i, k]] += 1
+    least = np.cos(np.deg2rad(CREASE_DEG))
+    smooth = np.empty((count, 3, 3), dtype=np.float32)
+    for i in range(count):
+        for k in range(3):
+            x, y, z = 0.0, 0.0, 0.0
+            for other in around[starts[faces[i, k]] : starts[faces[i, k] + 1]]:
+                a, b = normals[i], normals[other]
+                if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] > least:
+                    x, y, z = x + areas[other] * b[0], y + areas[other] * b[1], z + areas[other] * b[2]
+            size = np.sqrt(x * x + y * y + z * z) + 1e-30
+            smooth[i, k, 0], smooth[i, k, 1], smooth[i, k, 2] = x / size, y / size, z / size
+    return smooth
 
 
 def look_at(gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_from_body: Array) -> LookedAt | None:
@@ -114,13 +154,13 @@ def look_at(gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_fro
 
 @njit(cache=True, nogil=True)
 def shade(  # type: ignore[no-untyped-def]
-    bright, focal_px, middle_px, surface, diameter_mm, cam_from_body, information, gain
+    bright, focal_px, middle_px, surface, corners, diameter_mm, cam_from_body, information, gain
 ):
     """A pose refined by the shading of the part's surface, beside what else is known of it.
 
     Args:
         bright, focal_px, middle_px: see `LookedAt`.
-        surface: of the part, a `Surface` about the origin of the body.
+        surface: of the part, a `Surface` about the origin of the body; corners: see `corner_normals`.
         diameter_mm: of the part.
         cam_from_body: (4,4); information: (6,6) of it, from edges and colours, that it is the best of.
         gain: of the shading beside that.
@@ -142,6 +182,7 @@ def shade(  # type: ignore[no-untyped-def]
         for k in range(2):
             center_px[k] = middle_px[k] + focal_px[k] * pose[k, 3] / pose[2, 3]
         draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids)
+        _smooth(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm)
         places = _inner_places(drawn, face_ids)
         if len(places) < FEWEST_PIXELS:
             return cam_from_body.copy(), information.copy(), -1.0
@@ -162,6 +203,48 @@ def shade(  # type: ignore[no-untyped-def]
             step *= LARGEST_TURN_RAD / turn
         pose = apply_twist(pose, step)
     return pose, best, explained
+
+
+@njit(cache=True, nogil=True)
+def _smooth(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm):  # type: ignore[no-untyped-def]
+    """Replace the normals of faces by those between the normals of their corners (Phong, CACM 1975)."""
+    points, faces = surface[0], surface[1]
+    place, normal = np.empty(3), np.empty(3)
+    for v in range(face_ids.shape[0]):
+        for u in range(face_ids.shape[1]):
+            face = face_ids[v, u]
+            if face < 0:
+                continue
+            depth = pose[2, 3] + 0.5 * diameter_mm * drawn[3, v, u]
+            x = (u - middle_px[0]) / focal_px[0] * depth - pose[0, 3]
+            y = (v - middle_px[1]) / focal_px[1] * depth - pose[1, 3]
+            z = depth - pose[2, 3]
+            for k in range(3):
+                place[k] = pose[0, k] * x + pose[1, k] * y + pose[2, k] * z
+            a, b, c = points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]]
+            bb, bc, cc, pb, pc = 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(3):
+                to_b, to_c, to_p = b[k] - a[k], c[k] - a[k], place[k] - a[k]
+                bb, bc, cc = bb + to_b * to_b, bc + to_b * to_c, cc + to_c * to_c
+                pb, pc = pb + to_p * to_b, pc + to_p * to_c
+            size = bb * cc - bc * bc
+            if size <= 0.0:
+                continue
+            at_b = min(max((cc * pb - bc * pc) / size, 0.0), 1.0)
+            at_c = min(max((bb * pc - bc * pb) / size, 0.0), 1.0 - at_b)
+            own = corners[face]
+            for k in range(3):
+                normal[k] = (1.0 - at_b - at_c) * own[0, k] + at_b * own[1, k] + at_c * own[2, k]
+            x = pose[0, 0] * normal[0] + pose[0, 1] * normal[1] + pose[0, 2] * normal[2]
+            y = pose[1, 0] * normal[0] + pose[1, 1] * normal[1] + pose[1, 2] * normal[2]
+            z = -(pose[2, 0] * normal[0] + pose[2, 1] * normal[1] + pose[2, 2] * normal[2])
+            size = np.sqrt(x * x + y * y + z * z)
+            if size < 1e-6:
+                continue
+            # Faces are drawn as if their normals pointed to the camera.
+            if x * drawn[0, v, u] + y * drawn[1, v, u] + z * drawn[2, v, u] < 0.0:
+                size = -size
+            drawn[0, v, u], drawn[1, v, u], drawn[2, v, u] = x / size, y / size, z / size
 
 
 @njit(cache=True, nogil=True)
@@ -218,7 +301,7 @@ def _fitted_light(values, functions, light, is_known):  # type: ignore[no-untype
 
 @njit(cache=True, nogil=True)
 def _weigh(left, weights):  # type: ignore[no-untyped-def]
-    scale = LEAST_DEVIATION + 2.0 * np.abs(left).mean()
+    scale = LEAST_DEVIATION + OUTLYING * np.median(np.abs(left))
     for i in range(len(left)):
         weights[i] = 1.0 / (1.0 + (left[i] / scale) ** 2) ** 2
 
@@ -289,6 +372,9 @@ def _reduced(motion, functions, values, weights, light):  # type: ignore[no-unty
     mean = (weights * values).sum() / total
     variance = LEAST_DEVIATION**2 + (weights * left * left).sum() / total
     spread = LEAST_DEVIATION**2 + (weights * (values - mean) ** 2).sum() / total
-    hessian = (hessian - np.dot(across, solved)) / variance
-    gradient = (gradient + np.dot(solved.T, sums)) / variance
-    return hessian, gradient, 1.0 - variance / spread
+    explained = 1.0 - variance / spread
+    # What is explained badly is hardly the part.
+    share = max(explained, 0.0) ** 2 / variance
+    hessian = share * (hessian - np.dot(across, solved))
+    gradient = share * (gradient + np.dot(solved.T, sums))
+    return hessian, gradient, explained

@@ -26,7 +26,7 @@ from arview.tracking.patch import Pyramid
 from arview.tracking.quality import Evidence, quality_of
 from arview.tracking.refine import count_colours, median_brightness_ratio, run_edge_steps, run_evidence, run_stages
 from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
-from arview.tracking.shading import GAIN, LEAST_CURVED, curved_share, look_at, shade
+from arview.tracking.shading import GAIN, LEAST_CURVED, corner_normals, curved_share, look_at, shade
 from arview.tracking.solver import apply_twist, relative_twist
 
 
@@ -217,6 +217,7 @@ class PartView:
         )
         self.surface = views.surface
         self.is_curved = curved_share(self.surface) >= LEAST_CURVED
+        self.corner_normals = corner_normals(self.surface)
 
 
 def intrinsics_of(camera: Camera) -> Array:
@@ -490,7 +491,9 @@ class Tracker:
         look = look_at(gray, self.camera, self.diameter_mm, cam_from_body)
         if look is None:
             return cam_from_body, information
-        pose, more, _ = shade(*look, self.part.surface, self.diameter_mm, cam_from_body, information, GAIN)
+        pose, more, _ = shade(
+            *look, self.part.surface, self.part.corner_normals, self.diameter_mm, cam_from_body, information, GAIN
+        )
         return pose, more
 
     def _strangeness(self, cam_from_body: Array, predicted: Array) -> float:
