@@ -163,6 +163,12 @@ def test_wrong_inspection_camera_or_guide_end_it_with_one_line(tmp_path: Path) -
         assert len(result.stderr.splitlines()) == 1
 
 
+def test_a_part_that_is_not_there_is_said_before_anything_else() -> None:
+    result = CliRunner().invoke(main, ["live", "--part", "nowhere.toml"])
+    assert result.exit_code == 2 and "nowhere.toml: no such file" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
 def test_a_missing_extra_says_its_pip_line(monkeypatch: pytest.MonkeyPatch) -> None:
     real = importlib.util.find_spec
     missing = ("aiortc", "segno")

@@ -206,6 +206,20 @@ def default_view_range(model: Model) -> ViewRange:
     return ViewRange(distance_mm=(1.5 * model.diameter_mm, 6.0 * model.diameter_mm))
 
 
+def find_part_file(path: str | Path) -> Path:
+    """The part file or CAD file that is meant: of a folder its part.toml.
+
+    Raises:
+        InputError: there is none.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "part.toml"
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a part file (.toml) or a CAD file ({' '.join(SUFFIXES)})")
+    return path
+
+
 def load_part(path: str | Path, unit: str | None = None) -> Part:
     """Part of a part file (TOML, see PART_FILE_EXAMPLE), of a folder with a part.toml, or of a bare CAD file.
 
@@ -215,11 +229,7 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
         InputError: missing or broken file, unknown key, wrong type or value, a component that the CAD does
             not have; and everything that load_cad raises.
     """
-    path = Path(path)
-    if path.is_dir():
-        path = path / "part.toml"
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give a part file (.toml) or a CAD file ({' '.join(SUFFIXES)})")
+    path = find_part_file(path)
     if path.suffix.lower() != ".toml":
         cad = load_cad(path, unit)
         settings = tuple(ComponentSettings(component.name) for component in cad.model.components)

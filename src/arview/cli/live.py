@@ -132,10 +132,12 @@ def live(
 ) -> None:
     """Serve the overlay of PART to phones and screens in the local network."""
     require_extra()
+    from arview.cad.part import find_part_file
     from arview.live.options import LiveOptions
     from arview.live.server import LiveServer, take_place
     from arview.video.sources import check_source
 
+    find_part_file(part_path)
     if init is not None and not init.startswith("guide:"):
         raise InputError(f"--init {init}: expected guide:NAME")
     if (cert is None) != (key is None):
