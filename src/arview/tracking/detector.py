@@ -336,26 +336,26 @@ class Detector:
     ) -> tuple[Hypothesis, list[Hypothesis]]:
         """The pose that is borne out best among the near symmetries of one found, and those that do as well.
 
-        What tells is the edges that only one of two poses has, and all that speaks for either; hypotheses at the same
-        place that are no twins take the best one's place only if these say so clearly. Those from which they do not
-        part the best one are alternatives too, unless an exact symmetry makes them the same pose.
+        What tells is the edges that only one of two twins has, and all that speaks for either. Those from which these do
+        not part the best one are alternatives, unless an exact symmetry makes them the same pose.
         """
         pose = best.cam_from_body
         starts = [rigid(pose[:3, :3] @ turn, pose[:3, 3]) for turn in self.symmetries.near]
         reach_mm = 0.25 * self.views.diameter_mm
         rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
         rivals = self._ordered([best, *self._verified(picture, self._finished(picture, starts)), *rivals], 5.0)
-        rivals = [h for h in rivals if h is rivals[0] or h.logit > rivals[0].logit - LEAD]
+        first = rivals[0]
+        near = [h for h in rivals[1:] if h.logit > first.logit - LEAD]
+        rivals = [first, *(h for h in near if self._is_turned(h, first, self.turns, ALIKE_DEG))]
         seen = pool().map(lambda h: self.tracker.edge_steps(picture.gray, h.cam_from_body), rivals)
         steps = {id(h): one for h, one in zip(rivals, seen, strict=True)}
 
         def ahead(a: Hypothesis, b: Hypothesis) -> float:
             return telling(steps[id(a)], steps[id(b)]) + LEAD_TELLS * (a.logit - b.logit)
 
-        best = rivals[0]
+        best = first
         for rival in rivals[1:]:
-            is_twin = self._is_turned(rival, rivals[0], self.symmetries.near, ALIKE_DEG)
-            if ahead(rival, best) > (0.0 if is_twin else TELLING):
+            if ahead(rival, best) > 0.0:
                 best = rival
         twins = [h for h in rivals if h is not best and ahead(best, h) < TELLING]
         return best, [h for h in twins if not self._is_turned(h, best, self.same_turns, ALIKE_DEG)]
