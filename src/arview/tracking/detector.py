@@ -336,8 +336,8 @@ class Detector:
     ) -> tuple[Hypothesis, list[Hypothesis]]:
         """The pose that is borne out best among the near symmetries of one found, and those that do as well.
 
-        What tells is the edges that only one of two twins has, and all that speaks for either. Those from which these do
-        not part the best one are alternatives, unless an exact symmetry makes them the same pose.
+        What tells is the edges that only one of two twins has, and all that speaks for either. Those from which these
+        do not part the best one are alternatives, unless an exact symmetry makes them the same pose.
         """
         pose = best.cam_from_body
         starts = [rigid(pose[:3, :3] @ turn, pose[:3, 3]) for turn in self.symmetries.near]
