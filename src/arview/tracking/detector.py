@@ -243,13 +243,15 @@ class Detector:
         self.camera = camera
         self.best_rejected: Rejected | None = None
         self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
-        self.search = FirstSearch(views, self.tracker.part, camera, o.radius_px, o.roll_step_deg, o.subdivisions)
         self._line_network = LineNetwork()
         self._verifier = Verifier(self.tracker.part)
         self._components = ComponentCheck(views, model, camera) if model and len(model.components) > 1 else None
         self.symmetries = find_symmetries(views)
         self.same_turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
         self.turns = np.concatenate([self.same_turns, self.symmetries.near])
+        self.search = FirstSearch(
+            views, self.tracker.part, camera, o.radius_px, o.roll_step_deg, o.subdivisions, self.symmetries.exact
+        )
 
     def detect(self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True) -> list[Detection]:
         """Poses of the part in a frame, best first; an empty list when it is not found.

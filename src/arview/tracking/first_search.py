@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.cad.view_range import ViewRange
 from arview.camera import Camera
 from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
@@ -49,6 +50,11 @@ NEARER, FARTHER = 0.85, 1.18
 """Poses are looked for so far beyond the declared distances, as shares of them."""
 CELL_PX, CELL_ROLL = 4.0, 0.33
 """Of matches whose place and roll (rad) fall in one cell, of one scale and group of views, the best is enough."""
+WANTED_SIDE = np.array([0.36, 0.48, 0.8])
+"""On no axis or plane that a part's symmetries are likely to have."""
+WANTED_MARGIN_DEG = 14.0
+"""Near the border the templates on both sides matter: 192 of 200 frames of the recorded cube, 189 with 9 (193 with all
+directions)."""
 ALIKE = 5
 """So many matches are there for one that is left then."""
 
@@ -144,6 +150,23 @@ class Likely(NamedTuple):
     responses: Array
 
 
+def _are_wanted(directions: Array, turns: Array, view_range: ViewRange) -> NDArray[np.bool_]:
+    """Which of the directions (V,3) to the camera to look for: of those that turns make the same, one and a margin.
+
+    The part of the sphere nearer to one fixed direction than to its images under the turns; images outside the
+    declared range do not count, nor does any symmetry where not all rolls are declared.
+    """
+    wanted = np.ones(len(directions), dtype=np.bool_)
+    low, high = view_range.roll_deg
+    if high - low < 360.0:
+        return wanted
+    for turn in turns:
+        across = turn @ WANTED_SIDE - WANTED_SIDE
+        is_farther = directions @ across > np.sin(np.deg2rad(WANTED_MARGIN_DEG)) * np.linalg.norm(across)
+        wanted &= ~(is_farther & view_range.contains_direction(directions @ turn))
+    return wanted
+
+
 NOTHING_LIKELY = Likely(np.empty((0, 4, 4)), np.empty(0), np.empty(0))
 
 
@@ -166,6 +189,7 @@ class FirstSearch:
         radius_px: half the part's diameter in the templates.
         roll_step_deg: spacing of the templates.
         subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
+        turns: (N,3,3) of the part onto itself: of views that these make the same one is looked for.
 
     Raises:
         InputError: no view shows an outline.
@@ -179,6 +203,7 @@ class FirstSearch:
         radius_px: float,
         roll_step_deg: float,
         subdivisions: int,
+        turns: Array,
     ) -> None:
         self.camera = camera
         self._radius_px = radius_px
@@ -193,6 +218,8 @@ class FirstSearch:
         top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
         chosen = outlines_around(views, self.outlines, subdivisions)
+        chosen = chosen[_are_wanted(-self.outlines.rotations[chosen, 2], turns, views.view_range)]
+        self._groups = len(np.unique(self.outlines.groups[chosen]))
         rolls = np.deg2rad(views.view_range.rolls_deg(roll_step_deg))
         focals_px = {step: self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE) for step in self._steps}
         self.banks = {
@@ -232,7 +259,7 @@ class FirstSearch:
         halves = [0, count // 2, count]
         votes = {step: np.zeros((GROUPS, 1024), dtype=np.int64) for step in scales}
         # Of each group of views at each scale as many; most that are found are alike.
-        kept = ALIKE * -(-effort.matches // (GROUPS * len(scales)))
+        kept = ALIKE * -(-effort.matches // (self._groups * len(scales)))
         levels = list(zip(scales, phases, strict=True))
         jobs = [(*level, first, last) for level in levels for first, last in pairwise(halves)]
         found = pool().map(lambda job: self._match(votes[job[0]], kept, picture, *job), jobs)
