@@ -17,12 +17,12 @@ from arview.evaluation.semisynthetic import CAMERA, VARIANTS, SequenceOptions, r
 from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.evaluation.semisynthetic.look_alikes import look_alikes
 from arview.evaluation.semisynthetic.random_solids import random_solid
-from arview.geometry import Array, exp_so3, rigid
+from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews.surface import Surface, reduced_surface, surface_about
 from arview.tracking.component_network import ComponentLook, component_looks
 from arview.tracking.tracker import intrinsics_of
 from judge_examples import ANYWHERE, OCCLUDER, noisy, some_solids
-from line_examples import crowded_picture
+from line_examples import covered_picture, crowded_picture, lone_picture
 
 LEAST_COMPONENTS = 4
 """Solids of fewer are no assemblies."""
@@ -42,6 +42,9 @@ TURNED_DEG, OFF_SHARE, OFF_MM = 0.35, 0.003, 0.6
 WORSE = 0.3
 IN_CROWD = 0.3
 """Share of pictures that show a crowd of other solids too."""
+COVERED, COVER_SIZE, COVER_OFF = 0.35, (0.5, 3.0), 0.6
+"""Share of pictures in which something is before some component, its half diameter in the component's larger sides, and
+how far its middle is off: what is hidden is neither right nor wrong."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,14 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
         options = SequenceOptions(variant, 1, int(rng.integers(1 << 30)), noise=rng.uniform(2.0, 8.0), motion=ANYWHERE)
         pose = trajectory(model, options)[0]
         shown = _displaced(built, model, rng)
-        if rng.random() < IN_CROWD:
-            image = noisy(crowded_picture(others, (shown, pose), photos, rng)[0], rng)
+        is_crowded, is_covered = rng.random() < IN_CROWD, rng.random() < COVERED
+        if is_crowded or is_covered:
+            picture = (
+                crowded_picture(others, (shown, pose), photos, rng)[0]
+                if is_crowded
+                else lone_picture(shown, pose, photos, rng)
+            )
+            image = noisy(_covered(picture, model, pose, others, photos, rng) if is_covered else picture, rng)
         else:
             photo = read_photo(photos[rng.integers(len(photos))])
             image = next(iter(render_sequence(shown, pose[None], photo, options, CAMERA, occluder))).image
@@ -122,6 +131,32 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
                 np.array([look.size_px for look in looks]),
                 np.array(is_wrong),
             )
+
+
+def _covered(
+    picture: NDArray[np.float32],
+    model: Model,
+    pose: Array,
+    others: Sequence[Model],
+    photos: Sequence[Path],
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """A picture of an assembly with something before one of its components."""
+    base = _base(model)
+    small = [component for component in model.components if component is not base]
+    # Of those on the near side, if there are any: the base hides the others.
+    before = [one for one in small if _depth_mm(one, pose) < _depth_mm(base, pose)] or small
+    chosen = before[rng.integers(len(before))]
+    seen_px = CAMERA.project(apply(pose, chosen.vertices_in_model))
+    low_px, high_px = seen_px.min(axis=0), seen_px.max(axis=0)
+    size_px = float(np.max(high_px - low_px))
+    radius_px = size_px * rng.uniform(*COVER_SIZE)
+    place_px = 0.5 * (low_px + high_px) + COVER_OFF * radius_px * rng.normal(size=2)
+    return covered_picture(picture, place_px, radius_px, others, photos, rng)
+
+
+def _depth_mm(component: Component, pose: Array) -> float:
+    return float(apply(pose, np.mean(np.stack(component.bounds_in_model), axis=0))[2])
 
 
 def _off(pose: Array, rng: np.random.Generator) -> Array:

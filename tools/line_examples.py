@@ -146,6 +146,29 @@ def crowded_picture(
     return picture, float(seen.sum() / max(covers[place].sum(), 1.0))
 
 
+def lone_picture(solid: Model, pose: Array, photos: Sequence[Path], rng: np.random.Generator) -> NDArray[np.float32]:
+    """A picture (H,W,3), without noise, of one solid at a ``cam_from_model`` before one of some photos."""
+    photo = read_photo(photos[rng.integers(len(photos))])
+    return drawn_before(_crop(photo, rng).astype(np.float32), photo, [(solid, pose)], photos, rng)[0]
+
+
+def covered_picture(
+    picture: NDArray[np.float32],
+    place_px: Array,
+    radius_px: float,
+    solids: Sequence[Model],
+    photos: Sequence[Path],
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """A picture with one of some solids, of whatever colour, drawn over a place."""
+    solid = solids[rng.integers(len(solids))]
+    if rng.random() < RECOLOURED:
+        solid = _recoloured(solid, rng)
+    photo = read_photo(photos[rng.integers(len(photos))])
+    placed = [(solid, _pose_at(solid, place_px, radius_px, rng))]
+    return drawn_before(picture, photo, placed, photos, rng)[0]
+
+
 def _distance_mm(solid: Model, pose: Array) -> float:
     return float(apply(pose, solid.center_in_model)[2])
 

@@ -55,9 +55,9 @@ class LineNetwork:
         if share < 1.0:
             image = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
             height, width = image.shape[:2]
-        shown = (image.astype(np.float32) - np.float32(image.mean())) / np.float32(CONTRAST)
-        shown = cv2.copyMakeBorder(shown, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REPLICATE)
-        self._network.setInput(np.ascontiguousarray(shown.transpose(2, 0, 1))[None])
+        mean = sum(cv2.mean(image)[:3]) / 3.0
+        image = cv2.copyMakeBorder(image, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REPLICATE)
+        self._network.setInput(cv2.dnn.blobFromImage(image, 1.0 / CONTRAST, mean=(mean, mean, mean)))
         seen = self._network.forward()[0, :ORIENTATIONS, : -(-height // SHRINK), : -(-width // SHRINK)]
         around = cv2.dilate(seen.max(axis=0), np.ones((AROUND_PX, AROUND_PX), dtype=np.uint8))
         clear = np.maximum(CLEAR_SHARE * cv2.blur(around, (AROUND_PX // 2, AROUND_PX // 2)), LEAST_CLEAR)
