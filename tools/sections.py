@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from arview.cad import Model, ViewRange, load_part
-from arview.evaluation import PoseMeter, Scene, load_scene
+from arview.evaluation import PoseMeter, Scene, SceneFrame, load_scene
 from arview.evaluation.protocols import (
     Tally,
     box_symmetries,
@@ -183,52 +183,86 @@ class Sections:
         return Detector(shape_views(scene.part.model), scene.camera), scene.camera
 
     def look_alikes(self) -> list[Line]:
-        """Whether a session says what is wrong with an assembly, from a detection in single frames."""
+        """Whether a session says what is wrong with an assembly: of single frames, and walked round it."""
         models = {"assembly": shape("assembly")} if "assembly" in self.shapes else {}
         if (SAMPLE / "part.toml").is_file() and self.frames is None:
             models[SAMPLE.name] = load_part(SAMPLE / "part.toml").model
-        results = []
+        results, walks = [], []
         for name, model in models.items():
             variants = look_alikes(model)
             every = max(1, len(variants) // self.frames) if self.frames else 1
             for look_alike in watched(variants[::every], f"lookalike {name}"):
-                results += self._look_alike_results(name, model, look_alike)
+                walk = self._walk(name, model, look_alike)
+                if walk is not None:
+                    results += walk.single_frames(self.frames or DETECT_FRAMES["look-alike"])
+                    walks.append(walk.to_the_end())
         self.details["lookalike"] = [asdict(result) for result in results]
+        self.details["lookalike-walk"] = [asdict(result) for result in walks]
         total = len(results)
-        named, clean = sum(r.is_named for r in results), sum(r.is_clean for r in results)
         silent = sum(not r.is_locked for r in results)
+        clean, clean_walks = (sum(r.is_clean for r in of) for of in (results, walks))
+        named, named_walks = (sum(r.is_named for r in of) for of in (results, walks))
         on = f"{', '.join(models)}: {total} frames"
+        after = f"{len(walks)} of them, walked round for {LOOK_ALIKE_FRAMES / 30.0:.0f} s"
         text = f"{percent(named, total)} named, {percent(silent, total)} not found"
+        all_named = percent(named_walks, len(walks))
         return [
             Line("lookalike named", on, text, "≥ 90 %", total > 0 and named >= 0.9 * total),
             Line("lookalike clean lock", on, f"{clean} of {total}", "none", total > 0 and clean == 0),
+            Line("lookalike named at last", after, all_named, "≥ 90 %", named_walks >= 0.9 * len(walks) > 0),
+            Line("lookalike clean at last", after, f"{clean_walks} of {len(walks)}", "none", clean_walks == 0),
         ]
 
-    def _look_alike_results(self, name: str, model: Model, look_alike: LookAlike) -> Iterator[LookAlikeResult]:
+    def _walk(self, name: str, model: Model, look_alike: LookAlike) -> LookAlikeWalk | None:
+        """A walk round a look-alike; None when its fault shows in none of the frames."""
         options = SequenceOptions("regular", LOOK_ALIKE_FRAMES, SEED)
         made = make_sequence(look_alike_job(name, model, look_alike, options, self.photos), self.folder / "look_alikes")
         scene = load_scene(made / "test" / "000001")
         infos = json.loads((scene.folder / "scene_gt_info.json").read_text())
         shown = tuple(f for f in scene.frames if infos[str(f.index)][0]["different_fract"] >= LEAST_DIFFERENT)
         if not shown:
-            return
+            return None
         session = TrackingSession(
             full_sphere_views(scene.part.model, WALK_ROUND.distance_mm), scene.part.model, scene.camera
         )
-        scene = Scene(scene.name, scene.folder, scene.part, scene.symmetric_poses, scene.camera, shown)
-        for frame in spread_frames(scene, self.frames or DETECT_FRAMES["look-alike"]):
-            image = scene.image(frame)
-            session.reset()
-            for _ in range(2):  # a detection must hold a second frame before it is believed
-                pose = session.process(image, frame.index, frame.index / 30.0)
-            found = pose.mismatches
-            is_named = any(part in words(text) for text in found for part in look_alike.components)
-            yield LookAlikeResult(look_alike.name, frame.index, str(pose.state), is_named, found)
+        return LookAlikeWalk(look_alike, scene, shown, session)
+
+
+@dataclass(frozen=True)
+class LookAlikeWalk:
+    """A look-alike, pictures from a walk round it, those of them that show its fault, and a session for the part."""
+
+    look_alike: LookAlike
+    scene: Scene
+    shown: tuple[SceneFrame, ...]
+    session: TrackingSession
+
+    def single_frames(self, count: int) -> Iterator[LookAlikeResult]:
+        """What the session makes of some single frames that show the fault."""
+        scene = self.scene
+        scene = Scene(scene.name, scene.folder, scene.part, scene.symmetric_poses, scene.camera, self.shown)
+        for frame in spread_frames(scene, count):
+            self.session.reset()
+            # A detection must hold a second frame before it is believed.
+            yield self._seen([frame, frame])
+
+    def to_the_end(self) -> LookAlikeResult:
+        """What it makes of all of them, one after the other."""
+        self.session.reset()
+        return self._seen(self.scene.frames)
+
+    def _seen(self, frames: Sequence[SceneFrame]) -> LookAlikeResult:
+        """What the session says after some frames."""
+        for frame in frames:
+            pose = self.session.process(self.scene.image(frame), frame.index, frame.index / 30.0)
+        found = pose.mismatches
+        is_named = any(part in words(text) for text in found for part in self.look_alike.components)
+        return LookAlikeResult(self.look_alike.name, frames[-1].index, str(pose.state), is_named, found)
 
 
 @dataclass(frozen=True)
 class LookAlikeResult:
-    """What a session made of one picture of a look-alike."""
+    """What a session made of pictures of a look-alike, and the last of them."""
 
     look_alike: str
     frame: int
