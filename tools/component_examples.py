@@ -100,17 +100,7 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
         options = SequenceOptions(variant, 1, int(rng.integers(1 << 30)), noise=rng.uniform(2.0, 8.0), motion=ANYWHERE)
         pose = trajectory(model, options)[0]
         shown = _displaced(built, model, rng)
-        is_crowded, is_covered = rng.random() < IN_CROWD, rng.random() < COVERED
-        if is_crowded or is_covered:
-            picture = (
-                crowded_picture(others, (shown, pose), photos, rng)[0]
-                if is_crowded
-                else lone_picture(shown, pose, photos, rng)
-            )
-            image = noisy(_covered(picture, model, pose, others, photos, rng) if is_covered else picture, rng)
-        else:
-            photo = read_photo(photos[rng.integers(len(photos))])
-            image = next(iter(render_sequence(shown, pose[None], photo, options, CAMERA, occluder))).image
+        image = _picture(shown, model, pose, options, (occluder, *others), photos, rng)
         cam_from_body = _off(pose, rng) @ rigid(np.eye(3), model.center_in_model)
 
         def looks_at(expected: Surface, of: Model, names: tuple[str, ...] | None) -> list[ComponentLook]:
@@ -131,6 +121,26 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
                 np.array([look.size_px for look in looks]),
                 np.array(is_wrong),
             )
+
+
+def _picture(
+    shown: Model,
+    model: Model,
+    pose: Array,
+    options: SequenceOptions,
+    others: Sequence[Model],
+    photos: Sequence[Path],
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """A picture of what is built for an assembly, perhaps in a crowd, perhaps with something before a component."""
+    is_crowded, is_covered = rng.random() < IN_CROWD, rng.random() < COVERED
+    if not (is_crowded or is_covered):
+        photo = read_photo(photos[rng.integers(len(photos))])
+        return next(iter(render_sequence(shown, pose[None], photo, options, CAMERA, others[0]))).image
+    picture = (
+        crowded_picture(others, (shown, pose), photos, rng)[0] if is_crowded else lone_picture(shown, pose, photos, rng)
+    )
+    return noisy(_covered(picture, model, pose, others, photos, rng) if is_covered else picture, rng)
 
 
 def _covered(
