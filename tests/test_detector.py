@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import permutations, product
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ import pytest
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.errors import InputError
-from arview.geometry import apply, are_near
+from arview.geometry import apply, are_near, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
+from arview.guideviews.sphere import icosphere_directions
 from arview.pose import TrackingState
 from arview.tracking import Detector, DetectorOptions, TrackingSession
 from arview.tracking.ambiguity import TELLING, EdgeSteps, find_symmetries, telling
 from arview.tracking.detector import Hypothesis
-from arview.tracking.first_search import FARTHER, NEARER, RESPONSE_WORTH, WIDE, Likely
+from arview.tracking.first_search import FARTHER, NEARER, RESPONSE_WORTH, WANTED_SIDE, WIDE, Likely, are_wanted
 from arview.tracking.quality import Evidence
 from cad_files import box
 from synthetic import (
@@ -34,6 +36,8 @@ from synthetic import (
     post,
     wrong,
 )
+
+SIGNS = tuple(product((-1.0, 1.0), repeat=3))
 
 
 @cache
@@ -110,6 +114,68 @@ def test_symmetries_are_discovered() -> None:
     assert np.allclose(np.trace(half_turns, axis1=1, axis2=2), -1.0, atol=1e-9)
     assert len(find_symmetries(assembly_views()).exact) == 0
     assert len(find_symmetries(assembly_views()).near) == 0
+
+
+def cube_turns() -> np.ndarray:
+    """The 24 turns of a cube onto itself."""
+    signed = [np.diag(signs) @ np.eye(3)[list(order)] for order in permutations(range(3)) for signs in SIGNS]
+    return np.array([turn for turn in signed if np.linalg.det(turn) > 0.0])
+
+
+def farthest_from_wanted_deg(directions: np.ndarray, wanted: np.ndarray, turns: np.ndarray) -> float:
+    """How far the farthest of some directions (N,3) is from all images of the wanted ones."""
+    images = np.concatenate([wanted @ turn for turn in turns])
+    return float(np.rad2deg(np.arccos(np.clip((directions @ images.T).max(axis=1), -1.0, 1.0)).max()))
+
+
+def test_of_views_that_symmetries_make_the_same_one_and_a_margin_is_looked_for() -> None:
+    turns, directions = cube_turns(), icosphere_directions(2)
+    assert len(turns) == 24
+    rng = np.random.default_rng(2)
+    anywhere = rng.normal(size=(2000, 3))
+    anywhere /= np.linalg.norm(anywhere, axis=1, keepdims=True)
+    full = ViewRange((200.0, 500.0))
+    wanted = directions[are_wanted(directions, turns, full)]
+    assert 162 / 24 < len(wanted) < 162 / 6
+    assert farthest_from_wanted_deg(anywhere, wanted, turns) < 11.0
+    # A margin: by every direction there are templates on all sides that need no turn.
+    inside = anywhere[np.all((turns @ WANTED_SIDE - WANTED_SIDE) @ anywhere.T <= 0.0, axis=0)]
+    assert len(inside) > 40
+    assert farthest_from_wanted_deg(inside, wanted, np.eye(3)[None]) < 11.0
+
+    above = ViewRange((200.0, 500.0), elevation_deg=(20.0, 90.0), azimuth_deg=(-100.0, 40.0))
+    sought = directions[above.contains_direction(directions, 3.0)]
+    wanted = sought[are_wanted(sought, turns, above)]
+    assert len(wanted) < len(sought)
+    declared = anywhere[above.contains_direction(anywhere)]
+    assert farthest_from_wanted_deg(declared, wanted, turns) < 13.0
+
+    upright = ViewRange((200.0, 500.0), roll_deg=(-20.0, 20.0))
+    assert are_wanted(directions, turns, upright).all()
+    assert are_wanted(directions, turns[:0], full).all()
+
+
+def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
+    sought = Detector(make_guide_views(block(), ViewRange((250.0, 500.0)), GuideViewOptions(subdivisions=3)), CAMERA)
+    assert len(sought.same_turns) == 4
+    rng = np.random.default_rng(5)
+    found, wrong_ones = 0, 0
+    for k in range(16):
+        place = rng.uniform(-180, 180), rng.uniform(-80, 80), rng.uniform(280, 450)
+        truth = pose_from(*place, block(), rng.uniform(-180, 180))
+        detections = sought.detect(picture(truth, block(), seed=k, scene=k % 9, noise=3.0), max_results=1)
+        if detections:
+            pose = detections[0].cam_from_model
+            to_center = rigid(np.eye(3), block().center_in_model)
+            alike = [
+                pose @ to_center @ rigid(turn, np.zeros(3)) @ np.linalg.inv(to_center) for turn in sought.same_turns
+            ]
+            mm, _, deg = min((error(one, truth, block()) for one in alike), key=lambda of: of[2])
+            found += mm < 8.0 and deg < 2.0
+            wrong_ones += mm > 50.0 or deg > 5.0
+    assert found >= 14
+    # From some places a plain box looks much like a box seen from elsewhere, with and without this.
+    assert wrong_ones <= 1
 
 
 @cache

@@ -150,7 +150,7 @@ class Likely(NamedTuple):
     responses: Array
 
 
-def _are_wanted(directions: Array, turns: Array, view_range: ViewRange) -> NDArray[np.bool_]:
+def are_wanted(directions: Array, turns: Array, view_range: ViewRange) -> NDArray[np.bool_]:
     """Which of the directions (V,3) to the camera to look for: of those that turns make the same, one and a margin.
 
     The part of the sphere nearer to one fixed direction than to its images under the turns; images outside the
@@ -218,7 +218,7 @@ class FirstSearch:
         top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
         chosen = outlines_around(views, self.outlines, subdivisions)
-        chosen = chosen[_are_wanted(-self.outlines.rotations[chosen, 2], turns, views.view_range)]
+        chosen = chosen[are_wanted(-self.outlines.rotations[chosen, 2], turns, views.view_range)]
         self._groups = len(np.unique(self.outlines.groups[chosen]))
         rolls = np.deg2rad(views.view_range.rolls_deg(roll_step_deg))
         focals_px = {step: self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE) for step in self._steps}
