@@ -60,6 +60,24 @@ def test_a_missing_component_is_told_from_one_that_is_there(noise: float) -> Non
     assert np.median(gone) > 0.0 > np.median(there)
 
 
+def test_what_hides_a_component_speaks_less_against_it_than_its_absence() -> None:
+    hidden, gone = [], []
+    for name in ("post_1", "post_2", "post_3", "block_1", "block_2"):
+        for k, pose in enumerate(POSES):
+            at_px = CAMERA.project(apply(pose, assembly().components[NAMES.index(name)].vertices_in_model))
+            low, high = at_px.min(axis=0), at_px.max(axis=0)
+            margin = 0.15 * (k % 3) * (high - low)
+            left, top, right, bottom = np.concatenate([low - margin, high + margin]).astype(int).tolist()
+            before = looks(picture(pose, seed=k, scene=k, card=(left, top, right, bottom)), pose, name)
+            without_it = looks(picture(pose, without(name), seed=k, scene=k), pose, name)
+            if before and without_it:
+                hidden += network().ratios(before).tolist()
+                gone += network().ratios(without_it).tolist()
+    assert len(hidden) >= 12
+    assert np.median(hidden) < 0.5 * np.median(gone)
+    assert np.mean(np.array(gone) > np.array(hidden)) > 0.72
+
+
 def test_a_component_is_shown_where_it_is_in_the_picture() -> None:
     pose = POSES[2]
     (look,) = looks(picture(pose, noise=2.0), pose, "block_1")
