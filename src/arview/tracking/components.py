@@ -89,6 +89,8 @@ BOUND = 6.0
 """Evidence is kept within ± this."""
 SINGLE = 1.2
 """A single picture's ratio above which a component is named."""
+CLEARING = 0.5
+"""What speaks for a component that was named counts so much: one that was moved looks right along the way it moved."""
 FORGETTING = 0.01
 """Share of the evidence that is lost with every look."""
 NEW_DIRECTION_DEG = 6.0
@@ -615,6 +617,7 @@ class ComponentCheck:
         self._rested = 0
         self._has_suspects = bool(look.is_suspect.any())
         news = self._news(cam_from_model, look.against)
+        news = np.where(self._is_named & (look.against < 0.0), CLEARING * news, news)
         self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + news * look.against, -BOUND, BOUND)
         self._is_named = self._evidence > np.where(self._is_named, CLEARED, NAMED)
 
