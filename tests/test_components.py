@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model, make_model
 from arview.geometry import Array, apply
 from arview.tracking import TrackingSession
-from arview.tracking.components import ComponentCheck
+from arview.tracking.components import SUSPICIOUS_FRAMES, ComponentCheck, Look
 from synthetic import CAMERA, assembly, assembly_views, block, path, picture, pose_from, wrong
 
 MOVED_MM = 20.0
@@ -140,6 +140,29 @@ def test_a_component_set_right_is_cleared() -> None:
         for _ in range(7):  # it does not look at every frame
             seen.update(image, pose)
     assert seen.mismatches == ()
+
+
+def test_a_moved_component_stays_named_where_it_looks_right_along_the_way_it_moved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    count = len(assembly().components)
+    flags, shares = np.zeros(count, dtype=bool), np.zeros(count)
+
+    def watched(*said: float) -> tuple[str, ...]:
+        """The mismatches after looks from new directions that say so much against the third component."""
+        seen.reset()
+        for k, ratio in enumerate(said):
+            against = np.where(np.arange(count) == 2, ratio, 0.0)
+            monkeypatch.setattr(seen, "look", lambda *_: Look(against, flags, flags, shares, shares, shares, shares))  # noqa: B023
+            for _ in range(SUSPICIOUS_FRAMES):
+                seen.update(np.zeros((480, 640, 3), np.uint8), pose_from(-70 + 10 * k, 45, 520))
+        return seen.mismatches
+
+    assert len(watched(3.0)) == 1
+    assert len(watched(3.0, 3.0, -1.5, -1.5, -4.0)) == 1
+    assert watched(3.0, -4.0, -4.0) == ()
+    assert watched(-4.0, 3.0) == ()
 
 
 def test_what_a_card_hides_is_no_mismatch() -> None:
