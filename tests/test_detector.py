@@ -165,11 +165,8 @@ def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
         truth = pose_from(*place, block(), rng.uniform(-180, 180))
         detections = sought.detect(picture(truth, block(), seed=k, scene=k % 9, noise=3.0), max_results=1)
         if detections:
-            pose = detections[0].cam_from_model
-            to_center = rigid(np.eye(3), block().center_in_model)
-            alike = [
-                pose @ to_center @ rigid(turn, np.zeros(3)) @ np.linalg.inv(to_center) for turn in sought.same_turns
-            ]
+            body = detections[0].cam_from_model @ sought.tracker.part.model_from_body
+            alike = [body @ rigid(t, np.zeros(3)) @ sought.tracker.part.body_from_model for t in sought.same_turns]
             mm, _, deg = min((error(one, truth, block()) for one in alike), key=lambda of: of[2])
             found += mm < 8.0 and deg < 2.0
             wrong_ones += mm > 50.0 or deg > 5.0

@@ -132,7 +132,10 @@ def _picture(
     photos: Sequence[Path],
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """A picture of what is built for an assembly, perhaps in a crowd, perhaps with something before a component."""
+    """A picture of what is built for an assembly, perhaps in a crowd, perhaps with something before a component.
+
+    The first of the others is what passes by in sequences with occlusion.
+    """
     is_crowded, is_covered = rng.random() < IN_CROWD, rng.random() < COVERED
     if not (is_crowded or is_covered):
         photo = read_photo(photos[rng.integers(len(photos))])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewSet
 from arview.pose import TrackingState
 from arview.tracking import Detector, TrackingSession
+from arview.video import Image
 from lines import Line, timing, watched
 from photos import all_photos, background_photos
 from recordings import SAMPLE
@@ -210,7 +211,13 @@ class Sections:
             Line("lookalike named", on, text, "≥ 90 %", total > 0 and named >= 0.9 * total),
             Line("lookalike clean lock", on, f"{clean} of {total}", "none", total > 0 and clean == 0),
             Line("lookalike named at last", after, all_named, "≥ 90 %", named_walks >= 0.9 * len(walks) > 0),
-            Line("lookalike clean at last", after, f"{clean_walks} of {len(walks)}", "none", clean_walks == 0),
+            Line(
+                "lookalike clean at last",
+                after,
+                f"{clean_walks} of {len(walks)}",
+                "none",
+                len(walks) > 0 and clean_walks == 0,
+            ),
         ]
 
     def _walk(self, name: str, model: Model, look_alike: LookAlike) -> LookAlikeWalk | None:
@@ -239,25 +246,24 @@ class LookAlikeWalk:
 
     def single_frames(self, count: int) -> Iterator[LookAlikeResult]:
         """What the session makes of some single frames that show the fault."""
-        scene = self.scene
-        scene = Scene(scene.name, scene.folder, scene.part, scene.symmetric_poses, scene.camera, self.shown)
-        for frame in spread_frames(scene, count):
+        for frame in spread_frames(replace(self.scene, frames=self.shown), count):
             self.session.reset()
             # A detection must hold a second frame before it is believed.
-            yield self._seen([frame, frame])
+            picture = frame, self.scene.image(frame)
+            yield self._seen([picture, picture])
 
     def to_the_end(self) -> LookAlikeResult:
         """What it makes of all of them, one after the other."""
         self.session.reset()
-        return self._seen(self.scene.frames)
+        return self._seen((frame, self.scene.image(frame)) for frame in self.scene.frames)
 
-    def _seen(self, frames: Sequence[SceneFrame]) -> LookAlikeResult:
-        """What the session says after some frames."""
-        for frame in frames:
-            pose = self.session.process(self.scene.image(frame), frame.index, frame.index / 30.0)
+    def _seen(self, pictures: Iterable[tuple[SceneFrame, Image]]) -> LookAlikeResult:
+        """What the session says after some pictures."""
+        for frame, image in pictures:
+            pose = self.session.process(image, frame.index, frame.index / 30.0)
         found = pose.mismatches
         is_named = any(part in words(text) for text in found for part in self.look_alike.components)
-        return LookAlikeResult(self.look_alike.name, frames[-1].index, str(pose.state), is_named, found)
+        return LookAlikeResult(self.look_alike.name, frame.index, str(pose.state), is_named, found)
 
 
 @dataclass(frozen=True)

@@ -150,6 +150,13 @@ class Likely(NamedTuple):
     responses: Array
 
 
+NOTHING_LIKELY = Likely(np.empty((0, 4, 4)), np.empty(0), np.empty(0))
+
+
+def _joined(parts: list[Matches]) -> Matches:
+    return Matches(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Matches)))
+
+
 def are_wanted(directions: Array, turns: Array, view_range: ViewRange) -> NDArray[np.bool_]:
     """Which of the directions (V,3) to the camera to look for: of those that turns make the same, one and a margin.
 
@@ -165,13 +172,6 @@ def are_wanted(directions: Array, turns: Array, view_range: ViewRange) -> NDArra
         is_farther = directions @ across > np.sin(np.deg2rad(WANTED_MARGIN_DEG)) * np.linalg.norm(across)
         wanted &= ~(is_farther & view_range.contains_direction(directions @ turn))
     return wanted
-
-
-NOTHING_LIKELY = Likely(np.empty((0, 4, 4)), np.empty(0), np.empty(0))
-
-
-def _joined(parts: list[Matches]) -> Matches:
-    return Matches(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Matches)))
 
 
 def weighed(scores: Array, lines: Array) -> Array:
