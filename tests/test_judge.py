@@ -7,7 +7,21 @@ import pytest
 
 from arview.geometry import Array, exp_so3, rigid
 from arview.guideviews import GuideViewSet
-from arview.tracking.judge import FINE, INNER_LINES, OUTLINE_LINES, RADII_PX, ROUGH, STRETCHES, describe, judge, network
+from arview.tracking.judge import (
+    FINE,
+    INNER_LINES,
+    OUTLINE_LINES,
+    PLACES,
+    RADII_PX,
+    REACH_PX,
+    ROUGH,
+    SEEN,
+    STRETCHES,
+    describe,
+    judge,
+    network,
+)
+from arview.tracking.line_network import LineNetwork
 from arview.tracking.picture import Picture
 from arview.tracking.tracker import PartView
 from synthetic import CAMERA, assembly_views, pose_from, turned_about
@@ -21,7 +35,7 @@ NETWORKS = pytest.mark.parametrize("networks", [ROUGH, FINE], ids=["rough", "fin
 
 def picture(noise: float = 6.0) -> Picture:
     """The assembly before clutter, with noise."""
-    return Picture(drawn(TRUTH @ PART.body_from_model, noise=noise), CAMERA, 12)
+    return Picture(drawn(TRUTH @ PART.body_from_model, noise=noise), CAMERA, 12, LineNetwork())
 
 
 def turned(angle_deg: float, count: int) -> Array:
@@ -65,7 +79,7 @@ def test_the_kernel_scores_as_numpy_does(networks: tuple[str, ...]) -> None:
     for name in networks:
         lines, both = describe(seen, PART, poses, np.full(len(poses), 12.0), RADII_PX[name])
         net = network(name)
-        counts = lines[..., -2:-1]
+        counts = lines[..., SEEN : SEEN + 1]
         hidden = np.maximum(lines @ net.first + net.first_bias, 0)
         hidden = np.maximum(hidden @ net.second + net.second_bias, 0) * counts
         outline, inner = np.split(hidden, [OUTLINE_LINES], axis=1)
@@ -87,3 +101,18 @@ def test_lines_outside_the_picture_are_empty_and_still_give_a_score() -> None:
     assert both[0, 2] == 0.0
     assert np.isfinite(scores(picture(), aside[None], FINE)).all()
     assert scores(picture(), aside[None], FINE)[0] < scores(picture(), TRUTH[None], FINE)[0]
+
+
+def test_it_is_shown_the_lines_of_the_line_network_and_where_that_sees_solids() -> None:
+    seen = picture()
+    lines, _ = describe(seen, PART, TRUTH[None], np.full(1, 12.0), RADII_PX["rough"])
+    outline = lines[0, :OUTLINE_LINES]
+    assert (outline[:, SEEN] == 1.0).all()
+    alike, inside = np.split(outline[:, SEEN + 2 :].mean(axis=0), 2)
+    assert len(alike) == len(inside) == PLACES
+    # A line there, no other beside it; solid on the inner side only.
+    assert alike[REACH_PX - 1 : REACH_PX + 2].max() > 0.6 > 4.0 * alike[-3:].mean()
+    assert inside[:3].mean() > 0.6 and inside[-3:].mean() < 0.3
+    without = Picture(seen.image, CAMERA, 12)
+    lines, _ = describe(without, PART, TRUTH[None], np.full(1, 12.0), RADII_PX["rough"])
+    assert not lines[0, :, SEEN + 2 :].any()

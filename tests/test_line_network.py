@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.geometry import Array
-from arview.tracking.line_network import LONGEST_SIDE_PX, LineNetwork, halved_lines, lines_at
+from arview.geometry import Array, apply
+from arview.raster import rasterise
+from arview.tracking.line_network import INSIDE, LONGEST_SIDE_PX, LineNetwork, halved_lines, lines_at
 from arview.tracking.matching import ORIENTATIONS, orientation_bins, response_maps
 from arview.tracking.picture import Picture
 from arview.tracking.solver import project_lines
 from arview.tracking.tracker import PartView
-from synthetic import CAMERA, assembly_views, background, pose_from
+from synthetic import CAMERA, assembly, assembly_views, background, pose_from
 from synthetic import picture as drawn
 
 PART = PartView(assembly_views())
@@ -49,7 +50,7 @@ def standing_out(maps: NDArray[np.uint8], quarter_turns: int = 0) -> float:
 @pytest.mark.parametrize("noise", [3.0, 9.0, 16.0])
 def test_the_outline_stands_out_before_clutter_and_noise_as_it_does_not_by_gradients(noise: float) -> None:
     image = drawn(POSE, noise=noise)
-    seen = network().lines(image)
+    seen = network().lines(image)[:ORIENTATIONS]
     assert standing_out(seen) > 6.0
     assert standing_out(seen) > 2.5 * standing_out(response_maps(image, 0, 0, 2))
     assert standing_out(seen, 1) < 0.3 * standing_out(seen)
@@ -59,7 +60,19 @@ def test_it_hardly_answers_to_noise() -> None:
     rng = np.random.default_rng(0)
     noise = np.clip(110 + 14 * rng.standard_normal((480, 640, 3)), 0, 255).astype(np.uint8)
     seen = network().lines(noise)
-    assert np.mean(seen.max(axis=0) > 128) < 0.01
+    assert np.mean(seen[:ORIENTATIONS].max(axis=0) > 128) < 0.01
+    assert np.mean(seen[INSIDE] > 128) < 0.01
+
+
+@pytest.mark.parametrize("noise", [3.0, 9.0, 16.0])
+def test_it_sees_where_the_solid_is(noise: float) -> None:
+    seen = network().lines(drawn(POSE, noise=noise))[INSIDE]
+    vertices, faces, _ = assembly().mesh
+    c = CAMERA.scaled(seen.shape[1], seen.shape[0])
+    _, face_ids = rasterise(apply(POSE, vertices), faces, c.fx, c.fy, c.cx, c.cy, c.width, c.height)
+    is_inside, side = (face_ids >= 0).astype(np.uint8), np.ones((9, 9), np.uint8)
+    assert np.median(seen[cv2.erode(is_inside, side) > 0]) > 128
+    assert np.median(seen[cv2.dilate(is_inside, side) == 0]) < 64
 
 
 class Answers:
@@ -110,7 +123,7 @@ def test_pictures_of_any_size_are_taken(height: int, width: int) -> None:
 def test_lines_of_a_large_picture_are_where_they_are_in_a_small_one() -> None:
     image = drawn(POSE, noise=2.0)
     large = np.asarray(cv2.resize(image, None, fx=1.5, fy=1.5, interpolation=cv2.INTER_CUBIC))
-    small, again = network().lines(image).max(axis=0), network().lines(large).max(axis=0)
+    small, again = (network().lines(of)[:ORIENTATIONS].max(axis=0) for of in (image, large))
     again = cv2.resize(again, small.shape[::-1]).astype(np.uint8)
     assert np.corrcoef(cv2.blur(small, (5, 5)).ravel(), cv2.blur(again, (5, 5)).ravel())[0, 1] > 0.8
 

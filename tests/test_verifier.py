@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from arview.geometry import Array, apply
 from arview.raster import rasterise
+from arview.tracking.line_network import LineNetwork
 from arview.tracking.picture import Picture
 from arview.tracking.tracker import PartView
 from arview.tracking.verifier import (
@@ -41,7 +42,12 @@ def verifier() -> Verifier:
 def picture(noise: float = 6.0, is_hidden: bool = False) -> Picture:
     pose = TRUTH @ PART.body_from_model
     card = half_hidden(pose) if is_hidden else None
-    return Picture(drawn(pose, noise=noise, card=card), CAMERA, 12)
+    return Picture(drawn(pose, noise=noise, card=card), CAMERA, 12, lines())
+
+
+@cache
+def lines() -> LineNetwork:
+    return LineNetwork()
 
 
 def scores(seen: Picture, poses: Array) -> Array:
@@ -49,7 +55,11 @@ def scores(seen: Picture, poses: Array) -> Array:
 
 
 def shown(pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    seen = picture()
+    """The picture around a pose, and what is drawn there."""
+    return looked_at(picture(), pose)[:2]
+
+
+def looked_at(seen: Picture, pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
     return raw_look(seen, PART, pose, float(seen.radii_px(PART.views.diameter_mm, pose[None])[0]))
 
 
@@ -72,21 +82,21 @@ def test_the_further_off_the_less_is_a_pose_verified() -> None:
 
 
 def test_a_picture_without_the_part_verifies_no_pose() -> None:
-    clutter = [Picture(background(seed), CAMERA, 12) for seed in range(6)]
+    clutter = [Picture(background(seed), CAMERA, 12, lines()) for seed in range(6)]
     true = scores(picture(), TRUTH[None])[0]
     assert max(scores(seen, turned(20.0, 20)).max() for seen in clutter) < true - 2.0
 
 
 def test_the_outline_that_is_shown_is_that_of_the_mesh() -> None:
-    pixels, lines = shown(TRUTH)
+    pixels, drawn_part = shown(TRUTH)
     is_inside = around_truth(rendered()[1] >= 0) > 0.5
     outside_px = cv2.distanceTransform((~is_inside).astype(np.uint8), cv2.DIST_L2, 5)
     inside_px = cv2.distanceTransform(is_inside.astype(np.uint8), cv2.DIST_L2, 5)
     expected = np.clip(np.where(is_inside, 0.5 - inside_px, outside_px - 0.5) / BAND_PX, -1.0, 1.0)
-    assert np.mean((lines[0] < 0) == is_inside) > 0.98
-    assert np.mean(np.abs(lines[0] - expected) * BAND_PX) < 0.5
-    assert 0.02 < np.mean(lines[1] > 0.5) < 0.3
-    assert np.mean(lines[0][lines[1] > 0.5] < 1.0 / BAND_PX) > 0.95
+    assert np.mean((drawn_part[0] < 0) == is_inside) > 0.98
+    assert np.mean(np.abs(drawn_part[0] - expected) * BAND_PX) < 0.5
+    assert 0.02 < np.mean(drawn_part[1] > 0.5) < 0.3
+    assert np.mean(drawn_part[0][drawn_part[1] > 0.5] < 1.0 / BAND_PX) > 0.95
     assert (pixels[..., 3] == 255).all()
 
 
@@ -109,6 +119,23 @@ def test_the_surface_that_is_shown_is_that_of_the_mesh() -> None:
     for axis, sign in ((0, 1.0), (1, 1.0), (2, -1.0)):
         true = around_truth(np.where(face_ids >= 0, sign * flat[face_ids, axis], 0.0))
         assert np.median(np.abs(normals[axis] - true)[is_inside]) < 0.05
+
+
+def test_the_lines_that_are_shown_lie_where_the_outline_is_and_solids_where_the_part_is() -> None:
+    _, drawn_part, seen = looked_at(picture(), TRUTH)
+    strongest, along, solids = seen.astype(float) / 255.0
+    is_inside = around_truth(rendered()[1] >= 0) > 0.5
+    at_outline = np.abs(drawn_part[0]) < 1.0 / BAND_PX
+    far_off = drawn_part[0] == 1.0
+    assert np.median(strongest[at_outline]) > 0.6 > 0.2 > np.median(strongest[far_off])
+    assert np.median(along[at_outline]) > 0.5
+    assert not along[np.abs(drawn_part[0]) == 1.0].any()
+    assert (along <= strongest).all()
+    assert np.median(solids[is_inside & ~at_outline]) > 0.6 > 0.3 > np.median(solids[far_off])
+
+
+def test_without_a_line_network_no_lines_are_shown() -> None:
+    assert not looked_at(Picture(picture().image, CAMERA, 12), TRUTH)[2].any()
 
 
 def rendered() -> tuple[Array, NDArray[np.int32]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.tracking.component_network import GLOBALS, SIDE_PX, overall
-from arview.tracking.verifier import contrasted, with_gradients
+from arview.tracking.verifier import CHANNELS, contrasted, with_gradients
 from component_examples import Looked
 from judge_examples import read_examples
 from verifier_fitting import augmented, score_network, torch_with_onnx, write_network
@@ -34,11 +34,11 @@ def fit_components(folder: Path, epochs: int) -> None:
     torch = torch_with_onnx()
     examples, held_out = read_examples(folder, "components_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    network = score_network(torch, GLOBALS)
+    network = score_network(torch, CHANNELS, GLOBALS)
     _fit(network, [one for one in examples if one.solid not in held_out], epochs, torch)
     network.eval()
     _report(network, [one for one in examples if one.solid in held_out], torch)
-    write_network(network, folder / "components.onnx", SIDE_PX, GLOBALS, torch)
+    write_network(network, folder / "components.onnx", (CHANNELS, SIDE_PX), GLOBALS, torch)
 
 
 def _fit(network: Any, examples: Sequence[Looked], epochs: int, torch: Any) -> None:

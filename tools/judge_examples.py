@@ -52,6 +52,10 @@ OTHERS_EACH = 8
 """Solids that crowds are made of."""
 PRINTED_SHARE = 0.5
 """So many solids are printed on: a photo shines through them."""
+UNSHARP_SHARE = 0.2
+"""So many pictures are taken with a moving hand or out of focus."""
+MOVED_PX, DEFOCUSED_PX, GRAIN = (3.0, 14.0), (0.8, 2.4), (1.0, 4.0)
+"""By so much; and deviation of the noise there, grey levels."""
 HARD, OTHERS, RIGHT = 60, 60, 40
 """Of rough poses the likeliest, a choice of all and so many right ones are examples."""
 OTHER_SOLID, OCCLUDER = 3301, 7919
@@ -94,7 +98,7 @@ class Looks:
 
     Attributes:
         solid: its seed.
-        pixels: (N,S,S,4) uint8; drawn: (N,6,S,S) int8, 127 for 1: see `verifier.raw_look`.
+        pixels: (N,S,S,4) uint8; drawn: (N,6,S,S) int8, 127 for 1; lines: (N,3,S,S) uint8: see `verifier.raw_look`.
         radii_px: (N,) half the diameter in the picture.
         known: (N,3) what else the verifier is told of refined poses.
         is_refined, is_right: (N,) bool.
@@ -103,6 +107,7 @@ class Looks:
     solid: int
     pixels: NDArray[np.uint8]
     drawn: NDArray[np.int8]
+    lines: NDArray[np.uint8]
     radii_px: Array
     known: Array
     is_refined: NDArray[np.bool_]
@@ -139,6 +144,15 @@ def pictures_of(
     seed: int, photos: Sequence[Path], efforts: tuple[Effort, ...]
 ) -> Iterator[tuple[Detector, NDArray[np.uint8], Array | None]]:
     """A detector of a solid, and pictures of it with the true ``cam_from_body``, or without it and none."""
+    rng = np.random.default_rng([seed, 4])
+    for detector, image, truth in _pictures_of(seed, photos, efforts):
+        yield detector, _unsharp(image, rng) if rng.random() < UNSHARP_SHARE else image, truth
+
+
+def _pictures_of(
+    seed: int, photos: Sequence[Path], efforts: tuple[Effort, ...]
+) -> Iterator[tuple[Detector, NDArray[np.uint8], Array | None]]:
+    """The same, all as sharp as sequences are."""
     try:
         solid, occluder, other = (random_solid(seed + k) for k in (0, OCCLUDER, OTHER_SOLID))
     except ValueError:  # outlines that cross each other
@@ -183,6 +197,23 @@ def noisy(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.
     if blur_px:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur_px))
     return np.clip(np.round(picture + noise * rng.standard_normal(picture.shape)), 0, 255).astype(np.uint8)
+
+
+def _unsharp(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A picture with the blur of motion or of the lens."""
+    picture = image.astype(np.float32)
+    if rng.random() < 0.5:
+        length_px, angle = rng.uniform(*MOVED_PX), rng.uniform(0.0, np.pi)
+        half = int(np.ceil(0.5 * length_px))
+        kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+        for t in np.linspace(-0.5, 0.5, 8 * half) * length_px:
+            x, y = half + t * np.cos(angle), half + t * np.sin(angle)
+            kernel[round(y), round(x)] += 1.0
+        picture = np.asarray(cv2.filter2D(picture, -1, cv2.GaussianBlur(kernel, (0, 0), 0.5) / kernel.sum()))
+    else:
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), rng.uniform(*DEFOCUSED_PX)))
+    picture = picture + rng.uniform(*GRAIN) * rng.standard_normal(picture.shape, dtype=np.float32)
+    return np.clip(np.round(picture), 0, 255).astype(np.uint8)
 
 
 def is_near(detector: Detector, poses: Array, truth: Array, turns: Array, angle_deg: float, share: float) -> Array:
@@ -282,11 +313,11 @@ def _looks(
     part = detector.tracker.part
     poses = poses[index]
     radii_px = picture.radii_px(part.views.diameter_mm, poses)
-    pixels, drawn = zip(
+    pixels, drawn, lines = zip(
         *(raw_look(picture, part, *of) for of in zip(poses, radii_px.tolist(), strict=True)), strict=True
     )
     yield Looks(
-        seed, np.stack(pixels), np.round(127.0 * np.stack(drawn)).astype(np.int8),
+        seed, np.stack(pixels), np.round(127.0 * np.stack(drawn)).astype(np.int8), np.stack(lines),
         radii_px, known[index], is_refined[index], right[index],
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from arview.atomic import replacing
 from arview.errors import InputError
-from arview.tracking.judge import FEATURES, GLOBALS, OUTLINE_LINES, STRETCHES, Network
+from arview.tracking.judge import FEATURES, GLOBALS, OUTLINE_LINES, SEEN, STRETCHES, Network
 from judge_examples import Group, read_examples
 
 WIDTH, LAST_WIDTH = 16, 32
@@ -117,7 +117,7 @@ def _network(torch: Any) -> Any:
             return self.first, self.second, self.third, self.last
 
         def forward(self, lines: Any, both: Any) -> Any:
-            seen = lines[..., FEATURES - 2 : FEATURES - 1]
+            seen = lines[..., SEEN : SEEN + 1]
             hidden = torch.relu(self.second(torch.relu(self.first(lines)))) * seen
             outline, counts = hidden[:, :OUTLINE_LINES], seen[:, :OUTLINE_LINES]
             inner = hidden[:, OUTLINE_LINES:].sum(1) / (seen[:, OUTLINE_LINES:].sum(1) + 1.0)

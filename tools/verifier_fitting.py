@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 
 from arview.atomic import replacing
 from arview.errors import InputError
-from arview.tracking.verifier import CHANNELS, GLOBALS, MEANS, SIDE_PX, contrasted, overall, with_gradients
+from arview.tracking.verifier import (
+    CHANNELS,
+    GLOBALS,
+    LINES,
+    MEANS,
+    PLAIN,
+    SIDE_PX,
+    contrasted,
+    overall,
+    with_gradients,
+)
 from judge_examples import Looks, read_examples
 
 WIDTHS = (24, 24, 48, 48, 64, 64)
@@ -52,18 +62,19 @@ def fit_verifier(folder: Path, epochs: int) -> None:
     torch = torch_with_onnx()
     looks, held_out = read_examples(folder, "looks_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    network = score_network(torch, GLOBALS)
+    network = score_network(torch, CHANNELS + LINES, GLOBALS)
     _fit(network, [look for look in looks if look.solid not in held_out], epochs, torch)
     network.eval()
     _report(network, [look for look in looks if look.solid in held_out], torch)
-    write_network(network, folder / "verifier.onnx", SIDE_PX, GLOBALS, torch)
+    write_network(network, folder / "verifier.onnx", (CHANNELS + LINES, SIDE_PX), GLOBALS, torch)
 
 
-def write_network(network: Any, path: Path, side: int, told: int, torch: Any) -> None:
-    """Write a network as `cv2.dnn` reads it."""
+def write_network(network: Any, path: Path, shape: tuple[int, int], told: int, torch: Any) -> None:
+    """Write a network that is shown so many channels of so large a side as `cv2.dnn` reads it."""
+    channels, side = shape
     with replacing(path) as file:
         torch.onnx.export(
-            network, (torch.zeros(2, CHANNELS, side, side), torch.zeros(2, told)), file,
+            network, (torch.zeros(2, channels, side, side), torch.zeros(2, told)), file,
             input_names=["seen", "both"], output_names=["score"], dynamo=False,
             dynamic_axes={"seen": {0: "poses"}, "both": {0: "poses"}, "score": {0: "poses"}},
         )  # fmt: skip
@@ -118,20 +129,23 @@ def _inputs(
     plain, contrasts = zip(
         *(contrasted(look.pixels[k], look.drawn[k].astype(np.float32) / 127.0) for k in index), strict=True
     )
-    seen = np.stack(plain)
+    seen = np.concatenate([np.stack(plain), look.lines[list(index)].astype(np.float32) / np.float32(255.0)], axis=1)
     if rng is not None:
         seen = augmented(seen, rng)
-    shown, explained = zip(*map(with_gradients, seen), strict=True)
+    shown, explained = zip(*map(with_gradients, np.ascontiguousarray(seen[:, :PLAIN])), strict=True)
     both = []
     for k, contrast, share in zip(index, contrasts, explained, strict=True):
         # What is known of refined poses only is the mean for the others.
         known = look.known[k] if look.is_refined[k] else MEANS
         both.append(overall(float(look.radii_px[k]), contrast, known, share))
-    return np.stack(shown), np.stack(both)
+    return np.concatenate([np.stack(shown), seen[:, PLAIN:]], axis=1), np.stack(both)
 
 
 def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """The poses of one picture mirrored, turned, recoloured, shaded, blurred, noisier, or with something in front."""
+    """The poses of one picture mirrored, turned, recoloured, shaded, blurred, noisier, or with something in front.
+
+    What follows the plain channels, see `PLAIN`, is mirrored, turned and hidden too.
+    """
     right, down = NORMALS
     if rng.random() < 0.5:
         seen = seen[..., ::-1].copy()
@@ -161,6 +175,7 @@ def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np
         width, height = rng.integers(side // 10, side // 3, 2)
         left, top = rng.integers(0, side - width), rng.integers(0, side - height)
         seen[:, :3, top : top + height, left : left + width] = rng.normal(size=(1, 3, 1, 1))
+        seen[:, PLAIN:, top : top + height, left : left + width] = 0.0
     return np.ascontiguousarray(seen)
 
 
@@ -187,15 +202,15 @@ def _report(network: Any, looks: Sequence[Looks], torch: Any) -> None:
         print(f"  {100 * found:.0f} % found with {100 * share:.0f} % false alarms, of {len(highest)} without it")
 
 
-def score_network(torch: Any, told: int) -> Any:
-    """The network of `arview.tracking.verifier`, and of others that are told of so many things as a whole."""
+def score_network(torch: Any, channels: int, told: int) -> Any:
+    """The network of `arview.tracking.verifier`, and of others shown so many channels and told of so many things."""
     nn = torch.nn
 
     class _Network(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
             layers: list[Any] = []
-            before = CHANNELS
+            before = channels
             for k, width in enumerate(WIDTHS):
                 size = 5 if k == 0 else 3
                 layers += [

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.tracking.line_network import INSIDE
 from arview.tracking.picture import Picture, steps_to
 from arview.tracking.refine import nearest_view
 from arview.tracking.solver import project_lines
@@ -39,9 +40,12 @@ STRETCHES = 8
 REACH_PX = 6
 """Profiles reach so far to both sides."""
 PLACES = 2 * REACH_PX + 1
-FEATURES = 2 * PLACES + 7
+FEATURES = 4 * PLACES + 7
 """Of each line: gradients along and across it at each place, widths of the part and of the background along it,
-differences of colour (between both sides, inside from the part's mean, outside from it), 1, 1 if a design edge."""
+differences of colour (between both sides, inside from the part's mean, outside from it), 1, 1 if a design edge; what
+the line network says at each place of lines like this one and of solids."""
+SEEN = 2 * PLACES + 5
+"""The feature that is 1."""
 GLOBALS = 6
 """Of the pose: mean gradient, size, share of the outline in the picture, design edges, length of the outline, lines."""
 WIDEST_PX, SIZE_PX = 16.0, 48.0
@@ -151,7 +155,7 @@ def judge_poses(gradients, part, poses, log_lines, diameter_mm, weights):  # typ
         stretch[:] = zero
         count = np.float32(0.5)
         for i in range(OUTLINE_LINES + INNER_LINES):
-            if lines[i, FEATURES - 2] > zero:
+            if lines[i, SEEN] > zero:
                 group = 0 if i < OUTLINE_LINES else 1
                 counts[group] += np.float32(1.0)
                 count += np.float32(1.0)
@@ -175,9 +179,12 @@ def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  
 
     Lines outside the picture are all zero.
     """
-    gx, gy, colours, intrinsics = gradients
+    gx, gy, colours, answers, intrinsics = gradients
     height, width = gx.shape
+    rows, columns = answers.shape[1:]
+    shrunk = columns / width
     along = 2 * PLACES
+    answered = SEEN + 2
     points, directions, runs, outline, inner, length = _chosen_lines(part, pose)
     step_mm = 0.01 * diameter_mm
     outline_px, outline_normals, outline_depths = project_lines(
@@ -203,8 +210,9 @@ def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  
         if depth <= 0.0 or not (0 <= int(np.floor(u + 0.5)) < width and 0 <= int(np.floor(v + 0.5)) < height):
             continue
         line = lines[slot]
-        line[along + 5] = 1.0
-        line[along + 6] = 1.0 if is_inner else 0.0
+        line[SEEN] = 1.0
+        line[SEEN + 1] = 1.0 if is_inner else 0.0
+        turn = int(np.round(np.arctan2(nv, nu) / np.pi * INSIDE)) % INSIDE
         for side in range(2):
             run_px = WIDEST_PX if is_inner else min(WIDEST_PX, runs[i, side] * intrinsics[0] / depth)
             line[along + side] = run_px / WIDEST_PX
@@ -217,6 +225,9 @@ def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  
             b = abs(gx[y, x] * nv - gy[y, x] * nu)
             line[REACH_PX + t] = a
             line[PLACES + REACH_PX + t] = b
+            row, column = min(int((y + 0.5) * shrunk), rows - 1), min(int((x + 0.5) * shrunk), columns - 1)
+            line[answered + REACH_PX + t] = answers[turn, row, column] / np.float32(255.0)
+            line[answered + PLACES + REACH_PX + t] = answers[INSIDE, row, column] / np.float32(255.0)
             total += a + b
             places += 1
             if abs(t) >= SIDE_PX:
@@ -238,7 +249,7 @@ def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  
     step = total / max(places, 1) + 1.0
     for slot in range(lines.shape[0]):
         line = lines[slot]
-        if line[along + 5] == 0.0:
+        if line[SEEN] == 0.0:
             continue
         for t in range(along):
             line[t] = line[t] / (line[t] + step)

@@ -30,6 +30,8 @@ CELL_PX = 32
 AROUND_PX, CLEAR_SHARE, LEAST_CLEAR = 49, 0.9, 0.15
 """Answers count relative to such a share of the strongest one this near (side of a square of the maps, smoothed), if
 that is not weaker than the last."""
+INSIDE = ORIENTATIONS
+"""Of its maps that which says where solids are."""
 CONTRAST = 64.0
 """Grey levels less their mean are shown in units of this."""
 
@@ -42,13 +44,13 @@ class LineNetwork:
         self._network = cv2.dnn.readNetFromONNX(np.frombuffer(model, dtype=np.uint8))
 
     def lines(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """How likely a line of each orientation runs through each place of an RGB picture (H,W,3).
+        """How likely a line of each orientation runs through each place of an RGB picture (H,W,3), and a solid is there.
 
-        Where it is sure of little, as of materials that it does not know or before some textures, its answers are
+        Where it is sure of few lines, as of materials that it does not know or before some textures, its answers are
         brought up to those elsewhere.
 
         Returns:
-            (8,h,w) 0–255, of half the picture's size, or of half of `LONGEST_SIDE_PX`.
+            (9,h,w) 0–255, the orientations and `INSIDE`, of half the picture's size, or of half of `LONGEST_SIDE_PX`.
         """
         height, width = image.shape[:2]
         share = min(1.0, LONGEST_SIDE_PX / max(height, width))
@@ -58,14 +60,16 @@ class LineNetwork:
         mean = sum(cv2.mean(image)[:3]) / 3.0
         image = cv2.copyMakeBorder(image, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REPLICATE)
         self._network.setInput(cv2.dnn.blobFromImage(image, 1.0 / CONTRAST, mean=(mean, mean, mean)))
-        seen = self._network.forward()[0, :ORIENTATIONS, : -(-height // SHRINK), : -(-width // SHRINK)]
-        around = cv2.dilate(seen.max(axis=0), np.ones((AROUND_PX, AROUND_PX), dtype=np.uint8))
+        seen = self._network.forward()[0, :, : -(-height // SHRINK), : -(-width // SHRINK)]
+        lines = seen[:INSIDE]
+        around = cv2.dilate(lines.max(axis=0), np.ones((AROUND_PX, AROUND_PX), dtype=np.uint8))
         clear = np.maximum(CLEAR_SHARE * cv2.blur(around, (AROUND_PX // 2, AROUND_PX // 2)), LEAST_CLEAR)
-        return np.asarray(np.round(255.0 * np.minimum(seen / clear, 1.0)).astype(np.uint8))
+        np.minimum(lines / clear, 1.0, out=lines)
+        return np.asarray(np.round(255.0 * seen).astype(np.uint8))
 
 
 def halved_lines(lines: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-    """Maps (8,h,w), and again at half the size and so on as long as that is even; the strongest of four pixels."""
+    """Maps (9,h,w), and again at half the size and so on as long as that is even; the strongest of four pixels."""
     levels = [lines]
     block = np.ones((2, 2), dtype=np.uint8)
     while levels[-1].shape[1] % 2 == 0 and levels[-1].shape[2] % 2 == 0:
@@ -75,7 +79,8 @@ def halved_lines(lines: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
 
 
 def lines_at(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) -> NDArray[np.uint8]:
-    """Maps (8,H,W) from those of `LineNetwork.lines`; the strongest of the pixels that one stands for, and spread."""
+    """Maps (8,H,W) of lines from `LineNetwork.lines`; the strongest of the pixels that one stands for, and spread."""
+    lines = lines[:ORIENTATIONS]
     shrunk = lines.shape[2] / width
     side = max(1, int(shrunk + 0.5))
     merged = np.ones((side, side), dtype=np.uint8)

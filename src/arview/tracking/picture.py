@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from threading import Lock
 from typing import NamedTuple
 
 import cv2
@@ -20,6 +21,8 @@ STEPS_PER_OCTAVE = 4
 """Scales at which response maps are made: the distances of the templates, shared by all levels of the search."""
 SPREAD_PX = 1
 """How far edges may lie from where a pose has them, in pixels of the maps."""
+NO_LINES = np.zeros((ORIENTATIONS + 1, 1, 1), dtype=np.uint8)
+"""Nothing is seen anywhere."""
 
 
 class Gradients(NamedTuple):
@@ -28,12 +31,14 @@ class Gradients(NamedTuple):
     Attributes:
         across, down: (H,W) float32, of each pixel's channel with the strongest gradient, grey levels per pixel.
         colours: (H,W,3) uint8, smoothed.
+        lines: (9,h,w) uint8, what the line network sees there, see `LineNetwork.lines`; zero without one.
         intrinsics: (10,) of it.
     """
 
     across: NDArray[np.float32]
     down: NDArray[np.float32]
     colours: NDArray[np.uint8]
+    lines: NDArray[np.uint8]
     intrinsics: Array
 
 
@@ -55,11 +60,11 @@ def steps_to(radius_px: float, radii_px: Array) -> NDArray[np.int64]:
     return half * np.minimum(np.round(STEPS_PER_OCTAVE / half * np.log2(radius_px / radii_px)), 0).astype(np.int64)
 
 
-def make_gradients(image: NDArray[np.uint8], intrinsics: Array) -> Gradients:
-    """The gradients of an RGB picture."""
+def make_gradients(image: NDArray[np.uint8], lines: NDArray[np.uint8], intrinsics: Array) -> Gradients:
+    """The gradients of an RGB picture, with the lines seen in it."""
     smooth, across, down, _ = colour_gradients(image)
     quarter = np.float32(0.25)  # of Sobel's sum
-    return Gradients(quarter * across, quarter * down, smooth, intrinsics)
+    return Gradients(quarter * across, quarter * down, smooth, lines, intrinsics)
 
 
 class Picture:
@@ -83,6 +88,7 @@ class Picture:
         self._network = network
         self._halved = _halved(image)
         self._lines: list[NDArray[np.uint8]] = []
+        self._lock = Lock()
         self._seen: SeenLines | None = None
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
         self._gradients: dict[int, Gradients] = {}
@@ -118,8 +124,9 @@ class Picture:
         return self._seen
 
     def _see_lines(self) -> None:
-        if self._network is not None and not self._lines:
-            self._lines = halved_lines(self._network.lines(self.image))
+        with self._lock:
+            if self._network is not None and not self._lines:
+                self._lines = halved_lines(self._network.lines(self.image))
 
     def _lines_at(self, width: int, height: int) -> NDArray[np.uint8]:
         """What the network sees, spread (8,H,W)."""
@@ -128,15 +135,14 @@ class Picture:
         return lines_at(_smallest(self._lines, width, 2), width, height, SPREAD_PX)
 
     def gradients(self, step: int) -> Gradients:
-        """Gradients and colours of the picture at a scale."""
+        """Gradients and colours of the picture at a scale, and the lines in it."""
         if step not in self._gradients:
-            self._gradients[step] = make_gradients(*self._scaled(step))
+            width, height = self._size(step)
+            self._see_lines()
+            lines = _smallest(self._lines, width, 2) if self._lines else NO_LINES
+            image = self._resized(width, height)
+            self._gradients[step] = make_gradients(image, lines, intrinsics_of(self._camera.scaled(width, height)))
         return self._gradients[step]
-
-    def _scaled(self, step: int) -> tuple[NDArray[np.uint8], Array]:
-        """The picture at a scale, and its intrinsics (10,)."""
-        width, height = self._size(step)
-        return self._resized(width, height), intrinsics_of(self._camera.scaled(width, height))
 
     def _make(self, step: int) -> tuple[NDArray[np.uint8], Array]:
         width, height = self._size(step)

@@ -5,8 +5,8 @@ outline is one thing and what lies around it another, whether strong edges run w
 hides a stretch of the outline is something in front of it. A small convolutional network sees it: it is given the
 picture around the pose beside what the CAD says is there: the distance to the outline, the design edges, the normals
 and depth of the surface, and what of the brightness the normals explain (as Labbé et al., "MegaPose", CoRL 2022, score
-poses by rendered normals). It knows nothing of a part: it was fitted on random solids before photos, see
-``tools/fit_judge``.
+poses by rendered normals); and what the line network sees there, for which noise is no matter. It knows nothing of a
+part: it was fitted on random solids before photos, see ``tools/fit_judge``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.guideviews.surface import draw_surface
+from arview.tracking.line_network import INSIDE
 from arview.tracking.picture import Picture, steps_to
 from arview.tracking.refine import nearest_view
 from arview.tracking.solver import project_lines
@@ -41,6 +42,9 @@ PLAIN = 4 + DRAWN
 CHANNELS = PLAIN + 6
 """What is plain; the gradient: all of it, across the outline, along it, under design edges; the shading that the
 normals explain, and the rest of the brightness."""
+LINES = 3
+"""Then, of what the line network sees: the strongest line, one along the outline near it, and whether solids are there.
+"""
 GLOBALS = 6
 """The part's size in the picture, the contrast around the pose; what evidence, judge and scatter say of the pose; the
 share of the brightness of the surface that its normals explain."""
@@ -90,9 +94,10 @@ class Verifier:
         list(pool().map(picture.gradients, set(steps_to(RADIUS_PX, radii_px).tolist())))
 
         def look(pose: Array, radius_px: float, of_it: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-            plain, contrast = contrasted(*raw_look(picture, self._part, pose, radius_px))
+            pixels, drawn, lines = raw_look(picture, self._part, pose, radius_px)
+            plain, contrast = contrasted(pixels, drawn)
             shown, explained = with_gradients(plain)
-            return shown, overall(radius_px, contrast, of_it, explained)
+            return with_lines(shown, lines), overall(radius_px, contrast, of_it, explained)
 
         looks = list(pool().map(look, poses, radii_px.tolist(), known))
         scores = np.empty(len(poses))
@@ -107,8 +112,8 @@ class Verifier:
 
 def raw_look(
     picture: Picture, part: PartView, pose: Array, radius_px: float
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The picture around a pose (S,S,4), RGB and 255 inside of it, and the part (6,S,S), see DRAWN.
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
+    """The picture around a pose (S,S,4), RGB and 255 inside of it; the part (6,S,S), see DRAWN; (3,S,S), see LINES.
 
     Args:
         picture, part: what is looked for, and where.
@@ -134,7 +139,42 @@ def raw_look(
     draw_surface(part.surface, pose, zoom * intrinsics[:2], np.full(2, middle), diameter_mm, drawn[2:], face_ids)
     is_far = drawn[0] > 1.0
     drawn[0][is_far] = np.where(face_ids[is_far] >= 0, -1.0, 1.0)
-    return np.dstack([crop, 255 * is_inside.astype(np.uint8)]), drawn
+    lines = lines_around(gradients.lines, gradients.lines.shape[2] / width, zoom, way[:, 2], drawn[0])
+    return np.dstack([crop, 255 * is_inside.astype(np.uint8)]), drawn, lines
+
+
+def with_lines(shown: NDArray[np.float32], lines: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """All that the verifier is shown (CHANNELS + LINES,S,S)."""
+    return np.concatenate([shown, lines.astype(np.float32) / np.float32(255.0)])
+
+
+@njit(cache=True, nogil=True)
+def lines_around(answers, shrunk, zoom, shift, outline):  # type: ignore[no-untyped-def]
+    """What the line network sees around a pose (3,S,S) uint8: see LINES.
+
+    Args:
+        answers: (9,h,w) uint8, see `LineNetwork.lines`; shrunk: their size against the picture's.
+        zoom, shift: (2,) what brings the picture's pixels to those of the look.
+        outline: (S,S) float32, distance to the outline as drawn.
+    """
+    rows, columns = answers.shape[1:]
+    side = outline.shape[0]
+    seen = np.zeros((LINES, side, side), dtype=np.uint8)
+    normal = np.empty(2, dtype=np.float32)
+    for v in range(side):
+        row = int(np.floor(((v - shift[1]) / zoom + 0.5) * shrunk))
+        for u in range(side):
+            column = int(np.floor(((u - shift[0]) / zoom + 0.5) * shrunk))
+            if not (0 <= row < rows and 0 <= column < columns):
+                continue
+            for k in range(INSIDE):
+                seen[0, v, u] = max(seen[0, v, u], answers[k, row, column])
+            if abs(outline[v, u]) < 1.0:
+                _slope_at(outline, v, u, normal)
+                turn = int(np.round(np.arctan2(normal[1], normal[0]) / np.pi * INSIDE)) % INSIDE
+                seen[1, v, u] = answers[turn, row, column]
+            seen[2, v, u] = answers[INSIDE, row, column]
+    return seen
 
 
 @njit(cache=True, nogil=True, fastmath=True)
