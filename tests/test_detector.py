@@ -17,8 +17,20 @@ from arview.guideviews.sphere import icosphere_directions
 from arview.pose import TrackingState
 from arview.tracking import Detector, DetectorOptions, TrackingSession
 from arview.tracking.ambiguity import TELLING, EdgeSteps, find_symmetries, telling
-from arview.tracking.detector import Hypothesis
-from arview.tracking.first_search import FARTHER, NEARER, RESPONSE_WORTH, WANTED_SIDE, WIDE, Likely, are_wanted
+from arview.tracking.detector import BEFORE_WORTH, SURE_QUALITY, Hypothesis
+from arview.tracking.first_search import (
+    FARTHER,
+    NEARER,
+    QUICK,
+    RESPONSE_WORTH,
+    WANTED_SIDE,
+    WIDE,
+    Candidate,
+    Effort,
+    Likely,
+    are_wanted,
+)
+from arview.tracking.picture import Picture
 from arview.tracking.quality import Evidence
 from cad_files import box
 from synthetic import (
@@ -345,3 +357,31 @@ def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
             assert a.verification is not None
             for b in found[i + 1 :]:
                 assert not are_near(a.cam_from_body, b.cam_from_body, 0.04 * detector().views.diameter_mm, 4.0)
+
+
+def test_a_quick_search_ends_the_matter_only_when_it_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = detector().picture(picture(pose_from(30, 40, 500.0)))
+    likely, efforts = detector().search.likely, []
+
+    def watched(of: Picture, effort: Effort = QUICK) -> Likely:
+        efforts.append(effort)
+        return likely(of, effort)
+
+    monkeypatch.setattr(detector().search, "likely", watched)
+    for quality, expected in ((SURE_QUALITY, [QUICK]), (SURE_QUALITY - 0.01, [QUICK, WIDE])):
+        monkeypatch.setattr(detector(), "qualities", lambda found, quality=quality: [quality] * len(found))
+        efforts.clear()
+        assert detector().hypotheses(seen)
+        assert efforts == expected
+
+
+def test_what_spoke_for_a_pose_at_one_level_counts_at_the_next() -> None:
+    seen = detector().picture(picture(pose_from(30, 40, 500.0)))
+    poses = [candidate.cam_from_body for candidate in detector().search.starts(seen, QUICK)]
+    plain = detector().climbed(seen, [Candidate(0.0, pose) for pose in poses])
+    # The last of them, and it alone, was far ahead before.
+    found = detector().climbed(seen, [Candidate(1000.0 * (k == len(poses) - 1), p) for k, p in enumerate(poses)])
+    alone = detector().climbed(seen, [Candidate(0.0, poses[-1])])
+    np.testing.assert_allclose(found[0].cam_from_body, alone[0].cam_from_body, atol=1e-9)
+    assert found[0].score == pytest.approx(alone[0].score + 1000.0 * BEFORE_WORTH**2)
+    assert not np.allclose(plain[0].cam_from_body, alone[0].cam_from_body, atol=1e-3)

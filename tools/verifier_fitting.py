@@ -35,6 +35,8 @@ REFINED_WEIGHT = 3.0
 LISTWISE_WEIGHT = 0.3
 """Beside telling right from wrong in all pictures, the right pose of each is to be told from its others."""
 RATE, DECAY, DROPPED = 2e-3, 2e-2, 0.2
+UNSURE = 0.3
+"""Share of pictures in which the line network sees less, and as many in which it sees less of solids."""
 NORMALS = 6, 7
 """Channels with the normals' parts to the right and down."""
 HELD_OUT = 8
@@ -144,7 +146,8 @@ def _inputs(
 def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """The poses of one picture mirrored, turned, recoloured, shaded, blurred, noisier, or with something in front.
 
-    What follows the plain channels, see `PLAIN`, is mirrored, turned and hidden too.
+    What follows the plain channels, see `PLAIN`, is mirrored, turned and hidden too, or weaker: on materials that it does
+    not know the line network is sure of little.
     """
     right, down = NORMALS
     if rng.random() < 0.5:
@@ -176,6 +179,9 @@ def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np
         left, top = rng.integers(0, side - width), rng.integers(0, side - height)
         seen[:, :3, top : top + height, left : left + width] = rng.normal(size=(1, 3, 1, 1))
         seen[:, PLAIN:, top : top + height, left : left + width] = 0.0
+    for channels in (slice(PLAIN, None), slice(PLAIN + LINES - 1, None)):
+        if rng.random() < UNSURE:
+            seen[:, channels] *= rng.uniform(0.0, 1.0)
     return np.ascontiguousarray(seen)
 
 

@@ -1,13 +1,14 @@
 """A judge of poses: what is seen across the part's lines, weighed by small networks.
 
 The mean response under an outline says how much edge there is, not what it looks like: whether it is one clean edge or
-one of many, whether other edges cross it, whether the part is of one colour along it and its surroundings are not,
-and whether a whole stretch of the outline has nothing. All that is in the profiles across the lines. The same few
-weights look at each line's profile; the means over the outline and over the design edges, and the least of any
-stretch of the outline, make the score (after Qi et al., "PointNet", CVPR 2017). The weights know nothing of a part:
-they were fitted on random solids before photos, see ``tools/fit_judge``, by which of a picture's poses is the right one
-(Cao et al., "Learning to rank: from pairwise approach to listwise approach", ICML 2007). There are three: for rough
-poses, and two for refined ones, which look at the part at two sizes.
+one of many, whether other edges cross it, whether the part is of one colour along it and its surroundings are not, and
+whether a whole stretch of the outline has nothing. All that is in the profiles across the lines, of gradients, of
+colours, and of what the line network sees. The same few weights look at each line's profile; the means over the outline
+and over the design edges, and the least of any stretch of the outline, make the score (after Qi et al., "PointNet",
+CVPR 2017). The weights know nothing of a part: they were fitted on random solids before photos, see
+``tools/fit_judge``, by which of a picture's poses is the right one (Cao et al., "Learning to rank: from pairwise
+approach to listwise approach", ICML 2007). There are three: for rough poses, and two for refined ones, which look at
+the part at two sizes.
 """
 
 from __future__ import annotations
