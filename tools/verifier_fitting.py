@@ -146,8 +146,8 @@ def _inputs(
 def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """The poses of one picture mirrored, turned, recoloured, shaded, blurred, noisier, or with something in front.
 
-    What follows the plain channels, see `PLAIN`, is mirrored, turned and hidden too, or weaker: on materials that it does
-    not know the line network is sure of little.
+    What follows the plain channels, see `PLAIN`, is mirrored, turned and hidden too, or weaker: on materials that it
+    does not know the line network is sure of little.
     """
     right, down = NORMALS
     if rng.random() < 0.5:

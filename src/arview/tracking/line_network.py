@@ -44,7 +44,7 @@ class LineNetwork:
         self._network = cv2.dnn.readNetFromONNX(np.frombuffer(model, dtype=np.uint8))
 
     def lines(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """How likely a line of each orientation runs through each place of an RGB picture (H,W,3), and a solid is there.
+        """How likely each place of an RGB picture (H,W,3) is on a line of each orientation, and on a solid.
 
         Where it is sure of few lines, as of materials that it does not know or before some textures, its answers are
         brought up to those elsewhere.
