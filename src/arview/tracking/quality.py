@@ -90,12 +90,12 @@ LOGIT_BIAS = -10.0
 be negative, on the hypotheses of the detector in 194 semi-synthetic and recorded frames, halved."""
 EVIDENCE_WEIGHT = 0.82
 """Of that beside what the judge says, fitted together with it."""
-VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES = 1.35, 0.74, 6.1
+VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES = 0.93, 0.95, 6.8
 """Of evidence, judge, and what the line network sees along a pose's lines, beside what the verifier says: fitted as
 above on 375 pictures of 16 random solids and recordings in which right and wrong poses compete."""
-FOUND_LINES = 8.2
-FOUND_WEIGHTS = (0.26, 0.41, 0.28, 0.19, 0.50, 1.45)
-FOUND_BIAS = -4.70
+FOUND_LINES = 8.75
+FOUND_WEIGHTS = (0.32, 0.35, 0.15, 0.31, 0.62, 1.43)
+FOUND_BIAS = -5.40
 """For the probability, in which lines count so much beside the verifier: logistic regression with weights that may not
 be negative, on the best hypotheses of the search in 268 pictures where these were right, of 16 random solids that none
 of the networks was fitted to, many in crowds of others, in 192 without the part, and in 257 and 299 of the recorded
