@@ -27,8 +27,9 @@ BLURRED_PX = 2.5
 FEWEST_EDGES = 6
 STEP_SHARE, STEP_LEVELS = 0.12, 10.0
 """Edges lower than this share of the brightest grey, or so many grey levels, do not say how sharp a picture is."""
-LEAST_QUALITY = 0.1
-"""Hypotheses of less quality are found in any clutter."""
+LEAST_QUALITY = 0.2
+"""Hypotheses of less quality are found in any clutter: of 294 pictures without the part 20 have one of more, of 21 in
+which the right pose is not believed 15."""
 FITTING_QUALITY = 0.5
 SMALLEST_PX = 36.0
 """A part that spans less shows too little to be found."""
