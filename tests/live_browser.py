@@ -34,6 +34,8 @@ START, STRIDE, COUNT = 21, 3, 14
 CLIP_SIZE = 1280, 720
 BITS, CELL_PX, EDGE_PX = 8, 12, 4
 """The counter in the upper left corner: the number of the frame and, below, the same inverted."""
+SPECK_PX = 60
+"""Smaller differences of two pictures are a video encoder's; the smallest component shown has several times as many."""
 
 
 @cache
@@ -172,5 +174,16 @@ def difference_mask(one: Image, other: Image, least: float, blur_px: int = 1) ->
     """(H,W) 0 or 1: where two pictures differ by so many grey levels; specks and pin holes are cleaned away."""
     difference = cv2.GaussianBlur(cv2.absdiff(one, other), (blur_px, blur_px), 0).max(axis=2)
     mask = (difference > least).astype(np.uint8)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
-    return np.asarray(cv2.morphologyEx(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disc), cv2.MORPH_OPEN, disc))
+    mask = np.asarray(cv2.morphologyEx(closed(mask, 5), cv2.MORPH_OPEN, _disc(5)))
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats(mask)
+    mask[sizes[labels, cv2.CC_STAT_AREA] < SPECK_PX] = 0
+    return mask
+
+
+def closed(mask: NDArray[np.uint8], gap_px: int) -> NDArray[np.uint8]:
+    """A mask (H,W) of 0 and 1 without the holes and gaps that are narrower."""
+    return np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(gap_px)))
+
+
+def _disc(diameter_px: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter_px, diameter_px)))

@@ -19,11 +19,14 @@ import live_browser
 from arview.live.stamp import Stamp, strip
 from arview.overlay.guide import GUIDE_RGB
 from arview.video import VideoSink
-from live_browser import difference_mask, number_in, outline_errors_px, screenshot, true_mask
+from live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
 from live_client import Running, running
 from live_sample import INSPECTION, loader, options
 
 WIDTH, HEIGHT, FPS = 640, 360, 5
+COLOUR_GAP_PX = 7
+"""A video has its colours at half the resolution, and its encoder smooths them: in narrower slots and holes the ghost
+and what is seen through it are one."""
 TIMEOUT_S = 120.0
 """Chromium without a GPU, the tracker and the tests share two cores."""
 VIEWPORT = {"width": 680, "height": 640}
@@ -128,10 +131,11 @@ def freeze(page: Any) -> int:
     return number
 
 
-def check_outline(found: np.ndarray, number: int) -> None:
-    """The ghost's outline against the truth's, of the frame shown and not of its neighbours."""
+def check_outline(found: np.ndarray, number: int, gap_px: int = 1) -> None:
+    """The ghost's outline against the truth's, of the frame shown and not of its neighbours; narrower gaps are none."""
     near = [n for n in (number - 1, number, number + 1) if 0 <= n < live_browser.COUNT]
-    errors_px = {n: outline_errors_px(found, true_mask(found.shape, n)) for n in near}
+    found = closed(found, gap_px)
+    errors_px = {n: outline_errors_px(found, closed(true_mask(found.shape, n), gap_px)) for n in near}
     assert np.median(errors_px[number]) < MEDIAN_PX
     assert np.quantile(errors_px[number], 0.95) < MOST_PX
     assert min(near, key=lambda n: np.mean(errors_px[n])) == number, "the ghost belongs to another frame"
@@ -166,7 +170,7 @@ def test_annotated_video(chromium: Any, server: Running) -> None:
         plain = cv2.resize(live_browser.frames(WIDTH, HEIGHT)[number], (width, height))
         found = difference_mask(shown, plain, 25, blur_px=5)
         found[: height // 8] = found[-8:] = found[:, :8] = found[:, -8:] = 0  # counter, frame of a frozen picture
-        check_outline(found, number)
+        check_outline(found, number, COLOUR_GAP_PX)
 
 
 def test_station_camera(chromium: Any, inspection: Path, tmp_path: Path) -> None:
