@@ -17,7 +17,7 @@ from arview.guideviews.sphere import icosphere_directions
 from arview.pose import TrackingState
 from arview.tracking import Detector, DetectorOptions, TrackingSession
 from arview.tracking.ambiguity import TELLING, EdgeSteps, find_symmetries, telling
-from arview.tracking.detector import BEFORE_WORTH, SURE_QUALITY, Hypothesis
+from arview.tracking.detector import SURE_QUALITY
 from arview.tracking.first_search import (
     FARTHER,
     NEARER,
@@ -30,6 +30,7 @@ from arview.tracking.first_search import (
     Likely,
     are_wanted,
 )
+from arview.tracking.local_search import BEFORE_WORTH, Hypothesis
 from arview.tracking.picture import Picture
 from arview.tracking.quality import Evidence
 from cad_files import box
@@ -177,8 +178,10 @@ def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
         truth = pose_from(*place, block(), rng.uniform(-180, 180))
         detections = sought.detect(picture(truth, block(), seed=k, scene=k % 9, noise=3.0), max_results=1)
         if detections:
-            body = detections[0].cam_from_model @ sought.tracker.part.model_from_body
-            alike = [body @ rigid(t, np.zeros(3)) @ sought.tracker.part.body_from_model for t in sought.same_turns]
+            body = detections[0].cam_from_model @ sought.local.tracker.part.model_from_body
+            alike = [
+                body @ rigid(t, np.zeros(3)) @ sought.local.tracker.part.body_from_model for t in sought.same_turns
+            ]
             mm, _, deg = min((error(one, truth, block()) for one in alike), key=lambda of: of[2])
             found += mm < 8.0 and deg < 2.0
             wrong_ones += mm > 50.0 or deg > 5.0
@@ -246,7 +249,7 @@ def test_a_small_part_and_a_close_rival_are_doubted_and_a_pose_a_little_aside_is
 
     def quality(distance_mm: float, rival_aside_mm: float | None, turn_deg: float) -> float:
         pose = pose_from(30, 40, distance_mm)
-        radius_px = detector().tracker.radius_px(pose)
+        radius_px = detector().local.tracker.radius_px(pose)
         hypotheses = [Hypothesis(pose, evidence, 4.0, 8.0, radius_px, verification=1.0)]
         if rival_aside_mm is not None:
             other = pose_from(30 + turn_deg, 40, distance_mm)
@@ -318,10 +321,10 @@ def test_options_without_sense_are_refused() -> None:
 
 
 def test_no_search_looks_beyond_the_declared_distances() -> None:
-    seen = detector().picture(picture(pose_from(30, 40, 500.0), noise=12.0))
+    seen = detector().local.picture(picture(pose_from(30, 40, 500.0), noise=12.0))
     low, high = detector().views.view_range.distance_mm
     likely = detector().search.likely(seen, WIDE).poses
-    climbed = detector().climbed(seen, detector().search.starts(seen, WIDE), WIDE)
+    climbed = detector().local.climbed(seen, detector().search.starts(seen, WIDE), WIDE.kept)
     poses = np.concatenate([likely, [candidate.cam_from_body for candidate in climbed]])
     distances_mm = np.linalg.norm(poses[:, :3, 3], axis=1)
     assert len(likely) > 100 and climbed
@@ -329,8 +332,8 @@ def test_no_search_looks_beyond_the_declared_distances() -> None:
 
 
 def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None:
-    seen = detector().picture(picture(pose_from(30, 40, 500.0)))
-    pose = pose_from(10, 20, 480.0) @ detector().tracker.part.model_from_body
+    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
+    pose = pose_from(10, 20, 480.0) @ detector().local.tracker.part.model_from_body
     responses = np.array([0.2, 0.7, 0.4])
     alike = Likely(np.stack([pose] * 3), np.full(3, 12.0), responses)
     found = detector().search.judged(seen, alike)
@@ -341,7 +344,7 @@ def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None
 def test_matches_that_all_leave_the_declared_distances_are_no_detection(monkeypatch: pytest.MonkeyPatch) -> None:
     search = detector().search
     monkeypatch.setattr(search, "_reach_mm", (1.0, 2.0))
-    seen = detector().picture(picture(pose_from(30, 40, 500.0)))
+    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
     likely, lines, _ = search.likely(seen, WIDE)
     assert likely.shape == (0, 4, 4) and lines.shape == (0,)
     assert detector().detect(seen.image) == []
@@ -350,7 +353,7 @@ def test_matches_that_all_leave_the_declared_distances_are_no_detection(monkeypa
 def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
     rng = np.random.default_rng(5)
     for k in range(4):
-        found = detector().hypotheses(detector().picture(picture(anywhere(rng), seed=k, scene=k, noise=12.0)))
+        found = detector().hypotheses(detector().local.picture(picture(anywhere(rng), seed=k, scene=k, noise=12.0)))
         logits = [hypothesis.logit for hypothesis in found]
         assert logits == sorted(logits, reverse=True)
         for i, a in enumerate(found):
@@ -360,7 +363,7 @@ def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
 
 
 def test_a_quick_search_ends_the_matter_only_when_it_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = detector().picture(picture(pose_from(30, 40, 500.0)))
+    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
     likely, efforts = detector().search.likely, []
 
     def watched(of: Picture, effort: Effort = QUICK) -> Likely:
@@ -376,12 +379,12 @@ def test_a_quick_search_ends_the_matter_only_when_it_is_sure(monkeypatch: pytest
 
 
 def test_what_spoke_for_a_pose_at_one_level_counts_at_the_next() -> None:
-    seen = detector().picture(picture(pose_from(30, 40, 500.0)))
+    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
     poses = [candidate.cam_from_body for candidate in detector().search.starts(seen, QUICK)]
-    plain = detector().climbed(seen, [Candidate(0.0, pose) for pose in poses])
+    plain = detector().local.climbed(seen, [Candidate(0.0, pose) for pose in poses])
     # The last of them, and it alone, was far ahead before.
-    found = detector().climbed(seen, [Candidate(1000.0 * (k == len(poses) - 1), p) for k, p in enumerate(poses)])
-    alone = detector().climbed(seen, [Candidate(0.0, poses[-1])])
+    found = detector().local.climbed(seen, [Candidate(1000.0 * (k == len(poses) - 1), p) for k, p in enumerate(poses)])
+    alone = detector().local.climbed(seen, [Candidate(0.0, poses[-1])])
     np.testing.assert_allclose(found[0].cam_from_body, alone[0].cam_from_body, atol=1e-9)
     assert found[0].score == pytest.approx(alone[0].score + 1000.0 * BEFORE_WORTH**2)
     assert not np.allclose(plain[0].cam_from_body, alone[0].cam_from_body, atol=1e-3)

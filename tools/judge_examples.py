@@ -33,9 +33,10 @@ from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, exp_so3, rigid
 from arview.guideview_cache import cached_guide_views
 from arview.tracking import Detector
-from arview.tracking.detector import DetectorOptions, Hypothesis
+from arview.tracking.detector import DetectorOptions
 from arview.tracking.first_search import WIDE, Candidate, Effort
 from arview.tracking.judge import RADII_PX, describe
+from arview.tracking.local_search import Hypothesis
 from arview.tracking.picture import Picture
 from arview.tracking.verifier import raw_look
 from line_examples import crowded_picture
@@ -164,7 +165,7 @@ def _pictures_of(
         for frame in _rendered(solid, occluder, variant, FRAMES_EACH, photos, rng):
             if frame.visible >= 0.5:
                 image = _printed_on(frame, photos, rng) if rng.random() < PRINTED_SHARE else frame.image
-                yield detector, image, frame.cam_from_model @ detector.tracker.part.model_from_body
+                yield detector, image, frame.cam_from_model @ detector.local.tracker.part.model_from_body
         for frame in _rendered(other, occluder, variant, WITHOUT_EACH // len(VARIANTS), photos, rng):
             yield detector, frame.image, None
     others = some_solids(seed)
@@ -173,7 +174,7 @@ def _pictures_of(
         pose = trajectory(solid, options)[0] if k < CROWDS_EACH else None
         clean, visible = crowded_picture(others, None if pose is None else (solid, pose), photos, rng)
         if pose is None or visible >= 0.5:
-            truth = None if pose is None else pose @ detector.tracker.part.model_from_body
+            truth = None if pose is None else pose @ detector.local.tracker.part.model_from_body
             yield detector, noisy(clean, rng), truth
     for _, image in frames_without_part(photos, (), CAMERA.width, CAMERA.height, WITHOUT_EACH, seed):
         yield detector, image, None
@@ -245,10 +246,10 @@ def _printed_on(frame: SequenceFrame, photos: Sequence[Path], rng: np.random.Gen
 
 
 def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Array | None) -> Iterator[Group | Looks]:
-    picture = detector.picture(image)
+    picture = detector.local.picture(image)
     likely = detector.search.likely(picture, WIDE)
-    climbed = detector.climbed(picture, detector.search.judged(picture, likely, WIDE), WIDE)
-    refined = detector.settled(picture, climbed)
+    climbed = detector.local.climbed(picture, detector.search.judged(picture, likely, WIDE), WIDE.kept)
+    refined = detector.local.settled(picture, climbed)
     climbed_poses = np.array([c.cam_from_body for c in climbed]).reshape(-1, 4, 4)
     rng = np.random.default_rng(len(likely.poses))
     if truth is None:
@@ -265,7 +266,7 @@ def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
         index = index[known[index]]
         if right[index].any():
             yield _group(seed, "rough", detector, picture, poses[index], right[index])
-    refined += detector.settled(picture, [Candidate(0.0, truth)])
+    refined += detector.local.settled(picture, [Candidate(0.0, truth)])
     yield from _looks(seed, detector, picture, refined, climbed_poses, truth, rng)
     right, known = _told(
         detector,
@@ -310,7 +311,7 @@ def _looks(
     index = np.flatnonzero(is_told & (poses[:, 2, 3] > 0))
     if not len(index):
         return
-    part = detector.tracker.part
+    part = detector.local.tracker.part
     poses = poses[index]
     radii_px = picture.radii_px(part.views.diameter_mm, poses)
     pixels, drawn, lines = zip(
@@ -348,10 +349,10 @@ def _group(
 ) -> Group:
     hypotheses = found if isinstance(found, list) else []
     poses = np.array([h.cam_from_body for h in hypotheses]) if isinstance(found, list) else found
-    view_lines = np.array([detector.view_lines(pose) for pose in poses])
+    view_lines = np.array([detector.local.view_lines(pose) for pose in poses])
     lines, both = {}, {}
     for name in ("fine", "close") if hypotheses else ("rough",):
-        seen, both[name] = describe(picture, detector.tracker.part, poses, view_lines, RADII_PX[name])
+        seen, both[name] = describe(picture, detector.local.tracker.part, poses, view_lines, RADII_PX[name])
         lines[name] = np.round(255.0 * seen).astype(np.uint8)
     logits = np.array([h.own_logit for h in hypotheses] or np.zeros(len(poses)), dtype=np.float32)
     return Group(seed, stage, lines, both, logits, is_right)

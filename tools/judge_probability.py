@@ -79,7 +79,7 @@ def fit_probability(seeds: range, photos: Sequence[Path]) -> None:
 
 def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Outcome]:
     for detector, image, truth in pictures:
-        found = detector.hypotheses(detector.picture(image))
+        found = detector.hypotheses(detector.local.picture(image))
         if not found:
             continue
         best = found[0]
@@ -97,7 +97,7 @@ def _recorded(name: str) -> Iterator[Seen]:
     detector = Detector(recorded_views(scene), scene.camera)
     for frame in spread_frames(scene, RECORDED_EACH):
         if frame.cam_from_model is not None:
-            yield detector, scene.image(frame), frame.cam_from_model @ detector.tracker.part.model_from_body
+            yield detector, scene.image(frame), frame.cam_from_model @ detector.local.tracker.part.model_from_body
     camera = scene.camera
     for _, image in frames_without_part(all_photos(None, name), (), camera.width, camera.height, RECORDED_EACH, 1):
         yield detector, image, None

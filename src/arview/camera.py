@@ -98,6 +98,10 @@ class Camera:
             cy=(self.cy + 0.5) * sy - 0.5,
         )
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The same camera for a window of its image, width × height from a pixel on."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
     def rotated(self, quarter_turns_clockwise: int) -> Camera:
         """The same camera for an image turned clockwise by quarter turns; distortion turns with it."""
         camera = self

@@ -22,7 +22,7 @@ from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
 from arview.tracking.climb import climb_outlines
 from arview.tracking.judge import judge
-from arview.tracking.picture import STEPS_PER_OCTAVE, Picture
+from arview.tracking.picture import STEPS_PER_OCTAVE, Picture, step_for
 from arview.tracking.templates import (
     GROUPS,
     choose_apart,
@@ -174,6 +174,12 @@ def are_wanted(directions: Array, turns: Array, view_range: ViewRange) -> NDArra
     return wanted
 
 
+def reach_mm(view_range: ViewRange) -> tuple[float, float]:
+    """The distances in which poses are looked for: those declared and a little more."""
+    low, high = view_range.distance_mm
+    return NEARER * low, FARTHER * high
+
+
 def weighed(scores: Array, lines: Array) -> Array:
     """Scores by which poses of different views compare: one that shows few distinct lines often fits by chance."""
     return np.asarray(scores * lines**0.25)
@@ -213,7 +219,7 @@ class FirstSearch:
         self.outlines = make_outlines(views, part.model_from_body, POINTS)
         # Scale steps of the templates, large distances (large pictures) first.
         low, high = views.view_range.distance_mm
-        self._reach_mm = NEARER * low, FARTHER * high
+        self._reach_mm = reach_mm(views.view_range)
         near, far = self.step_at(low), self.step_at(high)
         top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
@@ -227,18 +233,13 @@ class FirstSearch:
             for step, focal_px in focals_px.items()
         }
 
-    def step_at(self, distance_mm: float, magnification: float = 1.0) -> float:
-        """Scale step at which the part at a distance has the size of the templates, times the magnification."""
-        radius_px = self._focal_px * 0.5 * self._diameter_mm / distance_mm
-        return STEPS_PER_OCTAVE * float(np.log2(magnification * self._radius_px / radius_px))
+    def step_at(self, distance_mm: float) -> float:
+        """Scale step at which the part at a distance has the size of the templates."""
+        return step_for(self._focal_px * 0.5 * self._diameter_mm / distance_mm, self._radius_px)
 
     def starts(self, picture: Picture, effort: Effort = QUICK) -> list[Candidate]:
         """Poses for the best matches over the whole range, apart from each other, best first."""
         return self.judged(picture, self.likely(picture, effort), effort)
-
-    def are_in_range(self, poses: Array) -> NDArray[np.bool_]:
-        """Which poses (N,4,4) about the centre are in front of the camera and at a declared distance, or nearly so."""
-        return self._are_in_reach(np.linalg.norm(poses[:, :3, 3], axis=1)) & (poses[:, 2, 3] > 0)
 
     def _are_in_reach(self, distances_mm: Array) -> NDArray[np.bool_]:
         low, high = self._reach_mm

@@ -54,6 +54,11 @@ class SeenLines(NamedTuple):
     intrinsics: Array
 
 
+def step_for(radius_px: float, wanted_px: float) -> float:
+    """Scale step, not rounded, that brings a size to another."""
+    return STEPS_PER_OCTAVE * float(np.log2(wanted_px / radius_px))
+
+
 def steps_to(radius_px: float, radii_px: Array) -> NDArray[np.int64]:
     """Scale steps (N,) that bring sizes (N,) to about another: half octaves are near enough, nothing is enlarged."""
     half = STEPS_PER_OCTAVE // 2

@@ -138,22 +138,32 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> O
         raise InputError("guide views: no view shows an outline; check the model and the declared distances")
     shown, angles, rotations, seen_from = (np.stack([row[k] for row in rows]) for k in range(4))
     near, far = _around(seen_from, 6)
+    shown_lines = ShownLines(views)
     return Outlines(
         points=shown.astype(np.float32),
         angles=(np.round(angles * 256.0).astype(np.int64) % 256).astype(np.uint8),
         rotations=rotations,
-        lines=_lines_shown(views, seen_from),
+        lines=np.array([shown_lines.towards(direction) for direction in seen_from]),
         groups=np.argmax(seen_from @ icosphere_directions(GROUP_SUBDIVISIONS).T, axis=1).astype(np.int32),
         near=Neighbours(near, rolls_between(rotations[near], rotations[:, None])),
         far=Neighbours(far, rolls_between(rotations[far], rotations[:, None])),
     )
 
 
-def _lines_shown(views: GuideViewSet, directions: Array) -> Array:
-    """Distinct lines, at least 1, of the view nearest to each direction (V,3) among those of a coarser icosphere."""
-    counted = _nearest_views(views, LINES_SUBDIVISIONS)
-    lines = np.array([view_lines(views.view(int(index)), views.diameter_mm) for index in counted])
-    return np.maximum(lines[np.argmax(directions @ views.directions[counted].T, axis=1)], 1.0)
+class ShownLines:
+    """Distinct lines that a part shows to each direction, counted when first asked for."""
+
+    def __init__(self, views: GuideViewSet) -> None:
+        self._views = views
+        self._counted = _nearest_views(views, LINES_SUBDIVISIONS)
+        self._known: dict[int, float] = {}
+
+    def towards(self, direction: Array) -> float:
+        """Lines, at least 1, of that view of an icosphere which is nearest to a direction (3,)."""
+        index = int(self._counted[np.argmax(self._views.directions[self._counted] @ direction)])
+        if index not in self._known:
+            self._known[index] = max(view_lines(self._views.view(index), self._views.diameter_mm), 1.0)
+        return self._known[index]
 
 
 def _around(directions: Array, count: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

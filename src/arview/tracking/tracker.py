@@ -6,8 +6,10 @@ with a damping towards the prediction, and updates the pose; scales shrink from 
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -28,6 +30,9 @@ from arview.tracking.refine import count_colours, median_brightness_ratio, run_e
 from arview.tracking.region import BINS, EDGE_FUNCTION, log_odds, value_bins
 from arview.tracking.shading import GAIN, LEAST_CURVED, corner_normals, curved_share, look_at, shade
 from arview.tracking.solver import apply_twist, relative_twist
+
+if TYPE_CHECKING:
+    from arview.tracking.second_look import SecondLook
 
 
 @dataclass(frozen=True)
@@ -138,7 +143,8 @@ class TrackerOptions:
         other_ways_share: other stages are tried, too, where a pose is worth less than this share of the usual.
         far_share: so are those for a part that moved far, where the others leave it worth less than this share.
         usual_share: it is searched for, too, where a pose is worth less than this share of the usual.
-        surprise_share, surprise: the same for poses off the prediction, from such a `_strangeness` on (about 6°).
+        surprise_share, surprise: the same for poses off the prediction, from such a `strangeness` on (about 6°).
+        second_look: from such a `strangeness` on (about 3°) the `SecondLook` is taken, if there is one.
         rotation_sigma_rad, translation_sigma: expected error of the prediction, the latter in diameters.
     """
 
@@ -163,6 +169,7 @@ class TrackerOptions:
     usual_share: float = 0.8
     surprise_share: float = 0.95
     surprise: float = 0.02
+    second_look: float = 0.005
     correlated_points: float = 8.0
 
     def __post_init__(self) -> None:
@@ -225,6 +232,13 @@ def intrinsics_of(camera: Camera) -> Array:
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0])
 
 
+def strangeness(cam_from_body: Array, predicted: Array, diameter_mm: float) -> float:
+    """How far a pose is from the predicted one: 1 at 45°, at a third of the diameter aside or two along."""
+    turn = float(rotation_angle_rad(cam_from_body, predicted)) / STRANGE_TURN_RAD
+    way = (cam_from_body[:3, 3] - predicted[:3, 3]) / (STRANGE_WAY * diameter_mm)
+    return float(turn**2 + way[0] ** 2 + way[1] ** 2 + 0.25 * way[2] ** 2)
+
+
 def smoothed(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """A gray picture as the edge modality takes it: averaged over 3×3."""
     return np.asarray(cv2.blur(gray, (3, 3)))
@@ -247,9 +261,11 @@ class Tracker:
         camera: Camera,
         options: TrackerOptions | None = None,
         model: Model | None = None,
+        second_look: SecondLook | None = None,
     ) -> None:
         self.options = options or TrackerOptions()
         self.camera = camera
+        self.second_look = second_look
         self.part = PartView(views)
         self.diameter_mm = views.diameter_mm
         self.appearance = Appearance()
@@ -282,6 +298,12 @@ class Tracker:
         if self.options.use_feature and model is not None:
             vertices, faces, _ = model.mesh
             self._features = FeatureModality(vertices - views.center_in_model, faces, camera)
+
+    def seen_by(self, camera: Camera) -> Tracker:
+        """The same for `refine_fresh` and `evidence` in pictures of another camera, such as that of a window."""
+        other = copy.copy(self)
+        other.camera, other._intrinsics = camera, intrinsics_of(camera)
+        return other
 
     def start(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
         """Begin at a pose: colours are learned from this frame, the motion is taken as none."""
@@ -449,19 +471,26 @@ class Tracker:
                 other_evidence = self.evidence(image, gray, other)
                 if other_evidence.worth > evidence.worth + more:
                     pose, information, evidence = other, other_information, other_evidence
-        strangeness = self._strangeness(pose, predicted)
-        if self._is_suspicious(evidence, strangeness):
+        strange = strangeness(pose, predicted, self.diameter_mm)
+        if self._is_suspicious(evidence, strange):
             plain_gray, gray = self._gray_around(image)
-            best = evidence.worth - STRANGE_WORTH * strangeness
+            best = evidence.worth - STRANGE_WORTH * strange
             for start in self._search.find(image, (self._bin_of, self.appearance.odds), predicted):
                 other, other_information = self.refine(image, gray, start, o.stages)
                 other_evidence = self.evidence(image, gray, other)
-                worth = other_evidence.worth - STRANGE_WORTH * self._strangeness(other, predicted)
+                worth = other_evidence.worth - STRANGE_WORTH * strangeness(other, predicted, self.diameter_mm)
                 if worth > best + CLEARLY_MORE:
                     pose, information, evidence, matches = other, other_information, other_evidence, None
                     best = worth
             # What was looked for everywhere and found no better is usual from now on.
             self._usual_worth = evidence.worth
+        if self.second_look is not None and strangeness(pose, predicted, self.diameter_mm) > o.second_look:
+            better = self.second_look.better(image, pose, [predicted, before])
+            if better is not None:
+                plain_gray, gray = self._gray_around(image, better)
+                # Refined with the colours remembered it would be led back to where these, too, had been wrong.
+                _, information = self.refine(image, gray, better, LAST_STAGES[-1:])
+                pose, evidence, matches = better, self.evidence(image, gray, better), None
         if o.use_shading and self.part.is_curved:
             shaded, shaded_information = self.shaded(plain_gray, pose, information)
             shaded_evidence = self.evidence(image, gray, shaded)
@@ -496,17 +525,11 @@ class Tracker:
         )
         return pose, more
 
-    def _strangeness(self, cam_from_body: Array, predicted: Array) -> float:
-        """How far a pose is from the predicted one: 1 at 45°, at a third of the diameter aside or two along."""
-        turn = float(rotation_angle_rad(cam_from_body, predicted)) / STRANGE_TURN_RAD
-        way = (cam_from_body[:3, 3] - predicted[:3, 3]) / (STRANGE_WAY * self.diameter_mm)
-        return float(turn**2 + way[0] ** 2 + way[1] ** 2 + 0.25 * way[2] ** 2)
-
-    def _is_suspicious(self, evidence: Evidence, strangeness: float) -> bool:
+    def _is_suspicious(self, evidence: Evidence, strange: float) -> bool:
         """Whether the part may be elsewhere: the pose is worth little, less than usual, or off the prediction."""
         o = self.options
         share = evidence.worth / max(self._usual_worth, 1e-6)
-        is_less = share < o.usual_share or (share < o.surprise_share and strangeness > o.surprise)
+        is_less = share < o.usual_share or (share < o.surprise_share and strange > o.surprise)
         return is_less or evidence.quality < o.doubtful_quality
 
     def _gray_around(self, image: NDArray[np.uint8], *poses: Array) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
