@@ -420,7 +420,11 @@ def _session_options(modalities: tuple[str, ...]) -> SessionOptions:
     from arview.tracking import SessionOptions
 
     return SessionOptions(
-        use_region="region" in modalities, use_edge="edge" in modalities, use_feature="feature" in modalities
+        use_region="region" in modalities,
+        use_edge="edge" in modalities,
+        use_feature="feature" in modalities,
+        # It asks edges and colours.
+        use_second_look={"region", "edge"} <= set(modalities),
     )
 
 

@@ -20,8 +20,9 @@ from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.tracking.ambiguity import Rivals
 from arview.tracking.components import ComponentCheck
-from arview.tracking.detector import Detection, Detector, DetectorOptions
+from arview.tracking.detector import Detection, Detector, DetectorOptions, local_search_for
 from arview.tracking.learned import LearnedViews, Proposal
+from arview.tracking.second_look import SecondLook
 from arview.tracking.snap import Snap
 from arview.tracking.tracker import Estimate, Tracker, TrackerOptions
 from arview.tracking.why_not import NOTHING, Rejected, poor_picture, why_lost, why_not
@@ -36,6 +37,7 @@ class SessionOptions:
 
     Attributes:
         use_region, use_edge, use_feature: modalities of the tracker.
+        use_second_look: ask the detector's local search where a tracked pose surprises, see `SecondLook`.
         use_learned: remember how the part looks while it is tracked well, and look for that after a loss.
         lock_quality: a detection must be this good to be believed at once; a weaker one must hold a second frame.
         tracked_quality: at least this to be or become ``tracked``.
@@ -53,6 +55,7 @@ class SessionOptions:
     use_region: bool = True
     use_edge: bool = True
     use_feature: bool = True
+    use_second_look: bool = True
     use_learned: bool = True
     lock_quality: float = 0.8
     tracked_quality: float = 0.5
@@ -108,6 +111,7 @@ class TrackingSession:
             )
         self.camera = camera
         self._views = views
+        self._local = local_search_for(views, camera, self.options.detector)
         self.tracker = Tracker(
             views,
             camera,
@@ -117,6 +121,7 @@ class TrackingSession:
                 use_feature=self.options.use_feature,
             ),
             model,
+            SecondLook(self._local) if self.options.use_second_look else None,
         )
         self._detector: Detector | None = None
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
@@ -130,7 +135,7 @@ class TrackingSession:
     def detector(self) -> Detector:
         """The detector, made when first needed."""
         if self._detector is None:
-            self._detector = Detector(self._views, self.camera, self.options.detector)
+            self._detector = Detector(self._views, self.camera, self.options.detector, local=self._local)
         return self._detector
 
     @property
