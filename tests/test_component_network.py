@@ -20,8 +20,9 @@ from arview.tracking.component_network import (
     component_looks,
     shown,
 )
+from arview.tracking.line_network import LineNetwork
 from arview.tracking.tracker import PartView, intrinsics_of
-from arview.tracking.verifier import BAND_PX, CHANNELS
+from arview.tracking.verifier import BAND_PX, CHANNELS, LINES
 from synthetic import CAMERA, assembly, assembly_views, picture, pose_from
 
 PART = PartView(assembly_views())
@@ -34,6 +35,11 @@ def network() -> ComponentNetwork:
     return ComponentNetwork()
 
 
+@cache
+def line_network() -> LineNetwork:
+    return LineNetwork()
+
+
 def without(name: str) -> Model:
     return make_model("look-alike", tuple(part for part in assembly().components if part.name != name))
 
@@ -41,7 +47,15 @@ def without(name: str) -> Model:
 def looks(image: NDArray[np.uint8], pose: Array, *names: str) -> list[ComponentLook]:
     only = [NAMES.index(name) for name in names] or None
     pose_of_body = pose @ PART.model_from_body
-    return component_looks(image, intrinsics_of(CAMERA), PART.surface, PART.views.diameter_mm, pose_of_body, only)
+    return component_looks(
+        image,
+        line_network().lines(image),
+        intrinsics_of(CAMERA),
+        PART.surface,
+        PART.views.diameter_mm,
+        pose_of_body,
+        only,
+    )
 
 
 @pytest.mark.parametrize("noise", [2.0, 6.0])
@@ -101,7 +115,7 @@ def test_a_component_is_shown_where_it_is_in_the_picture() -> None:
 def test_what_the_network_is_shown_has_its_shape() -> None:
     for look in looks(picture(POSES[0], noise=2.0), POSES[0]):
         seen, both = shown(look)
-        assert seen.shape == (CHANNELS, SIDE_PX, SIDE_PX) and both.shape == (GLOBALS,)
+        assert seen.shape == (CHANNELS + LINES, SIDE_PX, SIDE_PX) and both.shape == (GLOBALS,)
         assert np.isfinite(seen).all() and np.isfinite(both).all()
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model, make_model
 from arview.geometry import Array, apply
 from arview.tracking import TrackingSession
-from arview.tracking.components import SUSPICIOUS_FRAMES, ComponentCheck, Look
+from arview.tracking.components import EDGES_ALONE, SUSPICIOUS_FRAMES, ComponentCheck, Look, together
 from synthetic import CAMERA, assembly, assembly_views, block, path, picture, pose_from, wrong
 
 MOVED_MM = 20.0
@@ -208,3 +208,15 @@ def test_a_session_never_calls_a_look_alike_tracked() -> None:
             assert named(result.mismatches) == {"post_1"}
             assert result.state.value == "critical"
             assert "post_1 not seen where expected" in result.reason
+
+
+def test_edges_that_something_hides_say_nothing_and_the_network_is_believed_in_sharp_pictures() -> None:
+    by_edges, by_network = np.array([3.0, 3.0, -3.0, -3.0]), np.array([2.0, np.nan, np.nan, -2.0])
+    seen = together(by_edges, by_network)
+    hidden = together(by_edges, by_network, 0.0, 1.0)
+    blurred = together(by_edges, by_network, 0.0, 0.0)
+    assert seen[0] > hidden[0] > blurred[0] > 0.0
+    assert seen[1] == pytest.approx(3.0 * EDGES_ALONE) and hidden[1] == blurred[1] == 0.0
+    # What speaks for a component is seen: nothing hides it.
+    assert np.all(seen[2:] == hidden[2:]) and np.all(seen[2:] == blurred[2:])
+    assert seen[3] < -1.0

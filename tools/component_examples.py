@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,9 @@ from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.evaluation.semisynthetic.look_alikes import look_alikes
 from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, apply, exp_so3, rigid
-from arview.guideviews.surface import Surface, reduced_surface, surface_about
-from arview.tracking.component_network import ComponentLook, component_looks
+from arview.guideviews.surface import reduced_surface, surface_about
+from arview.tracking.component_network import component_looks
+from arview.tracking.line_network import LineNetwork
 from arview.tracking.tracker import intrinsics_of
 from judge_examples import ANYWHERE, OCCLUDER, noisy, some_solids
 from line_examples import covered_picture, crowded_picture, lone_picture
@@ -53,7 +55,7 @@ class Looked:
 
     Attributes:
         solid: its seed.
-        pixels, drawn: (N,S,S,4) uint8 and (N,6,S,S) int8, 127 for 1, see `ComponentLook`.
+        pixels, drawn, lines: (N,S,S,4) uint8, (N,6,S,S) int8, 127 for 1, and (N,3,S,S) uint8, see `ComponentLook`.
         sizes_px: (N,).
         is_wrong: (N,) bool.
     """
@@ -61,6 +63,7 @@ class Looked:
     solid: int
     pixels: NDArray[np.uint8]
     drawn: NDArray[np.int8]
+    lines: NDArray[np.uint8]
     sizes_px: Array
     is_wrong: NDArray[np.bool_]
 
@@ -91,7 +94,7 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
     variants += [_resized(model, rng) for _ in range(RESIZED)]
     surfaces = [surface_about(*reduced_surface(one), model.center_in_model) for one, _ in variants]
     surface = surface_about(*reduced_surface(model), model.center_in_model)
-    others = some_solids(seed)
+    others, network = some_solids(seed), LineNetwork()
     for _ in range(PICTURES_EACH):
         is_right = rng.random() < RIGHT_SHARE
         number = -1 if is_right else int(rng.integers(len(variants)))
@@ -102,15 +105,13 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
         shown = _displaced(built, model, rng)
         image = _picture(shown, model, pose, options, (occluder, *others), photos, rng)
         cam_from_body = _off(pose, rng) @ rigid(np.eye(3), model.center_in_model)
-
-        def looks_at(expected: Surface, of: Model, names: tuple[str, ...] | None) -> list[ComponentLook]:
-            only = None if names is None else [k for k, c in enumerate(of.components) if c.name in names]
-            return component_looks(image, intrinsics_of(CAMERA), expected, model.diameter_mm, cam_from_body, only)  # noqa: B023
-
-        looks = looks_at(surface, model, None)
+        seen = partial(component_looks, image, network.lines(image), intrinsics_of(CAMERA))
+        looks = seen(surface, model.diameter_mm, cam_from_body)
         is_wrong = [model.components[look.index].name in changed for look in looks]
         for k in rng.permutation(len(variants))[:EXPECTED]:
-            more = looks_at(surfaces[k], *variants[k])
+            expected, names = variants[k]
+            only = [i for i, component in enumerate(expected.components) if component.name in names]
+            more = seen(surfaces[k], model.diameter_mm, cam_from_body, only)
             looks += more
             is_wrong += [k != number] * len(more)
         if looks:
@@ -118,6 +119,7 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
                 seed,
                 np.stack([look.pixels for look in looks]),
                 np.round(127.0 * np.stack([look.drawn for look in looks])).astype(np.int8),
+                np.stack([look.lines for look in looks]),
                 np.array([look.size_px for look in looks]),
                 np.array(is_wrong),
             )

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.tracking.component_network import GLOBALS, SIDE_PX, overall
-from arview.tracking.verifier import CHANNELS, contrasted, with_gradients
+from arview.tracking.verifier import CHANNELS, LINES
 from component_examples import Looked
 from judge_examples import read_examples
-from verifier_fitting import augmented, score_network, torch_with_onnx, write_network
+from verifier_fitting import network_input, score_network, torch_with_onnx, write_network
 
 BATCH = 128
 RATE, DECAY = 2e-3, 2e-2
@@ -34,11 +34,11 @@ def fit_components(folder: Path, epochs: int) -> None:
     torch = torch_with_onnx()
     examples, held_out = read_examples(folder, "components_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    network = score_network(torch, CHANNELS, GLOBALS)
+    network = score_network(torch, CHANNELS + LINES, GLOBALS)
     _fit(network, [one for one in examples if one.solid not in held_out], epochs, torch)
     network.eval()
     _report(network, [one for one in examples if one.solid in held_out], torch)
-    write_network(network, folder / "components.onnx", (CHANNELS, SIDE_PX), GLOBALS, torch)
+    write_network(network, folder / "components.onnx", (CHANNELS + LINES, SIDE_PX), GLOBALS, torch)
 
 
 def _fit(network: Any, examples: Sequence[Looked], epochs: int, torch: Any) -> None:
@@ -72,15 +72,9 @@ def _inputs(
     one: Looked, index: Sequence[int], rng: np.random.Generator | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Looks as the network takes them; with random numbers altered."""
-    plain, contrasts = zip(
-        *(contrasted(one.pixels[k], one.drawn[k].astype(np.float32) / 127.0) for k in index), strict=True
-    )
-    seen = np.stack(plain)
-    if rng is not None:
-        seen = augmented(seen, rng)
-    shown, explained = zip(*map(with_gradients, seen), strict=True)
+    shown, contrasts, explained = network_input(one, index, rng)
     sizes_px = [float(one.sizes_px[k]) for k in index]
-    return np.stack(shown), np.stack([overall(*of) for of in zip(sizes_px, contrasts, explained, strict=True)])
+    return shown, np.stack([overall(*of) for of in zip(sizes_px, contrasts, explained, strict=True)])
 
 
 def _report(network: Any, examples: Sequence[Looked], torch: Any) -> None:

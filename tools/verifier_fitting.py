@@ -23,6 +23,7 @@ from arview.tracking.verifier import (
     overall,
     with_gradients,
 )
+from component_examples import Looked
 from judge_examples import Looks, read_examples
 
 WIDTHS = (24, 24, 48, 48, 64, 64)
@@ -128,19 +129,28 @@ def _inputs(
     look: Looks, index: Sequence[int], rng: np.random.Generator | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Poses of a picture as the network takes them; with random numbers altered, all of them alike."""
-    plain, contrasts = zip(
-        *(contrasted(look.pixels[k], look.drawn[k].astype(np.float32) / 127.0) for k in index), strict=True
-    )
-    seen = np.concatenate([np.stack(plain), look.lines[list(index)].astype(np.float32) / np.float32(255.0)], axis=1)
-    if rng is not None:
-        seen = augmented(seen, rng)
-    shown, explained = zip(*map(with_gradients, np.ascontiguousarray(seen[:, :PLAIN])), strict=True)
+    shown, contrasts, explained = network_input(look, index, rng)
     both = []
     for k, contrast, share in zip(index, contrasts, explained, strict=True):
         # What is known of refined poses only is the mean for the others.
         known = look.known[k] if look.is_refined[k] else MEANS
         both.append(overall(float(look.radii_px[k]), contrast, known, share))
-    return np.concatenate([np.stack(shown), seen[:, PLAIN:]], axis=1), np.stack(both)
+    return shown, np.stack(both)
+
+
+def network_input(
+    looked: Looks | Looked, index: Sequence[int], rng: np.random.Generator | None
+) -> tuple[NDArray[np.float32], list[float], list[float]]:
+    """Some looks of a picture as networks take them, with their contrasts and shares explained; perhaps altered."""
+    plain, contrasts = zip(
+        *(contrasted(looked.pixels[k], looked.drawn[k].astype(np.float32) / 127.0) for k in index), strict=True
+    )
+    lines = looked.lines[list(index)].astype(np.float32) / np.float32(255.0)
+    seen = np.concatenate([np.stack(plain), lines], axis=1)
+    if rng is not None:
+        seen = augmented(seen, rng)
+    shown, explained = zip(*map(with_gradients, np.ascontiguousarray(seen[:, :PLAIN])), strict=True)
+    return np.concatenate([np.stack(shown), seen[:, PLAIN:]], axis=1), list(contrasts), list(explained)
 
 
 def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:

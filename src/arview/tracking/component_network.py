@@ -1,9 +1,9 @@
 """A small convolutional network that sees whether a component is where the CAD has it.
 
 Edges say little of components that look much alike, as two nuts do. The network, shown the picture around a component
-beside the normals and the depth that the CAD has there, sees the whole of it: what it is shown is made as for the
-`verifier`, about one component instead of the part. It was fitted on random assemblies in which components were right,
-missing, moved or swapped, see ``tools/fit_judge``.
+beside the normals and the depth that the CAD has there and what the line network sees, sees the whole of it: what it
+is shown is made as for the `verifier`, about one component instead of the part. It was fitted on random assemblies in
+which components were right, missing, moved or swapped, see ``tools/fit_judge``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from arview.geometry import Array, apply
 from arview.guideviews.surface import Surface, draw_surface
 from arview.tracking.solver import project
-from arview.tracking.verifier import BAND_PX, DRAWN, contrasted, with_gradients
+from arview.tracking.verifier import BAND_PX, DRAWN, contrasted, lines_around, with_gradients, with_lines
 
 SIDE_PX, RADIUS_PX = 48, 13.0
 """Side of the picture around a component, and half the component's larger side in it."""
@@ -49,12 +49,14 @@ class ComponentLook:
         pixels: (S,S,4) uint8, RGB and 255 inside the picture.
         drawn: (6,S,S) float32: distance to its outline as it is seen (-1 inside, 1 outside), edges of what is drawn;
             of the whole part the normal and the depth, see `verifier.DRAWN`.
+        lines: (3,S,S) uint8, what the line network sees there, see `verifier.LINES`.
         size_px: larger side of the component in the picture.
     """
 
     index: int
     pixels: NDArray[np.uint8]
     drawn: NDArray[np.float32]
+    lines: NDArray[np.uint8]
     size_px: float
 
 
@@ -76,10 +78,10 @@ class ComponentNetwork:
 
 
 def shown(look: ComponentLook) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A look as the network takes it: (CHANNELS,S,S) and (GLOBALS,)."""
+    """A look as the network takes it: (CHANNELS + LINES,S,S) and (GLOBALS,)."""
     plain, contrast = contrasted(look.pixels, look.drawn)
     seen, explained = with_gradients(plain)
-    return seen, overall(look.size_px, contrast, explained)
+    return with_lines(seen, look.lines), overall(look.size_px, contrast, explained)
 
 
 def overall(size_px: float, contrast: float, explained: float) -> NDArray[np.float32]:
@@ -90,6 +92,7 @@ def overall(size_px: float, contrast: float, explained: float) -> NDArray[np.flo
 
 def component_looks(
     window: NDArray[np.uint8],
+    answers: NDArray[np.uint8],
     intrinsics: Array,
     surface: Surface,
     diameter_mm: float,
@@ -100,7 +103,8 @@ def component_looks(
 
     Args:
         window: (H,W,3) RGB, the picture around the part.
-        intrinsics: (10,) of it, see `intrinsics_of`.
+        answers: (9,h,w) of the line network to it, see `LineNetwork.lines`.
+        intrinsics: (10,) of the window, see `intrinsics_of`.
         surface: of the part, about its centre.
         diameter_mm: of the part.
         cam_from_body: (4,4).
@@ -110,7 +114,7 @@ def component_looks(
     for index in range(int(surface.component.max()) + 1) if only is None else only:
         own = points[np.unique(surface.faces[surface.component == index])]
         if len(own) and own[:, 2].min() > NEAREST_SHARE * diameter_mm:
-            look = _look(index, own, window, intrinsics, surface, diameter_mm, cam_from_body)
+            look = _look(index, own, window, answers, intrinsics, surface, diameter_mm, cam_from_body)
             if look is not None:
                 looks.append(look)
     return looks
@@ -120,6 +124,7 @@ def _look(
     index: int,
     points_in_cam: Array,
     window: NDArray[np.uint8],
+    answers: NDArray[np.uint8],
     intrinsics: Array,
     surface: Surface,
     diameter_mm: float,
@@ -155,7 +160,9 @@ def _look(
     # Depths are told about the component's own.
     middle, scale = np.median(drawn[5][is_own > 0]), diameter_mm / _extent(points_in_cam)
     drawn[5] = np.where(face_ids >= 0, np.clip(scale * (drawn[5] - middle), -1.0, 1.0), 0.0)
-    return ComponentLook(index, _cut(window, corner, side), drawn, size_px)
+    shift = zoom * (0.5 - corner) - 0.5
+    lines = lines_around(answers, answers.shape[2] / window.shape[1], zoom, shift, drawn[0])
+    return ComponentLook(index, _cut(window, corner, side), drawn, lines, size_px)
 
 
 def _extent(points: Array) -> float:
