@@ -100,7 +100,7 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
         number = -1 if is_right else int(rng.integers(len(variants)))
         built, changed = (model, ()) if is_right else variants[number]
         variant = VARIANTS[rng.integers(len(VARIANTS))]
-        options = SequenceOptions(variant, 1, int(rng.integers(1 << 30)), noise=rng.uniform(2.0, 8.0), motion=ANYWHERE)
+        options = SequenceOptions(variant, 1, int(rng.integers(1 << 30)), noise=rng.uniform(2.0, 14.0), motion=ANYWHERE)
         pose = trajectory(model, options)[0]
         shown = _displaced(built, model, rng)
         image = _picture(shown, model, pose, options, (occluder, *others), photos, rng)
