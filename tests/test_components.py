@@ -210,13 +210,11 @@ def test_a_session_never_calls_a_look_alike_tracked() -> None:
             assert "post_1 not seen where expected" in result.reason
 
 
-def test_edges_that_something_hides_say_nothing_and_the_network_is_believed_in_sharp_pictures() -> None:
-    by_edges, by_network = np.array([3.0, 3.0, -3.0, -3.0]), np.array([2.0, np.nan, np.nan, -2.0])
-    seen = together(by_edges, by_network)
-    hidden = together(by_edges, by_network, 0.0, 1.0)
-    blurred = together(by_edges, by_network, 0.0, 0.0)
-    assert seen[0] > hidden[0] > blurred[0] > 0.0
-    assert seen[1] == pytest.approx(3.0 * EDGES_ALONE) and hidden[1] == blurred[1] == 0.0
+def test_what_is_hidden_is_in_doubt_only_where_the_network_is_sure() -> None:
+    by_edges, by_network = np.array([3.0, 3.0, 3.0, -3.0, -3.0]), np.array([3.5, 1.0, np.nan, np.nan, -2.0])
+    seen, hidden = together(by_edges, by_network), together(by_edges, by_network, 0.0)
+    assert seen[0] > hidden[0] > 1.0
+    assert seen[1] > 1.0 and hidden[1] < 0.0
+    assert seen[2] == pytest.approx(3.0 * EDGES_ALONE) and hidden[2] == 0.0
     # What speaks for a component is seen: nothing hides it.
-    assert np.all(seen[2:] == hidden[2:]) and np.all(seen[2:] == blurred[2:])
-    assert seen[3] < -1.0
+    assert np.all(seen[3:] == hidden[3:]) and seen[4] < -1.0

@@ -72,9 +72,10 @@ BOTH, MOST_SAID = (-0.11, 0.35, 1.15, 0.5), 4.0
 up to how much each. Fitted to 4,200 looks at components of random assemblies that the network was not fitted to, a
 tenth of them wrong, a third of the pictures with something before a component: of the wrong ones 54 % are above 99 % of
 the right, by edges alone 8 %. Edges that are not seen count only as far as those around are; the network sees itself
-what hides a component, but not how noisy or blurred the whole picture is."""
-BLURRED_SHARE = 0.5
-"""What the network says against a component counts so much in a picture in which all others are hardly borne out."""
+what hides a component."""
+HIDDEN_DOUBT = 1.5
+"""So much less the network says against a component around which nothing is borne out: of what a hand hides it is not
+sure either."""
 EDGES_ALONE = 0.35
 """Of a ratio against a component that the network cannot see, so small it is, this share counts: in those pictures
 what lies around it and before it leaves its edges empty oftener than where `MODEL` was fitted."""
@@ -568,24 +569,17 @@ def said_by_edges(found: Array) -> Array:
     return np.asarray(ratio * np.maximum(spread, 0.0) / (np.maximum(spread, 0.0) + HALF_LAMBDA))
 
 
-def _seen_share(borne_out: Array) -> Array:
-    """0 where so small a share is borne out as where something hides it, 1 where it is as large as in plain view."""
-    return np.asarray(np.clip((borne_out - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0))
-
-
-def together(by_edges: Array, by_network: Array, around: Array | float = 1.0, others: Array | float = 1.0) -> Array:
+def together(by_edges: Array, by_network: Array, is_open: Array | float = 1.0) -> Array:
     """Log-likelihood ratios (C,) by edges and network, NaN where this says nothing; see `BOTH`.
 
-    ``around`` and ``others`` are 0 where nothing is borne out around the components, and in the picture, and 1 where
-    all is: where they are not seen either, something hides a component, or the picture is blurred.
+    ``is_open`` is 0 where nothing is borne out around a component, or in the picture, and 1 where all is: where these
+    are not seen either, something hides it, or the picture is blurred.
     """
     constant, per_edges, per_against, per_for = BOTH
-    is_open = np.minimum(around, others)
-    is_sharp = BLURRED_SHARE + (1.0 - BLURRED_SHARE) * np.asarray(others)
     alone = np.where(by_edges > 0.0, EDGES_ALONE * by_edges * is_open, by_edges)
     edges = np.where(by_edges > 0.0, np.minimum(by_edges, MOST_SAID) * is_open, by_edges)
-    seen = np.minimum(by_network, MOST_SAID)
-    both = constant + per_edges * edges + np.where(seen > 0.0, per_against * is_sharp, per_for) * seen
+    against = np.maximum(np.minimum(by_network, MOST_SAID) - HIDDEN_DOUBT * (1.0 - np.asarray(is_open)), 0.0)
+    both = constant + per_edges * edges + per_against * against + per_for * np.minimum(by_network, 0.0)
     return np.asarray(np.where(np.isnan(by_network), alone, both))
 
 
@@ -680,7 +674,8 @@ class ComponentCheck:
         by_network = self._seen_by_network(image, cam_from_model, is_shown & (by_edges > SETTLED))
         is_suspect = is_shown & (together(by_edges, by_network) > SUSPECT)
         more_suspects = max(0, int(np.count_nonzero(is_suspect)) - SUSPECTS)
-        ratio = together(by_edges, by_network, *(_seen_share(share) for share in (around, others)))
+        is_open = np.clip((np.minimum(around, others) - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
+        ratio = together(by_edges, by_network, is_open)
         ratio = np.where(ratio > 0.0, ratio * 0.5**more_suspects, ratio)
         against = np.where(is_shown, np.clip(ratio, -LARGEST_RATIO, LARGEST_RATIO), 0.0)
         return Look(against, is_suspect, is_shown, borne_out, elsewhere, contrast, around)
