@@ -708,10 +708,8 @@ class ComponentCheck:
         window = image[low[1] : high[1], low[0] : high[0]]
         if shrink > 1:
             window = np.asarray(cv2.resize(window, (int(small[0]), int(small[1])), interpolation=cv2.INTER_AREA))
-        intrinsics = intrinsics_of(camera)
-        intrinsics[:2] /= shrink
-        intrinsics[2:4] = (intrinsics[2:4] - low + 0.5) / shrink - 0.5
-        return window, intrinsics, scale / shrink
+        seen_by = camera.cropped(*low.tolist(), *(high - low).tolist()).scaled(*small.tolist())
+        return window, intrinsics_of(seen_by), scale / shrink
 
     def _measured(self, image: NDArray[np.uint8], cam_from_model: Array) -> Array:
         """(C,6), see `measure_components`."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ class DetectorOptions:
         roll_step_deg: spacing of the templates.
         subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
         efforts: of the searches, each made if those before it did not settle the matter.
-        local: of the search around the best matches.
+        local: of the search around the best matches; its radius_px is that of the templates.
         min_quality: a weaker result is no detection.
     """
 
@@ -66,7 +66,7 @@ class DetectorOptions:
             raise InputError(f"detector: radius_px = {self.radius_px}, expected 10 to 60")
 
 
-NARROW_DETAIL = DetectorOptions(26.0, roll_step_deg=12.0, subdivisions=3, local=LocalOptions(26.0))
+NARROW_DETAIL = DetectorOptions(radius_px=26.0, roll_step_deg=12.0, subdivisions=3)
 """Finer templates, for ranges in which they are few."""
 FEW_TEMPLATES = 1500
 
@@ -98,7 +98,8 @@ class Detection:
 
 def local_search_for(views: GuideViewSet, camera: Camera, options: DetectorOptions | None = None) -> LocalSearch:
     """The local search that a detector with these options uses."""
-    return LocalSearch(views, camera, (options or options_for(views)).local, reach_mm(views.view_range))
+    o = options or options_for(views)
+    return LocalSearch(views, camera, replace(o.local, radius_px=o.radius_px), reach_mm(views.view_range))
 
 
 class Detector:

@@ -35,7 +35,7 @@ from arview.tracking.quality import (
 )
 from arview.tracking.templates import ShownLines, choose_apart
 from arview.tracking.threads import pool
-from arview.tracking.tracker import NEAR_STAGES, Stage, Tracker, TrackerOptions
+from arview.tracking.tracker import NEAR_STAGES, SETTLING_STAGES, Stage, Tracker, TrackerOptions
 from arview.tracking.verifier import Verifier
 
 
@@ -62,18 +62,9 @@ BEFORE_WORTH = 0.5
 something in the way the right pose is among the first forty of a level in 52 with it, in 48 without."""
 COARSE_TOLERANCE_PX, FINE_TOLERANCE_PX = 3.5, 1.5
 """After the coarse and the fine stages edges are looked for this near."""
-FINE_STAGES = (
-    (
-        Stage(2, 12, 1.5, 5.0, 2),
-        Stage(2, 10, 1.0, 4.0, 2),
-        Stage(1, 8, 1.0, 2.5, 2),
-        Stage(1, 6, 1.0, 1.5, 2),
-        Stage(1, 5, 1.0, 1.0, 2),
-    ),
-    NEAR_STAGES,
-)
+FINE_STAGES = (SETTLING_STAGES, NEAR_STAGES)
 """Both ways are gone: edges and colours; near edges alone, for what hides a part of the outline pulls the colours."""
-LAST_STAGE = FINE_STAGES[0][-1:]
+LAST_STAGE = SETTLING_STAGES[-1:]
 LARGEST_LOSS = 3.0
 """Shading may cost so much of what outline and edges say of a pose."""
 

@@ -122,6 +122,7 @@ class TrackingSession:
             ),
             model,
             SecondLook(self._local) if self.options.use_second_look else None,
+            self._local.tracker.part,
         )
         self._detector: Detector | None = None
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")

@@ -20,7 +20,7 @@ from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
 from arview.tracking.matching import response_maps, score_around
 from arview.tracking.quality import Evidence
 from arview.tracking.threads import pool
-from arview.tracking.tracker import Stage, Tracker, TrackerOptions, intrinsics_of, smoothed
+from arview.tracking.tracker import SETTLING_STAGES, Tracker, TrackerOptions, intrinsics_of, smoothed
 
 
 @dataclass(frozen=True)
@@ -91,13 +91,6 @@ PLAIN_WORTH = 0.3
 """What a view without any line of its own takes from a pose's worth."""
 CROP_REACH = 1.35
 """Radii around the part's middle that are looked at: it may be nearer than the given pose says."""
-STAGES = (
-    Stage(2, 12, 1.5, 5.0, 2),
-    Stage(2, 10, 1.0, 4.0, 2),
-    Stage(1, 8, 1.0, 2.5, 2),
-    Stage(1, 6, 1.0, 1.5, 2),
-    Stage(1, 5, 1.0, 1.0, 2),
-)
 
 
 class Snap:
@@ -233,10 +226,8 @@ class Snap:
         part = np.ascontiguousarray(image[first[1] : last[1], first[0] : last[0]])
         part = np.asarray(cv2.resize(part, (int(small[0]), int(small[1])), interpolation=cv2.INTER_AREA))
         pad = level.shift_px
-        stretch = small / (last - first)
-        intrinsics = intrinsics_of(camera)
-        intrinsics[:2] *= stretch
-        intrinsics[2:4] = (intrinsics[2:4] - first + 0.5) * stretch - 0.5 + pad
+        intrinsics = intrinsics_of(camera.cropped(*first.tolist(), *(last - first).tolist()).scaled(*small.tolist()))
+        intrinsics[2:4] += pad
         return response_maps(part, SPREAD_PX, pad), intrinsics
 
     def _best(self, image: NDArray[np.uint8], starts: list[Array]) -> Snapped | None:
@@ -246,7 +237,7 @@ class Snap:
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
         def refine(start: Array) -> Snapped:
-            pose = self._tracker.refine_fresh(image, gray, start, STAGES)
+            pose = self._tracker.refine_fresh(image, gray, start, SETTLING_STAGES)
             look = self._tracker.fresh_appearance(image, pose)
             evidence = self._tracker.evidence(image, gray, pose, appearance=look)
             is_inside = evidence.points_in_picture >= self.options.min_in_picture

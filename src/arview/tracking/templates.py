@@ -156,11 +156,12 @@ class ShownLines:
     def __init__(self, views: GuideViewSet) -> None:
         self._views = views
         self._counted = _nearest_views(views, LINES_SUBDIVISIONS)
+        self._directions = views.directions[self._counted]
         self._known: dict[int, float] = {}
 
     def towards(self, direction: Array) -> float:
         """Lines, at least 1, of that view of an icosphere which is nearest to a direction (3,)."""
-        index = int(self._counted[np.argmax(self._views.directions[self._counted] @ direction)])
+        index = int(self._counted[np.argmax(self._directions @ direction)])
         if index not in self._known:
             self._known[index] = max(view_lines(self._views.view(index), self._views.diameter_mm), 1.0)
         return self._known[index]

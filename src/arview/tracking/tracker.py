@@ -86,6 +86,14 @@ NEAR_STAGES = (
     Stage(1, 5, 1.0, 1.0, 2, 0.0),
 )
 """Edges nearby alone: colours mislead where something hides a part of the outline, or looks like the part."""
+SETTLING_STAGES = (
+    Stage(2, 12, 1.5, 5.0, 2),
+    Stage(2, 10, 1.0, 4.0, 2),
+    Stage(1, 8, 1.0, 2.5, 2),
+    Stage(1, 6, 1.0, 1.5, 2),
+    Stage(1, 5, 1.0, 1.0, 2),
+)
+"""Edges and colours, for a pose that a search found, some pixels off."""
 PLAIN_SHARE = 0.05
 """With fewer design edges than this the outline alone turns with the light: colours are needed."""
 LAST_STAGES = 2 * TRACK_STAGES[2:]
@@ -253,7 +261,7 @@ _NO_MATCHES = Matches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
 
 
 class Tracker:
-    """6-DoF tracking of one part with one camera."""
+    """6-DoF tracking of one part with one camera; a ``part`` made from the same views need not be made again."""
 
     def __init__(
         self,
@@ -262,11 +270,12 @@ class Tracker:
         options: TrackerOptions | None = None,
         model: Model | None = None,
         second_look: SecondLook | None = None,
+        part: PartView | None = None,
     ) -> None:
         self.options = options or TrackerOptions()
         self.camera = camera
         self.second_look = second_look
-        self.part = PartView(views)
+        self.part = part or PartView(views)
         self.diameter_mm = views.diameter_mm
         self.appearance = Appearance()
         self._intrinsics = intrinsics_of(camera)
