@@ -15,8 +15,15 @@ import pytest
 
 from arview.cad import Model, Symmetry, make_model
 from arview.errors import InputError, OutputError
-from arview.evaluation import PoseMeter, load_scene
-from arview.evaluation.protocols import Tally, box_symmetries, full_sphere_range, spread_frames
+from arview.evaluation import PoseError, PoseMeter, SceneFrame, load_scene
+from arview.evaluation.protocols import (
+    Tally,
+    box_symmetries,
+    detect_in_frames,
+    full_sphere_range,
+    spread_frames,
+    true_pose,
+)
 from arview.evaluation.semisynthetic import (
     CAMERA,
     SHAPES,
@@ -40,6 +47,9 @@ from arview.evaluation.semisynthetic.look_alikes import different_share
 from arview.evaluation.semisynthetic.shading import corner_normals, muted
 from arview.evaluation.semisynthetic.solids import circle, prism, rectangle, triangulate
 from arview.geometry import Array, apply, exp_so3, look_at, rigid, rotation_angle_rad
+from arview.render import ZBufferRenderer
+from arview.tracking import Detection
+from arview.video import Image
 from cad_files import box
 from synthetic import background, component
 
@@ -324,6 +334,23 @@ def test_look_alike_of_one_component_is_refused() -> None:
 # --- Ambiguity ------------------------------------------------------------------------------------------
 
 
+def test_a_notch_behind_something_tells_nothing() -> None:
+    model, near = shape("flange"), near_symmetries("flange")
+    center = model.center_in_model
+    above = look_at(center + np.array([100.0, 50.0, 550.0]), center, [0, 1.0, 0])
+    in_view = ZBufferRenderer(model, CAMERA).render(above).depth_mm > 0
+    assert len(alike_poses(model, CAMERA, above, near, in_view)) == 1
+    # Something lies over the notch, at +X of the disc's rim, and over the next place that a twin's notch has.
+    mask = in_view.astype(np.uint8)
+    for angle in np.deg2rad([0.0, 60.0]):
+        rim_px = CAMERA.project(apply(above, np.array([85.0 * np.cos(angle), 85.0 * np.sin(angle), 9.0])[None]))[0]
+        cv2.circle(mask, (round(rim_px[0]), round(rim_px[1])), 30, 0, -1)
+    alike = alike_poses(model, CAMERA, above, near, mask > 0)
+    # The places of the other twins' notches are seen to have none.
+    assert len(alike) == 2
+    assert np.rad2deg(rotation_angle_rad(alike[1][:3, :3], above[:3, :3])) == pytest.approx(60.0, abs=1e-4)
+
+
 def test_sixths_of_the_flange_are_alike_only_where_the_notch_is_hidden() -> None:
     model, near = shape("flange"), near_symmetries("flange")
     center = model.center_in_model
@@ -353,10 +380,10 @@ def test_scene_is_read_back_with_its_truth(tmp_path: Path, photos: tuple[Path, .
     assert np.allclose(scene.poses, trajectory(shape("assembly"), options), atol=1e-9)
     for frame in scene.frames:
         assert scene.image(frame).shape == (512, 640, 3)
-        mask = cv2.imread(str(scene.folder / "mask_visib" / f"{frame.index:06d}_000000.png"), cv2.IMREAD_GRAYSCALE)
+        mask = scene.mask(frame)
         info = json.loads((scene.folder / "scene_gt_info.json").read_text())[str(frame.index)][0]
         assert frame.visible is not None and 0.0 < frame.visible <= 1.0
-        assert np.count_nonzero(mask) == pytest.approx(info["px_count_visib"], rel=0.03)
+        assert mask is not None and np.count_nonzero(mask) == pytest.approx(info["px_count_visib"], rel=0.03)
         assert info["visib_fract"] == pytest.approx(info["px_count_visib"] / info["px_count_all"], abs=1e-3)
 
 
@@ -456,6 +483,36 @@ def test_box_symmetries_turn_a_box_onto_itself() -> None:
     bar = make_model("bar", (component("bar", box((0, 0, 0), (40, 41, 100)), (0.5, 0.5, 0.5)),))
     assert [symmetry.order for symmetry in box_symmetries(bar)] == [2, 2, 4]
     assert box_symmetries(bar)[2] == Symmetry((0.0, 0.0, 1.0), (20.0, 20.5, 50.0), 4)
+
+
+class _Answers:
+    """A detector that says what it is told to, picture by picture."""
+
+    def __init__(self, *answers: list[Detection]) -> None:
+        self._answers = list(answers)
+
+    def detect(self, image: Image, max_results: int) -> list[Detection]:
+        return self._answers.pop(0)
+
+
+def test_ambiguous_answers_with_the_right_pose_are_counted_apart(tmp_path: Path, photos: tuple[Path, ...]) -> None:
+    made = make_sequence(shape_job("flange", SequenceOptions(frames=4), photos), tmp_path)
+    scene = load_scene(made / "test" / "000001")
+    meter = PoseMeter(scene.part.model, scene.camera)
+    frames = scene.frames
+    wrong = [true_pose(f) @ rigid(exp_so3([0.0, 0.0, np.deg2rad(60.0)]), np.zeros(3)) for f in frames]
+    detector = _Answers(
+        [Detection(true_pose(frames[0]), 0.9, alternatives=(wrong[0],))],
+        [Detection(wrong[1], 0.9, alternatives=(true_pose(frames[1]),))],
+        [Detection(wrong[2], 0.9)],
+        [],
+    )
+
+    def error_of(estimate: Array, frame: SceneFrame) -> PoseError:
+        return meter.measure(estimate, true_pose(frame))
+
+    tally = detect_in_frames(scene, frames, detector, error_of)  # type: ignore[arg-type]
+    assert (tally.frames, tally.right, tally.left_open) == (4, 1, 1)
 
 
 def test_tallies_add_up() -> None:

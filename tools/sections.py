@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from arview.cad import Model, ViewRange, load_part
-from arview.evaluation import PoseMeter, Scene, SceneFrame, load_scene
+from arview.evaluation import PoseError, PoseMeter, Scene, SceneFrame, load_scene
 from arview.evaluation.protocols import (
     Tally,
     box_symmetries,
@@ -18,6 +18,7 @@ from arview.evaluation.protocols import (
     full_sphere_range,
     spread_frames,
     track_with_resets,
+    true_pose,
 )
 from arview.evaluation.semisynthetic import (
     SHAPES,
@@ -89,7 +90,7 @@ class Sections:
             meter = PoseMeter(model, scene.camera, symmetries=symmetries, symmetric_poses=scene.symmetric_poses)
             detector = Detector(recorded_views(scene), scene.camera)
             frames = spread_frames(scene, self.frames or DETECT_FRAMES["real"])
-            tally = detect_in_frames(scene, frames, detector, meter.measure)
+            tally = detect_in_frames(scene, frames, detector, partial(_plain_error, meter))
             self.details.setdefault("detect", {})[name] = asdict(tally)
             target = "≥ 95 % within 5 cm/5°, full sphere, no hint"
             lines.append(Line("detect", name, detection_text(tally), target, tally.share >= 0.95))
@@ -287,6 +288,10 @@ class LookAlikeResult:
         return self.state == TrackingState.TRACKED and not self.mismatches
 
 
+def _plain_error(meter: PoseMeter, estimate: Array, frame: SceneFrame) -> PoseError:
+    return meter.measure(estimate, true_pose(frame))
+
+
 class _AlikeMeter:
     """Errors against whichever of the poses that look the same in a picture is nearest."""
 
@@ -294,8 +299,9 @@ class _AlikeMeter:
         self._scene, self._near = scene, near_symmetries(name)
         self._meter = PoseMeter(scene.part.model, scene.camera, symmetries=scene.part.symmetries)
 
-    def __call__(self, estimate: Array, truth: Array) -> Any:
-        truths = alike_poses(self._scene.part.model, self._scene.camera, truth, self._near)
+    def __call__(self, estimate: Array, frame: SceneFrame) -> PoseError:
+        mask = self._scene.mask(frame) if self._near else None
+        truths = alike_poses(self._scene.part.model, self._scene.camera, true_pose(frame), self._near, mask)
         return least_error(self._meter, estimate, truths)
 
 
@@ -326,7 +332,8 @@ def shares(tallies: dict[Any, Tally]) -> str:
 
 
 def detection_text(tally: Tally) -> str:
-    return f"{100 * tally.share:.0f} % of {tally.frames}, {timing(tally.ms)}"
+    left_open = f", right pose among ambiguous ones {tally.left_open}" if tally.left_open else ""
+    return f"{100 * tally.share:.0f} % of {tally.frames}{left_open}, {timing(tally.ms)}"
 
 
 def percent(part: int, whole: int) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.cad import Part, load_part
 from arview.cad.symmetry import Symmetry
@@ -23,6 +24,7 @@ from arview.video import Image
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 PICTURE_FOLDERS = ("rgb", "gray")
+MASK_FOLDER = "mask_visib"
 PEER_FILE = "peer_visp.json"
 VISIBILITY_KEYS = ("visib_fract", "plate_in_view")
 
@@ -38,6 +40,7 @@ class SceneFrame:
         cam_from_model: (4,4) reference pose in mm, or None.
         is_truth: the pose comes from scene_gt.json, not from a reference file.
         visible: share of the part that can be seen, 0–1, or None where the scene does not say.
+        mask_path: of the picture of what can be seen of the part, or None.
     """
 
     index: int
@@ -46,6 +49,7 @@ class SceneFrame:
     cam_from_model: Array | None = None
     is_truth: bool = False
     visible: float | None = None
+    mask_path: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -84,10 +88,23 @@ class Scene:
         Raises:
             InputError: the picture cannot be read, or has another size than the first.
         """
-        image = _read_picture(frame.path)
+        return self._as_taken(_read_picture(frame.path), frame, frame.path)
+
+    def mask(self, frame: SceneFrame) -> NDArray[np.bool_] | None:
+        """Where the part can be seen in a frame's `image`, (H,W); None where the scene does not say.
+
+        Raises:
+            InputError: the mask cannot be read, or has another size than the pictures.
+        """
+        if frame.mask_path is None:
+            return None
+        return np.asarray(self._as_taken(_read_picture(frame.mask_path), frame, frame.mask_path)[..., 0] > 127)
+
+    def _as_taken(self, image: Image, frame: SceneFrame, path: Path) -> Image:
+        """A picture that belongs to a frame, as `camera` would have taken it."""
         if image.shape[:2] != (self.camera.height, self.camera.width):
             raise InputError(
-                f"{frame.path}: is {image.shape[1]}×{image.shape[0]} px, the first picture of the scene is "
+                f"{path}: is {image.shape[1]}×{image.shape[0]} px, the first picture of the scene is "
                 f"{self.camera.width}×{self.camera.height} px"
             )
         if not np.allclose(frame.matrix, self.camera.matrix, rtol=0, atol=1e-6):
@@ -152,11 +169,13 @@ def load_scene(
         frame = SceneFrame(index, pictures[index], matrix)
         if place is not None:
             info = infos.get(key) or []
+            mask_path = folder / MASK_FOLDER / f"{index:06d}_{place:06d}.png"
             frame = replace(
                 frame,
                 cam_from_model=_pose(truths[key][place], "cam_R_m2c", "cam_t_m2c", f"{truth_file}: frame {key}"),
                 is_truth=True,
                 visible=_visibility(info[place] if place < len(info) else {}),
+                mask_path=mask_path if mask_path.is_file() else None,
             )
         elif key in peers:
             frame = replace(frame, cam_from_model=_pose(peers[key], "R", "t_mm", f"{reference}: frame {key}"))

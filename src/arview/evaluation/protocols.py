@@ -33,11 +33,13 @@ class Tally:
         frames: how many were looked at.
         right: how many of them are right.
         ms: (N,) time of each, the first left out: it may hold the loading of compiled code.
+        left_open: how many others were called ambiguous, with a right pose among the alternatives.
     """
 
     frames: int = 0
     right: int = 0
     ms: tuple[float, ...] = ()
+    left_open: int = 0
 
     @property
     def share(self) -> float:
@@ -45,7 +47,12 @@ class Tally:
         return self.right / self.frames if self.frames else 0.0
 
     def __add__(self, other: Tally) -> Tally:
-        return Tally(self.frames + other.frames, self.right + other.right, self.ms + other.ms)
+        return Tally(
+            self.frames + other.frames,
+            self.right + other.right,
+            self.ms + other.ms,
+            self.left_open + other.left_open,
+        )
 
 
 def full_sphere_range(nearest_mm: float, farthest_mm: float, ratio: float = 4.0) -> ViewRange:
@@ -84,17 +91,17 @@ def track_with_resets(scene: Scene, views: GuideViewSet, step: int = 1, most_fra
         views, scene.camera, model=scene.part.model, second_look=SecondLook(LocalSearch(views, scene.camera))
     )
     meter = PoseMeter(scene.part.model, scene.camera, symmetries=scene.part.symmetries)
-    tracker.start(scene.image(frames[0]), _truth(frames[0]))
+    tracker.start(scene.image(frames[0]), true_pose(frames[0]))
     right, ms = 0, []
     for frame in frames[1:]:
         image = scene.image(frame)
         began = time.perf_counter()
         estimate = tracker.track(image)
         ms.append(1e3 * (time.perf_counter() - began))
-        if meter.measure(estimate.cam_from_model, _truth(frame)).within(*COARSE):
+        if meter.measure(estimate.cam_from_model, true_pose(frame)).within(*COARSE):
             right += 1
         else:
-            tracker.start(image, _truth(frame))
+            tracker.start(image, true_pose(frame))
     return Tally(len(frames) - 1, right, tuple(ms[1:]))
 
 
@@ -102,7 +109,7 @@ def detect_in_frames(
     scene: Scene,
     frames: Sequence[SceneFrame],
     detector: Detector,
-    error_of: Callable[[Array, Array], PoseError],
+    error_of: Callable[[Array, SceneFrame], PoseError],
 ) -> Tally:
     """Look for the part in single frames; the best detection counts.
 
@@ -110,16 +117,22 @@ def detect_in_frames(
         scene: of the frames.
         frames: each with a pose.
         detector: of the scene's part and camera.
-        error_of: error of an estimated against a true ``cam_from_model``.
+        error_of: error of an estimated ``cam_from_model`` (4,4) in a frame.
     """
-    right, ms = 0, []
+    right, left_open, ms = 0, 0, []
     for frame in frames:
         image = scene.image(frame)
         began = time.perf_counter()
         detections = detector.detect(image, max_results=1)
         ms.append(1e3 * (time.perf_counter() - began))
-        right += bool(detections) and error_of(detections[0].cam_from_model, _truth(frame)).within(*COARSE)
-    return Tally(len(frames), right, tuple(ms[1:]))
+        if not detections:
+            continue
+        best = detections[0]
+        if error_of(best.cam_from_model, frame).within(*COARSE):
+            right += 1
+        elif any(error_of(pose, frame).within(*COARSE) for pose in best.alternatives):
+            left_open += 1
+    return Tally(len(frames), right, tuple(ms[1:]), left_open)
 
 
 def spread_frames(scene: Scene, count: int) -> list[SceneFrame]:
@@ -129,6 +142,7 @@ def spread_frames(scene: Scene, count: int) -> list[SceneFrame]:
     return [fit[k] for k in chosen]
 
 
-def _truth(frame: SceneFrame) -> Array:
+def true_pose(frame: SceneFrame) -> Array:
+    """``cam_from_model`` (4,4) of a frame that has one."""
     assert frame.cam_from_model is not None
     return frame.cam_from_model

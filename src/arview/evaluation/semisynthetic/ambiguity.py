@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.cad.symmetry import Symmetry
@@ -13,12 +15,19 @@ from arview.render import ZBufferRenderer
 
 LEAST_PIXELS = 24
 """Fewer pixels than these cannot tell two poses apart: a patch of about 5 × 5 px."""
+IN_VIEW_PX = 8
+"""What lies so near to a pixel that shows the part is in view too, such as a notch in its outline; what lies farther
+from all of them is outside the picture or behind what is in front of the part."""
 _DIFFERENT_DEPTH = 0.004
 """Of the part's diameter: less depth between two surfaces makes no edge."""
 
 
 def alike_poses(
-    model: Model, camera: Camera, cam_from_model: Array, near_symmetries: tuple[Symmetry, ...]
+    model: Model,
+    camera: Camera,
+    cam_from_model: Array,
+    near_symmetries: tuple[Symmetry, ...],
+    mask: NDArray[np.bool_] | None = None,
 ) -> tuple[Array, ...]:
     """``cam_from_model`` (4,4) of all poses that look the same as one, itself first.
 
@@ -27,17 +36,22 @@ def alike_poses(
         camera: ideal, of the picture.
         cam_from_model: the true pose.
         near_symmetries: rotations that all but small features of the part keep; a turn counts as long as fewer
-            than `LEAST_PIXELS` of the picture change.
+            than `LEAST_PIXELS` of the picture change in view.
+        mask: (H,W) where the part can be seen; None where nothing is in front of it.
     """
     if not near_symmetries:
         return (cam_from_model,)
     renderer = ZBufferRenderer(model, camera)
     truth = renderer.render(cam_from_model).depth_mm
+    in_view: NDArray[np.bool_] | bool = True
+    if mask is not None:
+        reach = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * IN_VIEW_PX + 1, 2 * IN_VIEW_PX + 1))
+        in_view = cv2.dilate(mask.astype(np.uint8), reach) > 0
     limit_mm = _DIFFERENT_DEPTH * model.diameter_mm
     alike = [cam_from_model]
     for turn in symmetry_group(near_symmetries)[1:]:
         turned = renderer.render(cam_from_model @ turn).depth_mm
-        if np.count_nonzero(np.abs(turned - truth) > limit_mm) < LEAST_PIXELS:
+        if np.count_nonzero((np.abs(turned - truth) > limit_mm) & in_view) < LEAST_PIXELS:
             alike.append(cam_from_model @ turn)
     return tuple(alike)
 

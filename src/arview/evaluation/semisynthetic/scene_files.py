@@ -15,6 +15,7 @@ import numpy as np
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import OutputError
+from arview.evaluation.bop import MASK_FOLDER
 from arview.evaluation.semisynthetic.sequence import SequenceFrame
 from arview.geometry import Array
 
@@ -73,7 +74,7 @@ def _write_frames(
     progress: Callable[[int], None] | None,
 ) -> None:
     (folder / "rgb").mkdir(parents=True)
-    (folder / "mask_visib").mkdir()
+    (folder / MASK_FOLDER).mkdir()
     cameras, truths, infos = {}, {}, {}
     matrix = camera.matrix.ravel().tolist()
     for number, frame in enumerate(frames):
@@ -81,7 +82,7 @@ def _write_frames(
         quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         _write_picture(folder / "rgb" / f"{number:06d}.jpg", frame.image[..., ::-1], quality)
         covered = np.where(frame.mask >= 0.5, np.uint8(255), np.uint8(0))
-        _write_picture(folder / "mask_visib" / f"{number:06d}_000000.png", covered, [])
+        _write_picture(folder / MASK_FOLDER / f"{number:06d}_000000.png", covered, [])
         cameras[str(number)] = {"cam_K": matrix, "depth_scale": 1.0}
         place = {"cam_R_m2c": pose[:3, :3].ravel().tolist(), "cam_t_m2c": pose[:3, 3].tolist(), "obj_id": 1}
         truths[str(number)] = [place]
