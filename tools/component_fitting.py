@@ -13,8 +13,11 @@ from arview.tracking.component_network import GLOBALS, SIDE_PX, overall
 from arview.tracking.verifier import CHANNELS, LINES
 from component_examples import Looked
 from judge_examples import read_examples
-from verifier_fitting import network_input, score_network, torch_with_onnx, write_network
+from score_networks import go_on_from, in_use, score_network, torch_with_onnx, write_network
+from verifier_fitting import GONE_ON, network_input
 
+WIDTHS = (24, 24, 48, 48, 64, 64)
+"""Of the convolutions."""
 BATCH = 128
 RATE, DECAY = 2e-3, 2e-2
 HELD_OUT = 8
@@ -23,10 +26,15 @@ FALSE_SHARES = (0.002, 0.005, 0.01, 0.03)
 """Shares of right components that are said to be wrong, to say the wrong ones that are for."""
 
 
-def fit_components(folder: Path, epochs: int) -> None:
+def fit_components(folder: Path, epochs: int, is_anew: bool = True) -> None:
     """Fit the network to the looks in a folder, write components.onnx there, and say how well it does.
 
     Wrong and right ones count alike in all, so that the score is a log-likelihood ratio.
+
+    Args:
+        folder: with looks, see `collect_components`.
+        epochs: how often each is looked at.
+        is_anew: not going on from the network in use.
 
     Raises:
         InputError: no examples, or no torch or onnx.
@@ -34,21 +42,27 @@ def fit_components(folder: Path, epochs: int) -> None:
     torch = torch_with_onnx()
     examples, held_out = read_examples(folder, "components_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    network = score_network(torch, CHANNELS + LINES, GLOBALS)
-    _fit(network, [one for one in examples if one.solid not in held_out], epochs, torch)
+    network = score_network(torch, CHANNELS + LINES, GLOBALS, WIDTHS)
+    fitted = [one for one in examples if one.solid not in held_out]
+    if not is_anew:
+        rng = np.random.default_rng(0)
+        some = [fitted[i] for i in rng.integers(len(fitted), size=60)]
+        seen = [_inputs(one, range(min(8, len(one.is_wrong))), rng)[0] for one in some]
+        go_on_from(network, in_use("components.onnx"), np.concatenate(seen), torch)
+    _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, [one for one in examples if one.solid in held_out], torch)
     write_network(network, folder / "components.onnx", (CHANNELS + LINES, SIDE_PX), GLOBALS, torch)
 
 
-def _fit(network: Any, examples: Sequence[Looked], epochs: int, torch: Any) -> None:
+def _fit(network: Any, examples: Sequence[Looked], epochs: int, rate: float, torch: Any) -> None:
     rng = np.random.default_rng(0)
     network.train().to(memory_format=torch.channels_last)
     places = [(one, k) for one in examples for k in range(len(one.is_wrong))]
     share = float(np.mean([one.is_wrong[k] for one, k in places]))
-    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=DECAY)
     steps = max(1, len(places) // BATCH)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * steps, pct_start=0.05)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps, pct_start=0.05)
     for epoch in range(epochs):
         order, losses = rng.permutation(len(places)), []
         for k in range(steps):

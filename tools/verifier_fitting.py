@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
-from arview.errors import InputError
 from arview.tracking.verifier import (
     CHANNELS,
     GLOBALS,
@@ -25,17 +23,19 @@ from arview.tracking.verifier import (
 )
 from component_examples import Looked
 from judge_examples import Looks, read_examples
+from score_networks import go_on_from, in_use, score_network, torch_with_onnx, write_network
 
 WIDTHS = (24, 24, 48, 48, 64, 64)
-"""Of the convolutions, every other one halves the picture."""
-LAST_WIDTH = 48
+"""Of the convolutions."""
 PICTURES, POSES = 6, 20
 """A step looks at so many poses of so many pictures, a third of them right where there are any."""
 REFINED_WEIGHT = 3.0
 """Refined poses are taken so much oftener than others."""
 LISTWISE_WEIGHT = 0.3
 """Beside telling right from wrong in all pictures, the right pose of each is to be told from its others."""
-RATE, DECAY, DROPPED = 2e-3, 2e-2, 0.2
+RATE, DECAY = 2e-3, 2e-2
+GONE_ON = 0.5
+"""Share of the rate for a network that is gone on with."""
 UNSURE = 0.3
 """Share of pictures in which the line network sees less, and as many in which it sees less of solids."""
 NORMALS = 6, 7
@@ -46,18 +46,13 @@ FALSE_SHARES = (0.0, 0.02, 0.05, 0.1)
 """Shares of false alarms to say the found ones for."""
 
 
-def torch_with_onnx() -> Any:
-    """The module, or an InputError that says what to install."""
-    try:
-        import onnx  # noqa: F401  torch writes with it
-        import torch
-    except ImportError as error:
-        raise InputError(f"fit_judge: {error.name} is not installed; pip install torch onnx") from error
-    return torch
-
-
-def fit_verifier(folder: Path, epochs: int) -> None:
+def fit_verifier(folder: Path, epochs: int, is_anew: bool = True) -> None:
     """Fit the network to the looks in a folder, write verifier.onnx there, and say how well it does.
+
+    Args:
+        folder: with looks, see `collect_examples`.
+        epochs: how often each picture is looked at.
+        is_anew: not going on from the network in use.
 
     Raises:
         InputError: no examples, or no torch or onnx.
@@ -65,31 +60,24 @@ def fit_verifier(folder: Path, epochs: int) -> None:
     torch = torch_with_onnx()
     looks, held_out = read_examples(folder, "looks_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    network = score_network(torch, CHANNELS + LINES, GLOBALS)
-    _fit(network, [look for look in looks if look.solid not in held_out], epochs, torch)
+    network = score_network(torch, CHANNELS + LINES, GLOBALS, WIDTHS)
+    fitted = [look for look in looks if look.solid not in held_out]
+    if not is_anew:
+        rng = np.random.default_rng(0)
+        some = [_inputs(fitted[i], _chosen(fitted[i], rng), rng)[0] for i in rng.integers(len(fitted), size=60)]
+        go_on_from(network, in_use("verifier.onnx"), np.concatenate(some), torch)
+    _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, [look for look in looks if look.solid in held_out], torch)
     write_network(network, folder / "verifier.onnx", (CHANNELS + LINES, SIDE_PX), GLOBALS, torch)
 
 
-def write_network(network: Any, path: Path, shape: tuple[int, int], told: int, torch: Any) -> None:
-    """Write a network that is shown so many channels of so large a side as `cv2.dnn` reads it."""
-    channels, side = shape
-    with replacing(path) as file:
-        torch.onnx.export(
-            network, (torch.zeros(2, channels, side, side), torch.zeros(2, told)), file,
-            input_names=["seen", "both"], output_names=["score"], dynamo=False,
-            dynamic_axes={"seen": {0: "poses"}, "both": {0: "poses"}, "score": {0: "poses"}},
-        )  # fmt: skip
-    print(f"wrote {path}")
-
-
-def _fit(network: Any, looks: Sequence[Looks], epochs: int, torch: Any) -> None:
+def _fit(network: Any, looks: Sequence[Looks], epochs: int, rate: float, torch: Any) -> None:
     rng = np.random.default_rng(0)
-    network.to(memory_format=torch.channels_last)
-    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    network.train().to(memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=DECAY)
     steps = max(1, len(looks) // PICTURES)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * steps, pct_start=0.05)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps, pct_start=0.05)
     functional = torch.nn.functional
     for epoch in range(epochs):
         order, losses = rng.permutation(len(looks)), []
@@ -216,32 +204,3 @@ def _report(network: Any, looks: Sequence[Looks], torch: Any) -> None:
     for share in FALSE_SHARES if len(highest) else ():
         found = np.mean(np.array(with_it) > highest[int(share * len(highest))])
         print(f"  {100 * found:.0f} % found with {100 * share:.0f} % false alarms, of {len(highest)} without it")
-
-
-def score_network(torch: Any, channels: int, told: int) -> Any:
-    """The network of `arview.tracking.verifier`, and of others shown so many channels and told of so many things."""
-    nn = torch.nn
-
-    class _Network(nn.Module):  # type: ignore[misc, name-defined]
-        def __init__(self) -> None:
-            super().__init__()
-            layers: list[Any] = []
-            before = channels
-            for k, width in enumerate(WIDTHS):
-                size = 5 if k == 0 else 3
-                layers += [
-                    nn.Conv2d(before, width, size, 2 - k % 2, size // 2, bias=False),
-                    nn.BatchNorm2d(width),
-                    nn.ReLU(),
-                ]
-                before = width
-            self.convolutions = nn.Sequential(*layers)
-            self.together = nn.Sequential(
-                nn.Linear(2 * before + told, LAST_WIDTH), nn.ReLU(), nn.Dropout(DROPPED), nn.Linear(LAST_WIDTH, 1)
-            )
-
-        def forward(self, seen: Any, both: Any) -> Any:
-            hidden = self.convolutions(seen)
-            return self.together(torch.cat([hidden.mean((2, 3)), hidden.amax((2, 3)), both], 1))[:, 0]
-
-    return _Network()
