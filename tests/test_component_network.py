@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -134,3 +135,21 @@ def test_many_looks_are_told_as_each_alone() -> None:
     assert len(found) > 3
     alone = [network().ratios([look])[0] for look in found]
     assert network().ratios(found) == pytest.approx(np.array(alone), abs=1e-3)
+
+
+@pytest.mark.parametrize(("across", "down"), [(True, False), (False, True), (True, True)])
+def test_a_look_in_a_mirror_is_told_as_the_look_itself(across: bool, down: bool) -> None:
+    found = looks(picture(POSES[2], noise=4.0), POSES[2])
+    assert len(found) > 3
+    turned_round = np.s_[..., :: -1 if down else 1, :: -1 if across else 1]
+    in_mirror = []
+    for look in found:
+        drawn = look.drawn[turned_round].copy()
+        drawn[2] *= -1.0 if across else 1.0
+        drawn[3] *= -1.0 if down else 1.0
+        pixels = np.ascontiguousarray(np.moveaxis(np.moveaxis(look.pixels, 2, 0)[turned_round], 0, 2))
+        lines = np.ascontiguousarray(look.lines[turned_round])
+        in_mirror.append(replace(look, pixels=pixels, drawn=drawn, lines=lines))
+    ratios, mirrored = network().ratios(found), network().ratios(in_mirror)
+    assert mirrored == pytest.approx(ratios, abs=0.05)
+    assert np.std(ratios) > 1.0

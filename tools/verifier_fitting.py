@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.tracking.score_network import DOWNWARD, RIGHTWARD, mirrored
 from arview.tracking.verifier import (
     CHANNELS,
     GLOBALS,
@@ -38,8 +39,6 @@ GONE_ON = 0.5
 """Share of the rate for a network that is gone on with."""
 UNSURE = 0.3
 """Share of pictures in which the line network sees less, and as many in which it sees less of solids."""
-NORMALS = 6, 7
-"""Channels with the normals' parts to the right and down."""
 HELD_OUT = 8
 """Every so manieth solid is not fitted to, but for telling how well others are verified."""
 FALSE_SHARES = (0.0, 0.02, 0.05, 0.1)
@@ -147,16 +146,14 @@ def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np
     What follows the plain channels, see `PLAIN`, is mirrored, turned and hidden too, or weaker: on materials that it
     does not know the line network is sure of little.
     """
-    right, down = NORMALS
     if rng.random() < 0.5:
-        seen = seen[..., ::-1].copy()
-        seen[:, right] *= -1.0
+        seen = mirrored(seen)
     if rng.random() < 0.5:
         seen = seen[..., ::-1, :].copy()
-        seen[:, down] *= -1.0
+        seen[:, DOWNWARD] *= -1.0
     if rng.random() < 0.5:
         seen = seen.swapaxes(2, 3).copy()
-        seen[:, [right, down]] = seen[:, [down, right]]
+        seen[:, [RIGHTWARD, DOWNWARD]] = seen[:, [DOWNWARD, RIGHTWARD]]
     seen = np.concatenate([seen[:, rng.permutation(3)], seen[:, 3:]], axis=1)
     if rng.random() < 0.25:
         share = rng.uniform(0.5, 1.0)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 
 import cv2
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from arview.geometry import Array, apply
 from arview.guideviews.surface import Surface, draw_surface
+from arview.tracking.score_network import Look, ScoreNetwork
 from arview.tracking.solver import project
 from arview.tracking.verifier import BAND_PX, DRAWN, contrasted, lines_around, with_gradients, with_lines
 
@@ -36,6 +36,10 @@ JUMP = 0.03
 TURN_COS = 0.866
 TYPICAL_SIZE_PX, TYPICAL_CONTRAST = 30.0, 40.0
 """Sizes and contrasts count relative to these."""
+MIRRORS = ((False, False), (True, False), (False, True), (True, True))
+"""Forms in which a look is scored: of 4,454 wrong components of assemblies not fitted to 59 % are then above 99 % of
+the right ones, with the first form alone 57 %. The verifier of poses gains nothing from it.
+"""
 GLOBALS = 3
 """The component's size in the picture, the contrast around it, the share that its normals explain."""
 
@@ -64,20 +68,14 @@ class ComponentNetwork:
     """The network."""
 
     def __init__(self) -> None:
-        model = files("arview.tracking").joinpath("components.onnx").read_bytes()
-        self._network = cv2.dnn.readNetFromONNX(np.frombuffer(model, dtype=np.uint8))
+        self._network = ScoreNetwork("components.onnx", MIRRORS)
 
     def ratios(self, looks: list[ComponentLook]) -> Array:
         """Log-likelihood ratios of "not where expected" to "as expected" (N,)."""
-        if not looks:
-            return np.zeros(0)
-        seen, both = zip(*map(shown, looks), strict=True)
-        self._network.setInput(np.stack(seen), "seen")
-        self._network.setInput(np.stack(both), "both")
-        return np.asarray(self._network.forward().ravel(), dtype=np.float64)
+        return self._network.scores([shown(look) for look in looks])
 
 
-def shown(look: ComponentLook) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def shown(look: ComponentLook) -> Look:
     """A look as the network takes it: (CHANNELS + LINES,S,S) and (GLOBALS,)."""
     plain, contrast = contrasted(look.pixels, look.drawn)
     seen, explained = with_gradients(plain)

@@ -11,8 +11,6 @@ part: it was fitted on random solids before photos, see ``tools/fit_judge``.
 
 from __future__ import annotations
 
-from importlib.resources import files
-
 import cv2
 import numpy as np
 from numba import njit
@@ -24,6 +22,7 @@ from arview.guideviews.surface import draw_surface
 from arview.tracking.line_network import INSIDE
 from arview.tracking.picture import Picture, steps_to
 from arview.tracking.refine import nearest_view
+from arview.tracking.score_network import Look, ScoreNetwork
 from arview.tracking.solver import project_lines
 from arview.tracking.threads import pool
 from arview.tracking.tracker import PartView
@@ -66,8 +65,6 @@ TYPICAL_RADIUS_PX, TYPICAL_CONTRAST = 80.0, 40.0
 """Half diameters and contrasts count relative to these."""
 MEANS, DEVIATIONS = np.array([2.0, 1.0, 0.5]), np.array([4.0, 3.0, 1.0 / 3.0])
 """Of what is known of a pose."""
-MOST_AT_ONCE = 16
-"""Poses that the network looks at together."""
 _ORIGIN, _ANY_DIRECTION = np.zeros((1, 3), np.float32), np.array([[1.0, 0.0, 0.0]], np.float32)
 
 
@@ -76,8 +73,7 @@ class Verifier:
 
     def __init__(self, part: PartView) -> None:
         self._part = part
-        model = files("arview.tracking").joinpath("verifier.onnx").read_bytes()
-        self._network = cv2.dnn.readNetFromONNX(np.frombuffer(model, dtype=np.uint8))
+        self._network = ScoreNetwork("verifier.onnx")
 
     def scores(self, picture: Picture, poses: Array, known: Array) -> Array:
         """Log odds that refined poses are right, but for how often that is so.
@@ -93,21 +89,13 @@ class Verifier:
         radii_px = picture.radii_px(self._part.views.diameter_mm, poses)
         list(pool().map(picture.gradients, set(steps_to(RADIUS_PX, radii_px).tolist())))
 
-        def look(pose: Array, radius_px: float, of_it: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        def look(pose: Array, radius_px: float, of_it: Array) -> Look:
             pixels, drawn, lines = raw_look(picture, self._part, pose, radius_px)
             plain, contrast = contrasted(pixels, drawn)
             shown, explained = with_gradients(plain)
             return with_lines(shown, lines), overall(radius_px, contrast, of_it, explained)
 
-        looks = list(pool().map(look, poses, radii_px.tolist(), known))
-        scores = np.empty(len(poses))
-        for first in range(0, len(poses), MOST_AT_ONCE):
-            some = slice(first, first + MOST_AT_ONCE)
-            seen, both = zip(*looks[some], strict=True)
-            self._network.setInput(np.stack(seen), "seen")
-            self._network.setInput(np.stack(both), "both")
-            scores[some] = self._network.forward().ravel()
-        return scores
+        return self._network.scores(list(pool().map(look, poses, radii_px.tolist(), known)))
 
 
 def raw_look(
