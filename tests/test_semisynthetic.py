@@ -43,10 +43,12 @@ from arview.evaluation.semisynthetic import (
     shape_job,
     trajectory,
 )
+from arview.evaluation.semisynthetic.ambiguity import changed_share
 from arview.evaluation.semisynthetic.look_alikes import different_share
 from arview.evaluation.semisynthetic.shading import corner_normals, muted
-from arview.evaluation.semisynthetic.solids import circle, prism, rectangle, triangulate
+from arview.evaluation.semisynthetic.solids import circle, cylinder, prism, rectangle, triangulate
 from arview.geometry import Array, apply, exp_so3, look_at, rigid, rotation_angle_rad
+from arview.guideviews.surface import Surface, reduced_surface, surface_about
 from arview.render import ZBufferRenderer
 from arview.tracking import Detection
 from arview.video import Image
@@ -528,3 +530,27 @@ def test_spread_frames_leave_out_what_is_hidden(tmp_path: Path, photos: tuple[Pa
     frames = tuple(replace(frame, visible=0.3 if frame.index == 0 else 0.9) for frame in scene.frames)
     chosen = spread_frames(replace(scene, frames=frames), 3)
     assert [frame.index for frame in chosen] == [1, 3, 5]
+
+
+def test_a_turned_part_is_the_same_however_it_is_turned_about_its_axis_and_not_when_it_is_tilted() -> None:
+    shaft = [cylinder((0.0, 0.0), radius, *ends) for radius, ends in ((20.0, (-40.0, 10.0)), (12.0, (10.0, 40.0)))]
+    plain = make_model("shaft", tuple(component(f"part_{k}", mesh, (0.6, 0.6, 0.6)) for k, mesh in enumerate(shaft)))
+    key = component("key", box((-2, 12, 12), (2, 16, 38)), (0.6, 0.6, 0.6))
+    keyed = make_model("keyed", (*plain.components, key))
+    pose = rigid(exp_so3([1.9, 0.2, 0.1]), [15.0, -10.0, 400.0])
+
+    def surface(of: Model) -> Surface:
+        return surface_about(*reduced_surface(of), np.zeros(3))
+
+    def changed(of: Model, axis: int, angle_deg: float) -> float:
+        turn = exp_so3(np.deg2rad(angle_deg) * np.eye(3)[axis])
+        return changed_share(surface(of), of.diameter_mm, rigid(pose[:3, :3] @ turn, pose[:3, 3]), pose)
+
+    assert max(changed(plain, 2, angle) for angle in (4.0, 15.0, 37.0, 160.0)) < 0.01
+    assert min(changed(plain, axis, 7.0) for axis in (0, 1)) > 0.05
+    # The key is behind the shaft, and comes into view.
+    assert changed(keyed, 2, 37.0) < 0.01
+    assert changed(keyed, 2, 160.0) > 0.02
+    aside = pose.copy()
+    aside[0, 3] += 8.0
+    assert changed_share(surface(plain), plain.diameter_mm, aside, pose) > 0.1

@@ -19,7 +19,7 @@ from arview.geometry import Array
 from arview.tracking import Detector
 from arview.tracking.first_search import QUICK, WIDE
 from arview.tracking.quality import found_terms
-from judge_examples import REFINED_NEAR, is_near, pictures_of
+from judge_examples import ALIKE, REFINED_NEAR, is_alike, is_near, pictures_of
 from photos import all_photos
 from recordings import scenes
 from sections import recorded_views
@@ -88,7 +88,9 @@ def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Ou
         if truth is None:
             yield Outcome(terms, False, part, weight)
             continue
-        if is_near(detector, best.cam_from_body[None], truth, detector.turns, *REFINED_NEAR)[0]:
+        pose = best.cam_from_body[None]
+        near = is_near(detector, pose, truth, detector.turns, *REFINED_NEAR)
+        if near[0] or is_alike(detector, pose, truth, REFINED_NEAR[1], ALIKE)[0]:
             yield Outcome(terms, True, part, weight)
 
 

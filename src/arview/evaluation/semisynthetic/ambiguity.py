@@ -11,6 +11,7 @@ from arview.cad.symmetry import Symmetry
 from arview.camera import Camera
 from arview.evaluation.metrics import PoseError, PoseMeter, symmetry_group
 from arview.geometry import Array
+from arview.guideviews.surface import Surface, draw_surface
 from arview.render import ZBufferRenderer
 
 LEAST_PIXELS = 24
@@ -20,6 +21,10 @@ IN_VIEW_PX = 8
 from all of them is outside the picture or behind what is in front of the part."""
 _DIFFERENT_DEPTH = 0.004
 """Of the part's diameter: less depth between two surfaces makes no edge."""
+SIDE_PX, RADIUS_PX = 80, 35.0
+"""Side of the small picture in which looks are compared, and half the part's diameter in it."""
+OTHER_NORMAL, OTHER_DEPTH = 0.3, 0.05
+"""Parts of normals, and depths in half diameters, that differ by more show something else there."""
 
 
 def alike_poses(
@@ -54,6 +59,29 @@ def alike_poses(
         if np.count_nonzero((np.abs(turned - truth) > limit_mm) & in_view) < LEAST_PIXELS:
             alike.append(cam_from_model @ turn)
     return tuple(alike)
+
+
+def changed_share(surface: Surface, diameter_mm: float, cam_from_body: Array, true_cam_from_body: Array) -> float:
+    """Share of a part's pixels at a true pose that show something else at another pose, in a small picture.
+
+    Args:
+        surface: of the part, about its centre.
+        diameter_mm: of the part.
+        cam_from_body, true_cam_from_body: (4,4), with the part before the camera.
+    """
+    place = true_cam_from_body[:3, 3]
+    focal_px = np.full(2, RADIUS_PX / (0.5 * diameter_mm) * place[2])
+    shown, inside = [], []
+    for pose in (cam_from_body, true_cam_from_body):
+        drawn = np.empty((4, SIDE_PX, SIDE_PX), dtype=np.float32)
+        face_ids = np.empty((SIDE_PX, SIDE_PX), dtype=np.int32)
+        center_px = 0.5 * (SIDE_PX - 1) + focal_px * (pose[:2, 3] / pose[2, 3] - place[:2] / place[2])
+        draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids)
+        shown.append(drawn)
+        inside.append(face_ids >= 0)
+    off = np.abs(shown[0] - shown[1])
+    is_other = (inside[0] != inside[1]) | (off[:3].max(axis=0) > OTHER_NORMAL) | (off[3] > OTHER_DEPTH)
+    return int(np.count_nonzero(is_other)) / max(1, int(np.count_nonzero(inside[1])))
 
 
 def least_error(meter: PoseMeter, estimate: Array, truths: tuple[Array, ...]) -> PoseError:
