@@ -6,10 +6,13 @@ import importlib.util
 import os
 from pathlib import Path
 
+from arview.errors import InputError
 from arview.evaluation.semisynthetic import photos_in
 from recordings import DATA, SEQUENCES
 
 EACH_RECORDING = 8
+FEWEST = 20
+"""Photos that networks are fitted on."""
 PACKAGES = {
     "skimage": (
         "data/astronaut.png",
@@ -46,6 +49,21 @@ def all_photos(folder: Path | None, without: str = "") -> tuple[Path, ...]:
     if folder is not None:
         return tuple(photos_in(folder))
     return tuple(path for frames in recorded_frames(without) for path in frames) + machine_photos()
+
+
+def fitting_photos(folder: Path | None) -> tuple[Path, ...]:
+    """Photos of a folder or the machine's to fit networks on; no recordings, for what stands in them is looked for.
+
+    Raises:
+        InputError: fewer than `FEWEST`: networks would know each of them.
+    """
+    photos = machine_photos() if folder is None else tuple(photos_in(folder))
+    if len(photos) < FEWEST:
+        where = "this machine" if folder is None else str(folder)
+        raise InputError(
+            f"{where}: {len(photos)} background photos, {FEWEST} are needed; give a folder of more by --photos"
+        )
+    return photos
 
 
 def recorded_frames(*without: str) -> list[list[Path]]:

@@ -28,10 +28,10 @@ def photos_in(folder: Path) -> list[Path]:
         InputError: no such folder, or no picture in it.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give --backgrounds a folder of photos")
+        raise InputError(f"{folder}: no such folder of background photos")
     photos = sorted(p for p in folder.rglob("*") if p.suffix.lower() in PICTURE_SUFFIXES and p.is_file())
     if not photos:
-        raise InputError(f"{folder}: holds no photos ({' '.join(PICTURE_SUFFIXES)}); give --backgrounds another folder")
+        raise InputError(f"{folder}: holds no photos ({' '.join(PICTURE_SUFFIXES)}); give another folder")
     return photos
 
 
