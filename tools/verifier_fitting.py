@@ -26,7 +26,7 @@ from component_examples import Looked
 from judge_examples import Looks, read_examples
 from score_networks import go_on_from, in_use, score_network, torch_with_onnx, write_network
 
-WIDTHS = (24, 24, 48, 48, 64, 64)
+WIDTHS = (24, 24, 48, 48, 96, 128)
 """Of the convolutions."""
 PICTURES, POSES = 6, 20
 """A step looks at so many poses of so many pictures, a third of them right where there are any."""

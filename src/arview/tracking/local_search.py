@@ -26,6 +26,7 @@ from arview.tracking.picture import Picture, step_for
 from arview.tracking.quality import (
     EVIDENCE_WEIGHT,
     FOUND_LINES,
+    LEAST_VERIFIED,
     RIGHT_WORTH,
     VERIFIED_EVIDENCE,
     VERIFIED_JUDGEMENT,
@@ -126,7 +127,7 @@ class Hypothesis:
     @property
     def seen(self) -> float:
         """What verifier and line network say of it, once verified: for `found_probability`."""
-        return (self.verification or 0.0) + FOUND_LINES * self.line_support
+        return max(self.verification or 0.0, LEAST_VERIFIED) + FOUND_LINES * self.line_support
 
     @property
     def logit(self) -> float:
