@@ -19,9 +19,11 @@ from arview.errors import InputError
 from arview.evaluation.semisynthetic import photos_in
 from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.geometry import Array
+from arview.live.frames import to_jpeg
 from arview.video import Image
 
 WIDTH, HEIGHT = 1280, 960
+JPEG_QUALITY = 92
 SMALLEST_THING_PX = 60
 FEWEST_THINGS = 20
 PART_SHARE, SOFT_PX, PALE = (0.15, 0.6), (0.5, 6.0), (0.3, 1.0)
@@ -39,7 +41,7 @@ Cutout = NDArray[np.uint8]
 
 
 def make_desks(seeds: range, photos: Sequence[Path], things: Path, folder: Path) -> None:
-    """Write a desk for each seed to ``folder``.
+    """Write a desk for each seed to ``folder``, unless it is there.
 
     Args:
         seeds: each gives the same desk again.
@@ -54,11 +56,13 @@ def make_desks(seeds: range, photos: Sequence[Path], things: Path, folder: Path)
         raise InputError(f"{things}: {len(cutouts)} pictures with transparency, {FEWEST_THINGS} are needed")
     folder.mkdir(parents=True, exist_ok=True)
     for seed in tqdm(seeds, desc="desks", disable=None):
+        path = folder / f"desk_{seed:04d}.jpg"
+        if path.exists():
+            continue
         rng = np.random.default_rng([seed, 6])
         picture = desk(read_photo(photos[rng.integers(len(photos))]), cutouts, rng)
-        coded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
-        with replacing(folder / f"desk_{seed:04d}.jpg") as file:
-            file.write(coded.tobytes())
+        with replacing(path) as file:
+            file.write(to_jpeg(picture, JPEG_QUALITY))
 
 
 def desk(photo: Image, cutouts: Sequence[Cutout], rng: np.random.Generator) -> Image:
@@ -101,7 +105,8 @@ def _placed(cutout: Cutout, rng: np.random.Generator) -> tuple[Array, NDArray[np
 
 def _read_cutout(path: Path) -> Cutout | None:
     """A picture with transparency, or none where it has none or is small."""
-    read = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    data = np.fromfile(path, dtype=np.uint8)
+    read = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if read is None or read.ndim != 3 or read.shape[2] != 4 or min(read.shape[:2]) < SMALLEST_THING_PX:
         return None
     return np.asarray(cv2.cvtColor(read, cv2.COLOR_BGRA2RGBA), dtype=np.uint8)
