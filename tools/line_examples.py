@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from arview.atomic import replacing
 from arview.cad.model import Component, Model, make_model
+from arview.errors import InputError
 from arview.evaluation.semisynthetic import CAMERA
 from arview.evaluation.semisynthetic.backgrounds import read_photo, surroundings
 from arview.evaluation.semisynthetic.random_solids import random_solid
@@ -27,6 +28,8 @@ from arview.video import Image
 
 SOLIDS_EACH, PICTURES_EACH = 14, 60
 """A file holds so many pictures of so many solids."""
+FEWEST_PICTURES = 20
+"""To fit a network to."""
 RADIUS_PX, OTHER_RADIUS_PX = (38.0, 300.0), (30.0, 120.0)
 """Half diameters of the first solid in a picture and of those beside it."""
 ALONE, NOT_ALONE = (0.55, 0.3, 0.15), (1, 2, 3)
@@ -94,6 +97,18 @@ def collect_lined_pictures(seeds: range, photos: Sequence[Path], folder: Path) -
         pictures = [_lined_picture(solids, photos, rng) for _ in range(PICTURES_EACH if solids else 0)]
         with replacing(path) as file:
             pickle.dump(pictures, file)
+
+
+def read_lined_pictures(folder: Path) -> list[LinedPicture]:
+    """All that were written to a folder.
+
+    Raises:
+        InputError: hardly any.
+    """
+    pictures = [picture for path in sorted(folder.glob("lines_*.pkl")) for picture in pickle.loads(path.read_bytes())]
+    if len(pictures) < FEWEST_PICTURES:
+        raise InputError(f"{folder}: too few pictures; run tools/fit_judge pictures first")
+    return pictures
 
 
 def _lined_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.random.Generator) -> LinedPicture:

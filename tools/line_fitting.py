@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.atomic import replacing
-from arview.errors import InputError
 from arview.tracking.line_network import CONTRAST, SHRINK
 from arview.tracking.matching import ORIENTATIONS
-from line_examples import FINE, LinedPicture
+from line_examples import FINE, LinedPicture, read_lined_pictures
+from pyramid import pyramid
+from widening import begin_as_in_use, torch_with_onnx
 
 WIDTHS = (16, 24, 40, 56, 64)
 """Of the levels, each half as large as that before."""
@@ -34,8 +34,8 @@ MOTTLED, CLUTTERED = 0.45, 0.3
 FEWEST_THINGS, MOST_THINGS = 1, 6
 """Drawn there."""
 RATE, DECAY, WARM_UP = 2.5e-3, 1e-2, 0.01
-HELD_OUT = 20
-"""Every so manieth picture is not fitted to."""
+HELD_OUT, BEGUN = 20, 24
+"""Every so manieth picture is not fitted to; in so many squares one that goes on sees how it is to begin."""
 FALSE_SHARES = (0.05, 0.02, 0.01)
 """Shares of places without a line to say the lines seen for."""
 TURNED = {
@@ -45,23 +45,24 @@ TURNED = {
 """What becomes of orientations and inside."""
 
 
-def fit_lines(folder: Path, epochs: int) -> None:
+def fit_lines(folder: Path, epochs: int, is_new: bool) -> None:
     """Fit the network to the pictures in a folder, write lines.onnx there, and say how many lines it sees.
 
+    ``is_new``: from nothing; else it begins as the one in use.
+
     Raises:
-        InputError: no pictures, or no torch or onnx.
+        InputError: no pictures, no torch or onnx, or the network in use is wider.
     """
-    try:
-        import onnx  # noqa: F401  torch writes with it
-        import torch
-    except ImportError as error:
-        raise InputError(f"fit_judge: {error.name} is not installed; pip install torch onnx") from error
-    pictures = [picture for path in sorted(folder.glob("lines_*.pkl")) for picture in pickle.loads(path.read_bytes())]
-    if len(pictures) < HELD_OUT:
-        raise InputError(f"{folder}: too few pictures; run tools/fit_judge pictures first")
+    torch = torch_with_onnx()
+    pictures = read_lined_pictures(folder)
     torch.manual_seed(0)
     network = _network(torch)
-    _fit(network, [p for k, p in enumerate(pictures) if k % HELD_OUT], epochs, torch)
+    fitted = [p for k, p in enumerate(pictures) if k % HELD_OUT]
+    if not is_new:
+        rng = np.random.default_rng(5)
+        shown = torch.from_numpy(np.stack([_example(fitted[k], rng)[0] for k in rng.integers(len(fitted), size=BEGUN)]))
+        begin_as_in_use(network, "lines.onnx", lambda: network(shown), torch)
+    _fit(network, fitted, epochs, torch)
     network.eval()
     _report(network, pictures[::HELD_OUT], torch)
     with replacing(folder / "lines.onnx") as file:
@@ -135,7 +136,7 @@ def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[n
     covered = (inside / np.float32(255.0))[..., None]
     plain = np.asarray(image, dtype=np.float32)
     if rng.random() < CLUTTERED:
-        plain = covered * plain + (1.0 - covered) * _with_flat_things(image, rng)
+        plain = covered * plain + (1.0 - covered) * with_flat_things(image, rng)
     if rng.random() < MOTTLED:
         plain = plain * _mottles(rng) ** covered
     shown = _spoilt(plain, rng)
@@ -159,7 +160,7 @@ def _mottles(rng: np.random.Generator) -> NDArray[np.float32]:
     return np.clip(1.0 + rng.uniform(0.04, 0.35) * mixed, 0.1, 2.5)[..., None]
 
 
-def _with_flat_things(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+def with_flat_things(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
     """A copy with lines, discs, cards and letters drawn on it: things that have edges and are no solids."""
     drawn = image.copy()
     for _ in range(rng.integers(FEWEST_THINGS, MOST_THINGS + 1)):
@@ -246,7 +247,7 @@ def _report(network: Any, pictures: list[LinedPicture], torch: Any) -> None:
 
 
 def _network(torch: Any) -> Any:
-    """The network of `arview.tracking.line_network`: down level by level, and up again with what each level saw."""
+    """The network of `arview.tracking.line_network`."""
     nn = torch.nn
 
     def convolution(before: int, after: int, size: int = 3, step: int = 1) -> Any:
@@ -257,34 +258,19 @@ def _network(torch: Any) -> Any:
         def __init__(self, width: int) -> None:
             super().__init__()
             self.one = convolution(width, width)
-            self.other = nn.Conv2d(width, width, 3, padding=1, bias=False)
-            self.norm = nn.BatchNorm2d(width)
-            nn.init.zeros_(self.norm.weight)
+            self.other = nn.Sequential(nn.Conv2d(width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width))
+            nn.init.zeros_(self.other[1].weight)
 
         def forward(self, before: Any) -> Any:
-            return nn.functional.relu(before + self.norm(self.other(self.one(before))))
+            return nn.functional.relu(before + self.other(self.one(before)))
 
     def down(before: int, after: int, blocks: int) -> Any:
         residuals = [_Residual(after) for _ in range(blocks)]
         return nn.Sequential(convolution(before, after, 3, 2), convolution(after, after), *residuals)
 
-    class _Network(nn.Module):  # type: ignore[misc, name-defined]
-        def __init__(self) -> None:
-            super().__init__()
-            pairs = list(pairwise(WIDTHS))
-            self.first = convolution(3, WIDTHS[0], 5, 2)
-            self.down = nn.ModuleList(down(a, b, n) for (a, b), n in zip(pairs, DEEPER, strict=True))
-            self.narrow = nn.ModuleList(convolution(b, a, 1) for a, b in pairs)
-            self.up = nn.ModuleList(convolution(a, a) for a, _ in pairs)
-            self.last = nn.Conv2d(WIDTHS[0], ORIENTATIONS + 1, 1)
-
-        def forward(self, shown: Any) -> Any:
-            levels = [self.first(shown)]
-            for level in self.down:
-                levels.append(level(levels[-1]))
-            seen = levels.pop()
-            for level, narrow, up in zip(reversed(levels), reversed(self.narrow), reversed(self.up), strict=True):
-                seen = up(level + nn.functional.interpolate(narrow(seen), scale_factor=2, mode="nearest"))
-            return self.last(seen)
-
-    return _Network()
+    pairs = list(pairwise(WIDTHS))
+    downward = [down(a, b, blocks) for (a, b), blocks in zip(pairs, DEEPER, strict=True)]
+    narrow = [convolution(b, a, 1) for a, b in pairs]
+    up = [convolution(a, a) for a, _ in pairs]
+    first, last = convolution(3, WIDTHS[0], 5, 2), nn.Conv2d(WIDTHS[0], ORIENTATIONS + 1, 1)
+    return pyramid(torch, first, downward, narrow, up, last)

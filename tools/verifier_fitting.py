@@ -24,7 +24,8 @@ from arview.tracking.verifier import (
 )
 from component_examples import Looked
 from judge_examples import Looks, read_examples
-from score_networks import go_on_from, in_use, score_network, torch_with_onnx, write_network
+from score_networks import go_on_from, score_network, write_network
+from widening import in_use, torch_with_onnx
 
 WIDTHS = (24, 24, 48, 48, 96, 128)
 """Of the convolutions."""

@@ -103,7 +103,7 @@ class Effort:
 
 
 QUICK = Effort(400, 200, 100, 16, (6, 4), 2)
-WIDE = Effort(3500, 2000, 1000, 160, (60, 20), 1)
+WIDE = Effort(2500, 1400, 700, 160, (60, 20), 1)
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 

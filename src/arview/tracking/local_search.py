@@ -19,6 +19,7 @@ from arview.camera import Camera
 from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.tracking.climb import climb
+from arview.tracking.denoiser import Denoiser
 from arview.tracking.first_search import QUICK, Candidate, weighed
 from arview.tracking.judge import FINE, judge
 from arview.tracking.line_network import LineNetwork, line_support
@@ -185,17 +186,20 @@ class LocalSearch:
         self.tracker = Tracker(views, camera, TrackerOptions(use_feature=False))
         self._reach_mm = reach_mm
         self._line_network = LineNetwork()
+        self._denoiser = Denoiser()
         self._verifier = Verifier(self.tracker.part)
         self._shown_lines = ShownLines(views)
 
     def picture(self, image: NDArray[np.uint8]) -> Picture:
-        """A frame (H,W,3) as the searches take it."""
-        return Picture(image, self.camera, round(0.6 * self.options.radius_px), self._line_network)
+        """A frame (H,W,3) as the searches take it: without the grain of noisy ones."""
+        clean = self._denoiser.cleaned(image)
+        return Picture(clean, self.camera, round(0.6 * self.options.radius_px), self._line_network)
 
     def with_options(self, options: LocalOptions) -> LocalSearch:
         """The same with other options and at any distance, beside which this one can be used: see `seen_by`."""
         other = copy.copy(self)
-        other.options, other._reach_mm, other._line_network = options, (0.0, math.inf), LineNetwork()
+        other.options, other._reach_mm = options, (0.0, math.inf)
+        other._line_network, other._denoiser = LineNetwork(), Denoiser()
         return other
 
     def seen_by(self, camera: Camera) -> LocalSearch:
