@@ -21,10 +21,13 @@ CELL_PX = 8
 """The network takes pictures of multiples of this."""
 SHOWN_MEAN, SHOWN_RANGE = 128.0, 64.0
 """Grey levels less the first are shown in units of the second; so is the grain that it says."""
-LEAST_NOISE = 3.0
-"""Of less noise, in grey levels, pictures stay as they are."""
+LEAST_NOISE = 5.0
+"""Of less noise, in grey levels, pictures stay as they are: of 32 pictures of a box 29 are found as they are and 27 cleaned
+at a noise of 3, 26 and 26 at 6, 26 and 27 at 10 (where 3 and 0 are taken for a wrong pose)."""
 BAND_ROWS, OVERLAP_ROWS = 512, 48
 """Pictures are cleaned in bands of so many rows, with so many more on either side: all that a place hears of."""
+LOOK_EVERY = 3
+"""The noise of every so manieth pixel of a row, and row, is looked at."""
 _DIFFERENCE = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
 _DIFFERENCE_DEVIATION = 6.0
 """Of what this says of noise of 1."""
@@ -37,10 +40,10 @@ def noise_level(image: NDArray[np.uint8]) -> float:
 
     Noise that a codec or a camera has smoothed is taken for less than it was.
     """
-    green = image[..., 1]
-    differences = np.abs(cv2.filter2D(green, cv2.CV_32F, _DIFFERENCE))
-    is_told = (green > 2) & (green < 253)
-    told = differences[is_told]
+    green = image[..., 1].copy()
+    some = np.s_[1::LOOK_EVERY, 1::LOOK_EVERY]
+    differences, values = cv2.filter2D(green, cv2.CV_16S, _DIFFERENCE)[some], green[some]
+    told = np.abs(differences[(values > 2) & (values < 253)])
     if not len(told):
         return 0.0
     return float(np.median(told)) / _MEDIAN_DEVIATIONS / _DIFFERENCE_DEVIATION
@@ -65,8 +68,9 @@ class Denoiser:
             band = cv2.copyMakeBorder(
                 image[first:last], 0, -(last - first) % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REPLICATE
             )
-            rest = (band - self._grain(band))[top - first : bottom - first, :width]
-            clean[top:bottom] = np.clip(np.round(rest), 0, 255)
+            # Rounded, and held between black and white.
+            rest = cv2.subtract(band, self._grain(band), dtype=cv2.CV_8U)
+            clean[top:bottom] = rest[top - first : bottom - first, :width]
         return clean
 
     def _grain(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
