@@ -22,8 +22,8 @@ CELL_PX = 8
 SHOWN_MEAN, SHOWN_RANGE = 128.0, 64.0
 """Grey levels less the first are shown in units of the second; so is the grain that it says."""
 LEAST_NOISE = 5.0
-"""Of less noise, in grey levels, pictures stay as they are: of 32 pictures of a box 29 are found as they are and 27 cleaned
-at a noise of 3, 26 and 26 at 6, 26 and 27 at 10 (where 3 and 0 are taken for a wrong pose)."""
+"""Of less noise, in grey levels, pictures stay as they are: of 32 pictures of a box 29 are found as they are and 27
+cleaned at a noise of 3, 26 and 26 at 6, 26 and 27 at 10 (where 3 and 0 are taken for a wrong pose)."""
 BAND_ROWS, OVERLAP_ROWS = 512, 48
 """Pictures are cleaned in bands of so many rows, with so many more on either side: all that a place hears of."""
 LOOK_EVERY = 3
