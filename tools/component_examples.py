@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from arview.atomic import replacing
 from arview.cad.model import Component, Model, make_model
@@ -25,6 +24,7 @@ from arview.tracking.line_network import LineNetwork
 from arview.tracking.tracker import intrinsics_of
 from judge_examples import ANYWHERE, OCCLUDER, noisy, some_solids
 from line_examples import covered_picture, crowded_picture, lone_picture
+from seeded_files import still_to_make
 
 LEAST_COMPONENTS = 4
 """Solids of fewer are no assemblies."""
@@ -70,11 +70,7 @@ class Looked:
 
 def collect_components(seeds: range, photos: Sequence[Path], folder: Path) -> None:
     """Write the looks at the components of each assembly to a file of its own, unless it is there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in tqdm(seeds, desc="assemblies", disable=None):
-        path = folder / f"components_{seed}.pkl"
-        if path.exists():
-            continue
+    for seed, path in still_to_make(seeds, folder, "components_{}.pkl", "assemblies"):
         looked = list(_looked(seed, photos))
         if looked:
             with replacing(path) as file:

@@ -14,8 +14,8 @@ from arview.tracking.verifier import CHANNELS, LINES
 from component_examples import Looked
 from judge_examples import read_examples
 from score_networks import go_on_from, score_network, write_network
-from verifier_fitting import GONE_ON, network_input
-from widening import in_use, torch_with_onnx
+from verifier_fitting import network_input
+from widening import GONE_ON, in_use, torch_with_onnx
 
 WIDTHS = (24, 24, 48, 48, 64, 64)
 """Of the convolutions."""

@@ -16,9 +16,9 @@ from tqdm import trange
 from arview.atomic import replacing
 from arview.tracking.denoiser import SHOWN_MEAN, SHOWN_RANGE
 from line_examples import LinedPicture, read_lined_pictures
-from line_fitting import with_flat_things
+from line_fitting import compressed, with_flat_things
 from pyramid import pyramid
-from widening import begin_as_in_use, torch_with_onnx
+from widening import GONE_ON, begin_as, in_use, torch_with_onnx
 
 WIDTHS = (24, 32, 48)
 """Of the levels, at half the picture's size and each half as large as that before."""
@@ -26,8 +26,7 @@ DEEPER = (1, 2)
 """So many more convolutions on those after the first."""
 CROP_PX, CROPS = 192, 16
 """A step looks at so many squares of pictures."""
-RATE, RATE_ON, DECAY, WARM_UP, LARGEST_GRADIENT = 2e-3, 1e-3, 1e-3, 0.05, 1.0
-"""The second where the network in use is gone on with."""
+RATE, DECAY, WARM_UP, LARGEST_GRADIENT = 2e-3, 1e-3, 0.05, 1.0
 HELD_OUT = 40
 """Every so manieth picture is not fitted to."""
 NOISE, HARDLY_ANY = (3.0, 22.0), (0.0, 4.0)
@@ -41,10 +40,10 @@ Pair = tuple[NDArray[np.float32], NDArray[np.float32]]
 """A square as it is shown and as it was (3,S,S), grey levels."""
 
 
-def fit_denoiser(folder: Path, epochs: int, is_new: bool) -> None:
+def fit_denoiser(folder: Path, epochs: int, is_anew: bool = True) -> None:
     """Fit the network to the pictures in a folder, write denoiser.onnx there, and say how much noise it leaves.
 
-    ``is_new``: from nothing; else it begins as the one in use.
+    ``is_anew``: not going on from the network in use.
 
     Raises:
         InputError: no pictures, no torch or onnx, or the network in use is wider.
@@ -53,11 +52,11 @@ def fit_denoiser(folder: Path, epochs: int, is_new: bool) -> None:
     pictures = [_decoded(picture) for picture in read_lined_pictures(folder)]
     torch.manual_seed(0)
     network = _network(torch)
-    if not is_new:
+    if not is_anew:
         shown = torch.zeros(1, 3, CROP_PX, CROP_PX)
-        begin_as_in_use(network, "denoiser.onnx", lambda: network(shown), torch)
+        begin_as(network, in_use("denoiser.onnx"), lambda: network(shown), torch)
     fitted = [p for k, p in enumerate(pictures) if k % HELD_OUT]
-    _fit(network, fitted, epochs, RATE if is_new else RATE_ON, torch)
+    _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, pictures[::HELD_OUT], torch)
     with replacing(folder / "denoiser.onnx") as file:
@@ -139,10 +138,7 @@ def _pair(image: NDArray[np.uint8], rng: np.random.Generator, noise: float | Non
     drawn = rng.uniform(*NOISE) if rng.random() < 0.85 else rng.uniform(*HARDLY_ANY)
     shown = np.clip(np.round(shown + _noise(shown, noise or drawn, rng)), 0.0, 255.0)
     if rng.random() < 0.2:
-        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(70, 96))]
-        decoded = cv2.imdecode(cv2.imencode(".jpg", shown.astype(np.uint8), quality)[1], cv2.IMREAD_COLOR)
-        assert decoded is not None
-        shown = decoded
+        shown = compressed(shown.astype(np.uint8), int(rng.integers(70, 96)))
     return shown.transpose(2, 0, 1).astype(np.float32), truth.transpose(2, 0, 1)
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from arview.atomic import replacing
 from arview.errors import InputError
@@ -21,6 +20,7 @@ from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.geometry import Array
 from arview.live.frames import to_jpeg
 from arview.video import Image
+from seeded_files import still_to_make
 
 WIDTH, HEIGHT = 1280, 960
 JPEG_QUALITY = 92
@@ -54,11 +54,7 @@ def make_desks(seeds: range, photos: Sequence[Path], things: Path, folder: Path)
     cutouts = [cutout for path in photos_in(things) if (cutout := _read_cutout(path)) is not None]
     if len(cutouts) < FEWEST_THINGS:
         raise InputError(f"{things}: {len(cutouts)} pictures with transparency, {FEWEST_THINGS} are needed")
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in tqdm(seeds, desc="desks", disable=None):
-        path = folder / f"desk_{seed:04d}.jpg"
-        if path.exists():
-            continue
+    for seed, path in still_to_make(seeds, folder, "desk_{:04d}.jpg", "desks"):
         rng = np.random.default_rng([seed, 6])
         picture = desk(read_photo(photos[rng.integers(len(photos))]), cutouts, rng)
         with replacing(path) as file:

@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from arview.atomic import replacing
 from arview.cad import Model
@@ -41,6 +40,7 @@ from arview.tracking.local_search import Hypothesis
 from arview.tracking.picture import Picture
 from arview.tracking.verifier import raw_look
 from line_examples import crowded_picture
+from seeded_files import still_to_make
 
 FRAMES_EACH = 4
 """Pictures of a solid in each variant, each with another pose."""
@@ -121,11 +121,7 @@ class Looks:
 
 def collect_examples(seeds: range, photos: Sequence[Path], folder: Path) -> None:
     """Write the groups and the looks of each solid to a file of its own, unless it is there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in tqdm(seeds, desc="solids", disable=None):
-        path = folder / f"solid_{seed}.pkl"
-        if path.exists():
-            continue
+    for seed, path in still_to_make(seeds, folder, "solid_{}.pkl", "solids"):
         examples = [e for picture in pictures_of(seed, photos, (WIDE,)) for e in _examples(seed, *picture)]
         for kind, name in ((Looks, f"looks_{seed}.pkl"), (Group, path.name)):
             with replacing(folder / name) as file:

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
 from arview.atomic import replacing
 from arview.cad.model import Component, Model, make_model
@@ -25,6 +24,7 @@ from arview.evaluation.semisynthetic.solids import box
 from arview.geometry import Array, apply, rigid
 from arview.raster import rasterise
 from arview.video import Image
+from seeded_files import still_to_make
 
 SOLIDS_EACH, PICTURES_EACH = 14, 60
 """A file holds so many pictures of so many solids."""
@@ -82,11 +82,7 @@ class LinedPicture:
 
 def collect_lined_pictures(seeds: range, photos: Sequence[Path], folder: Path) -> None:
     """Write some pictures of some solids to a file for each seed, unless it is there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in tqdm(seeds, desc="pictures with lines", disable=None):
-        path = folder / f"lines_{seed}.pkl"
-        if path.exists():
-            continue
+    for seed, path in still_to_make(seeds, folder, "lines_{}.pkl", "pictures with lines"):
         rng = np.random.default_rng([seed, 3])
         solids = []
         for k in range(SOLIDS_EACH):

@@ -15,7 +15,7 @@ from arview.tracking.line_network import CONTRAST, SHRINK
 from arview.tracking.matching import ORIENTATIONS
 from line_examples import FINE, LinedPicture, read_lined_pictures
 from pyramid import pyramid
-from widening import begin_as_in_use, torch_with_onnx
+from widening import GONE_ON, begin_as, in_use, torch_with_onnx
 
 WIDTHS = (16, 24, 40, 56, 64)
 """Of the levels, each half as large as that before."""
@@ -45,10 +45,10 @@ TURNED = {
 """What becomes of orientations and inside."""
 
 
-def fit_lines(folder: Path, epochs: int, is_new: bool) -> None:
+def fit_lines(folder: Path, epochs: int, is_anew: bool = True) -> None:
     """Fit the network to the pictures in a folder, write lines.onnx there, and say how many lines it sees.
 
-    ``is_new``: from nothing; else it begins as the one in use.
+    ``is_anew``: not going on from the network in use.
 
     Raises:
         InputError: no pictures, no torch or onnx, or the network in use is wider.
@@ -58,11 +58,11 @@ def fit_lines(folder: Path, epochs: int, is_new: bool) -> None:
     torch.manual_seed(0)
     network = _network(torch)
     fitted = [p for k, p in enumerate(pictures) if k % HELD_OUT]
-    if not is_new:
+    if not is_anew:
         rng = np.random.default_rng(5)
         shown = torch.from_numpy(np.stack([_example(fitted[k], rng)[0] for k in rng.integers(len(fitted), size=BEGUN)]))
-        begin_as_in_use(network, "lines.onnx", lambda: network(shown), torch)
-    _fit(network, fitted, epochs, torch)
+        begin_as(network, in_use("lines.onnx"), lambda: network(shown), torch)
+    _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, pictures[::HELD_OUT], torch)
     with replacing(folder / "lines.onnx") as file:
@@ -73,12 +73,12 @@ def fit_lines(folder: Path, epochs: int, is_new: bool) -> None:
     print(f"wrote {folder / 'lines.onnx'}")
 
 
-def _fit(network: Any, pictures: list[LinedPicture], epochs: int, torch: Any) -> None:
+def _fit(network: Any, pictures: list[LinedPicture], epochs: int, rate: float, torch: Any) -> None:
     rng = np.random.default_rng(0)
     network.to(memory_format=torch.channels_last)
-    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=DECAY)
     steps = max(1, len(pictures) // CROPS)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * steps, pct_start=WARM_UP)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps, pct_start=WARM_UP)
     for epoch in range(epochs):
         losses = []
         for _ in range(steps):
@@ -220,12 +220,15 @@ def _spoilt(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.
     noise = rng.uniform(1.0, 4.0) if rng.random() < 0.5 else rng.uniform(4.0, 22.0)
     image = image + noise * rng.standard_normal(image.shape)
     spoilt = np.clip(np.round(image), 0, 255).astype(np.uint8)
-    if rng.random() < 0.3:
-        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(50, 95))]
-        decoded = cv2.imdecode(cv2.imencode(".jpg", spoilt, quality)[1], cv2.IMREAD_COLOR)
-        assert decoded is not None
-        return np.asarray(decoded, dtype=np.uint8)
-    return spoilt
+    return compressed(spoilt, int(rng.integers(50, 95))) if rng.random() < 0.3 else spoilt
+
+
+def compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    """A picture as JPEG leaves it."""
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    decoded = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return np.asarray(decoded, dtype=np.uint8)
 
 
 def _report(network: Any, pictures: list[LinedPicture], torch: Any) -> None:

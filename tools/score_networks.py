@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.atomic import replacing
-from arview.errors import InputError
-from widening import begin_as, written_layers
+from widening import begin_as, beginning_as
 
 LAST_WIDTH, DROPPED = 48, 0.2
 
@@ -56,23 +55,19 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
     Raises:
         InputError: the written one is shown something else, or is wider.
     """
-    layers = written_layers(path, torch)
-    try:
-        begin_as(network, layers["Conv"], lambda: network.convolutions(torch.from_numpy(seen)), torch)
+    layers = begin_as(network, path, lambda: network.convolutions(torch.from_numpy(seen)), torch)
+    with beginning_as(path), torch.no_grad():
         (weight, bias), (last_weight, last_bias) = layers["Gemm"]
         first, last = network.together[0], network.together[3]
         old, wide = layers["Conv"][-1][0].shape[0], network.convolutions[-3].out_channels
-        with torch.no_grad():
-            # Means, maxima, and what the network is told.
-            first.weight.zero_()
-            first.weight[:, :old] = weight[:, :old]
-            first.weight[:, wide : wide + old] = weight[:, old : 2 * old]
-            first.weight[:, 2 * wide :] = weight[:, 2 * old :]
-            first.bias.copy_(bias)
-            last.weight.copy_(last_weight)
-            last.bias.copy_(last_bias)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: not a narrower network of this kind ({error})") from error
+        # Means, maxima, and what the network is told.
+        first.weight.zero_()
+        first.weight[:, :old] = weight[:, :old]
+        first.weight[:, wide : wide + old] = weight[:, old : 2 * old]
+        first.weight[:, 2 * wide :] = weight[:, 2 * old :]
+        first.bias.copy_(bias)
+        last.weight.copy_(last_weight)
+        last.bias.copy_(last_bias)
 
 
 def write_network(network: Any, path: Path, shape: tuple[int, int], told: int, torch: Any) -> None:

@@ -25,7 +25,7 @@ from arview.tracking.verifier import (
 from component_examples import Looked
 from judge_examples import Looks, read_examples
 from score_networks import go_on_from, score_network, write_network
-from widening import in_use, torch_with_onnx
+from widening import GONE_ON, in_use, torch_with_onnx
 
 WIDTHS = (24, 24, 48, 48, 96, 128)
 """Of the convolutions."""
@@ -36,8 +36,6 @@ REFINED_WEIGHT = 3.0
 LISTWISE_WEIGHT = 0.3
 """Beside telling right from wrong in all pictures, the right pose of each is to be told from its others."""
 RATE, DECAY = 2e-3, 2e-2
-GONE_ON = 0.5
-"""Share of the rate for a network that is gone on with."""
 UNSURE = 0.3
 """Share of pictures in which the line network sees less, and as many in which it sees less of solids."""
 HELD_OUT = 8

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Any
 
 from arview.errors import InputError
 
+GONE_ON = 0.5
+"""Share of the rate for a network that is gone on with."""
 NEW_GAIN = 0.5
 """Of channels that the network gone on with has not: they begin this much weaker than the others."""
 
@@ -32,7 +35,16 @@ def in_use(name: str) -> Path:
     return Path(str(files("arview.tracking").joinpath(name)))
 
 
-def written_layers(path: Path, torch: Any) -> Layers:
+@contextmanager
+def beginning_as(path: Path) -> Iterator[None]:
+    """While a network takes over what a written one does: an InputError where that is wider or of another kind."""
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"{path}: not a narrower network of this kind ({error})") from error
+
+
+def _written_layers(path: Path, torch: Any) -> Layers:
     """Of a network written as ONNX: convolutions (with their normalisations in them) and full layers."""
     import onnx
 
@@ -44,25 +56,29 @@ def written_layers(path: Path, torch: Any) -> Layers:
     }
 
 
-def begin_as(network: Any, convolutions: list[list[Any]], show: Callable[[], Any], torch: Any) -> None:
-    """Make the convolutions of a network do what written ones do that are as wide or narrower.
+def begin_as(network: Any, path: Path, show: Callable[[], Any], torch: Any) -> Layers:
+    """Make the convolutions of a network do what those of a written one do that is as wide or narrower.
 
     Channels that the written ones have not are there, but nothing listens to them yet, as in Chen et al., "Net2Net"
     (ICLR 2016). Normalisations, which the written ones have in their convolutions, begin anew with what is seen.
 
     Args:
         network: whose convolutions are each followed by their normalisation in one Sequential, if they have any.
-        convolutions: weight and bias of each in the order in which they are run, see `written_layers`.
+        path: of the written one.
         show: runs the network on what it is shown in fitting.
         torch: the module.
 
+    Returns:
+        the written one's layers.
+
     Raises:
-        RuntimeError: a written one is wider or shown something else; ValueError: there are more or fewer.
+        InputError: it is wider, shown something else, or has more or fewer convolutions.
     """
     nn = torch.nn
+    layers = _written_layers(path, torch)
     chains = [list(module) for module in network.modules() if isinstance(module, nn.Sequential)]
     norms = {a: b for chain in chains for a, b in pairwise(chain) if isinstance(b, nn.BatchNorm2d)}
-    left = list(convolutions)
+    left = list(layers["Conv"])
 
     def take_over(layer: Any, _: Any) -> None:
         if not left:
@@ -93,24 +109,12 @@ def begin_as(network: Any, convolutions: list[list[Any]], show: Callable[[], Any
             hooks += [module.register_forward_pre_hook(take_over), module.register_forward_hook(normalise)]
     network.eval()
     try:
-        with torch.no_grad():
+        with beginning_as(path), torch.no_grad():
             show()
+            if left:
+                raise ValueError(f"{len(left)} convolutions less than are written")
     finally:
         for hook in hooks:
             hook.remove()
-    if left:
-        raise ValueError(f"{len(left)} convolutions less than are written")
-
-
-def begin_as_in_use(network: Any, name: str, show: Callable[[], Any], torch: Any) -> None:
-    """The same for a network of convolutions only, as the package's of some name; it is ready to be fitted then.
-
-    Raises:
-        InputError: that one is wider, or of another kind.
-    """
-    path = in_use(name)
-    try:
-        begin_as(network, written_layers(path, torch)["Conv"], show, torch)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: not a narrower network of this kind ({error})") from error
     network.train()
+    return layers

@@ -9,8 +9,6 @@ but that levels are added. It knows nothing of a part: it was fitted to random s
 
 from __future__ import annotations
 
-from importlib.resources import files
-
 import cv2
 import numpy as np
 from numba import njit
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.tracking.matching import ORIENTATIONS
+from arview.tracking.networks import extended, read_network
 from arview.tracking.refine import nearest_view
 from arview.tracking.solver import project_lines
 
@@ -40,8 +39,7 @@ class LineNetwork:
     """The network; one picture at a time."""
 
     def __init__(self) -> None:
-        model = files("arview.tracking").joinpath("lines.onnx").read_bytes()
-        self._network = cv2.dnn.readNetFromONNX(np.frombuffer(model, dtype=np.uint8))
+        self._network = read_network("lines.onnx")
 
     def lines(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """How likely each place of an RGB picture (H,W,3) is on a line of each orientation, and on a solid.
@@ -58,7 +56,7 @@ class LineNetwork:
             image = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
             height, width = image.shape[:2]
         mean = sum(cv2.mean(image)[:3]) / 3.0
-        image = cv2.copyMakeBorder(image, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REPLICATE)
+        image = extended(image, CELL_PX)
         self._network.setInput(cv2.dnn.blobFromImage(image, 1.0 / CONTRAST, mean=(mean, mean, mean)))
         seen = self._network.forward()[0, :, : -(-height // SHRINK), : -(-width // SHRINK)]
         lines = seen[:INSIDE]

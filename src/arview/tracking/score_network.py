@@ -8,13 +8,12 @@ picture). ``tools/score_networks.py`` makes and writes such networks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.resources import files
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import Array
+from arview.tracking.networks import read_network
 
 RIGHTWARD, DOWNWARD = 6, 7
 """Channels with the parts of the surface's normal to the right and down: mirrors turn them round."""
@@ -34,8 +33,7 @@ class ScoreNetwork:
     """
 
     def __init__(self, name: str, mirrors: Sequence[tuple[bool, bool]] = ((False, False),)) -> None:
-        model = files("arview.tracking").joinpath(name).read_bytes()
-        self._network = cv2.dnn.readNetFromONNX(np.frombuffer(model, dtype=np.uint8))
+        self._network = read_network(name)
         self._mirrors = mirrors
 
     def scores(self, looks: Sequence[Look]) -> Array:
