@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.atomic import replacing
+from arview.tracking.denoiser import Denoiser
 from arview.tracking.line_network import CONTRAST, SHRINK
 from arview.tracking.matching import ORIENTATIONS
 from line_examples import FINE, LinedPicture, read_lined_pictures
@@ -105,7 +107,7 @@ def _loss(seen: Any, truth: Any, torch: Any) -> Any:
 
 def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """A square of a picture as the network takes it (3,S,S), and what it should see, lines and inside (9,S/2,S/2)."""
-    image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
     inside = cv2.imdecode(np.frombuffer(picture.inside, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image is not None and inside is not None
     size = np.array(image.shape[:2])
@@ -139,7 +141,8 @@ def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[n
         plain = covered * plain + (1.0 - covered) * with_flat_things(image, rng)
     if rng.random() < MOTTLED:
         plain = plain * _mottles(rng) ** covered
-    shown = _spoilt(plain, rng)
+    # As the searches are shown it.
+    shown = _denoiser().cleaned(_spoilt(plain, rng))
     if rng.random() < 0.5:
         shown, truth = shown[:, ::-1], truth[TURNED["mirrored"], :, ::-1]
     if rng.random() < 0.5:
@@ -148,6 +151,11 @@ def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[n
         shown, truth = shown.swapaxes(0, 1), truth[TURNED["transposed"]].swapaxes(1, 2)
     as_shown = (shown.astype(np.float32) - np.float32(shown.mean())) / np.float32(CONTRAST)
     return np.ascontiguousarray(as_shown.transpose(2, 0, 1)), np.ascontiguousarray(truth)
+
+
+@cache
+def _denoiser() -> Denoiser:
+    return Denoiser()
 
 
 def _mottles(rng: np.random.Generator) -> NDArray[np.float32]:
