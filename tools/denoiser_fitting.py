@@ -15,7 +15,7 @@ from tqdm import trange
 
 from arview.atomic import replacing
 from arview.tracking.denoiser import SHOWN_MEAN, SHOWN_RANGE
-from line_examples import LinedPicture, read_lined_pictures
+from line_examples import read_lined_pictures
 from line_fitting import compressed, with_flat_things
 from pyramid import pyramid
 from widening import GONE_ON, begin_as, in_use, torch_with_onnx
@@ -49,7 +49,7 @@ def fit_denoiser(folder: Path, epochs: int, is_anew: bool = True) -> None:
         InputError: no pictures, no torch or onnx, or the network in use is wider.
     """
     torch = torch_with_onnx()
-    pictures = [_decoded(picture) for picture in read_lined_pictures(folder)]
+    pictures = [picture.image() for picture in read_lined_pictures(folder)]
     torch.manual_seed(0)
     network = _network(torch)
     if not is_anew:
@@ -64,13 +64,6 @@ def fit_denoiser(folder: Path, epochs: int, is_anew: bool = True) -> None:
             network, (torch.zeros(1, 3, 480, 640),), file, input_names=["picture"], output_names=["clean"], dynamo=False
         )
     print(f"wrote {folder / 'denoiser.onnx'}")
-
-
-def _decoded(picture: LinedPicture) -> NDArray[np.uint8]:
-    """(H,W,3) RGB."""
-    image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
-    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
 
 
 def _fit(network: Any, pictures: Sequence[NDArray[np.uint8]], epochs: int, rate: float, torch: Any) -> None:

@@ -79,6 +79,12 @@ class LinedPicture:
     lines: NDArray[np.uint16]
     inside: bytes
 
+    def image(self) -> Image:
+        """It decoded, (H,W,3) RGB."""
+        bgr = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)
+        assert bgr is not None
+        return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
 
 def collect_lined_pictures(seeds: range, photos: Sequence[Path], folder: Path) -> None:
     """Write some pictures of some solids to a file for each seed, unless it is there."""

@@ -107,9 +107,9 @@ def _loss(seen: Any, truth: Any, torch: Any) -> Any:
 
 def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """A square of a picture as the network takes it (3,S,S), and what it should see, lines and inside (9,S/2,S/2)."""
-    image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
+    image = picture.image()
     inside = cv2.imdecode(np.frombuffer(picture.inside, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert image is not None and inside is not None
+    assert inside is not None
     size = np.array(image.shape[:2])
     middle = rng.integers(size)
     if len(picture.lines) and rng.random() < AROUND_LINES:
