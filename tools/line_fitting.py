@@ -19,7 +19,7 @@ from line_examples import FINE, LinedPicture, read_lined_pictures
 from pyramid import pyramid
 from widening import GONE_ON, begin_as, in_use, torch_with_onnx
 
-WIDTHS = (16, 24, 40, 56, 64)
+WIDTHS = (16, 32, 56, 80, 96)
 """Of the levels, each half as large as that before."""
 DEEPER = (0, 0, 2, 2)
 """So many residual blocks (He et al., CVPR 2016) on the levels after the first: they cost little on the small ones."""

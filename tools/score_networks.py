@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,29 @@ from widening import begin_as, beginning_as
 LAST_WIDTH, DROPPED = 48, 0.2
 
 
-def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...]) -> Any:
-    """A network shown so many channels and told of so many things; every other convolution halves the picture."""
+def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...], deepened: Collection[int] = ()) -> Any:
+    """A network shown so many channels and told of so many things; every other convolution halves the picture.
+
+    Args:
+        torch: the module.
+        channels, told: of a look.
+        widths: of the convolutions.
+        deepened: a residual block (He et al., "Deep residual learning for image recognition", CVPR 2016) follows these
+            of them. It begins by changing nothing.
+    """
     nn = torch.nn
+
+    def convolution(before: int, width: int, size: int, step: int) -> list[Any]:
+        return [nn.Conv2d(before, width, size, step, size // 2, bias=False), nn.BatchNorm2d(width)]
+
+    class _Residual(nn.Module):  # type: ignore[misc, name-defined]
+        def __init__(self, width: int) -> None:
+            super().__init__()
+            self.change = nn.Sequential(*convolution(width, width, 3, 1), nn.ReLU(), *convolution(width, width, 3, 1))
+            nn.init.zeros_(self.change[-1].weight)
+
+        def forward(self, seen: Any) -> Any:
+            return torch.relu(seen + self.change(seen))
 
     class _Network(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
@@ -24,12 +45,9 @@ def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...])
             layers: list[Any] = []
             before = channels
             for k, width in enumerate(widths):
-                size = 5 if k == 0 else 3
-                layers += [
-                    nn.Conv2d(before, width, size, 2 - k % 2, size // 2, bias=False),
-                    nn.BatchNorm2d(width),
-                    nn.ReLU(),
-                ]
+                layers += [*convolution(before, width, 5 if k == 0 else 3, 2 - k % 2), nn.ReLU()]
+                if k in deepened:
+                    layers.append(_Residual(width))
                 before = width
             self.convolutions = nn.Sequential(*layers)
             self.together = nn.Sequential(
@@ -53,13 +71,14 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
         torch: the module.
 
     Raises:
-        InputError: the written one is shown something else, or is wider.
+        InputError: the written one is shown something else, is wider, or is not as deep.
     """
     layers = begin_as(network, path, lambda: network.convolutions(torch.from_numpy(seen)), torch)
     with beginning_as(path), torch.no_grad():
         (weight, bias), (last_weight, last_bias) = layers["Gemm"]
         first, last = network.together[0], network.together[3]
-        old, wide = layers["Conv"][-1][0].shape[0], network.convolutions[-3].out_channels
+        old = layers["Conv"][-1][0].shape[0]
+        wide = (first.in_features - (weight.shape[1] - 2 * old)) // 2
         # Means, maxima, and what the network is told.
         first.weight.zero_()
         first.weight[:, :old] = weight[:, :old]

@@ -29,6 +29,8 @@ from widening import GONE_ON, in_use, torch_with_onnx
 
 WIDTHS = (24, 24, 48, 48, 96, 128)
 """Of the convolutions."""
+DEEPENED = (3, 5)
+"""These are followed by a residual block."""
 PICTURES, POSES = 6, 20
 """A step looks at so many poses of so many pictures, a third of them right where there are any."""
 REFINED_WEIGHT = 3.0
@@ -58,7 +60,7 @@ def fit_verifier(folder: Path, epochs: int, is_anew: bool = True) -> None:
     torch = torch_with_onnx()
     looks, held_out = read_examples(folder, "looks_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    network = score_network(torch, CHANNELS + LINES, GLOBALS, WIDTHS)
+    network = score_network(torch, CHANNELS + LINES, GLOBALS, WIDTHS, DEEPENED)
     fitted = [look for look in looks if look.solid not in held_out]
     if not is_anew:
         rng = np.random.default_rng(0)

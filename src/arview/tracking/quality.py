@@ -97,7 +97,7 @@ LEAST_VERIFIED = -4.0
 """Less than this the verifier does not say: on materials that it does not know it denies right poses, too."""
 FOUND_LINES = 6.2
 FOUND_WEIGHTS = (0.60, 0.49, 0.25, 0.39, 0.48, 1.04)
-FOUND_BIAS = -5.5
+FOUND_BIAS = -6.0
 """For the probability, in which lines count so much beside the verifier: logistic regression with weights that may not
 be negative, on the best hypotheses of the search in 809 pictures where these were right and in 659 without the part,
 of the same solids, many in crowds of others, half of them before cut-out things on photos, and on 257 frames of the
