@@ -165,6 +165,22 @@ def test_a_moved_component_stays_named_where_it_looks_right_along_the_way_it_mov
     assert watched(-4.0, 3.0) == ()
 
 
+@pytest.mark.parametrize(("second", "is_named"), [(3.0, True), (-1.2, False)])
+def test_one_frame_of_a_watched_part_names_nothing(
+    monkeypatch: pytest.MonkeyPatch, second: float, is_named: bool
+) -> None:
+    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    count = len(assembly().components)
+    flags, shares = np.zeros(count, dtype=bool), np.zeros(count)
+    said = iter([np.where(np.arange(count) == 2, ratio, -3.0) for ratio in (3.0, second)])
+    monkeypatch.setattr(seen, "look", lambda *_: Look(next(said), flags, flags, shares, shares, shares, shares))
+    blank, pose = np.zeros((480, 640, 3), np.uint8), pose_from(0, 45, 520)
+    seen.update(blank, pose)
+    assert seen.mismatches == () and len(seen.doubtful) == 1
+    seen.update(blank, pose)
+    assert (len(seen.mismatches) == 1) == is_named
+
+
 def test_what_a_card_hides_is_no_mismatch() -> None:
     for name in ("post_1", "post_3", "block_1", "block_2"):
         for k, pose in enumerate(views_of(2, seed=70)):
