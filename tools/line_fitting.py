@@ -15,6 +15,7 @@ from arview.atomic import replacing
 from arview.tracking.denoiser import Denoiser
 from arview.tracking.line_network import CONTRAST, SHRINK
 from arview.tracking.matching import ORIENTATIONS
+from layers import normalised, residual
 from line_examples import FINE, LinedPicture, read_lined_pictures
 from pyramid import pyramid
 from widening import GONE_ON, begin_as, in_use, torch_with_onnx
@@ -262,21 +263,10 @@ def _network(torch: Any) -> Any:
     nn = torch.nn
 
     def convolution(before: int, after: int, size: int = 3, step: int = 1) -> Any:
-        layer = nn.Conv2d(before, after, size, step, size // 2, bias=False)
-        return nn.Sequential(layer, nn.BatchNorm2d(after), nn.ReLU())
-
-    class _Residual(nn.Module):  # type: ignore[misc, name-defined]
-        def __init__(self, width: int) -> None:
-            super().__init__()
-            self.one = convolution(width, width)
-            self.other = nn.Sequential(nn.Conv2d(width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width))
-            nn.init.zeros_(self.other[1].weight)
-
-        def forward(self, before: Any) -> Any:
-            return nn.functional.relu(before + self.other(self.one(before)))
+        return nn.Sequential(*normalised(before, after, size, step, torch), nn.ReLU())
 
     def down(before: int, after: int, blocks: int) -> Any:
-        residuals = [_Residual(after) for _ in range(blocks)]
+        residuals = [residual(after, torch) for _ in range(blocks)]
         return nn.Sequential(convolution(before, after, 3, 2), convolution(after, after), *residuals)
 
     pairs = list(pairwise(WIDTHS))

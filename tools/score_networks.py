@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.atomic import replacing
+from layers import normalised, residual
 from widening import begin_as, beginning_as
 
 LAST_WIDTH, DROPPED = 48, 0.2
@@ -22,22 +23,9 @@ def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...],
         torch: the module.
         channels, told: of a look.
         widths: of the convolutions.
-        deepened: a residual block (He et al., "Deep residual learning for image recognition", CVPR 2016) follows these
-            of them. It begins by changing nothing.
+        deepened: a residual block follows these of them.
     """
     nn = torch.nn
-
-    def convolution(before: int, width: int, size: int, step: int) -> list[Any]:
-        return [nn.Conv2d(before, width, size, step, size // 2, bias=False), nn.BatchNorm2d(width)]
-
-    class _Residual(nn.Module):  # type: ignore[misc, name-defined]
-        def __init__(self, width: int) -> None:
-            super().__init__()
-            self.change = nn.Sequential(*convolution(width, width, 3, 1), nn.ReLU(), *convolution(width, width, 3, 1))
-            nn.init.zeros_(self.change[-1].weight)
-
-        def forward(self, seen: Any) -> Any:
-            return torch.relu(seen + self.change(seen))
 
     class _Network(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
@@ -45,9 +33,9 @@ def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...],
             layers: list[Any] = []
             before = channels
             for k, width in enumerate(widths):
-                layers += [*convolution(before, width, 5 if k == 0 else 3, 2 - k % 2), nn.ReLU()]
+                layers += [*normalised(before, width, 5 if k == 0 else 3, 2 - k % 2, torch), nn.ReLU()]
                 if k in deepened:
-                    layers.append(_Residual(width))
+                    layers.append(residual(width, torch))
                 before = width
             self.convolutions = nn.Sequential(*layers)
             self.together = nn.Sequential(

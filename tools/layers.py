@@ -1,0 +1,28 @@
+"""Layers that the fitted networks of convolutions are made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def normalised(before: int, after: int, size: int, step: int, torch: Any) -> list[Any]:
+    """A convolution and its normalisation."""
+    nn = torch.nn
+    return [nn.Conv2d(before, after, size, step, size // 2, bias=False), nn.BatchNorm2d(after)]
+
+
+def residual(width: int, torch: Any) -> Any:
+    """A residual block (He et al., "Deep residual learning", CVPR 2016) that begins by changing nothing."""
+    nn = torch.nn
+
+    class _Residual(nn.Module):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            one, other = (normalised(width, width, 3, 1, torch) for _ in range(2))
+            self.change = nn.Sequential(*one, nn.ReLU(), *other)
+            nn.init.zeros_(self.change[-1].weight)
+
+        def forward(self, before: Any) -> Any:
+            return torch.relu(before + self.change(before))
+
+    return _Residual()
