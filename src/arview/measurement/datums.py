@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from arview.cad.model import Component, Model
 from arview.cad.part import Datum
+from arview.cad.samples import sample_surface
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.alignment import Equations, move_equations, robust_weights, surface_equations
 from arview.measurement.features import edge_line, round_faces
 from arview.measurement.photo.edges import EdgePoints, edge_offsets
 from arview.measurement.photo.options import EdgeOptions, SweepOptions
-from arview.measurement.photo.surface import near_edges, near_others, sample_surface, tangents_of
+from arview.measurement.photo.surface import near_edges, near_others, tangents_of
 from arview.measurement.photo.sweep import sweep_offsets
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move

@@ -70,9 +70,9 @@ class ComponentNetwork:
     def __init__(self) -> None:
         self._network = ScoreNetwork("components.onnx", MIRRORS)
 
-    def ratios(self, looks: list[ComponentLook]) -> Array:
-        """Log-likelihood ratios of "not where expected" to "as expected" (N,)."""
-        return self._network.scores([shown(look) for look in looks])
+    def ratios(self, looks: list[ComponentLook], in_mirrors: bool = True) -> Array:
+        """Log-likelihood ratios of "not where expected" to "as expected" (N,); without mirrors four times as fast."""
+        return self._network.scores([shown(look) for look in looks], in_mirrors)
 
 
 def shown(look: ComponentLook) -> Look:

@@ -30,6 +30,7 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import facing, mesh_edges
 from arview.render import ZBufferRenderer
 from arview.tracking.component_network import ComponentNetwork, component_looks
+from arview.tracking.elsewhere import ElsewhereSearch, other_places
 from arview.tracking.line_network import LineNetwork
 from arview.tracking.solver import project_lines
 from arview.tracking.tracker import intrinsics_of
@@ -599,6 +600,7 @@ class ComponentCheck:
         self._model_from_body = rigid(np.eye(3), views.center_in_model)
         self._surface = views.surface
         self._network, self._line_network = ComponentNetwork(), LineNetwork()
+        self._elsewhere = ElsewhereSearch(other_places(model), self._surface, views.diameter_mm, self._network)
         low, high = model.bounds_in_model
         self._corners_in_model = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
         self._sheets: dict[int, ComponentSheet] = {}
@@ -632,7 +634,7 @@ class ComponentCheck:
         self._rested += 1
         if len(self.model.components) < 2 or not self._is_due(cam_from_model):
             return
-        look = self.look(image, cam_from_model)
+        look = self.look(image, cam_from_model, self._looked_for())
         self._looks += 1
         self._rested = 0
         self._has_suspects = bool(look.is_suspect.any())
@@ -641,6 +643,14 @@ class ComponentCheck:
         self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + news * look.against, -BOUND, BOUND)
         if self._looks >= EAGER_LOOKS:
             self._is_named = self._evidence > np.where(self._is_named, CLEARED, NAMED)
+
+    def _looked_for(self) -> NDArray[np.bool_]:
+        """(C,) which components are looked for elsewhere, too: of those not surely seen all at first, then in turn."""
+        is_open = self._evidence > SURE
+        if self._looks < EAGER_LOOKS or not is_open.any():
+            return is_open
+        in_turn = np.flatnonzero(is_open)
+        return np.asarray(np.arange(len(is_open)) == in_turn[self._looks % len(in_turn)])
 
     def _is_due(self, cam_from_model: Array) -> bool:
         """Whether a frame may tell something new; the more is open, the sooner the next look."""
@@ -661,38 +671,54 @@ class ComponentCheck:
             return ()
         return self._messages(self.look(image, cam_from_model).against > SINGLE)
 
-    def look(self, image: NDArray[np.uint8], cam_from_model: Array) -> Look:
+    def look(self, image: NDArray[np.uint8], cam_from_model: Array, is_open: NDArray[np.bool_] | None = None) -> Look:
         """What a picture says of the components at a pose.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             cam_from_model: (4,4) mm, right to a pixel or two.
+            is_open: (C,) which components have not been seen surely yet and are looked for elsewhere, too; None: all.
         """
         found = self._measured(image, cam_from_model)
         borne_out, elsewhere, contrast, around, others, _ = found.T
         is_shown = borne_out >= 0.0
         by_edges = said_by_edges(found)
-        by_network = self._seen_by_network(image, cam_from_model, is_shown & (by_edges > SETTLED))
-        is_suspect = is_shown & (together(by_edges, by_network) > SUSPECT)
+        is_asked = is_shown & (by_edges > SETTLED)
+        by_network, moved = self._seen_by_network(image, cam_from_model, is_asked, is_open)
+        is_suspect = is_shown & (together(by_edges, by_network) > SUSPECT) | (moved > SUSPECT)
         more_suspects = max(0, int(np.count_nonzero(is_suspect)) - SUSPECTS)
-        is_open = np.clip((np.minimum(around, others) - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
-        ratio = together(by_edges, by_network, is_open)
+        clear = np.clip((np.minimum(around, others) - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
+        ratio = np.maximum(np.where(is_shown, together(by_edges, by_network, clear), 0.0), moved)
         ratio = np.where(ratio > 0.0, ratio * 0.5**more_suspects, ratio)
-        against = np.where(is_shown, np.clip(ratio, -LARGEST_RATIO, LARGEST_RATIO), 0.0)
+        against = np.clip(ratio, -LARGEST_RATIO, LARGEST_RATIO)
         return Look(against, is_suspect, is_shown, borne_out, elsewhere, contrast, around)
 
-    def _seen_by_network(self, image: NDArray[np.uint8], cam_from_model: Array, is_asked: NDArray[np.bool_]) -> Array:
-        """What the network says (C,) of some components (C,); NaN of the others and of those that are too small."""
-        ratios = np.full(len(is_asked), np.nan)
-        if not is_asked.any():
-            return ratios
+    def _seen_by_network(
+        self,
+        image: NDArray[np.uint8],
+        cam_from_model: Array,
+        is_asked: NDArray[np.bool_],
+        is_open: NDArray[np.bool_] | None,
+    ) -> tuple[Array, Array]:
+        """What the network says of components: (C,) of those asked for, NaN of the others and those that are too small;
+        and (C,) for their standing elsewhere, of open ones, -inf where it says nothing.
+        """
+        is_open = np.ones(len(is_asked), dtype=bool) if is_open is None else is_open
+        at_home, moved = np.full(len(is_asked), np.nan), np.full(len(is_asked), -np.inf)
+        if not (is_asked | is_open).any():
+            return at_home, moved
         window, intrinsics, _ = self._window(image, cam_from_model)
+        cam_from_body = cam_from_model @ self._model_from_body
+        answers = self._line_network.lines(window)
         looks = component_looks(
-            window, self._line_network.lines(window), intrinsics, self._surface, self.views.diameter_mm,
-            cam_from_model @ self._model_from_body, np.flatnonzero(is_asked).tolist(),
+            window, answers, intrinsics, self._surface, self.views.diameter_mm, cam_from_body,
+            np.flatnonzero(is_asked | is_open).tolist(),
         )  # fmt: skip
-        ratios[[look.index for look in looks]] = self._network.ratios(looks)
-        return ratios
+        if looks:
+            at_home[[look.index for look in looks]] = self._network.ratios(looks)
+        if is_open.any():
+            moved = self._elsewhere.against(window, answers, intrinsics, cam_from_body, at_home, is_open)
+        return np.where(is_asked, at_home, np.nan), moved
 
     def _window(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[NDArray[np.uint8], Array, float]:
         """The picture around the part (H,W,3), perhaps shrunk, its intrinsics (10,), and px per mm in it."""

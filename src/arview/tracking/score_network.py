@@ -36,13 +36,14 @@ class ScoreNetwork:
         self._network = read_network(name)
         self._mirrors = mirrors
 
-    def scores(self, looks: Sequence[Look]) -> Array:
-        """Scores (N,) of some looks, means over their forms."""
+    def scores(self, looks: Sequence[Look], in_mirrors: bool = True) -> Array:
+        """Scores (N,) of some looks, means over their forms or of the first form alone."""
+        mirrors = self._mirrors if in_mirrors else self._mirrors[:1]
         scores = np.empty(len(looks))
         for first in range(0, len(looks), MOST_AT_ONCE):
             some = slice(first, first + MOST_AT_ONCE)
             seen, told = map(np.stack, zip(*looks[some], strict=True))
-            forms = [mirrored(seen, *mirror) for mirror in self._mirrors]
+            forms = [mirrored(seen, *mirror) for mirror in mirrors]
             self._network.setInput(np.concatenate(forms), "seen")
             self._network.setInput(np.concatenate([told] * len(forms)), "both")
             scores[some] = self._network.forward().reshape(len(forms), -1).mean(axis=0)

@@ -8,10 +8,11 @@ import numpy as np
 
 from arview.cad.model import Model
 from arview.cad.part import Part
+from arview.cad.samples import Samples, sample_surface
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.edges import ComponentEdges
 from arview.measurement.photo.options import PhotoOptions
-from arview.measurement.photo.surface import Samples, near_others, sample_surface
+from arview.measurement.photo.surface import near_others
 from arview.measurement.photo.sweep import ComponentSweep, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
 from arview.measurement.types import Method, Move, NotMeasured

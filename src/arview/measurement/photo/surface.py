@@ -1,54 +1,21 @@
-"""Samples of a component's CAD surface, patches that follow it, and what its shape leaves free."""
+"""Patches that follow a component's CAD surface, and what its shape leaves free."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from arview.cad.fitness import face_areas
 from arview.cad.model import Component, Model, make_model
 from arview.cad.part import Part
+from arview.cad.samples import Samples
 from arview.cad.symmetry import Symmetry, find_symmetries
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import mesh_edges
 from arview.tracking.raycast import RayCaster
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Points (N,3) of a surface in the model frame, with unit normals (N,3)."""
-
-    points: Array
-    normals: Array
-
-    def of(self, which: NDArray[np.bool_]) -> Samples:
-        """Some of them."""
-        return Samples(self.points[which], self.normals[which])
-
-
-def sample_surface(component: Component, spacing_mm: float, most: int, seed: int = 0) -> Samples:
-    """Samples about ``spacing_mm`` apart, at most ``most``, evenly by area."""
-    corners = component.vertices_in_model[component.faces]
-    areas = face_areas(component.vertices_in_model, component.faces.astype(np.int64))
-    spacing_mm = max(spacing_mm, float(np.sqrt(areas.sum() / most)))
-    count = int(np.ceil(6.0 * areas.sum() / spacing_mm**2))
-    rng = np.random.default_rng(seed)
-    edges = np.cumsum(areas) / areas.sum()
-    owners = np.minimum(np.searchsorted(edges, (np.arange(count) + rng.random(count)) / count), len(areas) - 1)
-    u, v = np.sqrt(rng.random(count)), rng.random(count)
-    points = np.einsum("nc,ncx->nx", np.stack([1 - u, u * (1 - v), u * v], axis=1), corners[owners])
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[owners]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # One a cell of space and of direction is even enough.
-    cells = np.concatenate([np.floor(points / spacing_mm), np.round(1.2 * normals)], axis=1).astype(np.int64)
-    first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    if len(first) > most:
-        first = np.sort(rng.permutation(first)[:most])
-    return Samples(points[first], normals[first])
 
 
 def tangents_of(normals: Array) -> tuple[Array, Array]:

@@ -13,18 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.cad.samples import Samples, sample_surface
 from arview.geometry import Array, apply
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.kernels import choose_views, sweep_scores, vote_shifts
 from arview.measurement.photo.options import SweepOptions
 from arview.measurement.photo.surface import (
-    Samples,
     cut_patches,
     face_normals,
     near_edges,
     near_others,
-    sample_surface,
     shades_of,
     tangents_of,
 )

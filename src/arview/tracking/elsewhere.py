@@ -1,0 +1,247 @@
+"""Components that stand elsewhere: whether one is seen at another place on what it is mounted on.
+
+A component that was mounted at the wrong place leaves little trace where the CAD has it when something else hides that
+place, or when it moved along the line of sight; where it stands now it is seen as well as any. So for each component
+that is not surely right, it is asked of places around what the component network says of it there: the difference to
+what is said of its own place is a log-likelihood ratio of the two hypotheses, of which the best of many places, and
+what it costs to have the choice, remain (generalised likelihood ratio, Neyman & Pearson 1933; the cost is that of
+Bonferroni's many tests). For two components that may have changed places, what each place says of one is held against
+what it says of the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from arview.cad.fitness import face_areas
+from arview.cad.model import Component, Model
+from arview.cad.samples import Samples, sample_surface
+from arview.geometry import Array
+from arview.guideviews.surface import Surface
+from arview.tracking.component_network import ComponentNetwork, component_looks
+
+SAMPLES, SPACING_SHARE = 4000, 0.01
+"""Samples of a component at most, and their distance in diameters of the part."""
+TOUCH_SHARE, LEAST_TOUCHING, LEAST_FLAT = 0.004, 0.01, 0.9
+"""A component is mounted on a larger one when such a share of it is within such a share of the diameter of the other's
+surface, and that is flat there: the mean of its normals is so long."""
+REACH_MM, REACH_SHARE, STEPS = 30.0, 0.15, 6
+"""Places as far away are looked at, in mm and in diameters of the part, in so many steps."""
+LEAST_STEPS = 1.2
+"""Nearer places look as the component's own."""
+OVERHANG_STEPS, CLEAR_SHARE = 0.6, 0.002
+"""A component may stick out beyond what it is mounted on so many steps, and must be clear of others by such a share of
+the diameter."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where components may stand instead.
+
+    Attributes:
+        shifts: of each component, (N,3) mm to free places along what it is mounted on.
+        across: of each component, (2,3) unit vectors along that.
+        step_mm: between places.
+        swaps: pairs of components that are mounted on the same one, and (3,) mm from the first one's foot to the
+            second one's.
+    """
+
+    shifts: tuple[Array, ...]
+    across: tuple[Array, ...]
+    step_mm: float
+    swaps: tuple[tuple[int, int, Array], ...]
+
+
+def other_places(model: Model) -> Places:
+    """Places where the components of a model may stand, by what they touch and what is in the way."""
+    samples = [sample_surface(one, SPACING_SHARE * model.diameter_mm, SAMPLES) for one in model.components]
+    areas = [float(face_areas(one.vertices_in_model, one.faces.astype(np.int64)).sum()) for one in model.components]
+    step_mm = min(REACH_MM, REACH_SHARE * model.diameter_mm) / STEPS
+    axis = step_mm * np.arange(-STEPS, STEPS + 1)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    far = np.linalg.norm(grid, axis=1)
+    grid = grid[(far >= LEAST_STEPS * step_mm) & (far <= axis[-1])]
+    shifts, across, feet = [], [], []
+    mounted = [_mounted_on(index, model, samples, areas) for index in range(len(model.components))]
+    for index, (base, normal) in enumerate(mounted):
+        frame = np.linalg.svd(normal[None])[2]
+        frame[0] = normal
+        is_free = _free(index, base, model, frame, grid, step_mm) if base >= 0 else np.zeros(len(grid), dtype=bool)
+        shifts.append(grid[is_free] @ frame[1:])
+        across.append(frame[1:])
+        feet.append(_foot(model.components[index], frame))
+    swaps = [
+        (one, other, feet[other] - feet[one])
+        for one, other in combinations(range(len(mounted)), 2)
+        if mounted[one][0] == mounted[other][0] >= 0 and mounted[one][1] @ mounted[other][1] > LEAST_FLAT
+    ]
+    return Places(tuple(shifts), tuple(across), step_mm, tuple(swaps))
+
+
+def _mounted_on(index: int, model: Model, samples: Sequence[Samples], areas: Sequence[float]) -> tuple[int, Array]:
+    """The larger component that one touches most, -1 if none, and the normal (3,) of its surface there."""
+    touch_mm, spacing_mm = TOUCH_SHARE * model.diameter_mm, 2.0 * SPACING_SHARE * model.diameter_mm
+    points, found, most = samples[index].points, (-1, np.array([0.0, 0.0, 1.0])), LEAST_TOUCHING
+    low, high = points.min(axis=0) - touch_mm, points.max(axis=0) + touch_mm
+    for other, on in enumerate(samples):
+        near = on.of(((on.points >= low - spacing_mm) & (on.points <= high + spacing_mm)).all(axis=1))
+        if areas[other] <= areas[index] or len(near.points) == 0:
+            continue
+        distance, nearest = cKDTree(near.points).query(points)
+        normals = near.normals[nearest]
+        gaps = np.abs(np.sum((points - near.points[nearest]) * normals, axis=1))
+        touches = (distance < spacing_mm) & (gaps < touch_mm)
+        if np.mean(touches) > most:
+            mean = normals[touches].mean(axis=0)
+            if np.linalg.norm(mean) > LEAST_FLAT:
+                found, most = (other, mean / np.linalg.norm(mean)), float(np.mean(touches))
+    return found
+
+
+def _free(index: int, base: int, model: Model, frame: Array, grid: Array, step_mm: float) -> NDArray[np.bool_]:
+    """(N,) which shifts (N,2) along a base leave a component on it and clear of the others, by their boxes."""
+    clear_mm, over_mm = CLEAR_SHARE * model.diameter_mm, OVERHANG_STEPS * step_mm
+    low, high = _box(model.components[index], frame)
+    base_low, base_high = _box(model.components[base], frame)
+    is_free = ((low[1:] + grid >= base_low[1:] - over_mm) & (high[1:] + grid <= base_high[1:] + over_mm)).all(axis=1)
+    for number, other in enumerate(model.components):
+        other_low, other_high = _box(other, frame)
+        beside = other_low[0] >= high[0] - clear_mm or other_high[0] <= low[0] + clear_mm
+        if number in (index, base) or beside:
+            continue
+        is_free &= ((low[1:] + grid >= other_high[1:] - clear_mm) | (high[1:] + grid <= other_low[1:] + clear_mm)).any(
+            axis=1
+        )
+    return np.asarray(is_free)
+
+
+def _box(component: Component, frame: Array) -> tuple[Array, Array]:
+    """Lowest and highest coordinates (3,) of a component along the rows of a frame (3,3)."""
+    along = component.vertices_in_model[np.unique(component.faces)] @ frame.T
+    return along.min(axis=0), along.max(axis=0)
+
+
+def _foot(component: Component, frame: Array) -> Array:
+    """The middle (3,) of a component's box along a frame (3,3), at the bottom along its first row."""
+    low, high = _box(component, frame)
+    return np.asarray(np.array([low[0], *(0.5 * (low + high))[1:]]) @ frame)
+
+
+AROUND = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
+"""Around the best place it is looked again, half a step away."""
+MOST_AT_HOME, UNSEEN = 1.5, -0.5
+"""Against a component at its own place no more is counted, for that is told of it anyway, and this of one that is not
+seen there."""
+AT_HOME = -2.5
+"""A component of which less is said stands where it should."""
+SLOPE, CHOICE = 2.0, 2.5
+"""Of what is left of the difference when the choice among many places is paid for, so much counts. Of XXX
+"""
+
+
+class _View(NamedTuple):
+    """A picture around the part, see `component_looks`."""
+
+    window: NDArray[np.uint8]
+    answers: NDArray[np.uint8]
+    intrinsics: Array
+    cam_from_body: Array
+
+
+class ElsewhereSearch:
+    """Looks for components at other places.
+
+    Args:
+        places: of the model.
+        surface: of the part, about its centre.
+        diameter_mm: of the part.
+        network: what says whether a component stands at a place.
+    """
+
+    def __init__(self, places: Places, surface: Surface, diameter_mm: float, network: ComponentNetwork) -> None:
+        self._places, self._surface, self._diameter_mm, self._network = places, surface, diameter_mm, network
+        self._points = [np.unique(surface.faces[surface.component == index]) for index in range(len(places.shifts))]
+
+    def against(
+        self,
+        window: NDArray[np.uint8],
+        answers: NDArray[np.uint8],
+        intrinsics: Array,
+        cam_from_body: Array,
+        at_home: Array,
+        is_open: NDArray[np.bool_],
+    ) -> Array:
+        """What speaks for components' standing elsewhere.
+
+        Args:
+            window, answers, intrinsics, cam_from_body: see `component_looks`.
+            at_home: (C,) log-likelihood ratios of "not here" to "here" at the components' own places, NaN where these
+                are not seen.
+            is_open: (C,) which components are looked for.
+
+        Returns:
+            (C,) log-likelihood ratios of "elsewhere" to "where expected"; -inf where nothing was looked for or seen.
+        """
+        view = _View(window, answers, intrinsics, cam_from_body)
+        home = np.where(np.isnan(at_home), UNSEEN, np.minimum(at_home, MOST_AT_HOME))
+        looked_for = np.flatnonzero(is_open & (home > AT_HOME)).tolist()
+        places = [(index, shift) for index in looked_for for shift in self._places.shifts[index]]
+        half = 0.5 * self._places.step_mm
+        places = [
+            (index, shift + half * step @ self._places.across[index])
+            for index, shift in self._likeliest(places, view)
+            for step in AROUND
+        ]
+        found = self._likeliest(places, view)
+        swaps = [(one, two, way) for one, two, way in self._places.swaps if one in looked_for and two in looked_for]
+        exchanged = [place for one, two, way in swaps for place in ((one, way, two), (two, -way, one))]
+        ratios = self._ratios([*((index, shift, -1) for index, shift in found), *exchanged], view)
+        elsewhere = np.full(len(home), -np.inf)
+        for (index, _), ratio in zip(found, ratios, strict=False):
+            elsewhere[index] = home[index] - ratio
+        for (one, two, _), (there, here) in zip(swaps, ratios[len(found) :].reshape(-1, 2), strict=True):
+            changed = np.fmax(0.0, home[two] - there) + np.fmax(0.0, home[one] - here)
+            elsewhere[[one, two]] = np.maximum(elsewhere[[one, two]], changed)
+        return np.asarray(SLOPE * (elsewhere - CHOICE))
+
+    def _likeliest(self, places: list[tuple[int, Array]], view: _View) -> list[tuple[int, Array]]:
+        """Of the places of each component the one that looks most like it; none where it is seen at none."""
+        ratios = self._ratios([(*place, -1) for place in places], view, in_mirrors=False)
+        best: dict[int, int] = {}
+        for number, (index, _) in enumerate(places):
+            if ratios[number] < ratios[best.get(index, number)] or (index not in best and np.isfinite(ratios[number])):
+                best[index] = number
+        return [places[number] for number in best.values()]
+
+    def _ratios(self, places: list[tuple[int, Array, int]], view: _View, in_mirrors: bool = True) -> Array:
+        """What the network says (N,) of components at shifts (3,) mm, perhaps without another; NaN where not seen."""
+        ratios = np.full(len(places), np.nan)
+        looks, where = [], []
+        for number, (index, shift, left_out) in enumerate(places):
+            moved = self._moved(index, shift, left_out)
+            seen = component_looks(*view[:3], moved, self._diameter_mm, view.cam_from_body, [index])
+            if seen:
+                looks += seen
+                where.append(number)
+        if looks:
+            ratios[where] = self._network.ratios(looks, in_mirrors)
+        return ratios
+
+    def _moved(self, index: int, shift: Array, left_out: int) -> Surface:
+        """The surface with a component shifted by (3,) mm and another left out, -1: none."""
+        points = self._surface.points.copy()
+        points[self._points[index]] += shift.astype(np.float32)
+        moved = self._surface._replace(points=points)
+        if left_out < 0:
+            return moved
+        is_left = moved.component != left_out
+        return moved._replace(
+            faces=moved.faces[is_left], normals=moved.normals[is_left], component=moved.component[is_left]
+        )
