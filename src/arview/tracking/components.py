@@ -16,7 +16,7 @@ instead. One set of constants serves all parts.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -68,15 +68,17 @@ MODEL = (14.3, -11.5, -13.9, -1.29)
 """Log-likelihood ratio: constant; share borne out; that less the best elsewhere; colour contrast up to 6."""
 SETTLED = -2.0
 """A component with a ratio below is as expected: the network is not asked, which is less sure on real pictures."""
+ELSEWHERE_EDGES = 0.5
+"""What edges say for a component beyond that counts so much against its standing elsewhere."""
 BOTH, MOST_SAID = (-0.11, 0.35, 1.15, 0.5), 4.0
 """Log-likelihood ratio by edges and network: constant, what edges count, the network against a component and for it;
 up to how much each. Fitted to 4,200 looks at components of random assemblies that the network was not fitted to, a
 tenth of them wrong, a third of the pictures with something before a component: of the wrong ones 54 % are above 99 % of
 the right, by edges alone 8 %. Edges that are not seen count only as far as those around are; the network sees itself
 what hides a component."""
-HIDDEN_DOUBT = 1.5
+HIDDEN_DOUBT = 2.4
 """So much less the network says against a component around which nothing is borne out: of what a hand hides it is not
-sure either."""
+sure either, and a single picture names none."""
 EDGES_ALONE = 0.35
 """Of a ratio against a component that the network cannot see, so small it is, this share counts: in those pictures
 what lies around it and before it leaves its edges empty oftener than where `MODEL` was fitted."""
@@ -155,6 +157,14 @@ class Look:
     elsewhere: Array
     contrast: Array
     surroundings: Array
+
+
+class _Seen(NamedTuple):
+    """What edges say of the components (C,): see `Look`, `said_by_edges` and `together`."""
+
+    is_shown: NDArray[np.bool_]
+    by_edges: Array
+    clear: Array
 
 
 @njit(cache=True, nogil=True)
@@ -683,11 +693,11 @@ class ComponentCheck:
         borne_out, elsewhere, contrast, around, others, _ = found.T
         is_shown = borne_out >= 0.0
         by_edges = said_by_edges(found)
-        is_asked = is_shown & (by_edges > SETTLED)
-        by_network, moved = self._seen_by_network(image, cam_from_model, is_asked, is_open)
+        clear = np.clip((np.minimum(around, others) - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
+        seen = _Seen(is_shown, np.where(is_shown, by_edges, 0.0), np.where(is_shown, clear, 1.0))
+        by_network, moved = self._seen_by_network(image, cam_from_model, seen, is_open)
         is_suspect = is_shown & (together(by_edges, by_network) > SUSPECT) | (moved > SUSPECT)
         more_suspects = max(0, int(np.count_nonzero(is_suspect)) - SUSPECTS)
-        clear = np.clip((np.minimum(around, others) - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
         ratio = np.maximum(np.where(is_shown, together(by_edges, by_network, clear), 0.0), moved)
         ratio = np.where(ratio > 0.0, ratio * 0.5**more_suspects, ratio)
         against = np.clip(ratio, -LARGEST_RATIO, LARGEST_RATIO)
@@ -697,12 +707,13 @@ class ComponentCheck:
         self,
         image: NDArray[np.uint8],
         cam_from_model: Array,
-        is_asked: NDArray[np.bool_],
+        seen: _Seen,
         is_open: NDArray[np.bool_] | None,
     ) -> tuple[Array, Array]:
-        """What the network says of components: (C,) of those asked for, NaN of the others and those that are too small;
-        and (C,) for their standing elsewhere, of open ones, -inf where it says nothing.
+        """What the network says of components: (C,) of those that edges do not settle, NaN of the others and those that
+        are too small; and (C,) for their standing elsewhere, of open ones, -inf where it says nothing.
         """
+        is_asked = seen.is_shown & (seen.by_edges > SETTLED)
         is_open = np.ones(len(is_asked), dtype=bool) if is_open is None else is_open
         at_home, moved = np.full(len(is_asked), np.nan), np.full(len(is_asked), -np.inf)
         if not (is_asked | is_open).any():
@@ -717,7 +728,9 @@ class ComponentCheck:
         if looks:
             at_home[[look.index for look in looks]] = self._network.ratios(looks)
         if is_open.any():
-            moved = self._elsewhere.against(window, answers, intrinsics, cam_from_body, at_home, is_open)
+            ratios = np.where(at_home > 0.0, seen.clear * at_home, at_home)
+            moved = self._elsewhere.against(window, answers, intrinsics, cam_from_body, ratios, is_open)
+            moved += ELSEWHERE_EDGES * np.minimum(seen.by_edges - SETTLED, 0.0)
         return np.where(is_asked, at_home, np.nan), moved
 
     def _window(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[NDArray[np.uint8], Array, float]:

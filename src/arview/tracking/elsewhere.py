@@ -91,8 +91,11 @@ def _mounted_on(index: int, model: Model, samples: Sequence[Samples], areas: Seq
     points, found, most = samples[index].points, (-1, np.array([0.0, 0.0, 1.0])), LEAST_TOUCHING
     low, high = points.min(axis=0) - touch_mm, points.max(axis=0) + touch_mm
     for other, on in enumerate(samples):
+        other_low, other_high = model.components[other].bounds_in_model
+        if areas[other] <= areas[index] or (other_low > high).any() or (other_high < low).any():
+            continue
         near = on.of(((on.points >= low - spacing_mm) & (on.points <= high + spacing_mm)).all(axis=1))
-        if areas[other] <= areas[index] or len(near.points) == 0:
+        if len(near.points) == 0:
             continue
         distance, nearest = cKDTree(near.points).query(points)
         normals = near.normals[nearest]
@@ -139,11 +142,15 @@ AROUND = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
 MOST_AT_HOME, UNSEEN = 1.5, -0.5
 """Against a component at its own place no more is counted, for that is told of it anyway, and this of one that is not
 seen there."""
+MOST_PLACES = 800
+"""In one picture: of large assemblies only the components that are likeliest elsewhere are looked for."""
 AT_HOME = -2.5
 """A component of which less is said stands where it should."""
-SLOPE, CHOICE = 2.0, 2.5
-"""Of what is left of the difference when the choice among many places is paid for, so much counts. Of XXX
-"""
+SLOPE, CHOICE = 2.0, 2.2
+"""Of what is left of the difference when the choice among many places is paid for, so much counts. Of 291 wrong
+components in 255 pictures of look-alikes 162 have a difference above 3, 19 of them in the 31 pictures in which what is
+seen of their own place did not give them away; of 5,063 right ones, half in pictures with noise, an occluder or of a
+real plate, eight have."""
 
 
 class _View(NamedTuple):
@@ -191,7 +198,7 @@ class ElsewhereSearch:
         """
         view = _View(window, answers, intrinsics, cam_from_body)
         home = np.where(np.isnan(at_home), UNSEEN, np.minimum(at_home, MOST_AT_HOME))
-        looked_for = np.flatnonzero(is_open & (home > AT_HOME)).tolist()
+        looked_for = self._worth_it(np.flatnonzero(is_open & (home > AT_HOME)), home)
         places = [(index, shift) for index in looked_for for shift in self._places.shifts[index]]
         half = 0.5 * self._places.step_mm
         places = [
@@ -207,17 +214,24 @@ class ElsewhereSearch:
         for (index, _), ratio in zip(found, ratios, strict=False):
             elsewhere[index] = home[index] - ratio
         for (one, two, _), (there, here) in zip(swaps, ratios[len(found) :].reshape(-1, 2), strict=True):
-            changed = np.fmax(0.0, home[two] - there) + np.fmax(0.0, home[one] - here)
-            elsewhere[[one, two]] = np.maximum(elsewhere[[one, two]], changed)
+            if np.isfinite(there) or np.isfinite(here):
+                changed = np.nan_to_num(home[two] - there) + np.nan_to_num(home[one] - here)
+                elsewhere[[one, two]] = np.maximum(elsewhere[[one, two]], changed)
         return np.asarray(SLOPE * (elsewhere - CHOICE))
+
+    def _worth_it(self, indices: NDArray[np.intp], home: Array) -> list[int]:
+        """Of some components those that are least likely at home, as many as may be looked for in one picture."""
+        in_order = indices[np.argsort(-home[indices], kind="stable")]
+        places = np.cumsum([len(self._places.shifts[index]) for index in in_order])
+        return sorted(in_order[: max(1, int(np.searchsorted(places, MOST_PLACES, side="right")))].tolist())
 
     def _likeliest(self, places: list[tuple[int, Array]], view: _View) -> list[tuple[int, Array]]:
         """Of the places of each component the one that looks most like it; none where it is seen at none."""
         ratios = self._ratios([(*place, -1) for place in places], view, in_mirrors=False)
         best: dict[int, int] = {}
-        for number, (index, _) in enumerate(places):
-            if ratios[number] < ratios[best.get(index, number)] or (index not in best and np.isfinite(ratios[number])):
-                best[index] = number
+        for number in np.argsort(ratios):
+            if np.isfinite(ratios[number]):
+                best.setdefault(places[number][0], int(number))
         return [places[number] for number in best.values()]
 
     def _ratios(self, places: list[tuple[int, Array, int]], view: _View, in_mirrors: bool = True) -> Array:
