@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model, make_model
 from arview.geometry import Array, apply
 from arview.tracking import TrackingSession
-from arview.tracking.components import EDGES_ALONE, SUSPICIOUS_FRAMES, ComponentCheck, Look, together
+from arview.tracking.components import EDGES_ALONE, OPEN_FRAMES, SUSPICIOUS_FRAMES, ComponentCheck, Look, together
 from synthetic import CAMERA, assembly, assembly_views, block, path, picture, pose_from, wrong
 
 MOVED_MM = 20.0
@@ -179,6 +179,24 @@ def test_one_frame_of_a_watched_part_names_nothing(
     assert seen.mismatches == () and len(seen.doubtful) == 1
     seen.update(blank, pose)
     assert (len(seen.mismatches) == 1) == is_named
+
+
+@pytest.mark.parametrize(("was_shown", "frames"), [(True, OPEN_FRAMES), (False, SUSPICIOUS_FRAMES)])
+def test_what_comes_into_view_is_looked_at_soon(monkeypatch: pytest.MonkeyPatch, was_shown: bool, frames: int) -> None:
+    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    count = len(assembly().components)
+    others, shares = np.arange(count) != 2, np.zeros(count)
+    flags = others | was_shown
+    said = Look(np.where(others, -3.0, 0.0), np.zeros(count, dtype=bool), flags, shares, shares, shares, shares)
+    looks = []
+    monkeypatch.setattr(seen, "look", lambda *_: looks.append(1) or said)
+    for _ in range(2):
+        seen.update(np.zeros((480, 640, 3), np.uint8), pose_from(-40, 45, 520))
+    waited = 0
+    while len(looks) < 3:
+        seen.update(np.zeros((480, 640, 3), np.uint8), pose_from(20, 45, 520))
+        waited += 1
+    assert waited == frames
 
 
 def test_what_a_card_hides_is_no_mismatch() -> None:

@@ -112,7 +112,8 @@ SURE = -1.0
 SUSPICIOUS_FRAMES, OPEN_FRAMES, REST_FRAMES = 6, 15, 45
 """Frames between looks while a component may be wrong, has not been seen, and while all are as expected.
 
-The first two hold for new directions; from one that was looked from before it takes one step longer.
+The first two hold for new directions; from one that was looked from before it takes one step longer. A direction that
+shows a component not seen yet counts as one from which it may be wrong.
 """
 KEPT_SHEETS = 64
 
@@ -635,7 +636,7 @@ class ComponentCheck:
         self._is_named = np.zeros(count, dtype=bool)
         self._looks = 0
         self._rested = 0
-        self._has_suspects = False
+        self._has_suspects, self._was_shown = False, np.zeros(count, dtype=bool)
         self._directions = np.zeros((0, 3))
         self._visits = np.zeros((0, 2, count))
 
@@ -647,7 +648,7 @@ class ComponentCheck:
         look = self.look(image, cam_from_model, self._looked_for())
         self._looks += 1
         self._rested = 0
-        self._has_suspects = bool(look.is_suspect.any())
+        self._has_suspects, self._was_shown = bool(look.is_suspect.any()), look.is_shown
         news = self._news(cam_from_model, look.against)
         news = np.where(self._is_named & (look.against < 0.0), CLEARING * news, news)
         self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + news * look.against, -BOUND, BOUND)
@@ -671,9 +672,17 @@ class ComponentCheck:
         highest = float(self._evidence.max())
         waits = (SUSPICIOUS_FRAMES, OPEN_FRAMES, REST_FRAMES, REST_FRAMES)
         step = 0 if self._has_suspects or highest > CLEARED else 1 if highest > SURE else 2
+        if step == 1 and self._shows_new(cam_from_model):
+            step = 0
         if self._rested < waits[step]:
             return False
         return self._rested >= waits[step + 1] or self._nearest_seen(cam_from_model) < 0
+
+    def _shows_new(self, cam_from_model: Array) -> bool:
+        """Whether this direction shows a component that has not been seen and that the last look could not show."""
+        sheet = self._sheet(cam_from_model)
+        points = np.bincount(sheet.component[sheet.is_own], minlength=len(self._was_shown))
+        return bool(np.any((self._evidence > SURE) & ~self._was_shown & (points >= LEAST_POINTS)))
 
     def single_look(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[str, ...]:
         """Mismatches that one picture alone bears out; what was seen before does not count, nor is it changed."""
