@@ -92,6 +92,8 @@ NAMED, CLEARED = 2.4, 0.1
 """Evidence above which a component is named, and below which it no longer is nor is in doubt. Of 255 frames of
 look-alikes 225 are named and 12 in order by these; of 1,091 of right assemblies, with noise and an occluder, in none
 one is named and 22 are in doubt or hardly seen."""
+LARGEST_NEWS = 2.3
+"""What one look says against a component it does not name: of one that comes into view only a little shows at first."""
 SUSPECT = 1.0
 """A look's ratio above which a component is a suspect, be it hidden or not."""
 BOUND = 6.0
@@ -651,7 +653,8 @@ class ComponentCheck:
         self._has_suspects, self._was_shown = bool(look.is_suspect.any()), look.is_shown
         news = self._news(cam_from_model, look.against)
         news = np.where(self._is_named & (look.against < 0.0), CLEARING * news, news)
-        self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + news * look.against, -BOUND, BOUND)
+        told = news * np.minimum(look.against, LARGEST_NEWS)
+        self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + told, -BOUND, BOUND)
         if self._looks >= EAGER_LOOKS:
             self._is_named = self._evidence > np.where(self._is_named, CLEARED, NAMED)
 
@@ -734,12 +737,15 @@ class ComponentCheck:
             window, answers, intrinsics, self._surface, self.views.diameter_mm, cam_from_body,
             np.flatnonzero(is_asked | is_open).tolist(),
         )  # fmt: skip
-        if looks:
-            at_home[[look.index for look in looks]] = self._network.ratios(looks)
+        # What is asked only to know whether to look elsewhere need not be told that well.
+        for is_exact in (True, False):
+            some = [look for look in looks if is_asked[look.index] == is_exact]
+            at_home[[look.index for look in some]] = self._network.ratios(some, in_mirrors=is_exact)
         if is_open.any():
             ratios = np.where(at_home > 0.0, seen.clear * at_home, at_home)
             moved = self._elsewhere.against(window, answers, intrinsics, cam_from_body, ratios, is_open)
             moved += ELSEWHERE_EDGES * np.minimum(seen.by_edges - SETTLED, 0.0)
+            moved = seen.clear * np.maximum(moved, 0.0) + np.minimum(moved, 0.0)
         return np.where(is_asked, at_home, np.nan), moved
 
     def _window(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[NDArray[np.uint8], Array, float]:

@@ -25,20 +25,25 @@ from arview.cad.model import Component, Model
 from arview.cad.samples import Samples, sample_surface
 from arview.geometry import Array
 from arview.guideviews.surface import Surface
-from arview.tracking.component_network import ComponentNetwork, component_looks
+from arview.tracking.component_network import ComponentLook, ComponentNetwork, component_looks
+from arview.tracking.verifier import BAND_PX
 
 SAMPLES, SPACING_SHARE = 4000, 0.01
 """Samples of a component at most, and their distance in diameters of the part."""
 TOUCH_SHARE, LEAST_TOUCHING, LEAST_FLAT = 0.004, 0.01, 0.9
 """A component is mounted on a larger one when such a share of it is within such a share of the diameter of the other's
 surface, and that is flat there: the mean of its normals is so long."""
-REACH_MM, REACH_SHARE, STEPS = 30.0, 0.15, 6
+REACH_MM, REACH_SHARE, STEPS = 30.0, 0.15, 4
 """Places as far away are looked at, in mm and in diameters of the part, in so many steps."""
-LEAST_STEPS = 1.2
+LEAST_STEPS = 0.9
 """Nearer places look as the component's own."""
 OVERHANG_STEPS, CLEAR_SHARE = 0.6, 0.002
 """A component may stick out beyond what it is mounted on so many steps, and must be clear of others by such a share of
 the diameter."""
+
+
+Swap = tuple[int, int, Array]
+"""Two components, and (3,) mm from the first one's foot to the second one's."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +54,13 @@ class Places:
         shifts: of each component, (N,3) mm to free places along what it is mounted on.
         across: of each component, (2,3) unit vectors along that.
         step_mm: between places.
-        swaps: pairs of components that are mounted on the same one, and (3,) mm from the first one's foot to the
-            second one's.
+        swaps: pairs of components that are mounted on the same one.
     """
 
     shifts: tuple[Array, ...]
     across: tuple[Array, ...]
     step_mm: float
-    swaps: tuple[tuple[int, int, Array], ...]
+    swaps: tuple[Swap, ...]
 
 
 def other_places(model: Model) -> Places:
@@ -138,10 +142,17 @@ def _foot(component: Component, frame: Array) -> Array:
 
 
 AROUND = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
-"""Around the best place it is looked again, half a step away."""
+GONE_ON_WITH = 2
+"""So many of a component's places are gone on with from the first step."""
+CLOSER = (0.5, 0.25)
+"""Around the best place it is looked again, such shares of a step away."""
 MOST_AT_HOME, UNSEEN = 1.5, -0.5
 """Against a component at its own place no more is counted, for that is told of it anyway, and this of one that is not
 seen there."""
+SWAP_MARGIN = 1.0
+"""Two components may have changed places when what speaks for it, seen in no mirror, is at most so much too little."""
+MOST_TRIED = 10
+"""Of the places of a component the network is shown those whose edges lie best on lines."""
 MOST_PLACES = 800
 """In one picture: of large assemblies only the components that are likeliest elsewhere are looked for."""
 AT_HOME = -2.5
@@ -200,24 +211,32 @@ class ElsewhereSearch:
         home = np.where(np.isnan(at_home), UNSEEN, np.minimum(at_home, MOST_AT_HOME))
         looked_for = self._worth_it(np.flatnonzero(is_open & (home > AT_HOME)), home)
         places = [(index, shift) for index in looked_for for shift in self._places.shifts[index]]
-        half = 0.5 * self._places.step_mm
-        places = [
-            (index, shift + half * step @ self._places.across[index])
-            for index, shift in self._likeliest(places, view)
-            for step in AROUND
-        ]
-        found = self._likeliest(places, view)
-        swaps = [(one, two, way) for one, two, way in self._places.swaps if one in looked_for and two in looked_for]
-        exchanged = [place for one, two, way in swaps for place in ((one, way, two), (two, -way, one))]
-        ratios = self._ratios([*((index, shift, -1) for index, shift in found), *exchanged], view)
+        found = self._likeliest(places, view, GONE_ON_WITH)
+        for share in CLOSER:
+            places = [
+                (index, shift + share * self._places.step_mm * step @ self._places.across[index])
+                for index, shift in found
+                for step in AROUND
+            ]
+            found = self._likeliest(places, view)
         elsewhere = np.full(len(home), -np.inf)
-        for (index, _), ratio in zip(found, ratios, strict=False):
+        ratios = self._ratios([(index, shift, -1) for index, shift in found], view)
+        for (index, _), ratio in zip(found, ratios, strict=True):
             elsewhere[index] = home[index] - ratio
-        for (one, two, _), (there, here) in zip(swaps, ratios[len(found) :].reshape(-1, 2), strict=True):
-            if np.isfinite(there) or np.isfinite(here):
-                changed = np.nan_to_num(home[two] - there) + np.nan_to_num(home[one] - here)
-                elsewhere[[one, two]] = np.maximum(elsewhere[[one, two]], changed)
+        swaps = [swap for swap in self._places.swaps if swap[0] in looked_for and swap[1] in looked_for]
+        likely = self._changed(swaps, home, view, in_mirrors=False) > CHOICE - SWAP_MARGIN
+        swaps = [swap for swap, is_likely in zip(swaps, likely, strict=True) if is_likely]
+        for (one, two, _), changed in zip(swaps, self._changed(swaps, home, view), strict=True):
+            elsewhere[[one, two]] = np.maximum(elsewhere[[one, two]], changed)
         return np.asarray(SLOPE * (elsewhere - CHOICE))
+
+    def _changed(self, swaps: list[Swap], home: Array, view: _View, in_mirrors: bool = True) -> Array:
+        """What speaks for components having changed places (N,): of each pair what it is at the two places."""
+        places = [place for one, two, way in swaps for place in ((one, way, two), (two, -way, one))]
+        there, here = self._ratios(places, view, in_mirrors).reshape(-1, 2).T
+        pairs = np.array([swap[:2] for swap in swaps], dtype=np.intp).reshape(-1, 2)
+        changed = np.nan_to_num(home[pairs[:, 1]] - there) + np.nan_to_num(home[pairs[:, 0]] - here)
+        return np.where(np.isnan(there) & np.isnan(here), -np.inf, changed)
 
     def _worth_it(self, indices: NDArray[np.intp], home: Array) -> list[int]:
         """Of some components those that are least likely at home, as many as may be looked for in one picture."""
@@ -225,28 +244,31 @@ class ElsewhereSearch:
         places = np.cumsum([len(self._places.shifts[index]) for index in in_order])
         return sorted(in_order[: max(1, int(np.searchsorted(places, MOST_PLACES, side="right")))].tolist())
 
-    def _likeliest(self, places: list[tuple[int, Array]], view: _View) -> list[tuple[int, Array]]:
-        """Of the places of each component the one that looks most like it; none where it is seen at none."""
-        ratios = self._ratios([(*place, -1) for place in places], view, in_mirrors=False)
-        best: dict[int, int] = {}
-        for number in np.argsort(ratios):
-            if np.isfinite(ratios[number]):
-                best.setdefault(places[number][0], int(number))
-        return [places[number] for number in best.values()]
+    def _likeliest(self, places: list[tuple[int, Array]], view: _View, kept: int = 1) -> list[tuple[int, Array]]:
+        """Of the places of each component those that look most like it; none where it is seen at none."""
+        looks = [self._look(index, shift, -1, view) for index, shift in places]
+        on_lines = np.array([-1.0 if look is None else _on_lines(look) for look in looks])
+        owners = np.array([index for index, _ in places])
+        tried = [k for k in np.argsort(-on_lines, kind="stable") if on_lines[k] >= 0.0]
+        tried = [k for n, k in enumerate(tried) if np.count_nonzero(owners[tried[:n]] == owners[k]) < MOST_TRIED]
+        ratios = self._network.ratios([look for k in tried if (look := looks[k]) is not None], in_mirrors=False)
+        best = [tried[n] for n in np.argsort(ratios)]
+        return [places[k] for n, k in enumerate(best) if np.count_nonzero(owners[best[:n]] == owners[k]) < kept]
 
     def _ratios(self, places: list[tuple[int, Array, int]], view: _View, in_mirrors: bool = True) -> Array:
         """What the network says (N,) of components at shifts (3,) mm, perhaps without another; NaN where not seen."""
         ratios = np.full(len(places), np.nan)
-        looks, where = [], []
-        for number, (index, shift, left_out) in enumerate(places):
-            moved = self._moved(index, shift, left_out)
-            seen = component_looks(*view[:3], moved, self._diameter_mm, view.cam_from_body, [index])
-            if seen:
-                looks += seen
-                where.append(number)
-        if looks:
-            ratios[where] = self._network.ratios(looks, in_mirrors)
+        looks = [self._look(*place, view) for place in places]
+        seen = [look for look in looks if look is not None]
+        if seen:
+            ratios[[look is not None for look in looks]] = self._network.ratios(seen, in_mirrors)
         return ratios
+
+    def _look(self, index: int, shift: Array, left_out: int, view: _View) -> ComponentLook | None:
+        """A look at a component shifted by (3,) mm, another left out, -1: none; None where it is not seen."""
+        moved = self._moved(index, shift, left_out)
+        looks = component_looks(*view[:3], moved, self._diameter_mm, view.cam_from_body, [index])
+        return looks[0] if looks else None
 
     def _moved(self, index: int, shift: Array, left_out: int) -> Surface:
         """The surface with a component shifted by (3,) mm and another left out, -1: none."""
@@ -259,3 +281,9 @@ class ElsewhereSearch:
         return moved._replace(
             faces=moved.faces[is_left], normals=moved.normals[is_left], component=moved.component[is_left]
         )
+
+
+def _on_lines(look: ComponentLook) -> float:
+    """How much of what a component's edges would show there the line network sees, 0–255."""
+    edges = np.where(look.drawn[0] < 1.5 / BAND_PX, look.drawn[1], 0.0)
+    return float(np.sum(edges * look.lines[0]) / max(float(np.sum(edges)), 1.0))
