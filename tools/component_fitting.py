@@ -19,6 +19,8 @@ from widening import GONE_ON, in_use, torch_with_onnx
 
 WIDTHS = (24, 24, 48, 48, 64, 64)
 """Of the convolutions."""
+DEEPENED = (3, 5)
+"""A residual block follows these of them."""
 BATCH = 128
 RATE, DECAY = 2e-3, 2e-2
 HELD_OUT = 8
@@ -43,7 +45,7 @@ def fit_components(folder: Path, epochs: int, is_anew: bool = True) -> None:
     torch = torch_with_onnx()
     examples, held_out = read_examples(folder, "components_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    network = score_network(torch, CHANNELS + LINES, GLOBALS, WIDTHS)
+    network = score_network(torch, CHANNELS + LINES, GLOBALS, WIDTHS, DEEPENED)
     fitted = [one for one in examples if one.solid not in held_out]
     if not is_anew:
         rng = np.random.default_rng(0)

@@ -16,6 +16,8 @@ def residual(width: int, torch: Any) -> Any:
     nn = torch.nn
 
     class _Residual(nn.Module):  # type: ignore[misc, name-defined]
+        begins_idle = True
+
         def __init__(self) -> None:
             super().__init__()
             one, other = (normalised(width, width, 3, 1, torch) for _ in range(2))

@@ -59,7 +59,7 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
         torch: the module.
 
     Raises:
-        InputError: the written one is shown something else, is wider, or is not as deep.
+        InputError: the written one is shown something else, is wider, or has other blocks.
     """
     layers = begin_as(network, path, lambda: network.convolutions(torch.from_numpy(seen)), torch)
     with beginning_as(path), torch.no_grad():

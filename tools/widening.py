@@ -56,11 +56,25 @@ def _written_layers(path: Path, torch: Any) -> Layers:
     }
 
 
+def _convolutions(network: Any, torch: Any) -> tuple[list[Any], set[Any]]:
+    """The convolutions of a network, and which of them are in blocks that begin by changing nothing."""
+    kind = torch.nn.Conv2d
+    idle = {
+        layer
+        for block in network.modules()
+        if getattr(block, "begins_idle", False)
+        for layer in block.modules()
+        if isinstance(layer, kind)
+    }
+    return [layer for layer in network.modules() if isinstance(layer, kind)], idle
+
+
 def begin_as(network: Any, path: Path, show: Callable[[], Any], torch: Any) -> Layers:
     """Make the convolutions of a network do what those of a written one do that is as wide or narrower.
 
     Channels that the written ones have not are there, but nothing listens to them yet, as in Chen et al., "Net2Net"
-    (ICLR 2016). Normalisations, which the written ones have in their convolutions, begin anew with what is seen.
+    (ICLR 2016). Residual blocks, if it has none, change nothing yet. Normalisations, which the written ones have in
+    their convolutions, begin anew with what is seen.
 
     Args:
         network: whose convolutions are each followed by their normalisation in one Sequential, if they have any.
@@ -79,6 +93,9 @@ def begin_as(network: Any, path: Path, show: Callable[[], Any], torch: Any) -> L
     chains = [list(module) for module in network.modules() if isinstance(module, nn.Sequential)]
     norms = {a: b for chain in chains for a, b in pairwise(chain) if isinstance(b, nn.BatchNorm2d)}
     left = list(layers["Conv"])
+    convolutions, idle = _convolutions(network, torch)
+    if len(left) == len(convolutions) - len(idle):
+        convolutions = [layer for layer in convolutions if layer not in idle]
 
     def take_over(layer: Any, _: Any) -> None:
         if not left:
@@ -104,9 +121,8 @@ def begin_as(network: Any, path: Path, show: Callable[[], Any], torch: Any) -> L
         norm.bias[:old] = bias + mean[:old]
 
     hooks = []
-    for module in network.modules():
-        if isinstance(module, nn.Conv2d):
-            hooks += [module.register_forward_pre_hook(take_over), module.register_forward_hook(normalise)]
+    for layer in convolutions:
+        hooks += [layer.register_forward_pre_hook(take_over), layer.register_forward_hook(normalise)]
     network.eval()
     try:
         with beginning_as(path), torch.no_grad():

@@ -184,8 +184,8 @@ class ElsewhereSearch:
     """
 
     def __init__(self, places: Places, surface: Surface, diameter_mm: float, network: ComponentNetwork) -> None:
-        self._places, self._surface, self._diameter_mm, self._network = places, surface, diameter_mm, network
-        self._points = [np.unique(surface.faces[surface.component == index]) for index in range(len(places.shifts))]
+        self._places, self._diameter_mm, self._network = places, diameter_mm, network
+        self._surface, self._starts = _by_component(surface, len(places.shifts))
 
     def against(
         self,
@@ -273,7 +273,7 @@ class ElsewhereSearch:
     def _moved(self, index: int, shift: Array, left_out: int) -> Surface:
         """The surface with a component shifted by (3,) mm and another left out, -1: none."""
         points = self._surface.points.copy()
-        points[self._points[index]] += shift.astype(np.float32)
+        points[self._starts[index] : self._starts[index + 1]] += shift.astype(np.float32)
         moved = self._surface._replace(points=points)
         if left_out < 0:
             return moved
@@ -287,3 +287,15 @@ def _on_lines(look: ComponentLook) -> float:
     """How much of what a component's edges would show there the line network sees, 0–255."""
     edges = np.where(look.drawn[0] < 1.5 / BAND_PX, look.drawn[1], 0.0)
     return float(np.sum(edges * look.lines[0]) / max(float(np.sum(edges)), 1.0))
+
+
+def _by_component(surface: Surface, count: int) -> tuple[Surface, list[int]]:
+    """A surface of which no two components share points, in order of these, and where each one's points start."""
+    parts, starts = [], [0]
+    for index in range(count):
+        own = surface.component == index
+        used, faces = np.unique(surface.faces[own], return_inverse=True)
+        faces = np.asarray(faces.reshape(-1, 3) + starts[-1], dtype=np.int32)
+        parts.append(Surface(surface.points[used], faces, surface.normals[own], surface.component[own]))
+        starts.append(starts[-1] + len(used))
+    return Surface(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True))), starts
