@@ -294,8 +294,8 @@ def _by_component(surface: Surface, count: int) -> tuple[Surface, list[int]]:
     parts, starts = [], [0]
     for index in range(count):
         own = surface.component == index
-        used, faces = np.unique(surface.faces[own], return_inverse=True)
-        faces = np.asarray(faces.reshape(-1, 3) + starts[-1], dtype=np.int32)
+        used, places = np.unique(surface.faces[own], return_inverse=True)
+        faces: NDArray[np.int32] = np.array(places.reshape(-1, 3) + starts[-1], dtype=np.int32)
         parts.append(Surface(surface.points[used], faces, surface.normals[own], surface.component[own]))
         starts.append(starts[-1] + len(used))
     return Surface(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True))), starts
