@@ -90,8 +90,8 @@ LARGEST_RATIO = 4.0
 """A single look says no more than this."""
 NAMED, CLEARED = 2.4, 0.1
 """Evidence above which a component is named, and below which it no longer is nor is in doubt. Of 255 frames of
-look-alikes 225 are named and 12 in order by these; of 1,091 of right assemblies, with noise and an occluder, in none
-one is named and 22 are in doubt or hardly seen."""
+look-alikes 234 are named and 6 in order by these; of 1,091 of right assemblies, with noise and an occluder, in none
+one is named and 29 are in doubt or hardly seen."""
 LARGEST_NEWS = 2.3
 """What one look says against a component it does not name: of one that comes into view only a little shows at first."""
 SUSPECT = 1.0
