@@ -157,7 +157,7 @@ MOST_PLACES = 800
 """In one picture: of large assemblies only the components that are likeliest elsewhere are looked for."""
 AT_HOME = -2.5
 """A component of which less is said stands where it should."""
-SLOPE, CHOICE = 2.0, 2.2
+SLOPE, CHOICE = 2.0, 2.5
 """Of what is left of the difference when the choice among many places is paid for, so much counts. Of 291 wrong
 components in 255 pictures of look-alikes 162 have a difference above 3, 19 of them in the 31 pictures in which what is
 seen of their own place did not give them away; of 5,063 right ones, half in pictures with noise, an occluder or of a
