@@ -6,6 +6,7 @@ gradients, blobs and lines; gain, an occluding card and sensor noise come last. 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -71,6 +72,16 @@ def assembly() -> Model:
             component("rail", box((52, 10, 12), (104, 20, 24)), (0.25, 0.30, 0.35)),
         ),
     )
+
+
+def changed(model: Model, **shifts_mm: tuple[float, float] | None) -> Model:
+    """A look-alike: components moved along x and y, or left out."""
+    kept = [part for part in model.components if shifts_mm.get(part.name, ()) is not None]
+    ways = [np.array([*(shifts_mm.get(part.name) or (0.0, 0.0)), 0.0]) for part in kept]
+    moved = [
+        replace(part, vertices_in_model=part.vertices_in_model + way) for part, way in zip(kept, ways, strict=True)
+    ]
+    return make_model("look-alike", tuple(moved))
 
 
 @cache

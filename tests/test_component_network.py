@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.cad.model import Model, make_model
+from arview.cad.model import Model
 from arview.geometry import Array, apply
 from arview.tracking.component_network import (
     GLOBALS,
@@ -24,7 +24,7 @@ from arview.tracking.component_network import (
 from arview.tracking.line_network import LineNetwork
 from arview.tracking.tracker import PartView, intrinsics_of
 from arview.tracking.verifier import BAND_PX, CHANNELS, LINES
-from synthetic import CAMERA, assembly, assembly_views, picture, pose_from
+from synthetic import CAMERA, assembly, assembly_views, changed, picture, pose_from
 
 PART = PartView(assembly_views())
 NAMES = [component.name for component in assembly().components]
@@ -42,7 +42,7 @@ def line_network() -> LineNetwork:
 
 
 def without(name: str) -> Model:
-    return make_model("look-alike", tuple(part for part in assembly().components if part.name != name))
+    return changed(assembly(), **{name: None})
 
 
 def looks(image: NDArray[np.uint8], pose: Array, *names: str) -> list[ComponentLook]:

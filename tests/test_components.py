@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.cad.model import Model, make_model
+from arview.cad.model import Model
 from arview.geometry import Array, apply
 from arview.tracking import TrackingSession
 from arview.tracking.components import EDGES_ALONE, OPEN_FRAMES, SUSPICIOUS_FRAMES, ComponentCheck, Look, together
 from synthetic import CAMERA, assembly, assembly_views, block, path, picture, pose_from, wrong
+from synthetic import changed as changed_from
 
 MOVED_MM = 20.0
 
@@ -23,15 +23,8 @@ def check() -> ComponentCheck:
     return ComponentCheck(assembly_views(), assembly(), CAMERA)
 
 
-def changed(**shifts: tuple[float, float] | None) -> Model:
-    """The assembly with components moved along the plate by (x, y) mm, or left out."""
-    kept = [part for part in assembly().components if shifts.get(part.name, ()) is not None]
-    ways = [np.array([*(shifts.get(part.name) or (0.0, 0.0)), 0.0]) for part in kept]
-    moved = [
-        replace(part, vertices_in_model=part.vertices_in_model + way) for part, way in zip(kept, ways, strict=True)
-    ]
-    return make_model("look-alike", tuple(moved))
-
+changed = partial(changed_from, assembly())
+"""The assembly with components moved along the plate by (x, y) mm, or left out."""
 
 LOOK_ALIKES: dict[tuple[str, ...], Model] = {
     ("post_1",): changed(post_1=None),

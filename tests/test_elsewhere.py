@@ -15,7 +15,7 @@ from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.tracking.components import ComponentCheck
 from arview.tracking.elsewhere import Places, other_places
 from cad_files import box
-from synthetic import CAMERA, assembly, block, component, picture, pose_from, post, wrong
+from synthetic import CAMERA, assembly, block, changed, component, picture, pose_from, post, wrong
 
 NAMES = [part.name for part in assembly().components]
 TURN = exp_so3([0.3, -0.5, 0.8])
@@ -47,15 +47,6 @@ def check() -> ComponentCheck:
     around = ViewRange((420.0, 560.0), elevation_deg=(15.0, 35.0), azimuth_deg=(-95.0, -60.0))
     views = make_guide_views(walled(), around, GuideViewOptions(renderer="zbuffer"))
     return ComponentCheck(views, walled(), CAMERA)
-
-
-def changed(**shifts_mm: tuple[float, float]) -> Model:
-    """The walled assembly with components moved along the plate."""
-    moved = [
-        replace(part, vertices_in_model=part.vertices_in_model + np.array([*shifts_mm.get(part.name, (0, 0)), 0.0]))
-        for part in walled().components
-    ]
-    return make_model("look-alike", tuple(moved))
 
 
 POSES = [pose_from(azimuth, 24.0, 480.0, walled()) for azimuth in (-80.0, -77.0, -74.0, -71.0)]
@@ -116,7 +107,7 @@ def test_pairs_that_change_places_stand_foot_on_foot() -> None:
 
 
 def test_what_is_hidden_at_its_place_is_named_where_it_is_seen_elsewhere() -> None:
-    found = [against(changed(hidden=(26.0, 0.0)), seed) for seed in range(8)]
+    found = [against(changed(walled(), hidden=(26.0, 0.0)), seed) for seed in range(8)]
     assert np.median([said["hidden"] for said in found]) > 1.0
     assert sum(said["hidden"] > 0.5 for said in found) >= 6
     assert all(ratio < 0.0 for said in found for name, ratio in said.items() if name != "hidden")

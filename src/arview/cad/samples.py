@@ -31,7 +31,7 @@ def sample_surface(component: Component, spacing_mm: float, most: int, seed: int
     spacing_mm = max(spacing_mm, float(np.sqrt(areas.sum() / most)))
     count = int(np.ceil(6.0 * areas.sum() / spacing_mm**2))
     rng = np.random.default_rng(seed)
-    edges = np.cumsum(areas) / areas.sum()
+    edges = np.cumsum(areas) / max(float(areas.sum()), 1e-300)
     owners = np.minimum(np.searchsorted(edges, (np.arange(count) + rng.random(count)) / count), len(areas) - 1)
     u, v = np.sqrt(rng.random(count)), rng.random(count)
     points = np.einsum("nc,ncx->nx", np.stack([1 - u, u * (1 - v), u * v], axis=1), corners[owners])

@@ -16,7 +16,7 @@ instead. One set of constants serves all parts.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -147,7 +147,7 @@ class Look:
 
     Attributes:
         against: (C,) log-likelihood ratio of "not where expected" to "as expected"; 0 where nothing is said.
-        is_suspect: (C,) its edges are not seen; it may be hidden.
+        is_suspect: (C,) its edges are not seen, it may be hidden; or it is seen elsewhere.
         is_shown: (C,) enough of it shows to say something.
         borne_out, elsewhere: (C,) share of its points on edges of the picture, at its place and at the best other.
         contrast: (C,) mean change of colour across its outline in deviations, -1 where there is none.
@@ -161,14 +161,6 @@ class Look:
     elsewhere: Array
     contrast: Array
     surroundings: Array
-
-
-class _Seen(NamedTuple):
-    """What edges say of the components (C,): see `Look`, `said_by_edges` and `together`."""
-
-    is_shown: NDArray[np.bool_]
-    by_edges: Array
-    clear: Array
 
 
 @njit(cache=True, nogil=True)
@@ -705,10 +697,14 @@ class ComponentCheck:
         found = self._measured(image, cam_from_model)
         borne_out, elsewhere, contrast, around, others, _ = found.T
         is_shown = borne_out >= 0.0
-        by_edges = said_by_edges(found)
+        is_open = np.ones(len(is_shown), dtype=bool) if is_open is None else is_open
+        by_edges = np.where(is_shown, said_by_edges(found), 0.0)
         clear = np.clip((np.minimum(around, others) - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
-        seen = _Seen(is_shown, np.where(is_shown, by_edges, 0.0), np.where(is_shown, clear, 1.0))
-        by_network, moved = self._seen_by_network(image, cam_from_model, seen, is_open)
+        clear = np.where(is_shown, clear, 1.0)
+        is_asked = is_shown & (by_edges > SETTLED)
+        by_network, moved = self._seen_by_network(image, cam_from_model, is_asked, is_open, clear)
+        moved += ELSEWHERE_EDGES * np.minimum(by_edges, 0.0)
+        moved = clear * np.maximum(moved, 0.0) + np.minimum(moved, 0.0)
         is_suspect = is_shown & (together(by_edges, by_network) > SUSPECT) | (moved > SUSPECT)
         more_suspects = max(0, int(np.count_nonzero(is_suspect)) - SUSPECTS)
         ratio = np.maximum(np.where(is_shown, together(by_edges, by_network, clear), 0.0), moved)
@@ -720,14 +716,15 @@ class ComponentCheck:
         self,
         image: NDArray[np.uint8],
         cam_from_model: Array,
-        seen: _Seen,
-        is_open: NDArray[np.bool_] | None,
+        is_asked: NDArray[np.bool_],
+        is_open: NDArray[np.bool_],
+        clear: Array,
     ) -> tuple[Array, Array]:
-        """What the network says of components: (C,) of those that edges do not settle, NaN of the others and those that
-        are too small; and (C,) for their standing elsewhere, of open ones, -inf where it says nothing.
+        """What the network says of components (C,), and for their standing elsewhere (C,).
+
+        The first of those that are asked for, NaN of the others and those that are too small; the second of those that
+        are open, -inf where it says nothing. What it says against a component counts as ``clear`` as its place is.
         """
-        is_asked = seen.is_shown & (seen.by_edges > SETTLED)
-        is_open = np.ones(len(is_asked), dtype=bool) if is_open is None else is_open
         at_home, moved = np.full(len(is_asked), np.nan), np.full(len(is_asked), -np.inf)
         if not (is_asked | is_open).any():
             return at_home, moved
@@ -743,10 +740,8 @@ class ComponentCheck:
             some = [look for look in looks if is_asked[look.index] == is_exact]
             at_home[[look.index for look in some]] = self._network.ratios(some, in_mirrors=is_exact)
         if is_open.any():
-            ratios = np.where(at_home > 0.0, seen.clear * at_home, at_home)
+            ratios = np.where(at_home > 0.0, clear * at_home, at_home)
             moved = self._elsewhere.against(window, answers, intrinsics, cam_from_body, ratios, is_open)
-            moved += ELSEWHERE_EDGES * np.minimum(seen.by_edges, 0.0)
-            moved = seen.clear * np.maximum(moved, 0.0) + np.minimum(moved, 0.0)
         return np.where(is_asked, at_home, np.nan), moved
 
     def _window(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[NDArray[np.uint8], Array, float]:

@@ -11,6 +11,7 @@ what it says of the other.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from arview.cad.fitness import face_areas
-from arview.cad.model import Component, Model
+from arview.cad.model import Model
 from arview.cad.samples import Samples, sample_surface
 from arview.geometry import Array
 from arview.guideviews.surface import Surface
@@ -74,13 +75,17 @@ def other_places(model: Model) -> Places:
     grid = grid[(far >= LEAST_STEPS * step_mm) & (far <= axis[-1])]
     shifts, across, feet = [], [], []
     mounted = [_mounted_on(index, model, samples, areas) for index in range(len(model.components))]
+    corners = [one.vertices_in_model[np.unique(one.faces)] for one in model.components]
+    clear_mm = CLEAR_SHARE * model.diameter_mm
     for index, (base, normal) in enumerate(mounted):
         frame = np.linalg.svd(normal[None])[2]
         frame[0] = normal
-        is_free = _free(index, base, model, frame, grid, step_mm) if base >= 0 else np.zeros(len(grid), dtype=bool)
-        shifts.append(grid[is_free] @ frame[1:])
+        boxes = np.array([(along.min(axis=0), along.max(axis=0)) for along in (one @ frame.T for one in corners)])
+        free = grid[_free(index, base, boxes, grid, OVERHANG_STEPS * step_mm, clear_mm)] if base >= 0 else grid[:0]
+        shifts.append(free @ frame[1:])
         across.append(frame[1:])
-        feet.append(_foot(model.components[index], frame))
+        # The middle of its box, at the bottom.
+        feet.append(np.array([boxes[index, 0, 0], *boxes[index, :, 1:].mean(axis=0)]) @ frame)
     swaps = [
         (one, other, feet[other] - feet[one])
         for one, other in combinations(range(len(mounted)), 2)
@@ -93,6 +98,8 @@ def _mounted_on(index: int, model: Model, samples: Sequence[Samples], areas: Seq
     """The larger component that one touches most, -1 if none, and the normal (3,) of its surface there."""
     touch_mm, spacing_mm = TOUCH_SHARE * model.diameter_mm, 2.0 * SPACING_SHARE * model.diameter_mm
     points, found, most = samples[index].points, (-1, np.array([0.0, 0.0, 1.0])), LEAST_TOUCHING
+    if len(points) == 0:
+        return found
     low, high = points.min(axis=0) - touch_mm, points.max(axis=0) + touch_mm
     for other, on in enumerate(samples):
         other_low, other_high = model.components[other].bounds_in_model
@@ -112,36 +119,24 @@ def _mounted_on(index: int, model: Model, samples: Sequence[Samples], areas: Seq
     return found
 
 
-def _free(index: int, base: int, model: Model, frame: Array, grid: Array, step_mm: float) -> NDArray[np.bool_]:
-    """(N,) which shifts (N,2) along a base leave a component on it and clear of the others, by their boxes."""
-    clear_mm, over_mm = CLEAR_SHARE * model.diameter_mm, OVERHANG_STEPS * step_mm
-    low, high = _box(model.components[index], frame)
-    base_low, base_high = _box(model.components[base], frame)
-    is_free = ((low[1:] + grid >= base_low[1:] - over_mm) & (high[1:] + grid <= base_high[1:] + over_mm)).all(axis=1)
-    for number, other in enumerate(model.components):
-        other_low, other_high = _box(other, frame)
-        beside = other_low[0] >= high[0] - clear_mm or other_high[0] <= low[0] + clear_mm
-        if number in (index, base) or beside:
-            continue
-        is_free &= ((low[1:] + grid >= other_high[1:] - clear_mm) | (high[1:] + grid <= other_low[1:] + clear_mm)).any(
-            axis=1
-        )
+def _free(index: int, base: int, boxes: Array, grid: Array, over_mm: float, clear_mm: float) -> NDArray[np.bool_]:
+    """(N,) which shifts (N,2) along a base leave a component on it and clear of the others.
+
+    Args:
+        boxes: (C,2,3) lowest and highest coordinates of all components: away from the base and along it.
+        over_mm, clear_mm: how far it may stick out beyond the base, and how far others may overlap.
+    """
+    low, high = boxes[index, 0, 1:] + grid, boxes[index, 1, 1:] + grid
+    is_free = ((low >= boxes[base, 0, 1:] - over_mm) & (high <= boxes[base, 1, 1:] + over_mm)).all(axis=1)
+    is_beside = (boxes[:, 0, 0] >= boxes[index, 1, 0] - clear_mm) | (boxes[:, 1, 0] <= boxes[index, 0, 0] + clear_mm)
+    is_beside[[index, base]] = True
+    for other_low, other_high in boxes[~is_beside, :, 1:]:
+        is_free &= ((low >= other_high - clear_mm) | (high <= other_low + clear_mm)).any(axis=1)
     return np.asarray(is_free)
 
 
-def _box(component: Component, frame: Array) -> tuple[Array, Array]:
-    """Lowest and highest coordinates (3,) of a component along the rows of a frame (3,3)."""
-    along = component.vertices_in_model[np.unique(component.faces)] @ frame.T
-    return along.min(axis=0), along.max(axis=0)
-
-
-def _foot(component: Component, frame: Array) -> Array:
-    """The middle (3,) of a component's box along a frame (3,3), at the bottom along its first row."""
-    low, high = _box(component, frame)
-    return np.asarray(np.array([low[0], *(0.5 * (low + high))[1:]]) @ frame)
-
-
 AROUND = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
+"""Steps around a place."""
 GONE_ON_WITH = 2
 """So many of a component's places are gone on with from the first step."""
 CLOSER = (0.5, 0.25)
@@ -153,7 +148,7 @@ SWAP_MARGIN = 1.0
 """Two components may have changed places when what speaks for it, seen in no mirror, is at most so much too little."""
 MOST_TRIED = 10
 """Of the places of a component the network is shown those whose edges lie best on lines."""
-MOST_PLACES = 800
+MOST_PLACES, MOST_COMPONENTS = 800, 20
 """In one picture: of large assemblies only the components that are likeliest elsewhere are looked for."""
 AT_HOME = -2.5
 """A component of which less is said stands where it should."""
@@ -162,6 +157,14 @@ SLOPE, CHOICE = 2.0, 2.5
 components in 255 pictures of look-alikes 162 have a difference above 3, 19 of them in the 31 pictures in which what is
 seen of their own place did not give them away; of 5,063 right ones, half in pictures with noise, an occluder or of a
 real plate, eight have."""
+
+
+class _Place(NamedTuple):
+    """A component, how far it is shifted (3,) mm, and the component that is left out to make room, -1: none."""
+
+    component: int
+    shift: Array
+    left_out: int = -1
 
 
 class _View(NamedTuple):
@@ -210,19 +213,19 @@ class ElsewhereSearch:
         view = _View(window, answers, intrinsics, cam_from_body)
         home = np.where(np.isnan(at_home), UNSEEN, np.minimum(at_home, MOST_AT_HOME))
         looked_for = self._worth_it(np.flatnonzero(is_open & (home > AT_HOME)), home)
-        places = [(index, shift) for index in looked_for for shift in self._places.shifts[index]]
+        places = [_Place(index, shift) for index in looked_for for shift in self._places.shifts[index]]
         found = self._likeliest(places, view, GONE_ON_WITH)
         for share in CLOSER:
             places = [
-                (index, shift + share * self._places.step_mm * step @ self._places.across[index])
-                for index, shift in found
+                _Place(place.component, place.shift + share * self._places.step_mm * step @ across)
+                for place in found
+                for across in [self._places.across[place.component]]
                 for step in AROUND
             ]
             found = self._likeliest(places, view)
         elsewhere = np.full(len(home), -np.inf)
-        ratios = self._ratios([(index, shift, -1) for index, shift in found], view)
-        for (index, _), ratio in zip(found, ratios, strict=True):
-            elsewhere[index] = home[index] - ratio
+        components = [place.component for place in found]
+        elsewhere[components] = home[components] - self._ratios(found, view)
         swaps = [swap for swap in self._places.swaps if swap[0] in looked_for and swap[1] in looked_for]
         likely = self._changed(swaps, home, view, in_mirrors=False) > CHOICE - SWAP_MARGIN
         swaps = [swap for swap, is_likely in zip(swaps, likely, strict=True) if is_likely]
@@ -232,7 +235,7 @@ class ElsewhereSearch:
 
     def _changed(self, swaps: list[Swap], home: Array, view: _View, in_mirrors: bool = True) -> Array:
         """What speaks for components having changed places (N,): of each pair what it is at the two places."""
-        places = [place for one, two, way in swaps for place in ((one, way, two), (two, -way, one))]
+        places = [place for one, two, way in swaps for place in (_Place(one, way, two), _Place(two, -way, one))]
         there, here = self._ratios(places, view, in_mirrors).reshape(-1, 2).T
         pairs = np.array([swap[:2] for swap in swaps], dtype=np.intp).reshape(-1, 2)
         changed = np.nan_to_num(home[pairs[:, 1]] - there) + np.nan_to_num(home[pairs[:, 0]] - here)
@@ -241,46 +244,55 @@ class ElsewhereSearch:
     def _worth_it(self, indices: NDArray[np.intp], home: Array) -> list[int]:
         """Of some components those that are least likely at home, as many as may be looked for in one picture."""
         in_order = indices[np.argsort(-home[indices], kind="stable")]
+        in_order = in_order[:MOST_COMPONENTS]
         places = np.cumsum([len(self._places.shifts[index]) for index in in_order])
         return sorted(in_order[: max(1, int(np.searchsorted(places, MOST_PLACES, side="right")))].tolist())
 
-    def _likeliest(self, places: list[tuple[int, Array]], view: _View, kept: int = 1) -> list[tuple[int, Array]]:
+    def _likeliest(self, places: list[_Place], view: _View, kept: int = 1) -> list[_Place]:
         """Of the places of each component those that look most like it; none where it is seen at none."""
-        looks = [self._look(index, shift, -1, view) for index, shift in places]
-        on_lines = np.array([-1.0 if look is None else _on_lines(look) for look in looks])
-        owners = np.array([index for index, _ in places])
-        tried = [k for k in np.argsort(-on_lines, kind="stable") if on_lines[k] >= 0.0]
-        tried = [k for n, k in enumerate(tried) if np.count_nonzero(owners[tried[:n]] == owners[k]) < MOST_TRIED]
-        ratios = self._network.ratios([look for k in tried if (look := looks[k]) is not None], in_mirrors=False)
-        best = [tried[n] for n in np.argsort(ratios)]
-        return [places[k] for n, k in enumerate(best) if np.count_nonzero(owners[best[:n]] == owners[k]) < kept]
+        seen = [(place, look) for place in places if (look := self._look(place, view)) is not None]
+        on_lines = np.array([_on_lines(look) for _, look in seen])
+        seen = _first_of_each([seen[k] for k in np.argsort(-on_lines, kind="stable")], MOST_TRIED)
+        ratios = self._network.ratios([look for _, look in seen], in_mirrors=False)
+        return [place for place, _ in _first_of_each([seen[k] for k in np.argsort(ratios)], kept)]
 
-    def _ratios(self, places: list[tuple[int, Array, int]], view: _View, in_mirrors: bool = True) -> Array:
-        """What the network says (N,) of components at shifts (3,) mm, perhaps without another; NaN where not seen."""
+    def _ratios(self, places: list[_Place], view: _View, in_mirrors: bool = True) -> Array:
+        """What the network says (N,) of components at places; NaN where they are not seen."""
         ratios = np.full(len(places), np.nan)
-        looks = [self._look(*place, view) for place in places]
-        seen = [look for look in looks if look is not None]
-        if seen:
-            ratios[[look is not None for look in looks]] = self._network.ratios(seen, in_mirrors)
+        looks = [self._look(place, view) for place in places]
+        ratios[[look is not None for look in looks]] = self._network.ratios(
+            [look for look in looks if look is not None], in_mirrors
+        )
         return ratios
 
-    def _look(self, index: int, shift: Array, left_out: int, view: _View) -> ComponentLook | None:
-        """A look at a component shifted by (3,) mm, another left out, -1: none; None where it is not seen."""
-        moved = self._moved(index, shift, left_out)
-        looks = component_looks(*view[:3], moved, self._diameter_mm, view.cam_from_body, [index])
+    def _look(self, place: _Place, view: _View) -> ComponentLook | None:
+        """A look at a component at a place; None where it is not seen."""
+        moved = self._moved(place)
+        looks = component_looks(*view[:3], moved, self._diameter_mm, view.cam_from_body, [place.component])
         return looks[0] if looks else None
 
-    def _moved(self, index: int, shift: Array, left_out: int) -> Surface:
-        """The surface with a component shifted by (3,) mm and another left out, -1: none."""
+    def _moved(self, place: _Place) -> Surface:
+        """The surface with a component at a place."""
         points = self._surface.points.copy()
-        points[self._starts[index] : self._starts[index + 1]] += shift.astype(np.float32)
+        points[self._starts[place.component] : self._starts[place.component + 1]] += place.shift.astype(np.float32)
         moved = self._surface._replace(points=points)
-        if left_out < 0:
+        if place.left_out < 0:
             return moved
-        is_left = moved.component != left_out
+        is_left = moved.component != place.left_out
         return moved._replace(
             faces=moved.faces[is_left], normals=moved.normals[is_left], component=moved.component[is_left]
         )
+
+
+def _first_of_each(seen: list[tuple[_Place, ComponentLook]], most: int) -> list[tuple[_Place, ComponentLook]]:
+    """The first few looks at each component, in order."""
+    counts: Counter[int] = Counter()
+    first = []
+    for place, look in seen:
+        if counts[place.component] < most:
+            counts[place.component] += 1
+            first.append((place, look))
+    return first
 
 
 def _on_lines(look: ComponentLook) -> float:
