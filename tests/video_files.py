@@ -84,15 +84,15 @@ def turn_by_metadata(path: Path, quarter_turns_clockwise: int) -> None:
 def write_hdr_clip(path: Path, levels: Sequence[int], transfer: int) -> Path:
     """10-bit BT.2020 clip of one frame whose vertical bars are grey at the given limited-range luma codes."""
     with av.open(str(path), "w") as container:
-        video = container.add_stream(
-            "libx265", rate=30, options={"x265-params": "log-level=none:lossless=1:pools=none:frame-threads=1"}
-        )
+        # With B-frames the decoding time of a clip this short is what memory held: the muxer refuses some.
+        parameters = "log-level=none:lossless=1:bframes=0:pools=none:frame-threads=1"
+        video = container.add_stream("libx265", rate=30, options={"x265-params": parameters})
         video.width, video.height, video.pix_fmt = 64 * len(levels), 64, "yuv420p10le"
         context = video.codec_context
         context.colorspace, context.color_primaries, context.color_range = 9, 9, 1
         context.color_trc = transfer
         frame = av.VideoFrame(64 * len(levels), 64, "yuv420p10le")
-        frame.pts, frame.time_base = 0, Fraction(1, 30)  # without them the encoder's flush fails now and then
+        frame.pts, frame.time_base = 0, Fraction(1, 30)
         luma = np.repeat(np.array(levels, dtype=np.uint16), 64)[None].repeat(64, 0)
         chroma = np.full((32, luma.shape[1] // 2), 512, np.uint16)
         for plane, values in zip(frame.planes, [luma, chroma, chroma], strict=True):
