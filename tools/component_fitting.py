@@ -55,7 +55,7 @@ def fit_components(folder: Path, epochs: int, is_anew: bool = True) -> None:
     _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, [one for one in examples if one.solid in held_out], torch)
-    write_network(network, folder / "components.onnx", (CHANNELS + LINES, SIDE_PX), GLOBALS, torch)
+    write_network(network, folder / "components.onnx", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, torch)
 
 
 def _fit(network: Any, examples: Sequence[Looked], epochs: int, rate: float, torch: Any) -> None:

@@ -280,7 +280,7 @@ def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
     for poses, share in ((likely.poses, 1.0), (climbed_poses, CLIMBED_SHARE)):
         if not len(poses):
             continue
-        right, known = _told(detector, poses, truth, ROUGH_NEAR, ROUGH_APART, share)
+        right, known = told(detector, poses, truth, ROUGH_NEAR, ROUGH_APART, share)
         chosen = {*range(min(HARD, len(poses))), *rng.permutation(len(poses))[:OTHERS].tolist()}
         index = np.array(sorted({*chosen, *np.flatnonzero(right)[:RIGHT].tolist()}))
         index = index[known[index]]
@@ -288,7 +288,7 @@ def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
             yield _group(seed, "rough", detector, picture, poses[index], right[index])
     refined += detector.local.settled(picture, [Candidate(0.0, truth)])
     yield from _looks(seed, detector, picture, refined, climbed_poses, truth, rng)
-    right, known = _told(
+    right, known = told(
         detector,
         np.array([h.cam_from_body for h in refined]).reshape(-1, 4, 4),
         truth,
@@ -301,7 +301,7 @@ def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
         yield _group(seed, "refined", detector, picture, kept, right[known])
 
 
-def _told(
+def told(
     detector: Detector, poses: Array, truth: Array, near: tuple[float, float], apart: tuple[float, float], share: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which poses are right, and of which that is known."""
@@ -331,7 +331,7 @@ def _looks(
     is_refined = np.arange(len(poses)) < len(refined)
     right, is_told = np.zeros(len(poses), bool), np.ones(len(poses), bool)
     if truth is not None:
-        right, is_told = _told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
+        right, is_told = told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
     index = np.flatnonzero(is_told & (poses[:, 2, 3] > 0))
     if not len(index):
         return

@@ -84,7 +84,7 @@ def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Ou
             continue
         best = found[0]
         leads = detector.leads(best, found[1:])
-        terms = found_terms(best.seen, best.own_logit, best.judgement, leads)
+        terms = found_terms(best.seen, best.own_logit, best.judgement, best.strips, leads)
         if truth is None:
             yield Outcome(terms, False, part, weight)
             continue

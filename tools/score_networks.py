@@ -1,4 +1,4 @@
-"""Networks that score a look, of the verifier and of components: how they are made, gone on with, and written."""
+"""Networks that score a look, of verifier, strips and components: how they are made, gone on with, and written."""
 
 from __future__ import annotations
 
@@ -77,12 +77,11 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
         last.bias.copy_(last_bias)
 
 
-def write_network(network: Any, path: Path, shape: tuple[int, int], told: int, torch: Any) -> None:
-    """Write a network that is shown so many channels of so large a side as `cv2.dnn` reads it."""
-    channels, side = shape
+def write_network(network: Any, path: Path, shape: tuple[int, int, int], told: int, torch: Any) -> None:
+    """Write a network that is shown looks of a shape (channels, rows, columns) as `cv2.dnn` reads it."""
     with replacing(path) as file:
         torch.onnx.export(
-            network, (torch.zeros(2, channels, side, side), torch.zeros(2, told)), file,
+            network, (torch.zeros(2, *shape), torch.zeros(2, told)), file,
             input_names=["seen", "both"], output_names=["score"], dynamo=False,
             dynamic_axes={"seen": {0: "poses"}, "both": {0: "poses"}, "score": {0: "poses"}},
         )  # fmt: skip

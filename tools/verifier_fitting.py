@@ -69,7 +69,7 @@ def fit_verifier(folder: Path, epochs: int, is_anew: bool = True) -> None:
     _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, [look for look in looks if look.solid in held_out], torch)
-    write_network(network, folder / "verifier.onnx", (CHANNELS + LINES, SIDE_PX), GLOBALS, torch)
+    write_network(network, folder / "verifier.onnx", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, torch)
 
 
 def _fit(network: Any, looks: Sequence[Looks], epochs: int, rate: float, torch: Any) -> None:

@@ -186,7 +186,7 @@ def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  
     shrunk = columns / width
     along = 2 * PLACES
     answered = SEEN + 2
-    points, directions, runs, outline, inner, length = _chosen_lines(part, pose)
+    points, directions, runs, outline, inner, length = chosen_lines(part, pose, OUTLINE_LINES, INNER_LINES)
     step_mm = 0.01 * diameter_mm
     outline_px, outline_normals, outline_depths = project_lines(
         points[:outline], directions[:outline], False, pose, intrinsics, step_mm
@@ -272,18 +272,18 @@ def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  
 
 
 @njit(cache=True, nogil=True)
-def _chosen_lines(part, pose):  # type: ignore[no-untyped-def]
+def chosen_lines(part, pose, most_outline, most_inner):  # type: ignore[no-untyped-def]
     """Evenly spread lines of the nearest view: points and directions (L,3), runs (L,2), how many are of the outline.
 
-    The last two: how many are design edges, which begin at OUTLINE_LINES; how many points the outline has in all.
+    The last two: how many are design edges, which begin at ``most_outline``; how many points the outline has in all.
     """
     directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
     view = nearest_view(directions, pose)
-    points = np.empty((OUTLINE_LINES + INNER_LINES, 3), dtype=np.float32)
-    across = np.empty((OUTLINE_LINES + INNER_LINES, 3), dtype=np.float32)
-    runs = np.empty((OUTLINE_LINES, 2), dtype=np.float32)
+    points = np.empty((most_outline + most_inner, 3), dtype=np.float32)
+    across = np.empty((most_outline + most_inner, 3), dtype=np.float32)
+    runs = np.empty((most_outline, 2), dtype=np.float32)
     first, length = c_start[view], c_start[view + 1] - c_start[view]
-    outline = min(OUTLINE_LINES, length)
+    outline = min(most_outline, length)
     for i in range(outline):
         k = first + (i * length) // outline
         points[i], across[i], runs[i] = c_points[k], c_normals[k], c_runs[k]
@@ -291,12 +291,12 @@ def _chosen_lines(part, pose):  # type: ignore[no-untyped-def]
     for k in range(e_start[view], e_start[view + 1]):
         design += int((e_kinds[k] & EDGE_CONTOUR) == 0 and (e_kinds[k] & EDGE_SHARP) > 0)
     inner, passed = 0, 0
-    wanted = min(INNER_LINES, design)
+    wanted = min(most_inner, design)
     for k in range(e_start[view], e_start[view + 1]):
         if (e_kinds[k] & EDGE_CONTOUR) > 0 or (e_kinds[k] & EDGE_SHARP) == 0:
             continue
         if inner < wanted and passed * wanted >= inner * design:
-            points[OUTLINE_LINES + inner], across[OUTLINE_LINES + inner] = e_points[k], e_tangents[k]
+            points[most_outline + inner], across[most_outline + inner] = e_points[k], e_tangents[k]
             inner += 1
         passed += 1
     return points, across, runs, outline, inner, length

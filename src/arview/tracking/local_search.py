@@ -32,9 +32,11 @@ from arview.tracking.quality import (
     VERIFIED_EVIDENCE,
     VERIFIED_JUDGEMENT,
     VERIFIED_LINES,
+    VERIFIED_STRIPS,
     Evidence,
     found_logit,
 )
+from arview.tracking.strips import Strips
 from arview.tracking.templates import ShownLines, choose_apart
 from arview.tracking.threads import pool
 from arview.tracking.tracker import NEAR_STAGES, SETTLING_STAGES, Stage, Tracker, TrackerOptions
@@ -108,6 +110,7 @@ class Hypothesis:
         judgement: of the networks for refined poses, see `judge`.
         verification: of the `verifier`, once it has looked at it.
         line_support: what the line network sees along its lines, see there; once verified.
+        strips: what the picture right across its outline says, see `Strips`; once verified.
         lines: distinct lines that its view shows.
         radius_px: half the part's diameter in the picture.
     """
@@ -119,6 +122,7 @@ class Hypothesis:
     radius_px: float
     verification: float | None = None
     line_support: float = 0.0
+    strips: float = 0.0
 
     @property
     def own_logit(self) -> float:
@@ -135,7 +139,8 @@ class Hypothesis:
         """For comparing the hypotheses of one picture, either all verified or none."""
         if self.verification is not None:
             others = VERIFIED_EVIDENCE * self.own_logit + VERIFIED_JUDGEMENT * self.judgement
-            return self.verification + others + VERIFIED_LINES * self.line_support
+            seen = VERIFIED_LINES * self.line_support + VERIFIED_STRIPS * self.strips
+            return self.verification + others + seen
         return EVIDENCE_WEIGHT * self.own_logit + self.judgement
 
 
@@ -188,6 +193,7 @@ class LocalSearch:
         self._line_network = LineNetwork()
         self._denoiser = Denoiser()
         self._verifier = Verifier(self.tracker.part)
+        self._strips = Strips(self.tracker.part)
         self._shown_lines = ShownLines(views)
 
     def picture(self, image: NDArray[np.uint8]) -> Picture:
@@ -276,18 +282,20 @@ class LocalSearch:
         return self.ordered(finished, 5.0, o.verified)
 
     def verified(self, picture: Picture, found: list[Hypothesis]) -> list[Hypothesis]:
-        """Refined poses after shading was heard, too, and the verifier has looked at them; in the same order."""
+        """Refined poses, in the same order, after shading was heard and verifier and strips have looked at them."""
         if not found:
             return []
         if self.tracker.part.is_curved:
             found = self._shaded(picture, found)
         known = np.array([(h.own_logit, h.judgement, h.evidence.scatter_px) for h in found])
-        scores = self._verifier.scores(picture, np.stack([h.cam_from_body for h in found]), known)
+        poses = np.stack([h.cam_from_body for h in found])
+        scores = self._verifier.scores(picture, poses, known).tolist()
+        strips = self._strips.scores(picture, poses).tolist()
         seen, part, step_mm = picture.lines(), self.tracker.part.arrays, 0.01 * self.views.diameter_mm
-        supports = (line_support(seen.answers, part, h.cam_from_body, seen.intrinsics, step_mm) for h in found)
+        supports = [line_support(seen.answers, part, pose, seen.intrinsics, step_mm) for pose in poses]
         return [
-            replace(h, verification=score, line_support=float(support))
-            for h, score, support in zip(found, scores.tolist(), supports, strict=True)
+            replace(h, verification=score, line_support=float(support), strips=across)
+            for h, score, support, across in zip(found, scores, supports, strips, strict=True)
         ]
 
     def _shaded(self, picture: Picture, found: list[Hypothesis]) -> list[Hypothesis]:

@@ -93,11 +93,12 @@ EVIDENCE_WEIGHT = 0.82
 VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES = 0.67, 0.48, 4.5
 """Of evidence, judge, and what the line network sees along a pose's lines, beside what the verifier says: fitted as
 above on 761 pictures of 53 random solids in which right and wrong poses compete."""
+VERIFIED_STRIPS = 0.6
 LEAST_VERIFIED = -4.0
 """Less than this the verifier does not say: on materials that it does not know it denies right poses, too."""
 FOUND_LINES = 6.2
-FOUND_WEIGHTS = (0.60, 0.49, 0.25, 0.39, 0.48, 1.04)
-FOUND_BIAS = -6.0
+FOUND_WEIGHTS = (0.29, 0.15, 0.02, 0.31, 0.27, 0.57, 1.06)
+FOUND_BIAS = -4.5
 """For the probability, in which lines count so much beside the verifier: logistic regression with weights that may not
 be negative, on the best hypotheses of the search in 809 pictures where these were right and in 659 without the part,
 of the same solids, many in crowds of others, half of them before cut-out things on photos, and on 257 frames of the
@@ -130,14 +131,14 @@ def found_logit(evidence: Evidence, lines: float, radius_px: float) -> float:
     return LOGIT_BIAS + _weighted(LOGIT_WEIGHTS, found_features(evidence, lines, radius_px))
 
 
-def found_terms(seen: float, own_logit: float, judgement: float, leads: Leads) -> tuple[float, ...]:
+def found_terms(seen: float, own_logit: float, judgement: float, strips: float, leads: Leads) -> tuple[float, ...]:
     """What speaks for the best hypothesis of a picture, for `found_probability`."""
     here, elsewhere = min(leads.here, LARGEST_HERE), min(leads.elsewhere, LARGEST_ELSEWHERE)
     is_alone = float(min(leads.here, leads.elsewhere) >= LARGEST_HERE)
-    return seen, own_logit, judgement, here, elsewhere, is_alone
+    return seen, own_logit, judgement, strips, here, elsewhere, is_alone
 
 
-def found_probability(seen: float, own_logit: float, judgement: float, leads: Leads) -> float:
+def found_probability(seen: float, own_logit: float, judgement: float, strips: float, leads: Leads) -> float:
     """Probability that the best hypothesis of a picture is right.
 
     Args:
@@ -145,9 +146,10 @@ def found_probability(seen: float, own_logit: float, judgement: float, leads: Le
             two are the surer ones.
         own_logit: see `found_logit`.
         judgement: see `judge`.
+        strips: see `Strips`.
         leads: over other hypotheses.
     """
-    total = FOUND_BIAS + _weighted(FOUND_WEIGHTS, found_terms(seen, own_logit, judgement, leads))
+    total = FOUND_BIAS + _weighted(FOUND_WEIGHTS, found_terms(seen, own_logit, judgement, strips, leads))
     return 1.0 / (1.0 + math.exp(-min(max(total, -50.0), 50.0)))
 
 

@@ -1,8 +1,8 @@
-"""Small networks that score looks: a picture around something beside what the CAD says is there.
+"""Small networks that score looks: a picture around or along something beside what the CAD says is there.
 
-The verifier and the component network are of this kind. A look may be scored in mirrors, too: neither form is truer,
-and where they differ it is chance, of which the mean has less (Krizhevsky et al., NIPS 2012, average over forms of a
-picture). ``tools/score_networks.py`` makes and writes such networks.
+The verifier, the network of strips and the component network are of this kind. A look may be scored in mirrors, too:
+neither form is truer, and where they differ it is chance, of which the mean has less (Krizhevsky et al., NIPS 2012,
+average over forms of a picture). ``tools/score_networks.py`` makes and writes such networks.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MOST_AT_ONCE = 8
 """Looks that a network is given together."""
 
 Look = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""What a network is shown (C,S,S), and what else it is told (G,)."""
+"""What a network is shown (C,H,W), and what else it is told (G,)."""
 
 
 class ScoreNetwork:
