@@ -30,7 +30,7 @@ OTHERS = (1.0, VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES)
 RATE, DECAY = 2e-3, 2e-2
 UNSURE = 0.3
 """Share of pictures in which the line network sees less, and as many in which it sees less of solids."""
-HELD_OUT = 6
+HELD_OUT = 8
 """Every so manieth solid is not fitted to, but for telling how well others are told."""
 FALSE_SHARES = (0.0, 0.01, 0.02, 0.05)
 """Shares of false alarms to say the found ones for."""

@@ -30,7 +30,7 @@ from arview.tracking.quality import Leads, found_probability
 from arview.tracking.threads import pool
 from arview.tracking.why_not import Rejected
 
-SURE_QUALITY = 0.75
+SURE_QUALITY = 0.6
 """So much is wanted of a quick search alone: with few rivals looked at, a lead says less. Of 450 semi-synthetic frames
 it is right in 9 and wrong in 6 of those in which it ends at 0.5 to 0.7."""
 ALIKE_ASIDE, ALIKE_ALONG, ALIKE_DEG = 0.12, 0.15, 20.0

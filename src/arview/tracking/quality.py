@@ -93,18 +93,12 @@ EVIDENCE_WEIGHT = 0.82
 VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES = 0.67, 0.48, 4.5
 """Of evidence, judge, and what the line network sees along a pose's lines, beside what the verifier says: fitted as
 above on 761 pictures of 53 random solids in which right and wrong poses compete."""
-VERIFIED_STRIPS = 0.6
+VERIFIED_STRIPS = 1.0
 LEAST_VERIFIED = -4.0
 """Less than this the verifier does not say: on materials that it does not know it denies right poses, too."""
 FOUND_LINES = 6.2
-FOUND_WEIGHTS = (0.29, 0.15, 0.02, 0.31, 0.27, 0.57, 1.06)
-FOUND_BIAS = -4.5
-"""For the probability, in which lines count so much beside the verifier: logistic regression with weights that may not
-be negative, on the best hypotheses of the search in 809 pictures where these were right and in 659 without the part,
-of the same solids, many in crowds of others, half of them before cut-out things on photos, and on 257 frames of the
-recordings and 495 photos of others, each recording as much as 100 pictures.
-The bias is 0.5 lower than fitted, for line network and verifier have been fitted anew since: every right one of 233
-recorded frames is told still, and of 495 photos without the part 11 are taken for it instead of 16."""
+FOUND_WEIGHTS = (0.40, 0.25, 0.10, 0.40, 0.20, 0.50, 1.00)
+FOUND_BIAS = -4.9
 LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
 """Larger leads say no more."""
 
