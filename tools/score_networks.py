@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,22 @@ def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...],
             return self.together(torch.cat([hidden.mean((2, 3)), hidden.amax((2, 3)), both], 1))[:, 0]
 
     return _Network()
+
+
+def telling_loss(scores: Any, truth: Sequence[Any], listwise_weight: float, torch: Any) -> Any:
+    """Loss of scores (N,) for telling right from wrong in all pictures, and the right one of each from its others.
+
+    Args:
+        scores: of the poses of some pictures, one after the other.
+        truth: of each picture which of its poses (bool) are right.
+        listwise_weight: of the latter beside the former, for each picture.
+        torch: the module.
+    """
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(scores, torch.cat(list(truth)).float())
+    for some, right in zip(scores.split([len(part) for part in truth]), truth, strict=True):
+        if right.any():
+            loss = loss + listwise_weight * (some.logsumexp(0) - some[right].logsumexp(0))
+    return loss
 
 
 def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) -> None:

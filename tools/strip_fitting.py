@@ -1,4 +1,9 @@
-"""Fitting the network that looks at strips to examples."""
+"""Fitting the network that looks at strips to examples.
+
+It is fitted to tell right poses by what it sees alone, and at once to say what is missing beside all that is known: by
+the second alone it learned little, for the rest tells most. On 204 solids 14 epochs are enough: 11 more tell other
+solids' poses better and those of the recordings, of real materials, worse.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +18,7 @@ from numpy.typing import NDArray
 from arview.tracking.quality import VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES
 from arview.tracking.strips import CHANNELS, COLUMNS, GLOBALS, OUTLINE_ROWS, ROWS, shown
 from judge_examples import read_examples
-from score_networks import go_on_from, score_network, write_network
+from score_networks import go_on_from, score_network, telling_loss, write_network
 from strip_examples import Stripped
 from widening import GONE_ON, in_use, torch_with_onnx
 
@@ -73,7 +78,6 @@ def _fit(network: Any, examples: Sequence[Stripped], epochs: int, rate: float, t
     optimiser = torch.optim.AdamW(weights, rate, weight_decay=DECAY)
     steps = max(1, len(examples) // PICTURES)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps, pct_start=0.05)
-    functional = torch.nn.functional
     for epoch in range(epochs):
         order, losses = rng.permutation(len(examples)), []
         for k in range(steps):
@@ -85,12 +89,9 @@ def _fit(network: Any, examples: Sequence[Stripped], epochs: int, rate: float, t
             with torch.autocast("cpu", torch.bfloat16):
                 found = network(seen.contiguous(memory_format=torch.channels_last), told)
             alone = found.float()
-            loss = 0.0
-            for all_scores in (alone, alone + others(known)[:, 0]):
-                loss = loss + functional.binary_cross_entropy_with_logits(all_scores, torch.cat(truth).float())
-                for scores, right in zip(all_scores.split([len(part) for part in truth]), truth, strict=True):
-                    if right.any():
-                        loss = loss + LISTWISE_WEIGHT / PICTURES * (scores.logsumexp(0) - scores[right].logsumexp(0))
+            beside = alone + others(known)[:, 0]
+            weight = LISTWISE_WEIGHT / PICTURES
+            loss = telling_loss(alone, truth, weight, torch) + telling_loss(beside, truth, weight, torch)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

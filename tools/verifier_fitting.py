@@ -24,7 +24,7 @@ from arview.tracking.verifier import (
 )
 from component_examples import Looked
 from judge_examples import Looks, read_examples
-from score_networks import go_on_from, score_network, write_network
+from score_networks import go_on_from, score_network, telling_loss, write_network
 from widening import GONE_ON, in_use, torch_with_onnx
 
 WIDTHS = (24, 24, 48, 48, 96, 128)
@@ -78,7 +78,6 @@ def _fit(network: Any, looks: Sequence[Looks], epochs: int, rate: float, torch: 
     optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=DECAY)
     steps = max(1, len(looks) // PICTURES)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps, pct_start=0.05)
-    functional = torch.nn.functional
     for epoch in range(epochs):
         order, losses = rng.permutation(len(looks)), []
         for k in range(steps):
@@ -88,11 +87,7 @@ def _fit(network: Any, looks: Sequence[Looks], epochs: int, rate: float, torch: 
             truth = [torch.from_numpy(looks[i].is_right[index]) for i, index in chosen]
             with torch.autocast("cpu", torch.bfloat16):
                 found = network(seen.contiguous(memory_format=torch.channels_last), both)
-            found = found.float()
-            loss = functional.binary_cross_entropy_with_logits(found, torch.cat(truth).float())
-            for scores, right in zip(found.split([len(part) for part in truth]), truth, strict=True):
-                if right.any():
-                    loss = loss + LISTWISE_WEIGHT / PICTURES * (scores.logsumexp(0) - scores[right].logsumexp(0))
+            loss = telling_loss(found.float(), truth, LISTWISE_WEIGHT / PICTURES, torch)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
