@@ -13,7 +13,7 @@ from arview.tracking.component_network import GLOBALS, SIDE_PX, overall
 from arview.tracking.verifier import CHANNELS, LINES
 from component_examples import Looked
 from judge_examples import read_examples
-from score_networks import go_on_from, score_network, write_network
+from score_networks import fit, go_on_from, score_network, scored, write_network
 from verifier_fitting import network_input
 from widening import GONE_ON, in_use, torch_with_onnx
 
@@ -63,26 +63,16 @@ def _fit(network: Any, examples: Sequence[Looked], epochs: int, rate: float, tor
     network.train().to(memory_format=torch.channels_last)
     places = [(one, k) for one in examples for k in range(len(one.is_wrong))]
     share = float(np.mean([one.is_wrong[k] for one, k in places]))
-    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=DECAY)
-    steps = max(1, len(places) // BATCH)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps, pct_start=0.05)
-    for epoch in range(epochs):
-        order, losses = rng.permutation(len(places)), []
-        for k in range(steps):
-            chosen = [places[i] for i in order[k * BATCH : (k + 1) * BATCH]]
-            shown = [_inputs(one, [index], rng) for one, index in chosen]
-            seen, both = (torch.from_numpy(np.concatenate([part[n] for part in shown])) for n in range(2))
-            wrong = torch.tensor([float(one.is_wrong[index]) for one, index in chosen])
-            weight = torch.where(wrong > 0, 0.5 / share, 0.5 / (1.0 - share))
-            with torch.autocast("cpu", torch.bfloat16):
-                found = network(seen.contiguous(memory_format=torch.channels_last), both)
-            loss = torch.nn.functional.binary_cross_entropy_with_logits(found.float(), wrong, weight)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            losses.append(loss.item())
-        print(f"components, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
+
+    def loss_of(some: NDArray[np.intp]) -> Any:
+        chosen = [places[i] for i in some]
+        seen, both = map(np.concatenate, zip(*(_inputs(one, [index], rng) for one, index in chosen), strict=True))
+        wrong = torch.tensor([float(one.is_wrong[index]) for one, index in chosen])
+        weight = torch.where(wrong > 0, 0.5 / share, 0.5 / (1.0 - share))
+        found = scored(network, seen, both, torch)
+        return torch.nn.functional.binary_cross_entropy_with_logits(found, wrong, weight)
+
+    fit("components", network.parameters(), (len(places), BATCH, epochs), rate, DECAY, loss_of, rng, torch)
 
 
 def _inputs(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,51 @@ def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...],
             return self.together(torch.cat([hidden.mean((2, 3)), hidden.amax((2, 3)), both], 1))[:, 0]
 
     return _Network()
+
+
+def fit(
+    name: str,
+    weights: Iterable[Any],
+    steps: tuple[int, int, int],
+    rate: float,
+    decay: float,
+    loss_of: Callable[[NDArray[np.intp]], Any],
+    rng: np.random.Generator,
+    torch: Any,
+) -> None:
+    """Bring a loss down by weights, and say after each epoch how far.
+
+    Args:
+        name: to say of what.
+        weights: of the network, and of what else is fitted.
+        steps: examples, how many of them a step takes, and how often each is taken.
+        rate, decay: the highest rate, reached soon and gone at the end; of the weights.
+        loss_of: of some examples, by their numbers.
+        rng: orders them.
+        torch: the module.
+    """
+    count, at_once, epochs = steps
+    weights = list(weights)
+    optimiser = torch.optim.AdamW(weights, rate, weight_decay=decay)
+    each = max(1, count // at_once)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * each, pct_start=0.05)
+    for epoch in range(epochs):
+        order, losses = rng.permutation(count), []
+        for k in range(each):
+            loss = loss_of(order[k * at_once : (k + 1) * at_once])
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            losses.append(loss.item())
+        print(f"{name}, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
+
+
+def scored(network: Any, seen: NDArray[np.float32], told: NDArray[np.float32], torch: Any) -> Any:
+    """Scores (N,) of looks while a network is fitted, in half precision."""
+    with torch.autocast("cpu", torch.bfloat16):
+        found = network(torch.from_numpy(seen).contiguous(memory_format=torch.channels_last), torch.from_numpy(told))
+    return found.float()
 
 
 def telling_loss(scores: Any, truth: Sequence[Any], listwise_weight: float, torch: Any) -> Any:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from arview.tracking.quality import VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES
 from arview.tracking.strips import CHANNELS, COLUMNS, GLOBALS, OUTLINE_ROWS, ROWS, shown
 from judge_examples import read_examples
-from score_networks import go_on_from, score_network, telling_loss, write_network
+from score_networks import fit, go_on_from, score_network, scored, telling_loss, write_network
 from strip_examples import Stripped
 from widening import GONE_ON, in_use, torch_with_onnx
 
@@ -74,30 +74,18 @@ def _fit(network: Any, examples: Sequence[Stripped], epochs: int, rate: float, t
         others.weight.copy_(torch.tensor([OTHERS]))
         others.bias.zero_()
     network.train().to(memory_format=torch.channels_last)
+
+    def loss_of(some: NDArray[np.intp]) -> Any:
+        chosen = [(examples[i], _chosen(examples[i], rng)) for i in some]
+        seen, told = map(np.concatenate, zip(*(_inputs(one, index, rng) for one, index in chosen), strict=True))
+        known = torch.from_numpy(np.concatenate([one.known[index] for one, index in chosen]).astype(np.float32))
+        truth = [torch.from_numpy(one.is_right[index]) for one, index in chosen]
+        alone = scored(network, seen, told, torch)
+        beside = alone + others(known)[:, 0]
+        return sum(telling_loss(scores, truth, LISTWISE_WEIGHT / PICTURES, torch) for scores in (alone, beside))
+
     weights = [*network.parameters(), *others.parameters()]
-    optimiser = torch.optim.AdamW(weights, rate, weight_decay=DECAY)
-    steps = max(1, len(examples) // PICTURES)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps, pct_start=0.05)
-    for epoch in range(epochs):
-        order, losses = rng.permutation(len(examples)), []
-        for k in range(steps):
-            chosen = [(examples[i], _chosen(examples[i], rng)) for i in order[k * PICTURES : (k + 1) * PICTURES]]
-            inputs = [_inputs(one, index, rng) for one, index in chosen]
-            seen, told = (torch.from_numpy(np.concatenate([part[n] for part in inputs])) for n in range(2))
-            known = torch.from_numpy(np.concatenate([one.known[index] for one, index in chosen]).astype(np.float32))
-            truth = [torch.from_numpy(one.is_right[index]) for one, index in chosen]
-            with torch.autocast("cpu", torch.bfloat16):
-                found = network(seen.contiguous(memory_format=torch.channels_last), told)
-            alone = found.float()
-            beside = alone + others(known)[:, 0]
-            weight = LISTWISE_WEIGHT / PICTURES
-            loss = telling_loss(alone, truth, weight, torch) + telling_loss(beside, truth, weight, torch)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            losses.append(loss.item())
-        print(f"strips, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
+    fit("strips", weights, (len(examples), PICTURES, epochs), rate, DECAY, loss_of, rng, torch)
 
 
 def _chosen(one: Stripped, rng: np.random.Generator) -> list[int]:

@@ -24,7 +24,7 @@ from arview.tracking.verifier import (
 )
 from component_examples import Looked
 from judge_examples import Looks, read_examples
-from score_networks import go_on_from, score_network, telling_loss, write_network
+from score_networks import fit, go_on_from, score_network, scored, telling_loss, write_network
 from widening import GONE_ON, in_use, torch_with_onnx
 
 WIDTHS = (24, 24, 48, 48, 96, 128)
@@ -75,25 +75,14 @@ def fit_verifier(folder: Path, epochs: int, is_anew: bool = True) -> None:
 def _fit(network: Any, looks: Sequence[Looks], epochs: int, rate: float, torch: Any) -> None:
     rng = np.random.default_rng(0)
     network.train().to(memory_format=torch.channels_last)
-    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=DECAY)
-    steps = max(1, len(looks) // PICTURES)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps, pct_start=0.05)
-    for epoch in range(epochs):
-        order, losses = rng.permutation(len(looks)), []
-        for k in range(steps):
-            chosen = [(i, _chosen(looks[i], rng)) for i in order[k * PICTURES : (k + 1) * PICTURES]]
-            shown = [_inputs(looks[i], index, rng) for i, index in chosen]
-            seen, both = (torch.from_numpy(np.concatenate([part[n] for part in shown])) for n in range(2))
-            truth = [torch.from_numpy(looks[i].is_right[index]) for i, index in chosen]
-            with torch.autocast("cpu", torch.bfloat16):
-                found = network(seen.contiguous(memory_format=torch.channels_last), both)
-            loss = telling_loss(found.float(), truth, LISTWISE_WEIGHT / PICTURES, torch)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            losses.append(loss.item())
-        print(f"verifier, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
+
+    def loss_of(some: NDArray[np.intp]) -> Any:
+        chosen = [(looks[i], _chosen(looks[i], rng)) for i in some]
+        seen, both = map(np.concatenate, zip(*(_inputs(look, index, rng) for look, index in chosen), strict=True))
+        truth = [torch.from_numpy(look.is_right[index]) for look, index in chosen]
+        return telling_loss(scored(network, seen, both, torch), truth, LISTWISE_WEIGHT / PICTURES, torch)
+
+    fit("verifier", network.parameters(), (len(looks), PICTURES, epochs), rate, DECAY, loss_of, rng, torch)
 
 
 def _chosen(look: Looks, rng: np.random.Generator) -> list[int]:
