@@ -250,11 +250,11 @@ def test_a_small_part_and_a_close_rival_are_doubted_and_a_pose_a_little_aside_is
     def quality(distance_mm: float, rival_aside_mm: float | None, turn_deg: float) -> float:
         pose = pose_from(30, 40, distance_mm)
         radius_px = detector().local.tracker.radius_px(pose)
-        hypotheses = [Hypothesis(pose, evidence, 4.0, 8.0, radius_px, verification=1.0)]
+        hypotheses = [Hypothesis(pose, evidence, 4.0, 8.0, radius_px, verification=1.0, strips=1.0)]
         if rival_aside_mm is not None:
             other = pose_from(30 + turn_deg, 40, distance_mm)
             other[0, 3] += rival_aside_mm
-            hypotheses.append(Hypothesis(other, weaker, 4.0, 8.0, radius_px, verification=1.0))
+            hypotheses.append(Hypothesis(other, weaker, 4.0, 8.0, radius_px, verification=1.0, strips=1.0))
         return detector().qualities(hypotheses)[0]
 
     alone = quality(500.0, None, 0.0)

@@ -243,13 +243,14 @@ class Detector:
             [best, *self.local.verified(picture, self.local.finished(picture, starts)), *rivals], 5.0
         )
         first = rivals[0]
-        near = [h for h in rivals[1:] if h.logit > first.logit - LEAD]
+        near = [h for h in rivals[1:] if h.logit_without_strips > first.logit_without_strips - LEAD]
         rivals = [first, *(h for h in near if self._is_turned(h, first, self.turns, ALIKE_DEG))]
         seen = pool().map(lambda h: self.local.tracker.edge_steps(picture.gray, h.cam_from_body), rivals)
         steps = {id(h): one for h, one in zip(rivals, seen, strict=True)}
 
         def ahead(a: Hypothesis, b: Hypothesis) -> float:
-            return telling(steps[id(a)], steps[id(b)]) + LEAD_TELLS * (a.logit - b.logit)
+            lead = a.logit_without_strips - b.logit_without_strips
+            return telling(steps[id(a)], steps[id(b)]) + LEAD_TELLS * lead
 
         best = first
         for rival in rivals[1:]:

@@ -138,10 +138,14 @@ class Hypothesis:
     def logit(self) -> float:
         """For comparing the hypotheses of one picture, either all verified or none."""
         if self.verification is not None:
-            others = VERIFIED_EVIDENCE * self.own_logit + VERIFIED_JUDGEMENT * self.judgement
-            seen = VERIFIED_LINES * self.line_support + VERIFIED_STRIPS * self.strips
-            return self.verification + others + seen
+            return self.logit_without_strips + VERIFIED_STRIPS * self.strips
         return EVIDENCE_WEIGHT * self.own_logit + self.judgement
+
+    @property
+    def logit_without_strips(self) -> float:
+        """The same of a verified one, for comparing twins: their outlines are the same, what differs is chance."""
+        others = VERIFIED_EVIDENCE * self.own_logit + VERIFIED_JUDGEMENT * self.judgement
+        return (self.verification or 0.0) + others + VERIFIED_LINES * self.line_support
 
 
 @dataclass(frozen=True)
