@@ -302,9 +302,16 @@ def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
 
 
 def told(
-    detector: Detector, poses: Array, truth: Array, near: tuple[float, float], apart: tuple[float, float], share: float
+    detector: Detector,
+    poses: Array,
+    truth: Array | None,
+    near: tuple[float, float],
+    apart: tuple[float, float],
+    share: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which poses are right, and of which that is known."""
+    """Which poses are right, and of which that is known: none and all where the part is not in the picture."""
+    if truth is None:
+        return np.zeros(len(poses), dtype=bool), np.ones(len(poses), dtype=bool)
     angle_deg, place = (share * limit for limit in near)
     right = is_near(detector, poses, truth, detector.same_turns, angle_deg, place)
     right |= is_alike(detector, poses, truth, place, SAME)
@@ -329,9 +336,7 @@ def _looks(
     known = np.zeros((len(poses), 3))
     known[: len(refined)] = [(h.own_logit, h.judgement, h.evidence.scatter_px) for h in refined] or np.empty((0, 3))
     is_refined = np.arange(len(poses)) < len(refined)
-    right, is_told = np.zeros(len(poses), bool), np.ones(len(poses), bool)
-    if truth is not None:
-        right, is_told = told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
+    right, is_told = told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
     index = np.flatnonzero(is_told & (poses[:, 2, 3] > 0))
     if not len(index):
         return

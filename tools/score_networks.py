@@ -74,7 +74,9 @@ def fit(
     weights = list(weights)
     optimiser = torch.optim.AdamW(weights, rate, weight_decay=decay)
     each = max(1, count // at_once)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * each, pct_start=0.05)
+    total = epochs * each
+    rising = max(0.05, 2.0 / total)  # of one step alone torch divides by zero
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total, pct_start=min(rising, 1.0))
     for epoch in range(epochs):
         order, losses = rng.permutation(count), []
         for k in range(each):

@@ -34,7 +34,6 @@ class Stripped:
         known: (N,4) verification, logit of the evidence, judgement, support by lines.
         is_right, is_told: (N,) bool: right, and that it is known whether so.
         is_given: (N,) bool: found from the true pose, not by the search.
-        rivalry: (N,N) int8 `Rivalry` of each with each.
         has_part: the part is in the picture.
     """
 
@@ -45,7 +44,6 @@ class Stripped:
     is_right: NDArray[np.bool_]
     is_told: NDArray[np.bool_]
     is_given: NDArray[np.bool_]
-    rivalry: NDArray[np.int8]
     has_part: bool
 
 
@@ -70,9 +68,7 @@ def strips_of(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
     if not both:
         return None
     poses = np.stack([h.cam_from_body for h in both])
-    right, is_told = np.zeros(len(both), bool), np.ones(len(both), bool)
-    if truth is not None:
-        right, is_told = told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
+    right, is_told = told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
     return Stripped(
         seed,
         np.stack([raw_strips(picture, local.tracker.part, pose) for pose in poses]),
@@ -81,6 +77,5 @@ def strips_of(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
         right,
         is_told,
         np.arange(len(both)) >= len(found),
-        np.array([[detector.rivalry(a, b) for b in both] for a in both], dtype=np.int8),
         truth is not None,
     )

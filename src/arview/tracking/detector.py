@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +39,6 @@ LEAD_TELLS = 0.4
 ahead of all in 45 with it, in 40 without; of 25 pictures of near-symmetric random solids in 7 and 3."""
 HERE_ASIDE, HERE_ALONG = 0.35, 0.25
 """Rivals this near are at the same place."""
-
-
-class Rivalry(IntEnum):
-    """Where a hypothesis stands to another: the same badly settled, for another pose at its place, or elsewhere."""
-
-    NONE = 0
-    HERE = 1
-    ELSEWHERE = 2
 
 
 @dataclass(frozen=True)
@@ -205,24 +196,21 @@ class Detector:
 
     def leads(self, best: Hypothesis, others: list[Hypothesis]) -> Leads:
         """Leads of a hypothesis over others for other poses; one a little aside of it is the same, badly settled."""
-        best_of = dict.fromkeys(Rivalry, -math.inf)
-        for other in others:
-            kind = self.rivalry(best, other)
-            best_of[kind] = max(best_of[kind], other.logit)
-        return Leads(best.logit - best_of[Rivalry.HERE], best.logit - best_of[Rivalry.ELSEWHERE])
-
-    def rivalry(self, best: Hypothesis, other: Hypothesis) -> Rivalry:
-        """Whether another hypothesis speaks against one, and where."""
+        here = elsewhere = -math.inf
         place = best.cam_from_body[:3, 3]
         distance_mm = float(np.linalg.norm(place))
-        offset = other.cam_from_body[:3, 3] - place
-        along_mm = abs(float(offset @ place)) / distance_mm
-        aside = math.sqrt(max(float(offset @ offset) - along_mm**2, 0.0)) / self.views.diameter_mm
-        is_alike = self._is_turned(best, other, self.turns, ALIKE_DEG)
-        if aside < ALIKE_ASIDE and along_mm < ALIKE_ALONG * distance_mm and is_alike:
-            return Rivalry.NONE
-        is_here = aside < HERE_ASIDE and along_mm < HERE_ALONG * distance_mm
-        return Rivalry.HERE if is_here else Rivalry.ELSEWHERE
+        for other in others:
+            offset = other.cam_from_body[:3, 3] - place
+            along_mm = abs(float(offset @ place)) / distance_mm
+            aside = math.sqrt(max(float(offset @ offset) - along_mm**2, 0.0)) / self.views.diameter_mm
+            is_alike = self._is_turned(best, other, self.turns, ALIKE_DEG)
+            if aside < ALIKE_ASIDE and along_mm < ALIKE_ALONG * distance_mm and is_alike:
+                continue
+            if aside < HERE_ASIDE and along_mm < HERE_ALONG * distance_mm:
+                here = max(here, other.logit)
+            else:
+                elsewhere = max(elsewhere, other.logit)
+        return Leads(best.logit - here, best.logit - elsewhere)
 
     def _in_model(self, hypothesis: Hypothesis) -> Array:
         return np.asarray(hypothesis.cam_from_body @ self.local.tracker.part.body_from_model)

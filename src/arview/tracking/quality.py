@@ -106,7 +106,7 @@ be negative, on the best hypotheses of the search in 412 pictures of those 26 so
 without the part, many in crowds of others, half of them before cut-out things on photos, and on 100 frames of the
 recordings and 99 photos of others, which count twice. It depends on how much the weights are held back: what is in use
 lies between two such fits, with more of the judge, who knows printed things better. As fitted the bias would be 2
-higher: all but one of 259 recorded frames are told still, and of 1,001 pictures without the part 8 are taken for it
+higher: 257 of 259 recorded frames are found and told still, and of 1,001 pictures without the part 8 are taken for it
 instead of more than 40."""
 LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
 """Larger leads say no more."""

@@ -23,6 +23,7 @@ from arview.tracking.score_network import Look, ScoreNetwork
 from arview.tracking.solver import project_lines
 from arview.tracking.threads import pool
 from arview.tracking.tracker import PartView
+from arview.tracking.verifier import relative_colours, size_and_contrast
 
 OUTLINE_ROWS, INNER_ROWS = 96, 48
 """Lines at most across the outline, and across design edges inside."""
@@ -37,10 +38,8 @@ CHANNELS = RAW + 2
 relative to the mean step; 1 in the rows of design edges."""
 GLOBALS = 3
 """The part's size in the picture, the contrast of the strips, the share of rows in the picture."""
-LEAST_CONTRAST, LEAST_STEP = 6.0, 1.0
-"""Grey levels added to the deviation, and to the mean step, that colours and steps are divided by."""
-TYPICAL_RADIUS_PX, TYPICAL_CONTRAST = 80.0, 40.0
-"""Half diameters and contrasts count relative to these."""
+LEAST_STEP = 1.0
+"""Grey levels added to the mean step, relative to which steps count."""
 
 
 class Strips:
@@ -127,39 +126,26 @@ def _cut(colours, answers, part, pose, intrinsics, step_mm, strips):  # type: ig
 def _shown(strips):  # type: ignore[no-untyped-def]
     """What the network is shown (CHANNELS, ROWS, COLUMNS) float32, the contrast, and the share of rows seen."""
     out = np.zeros((CHANNELS, ROWS, COLUMNS), dtype=np.float32)
-    sums = np.zeros(3)
-    count, seen = 1.0, 0
+    contrast = relative_colours(strips[:4].transpose(1, 2, 0), out)
+    count, seen, total = 1, 0, 0.0
     for row in range(ROWS):
         seen += 1 if strips[3, row, COLUMNS // 2] > 0 else 0
         for column in range(COLUMNS):
-            if strips[3, row, column] > 0:
-                count += 1.0
-                for c in range(3):
-                    sums[c] += strips[c, row, column]
-    square, total = 0.0, 0.0
-    for row in range(ROWS):
-        for column in range(COLUMNS):
             if strips[3, row, column] == 0:
                 continue
-            out[3, row, column] = 1.0
+            count += 1
             for c in range(4, RAW):
                 out[c, row, column] = np.float32(strips[c, row, column]) / np.float32(255.0)
             out[RAW + 1, row, column] = 1.0 if row >= OUTLINE_ROWS else 0.0
-            step = 0.0
-            for c in range(3):
-                value = strips[c, row, column] - sums[c] / count
-                out[c, row, column] = value
-                square += value * value
-                if 0 < column < COLUMNS - 1 and strips[3, row, column - 1] > 0 and strips[3, row, column + 1] > 0:
+            if 0 < column < COLUMNS - 1 and strips[3, row, column - 1] > 0 and strips[3, row, column + 1] > 0:
+                step = 0.0
+                for c in range(3):
                     step = max(step, abs(float(strips[c, row, column + 1]) - float(strips[c, row, column - 1])))
-            out[RAW, row, column] = step
-            total += step
-    contrast = np.sqrt(square / (3.0 * count) + 1e-6)
+                out[RAW, row, column] = step
+                total += step
     mean = np.float32(total / count + LEAST_STEP)
     for row in range(ROWS):
         for column in range(COLUMNS):
-            for c in range(3):
-                out[c, row, column] /= np.float32(contrast + LEAST_CONTRAST)
             out[RAW, row, column] /= out[RAW, row, column] + mean
     return out, contrast, seen / ROWS
 
@@ -167,5 +153,4 @@ def _shown(strips):  # type: ignore[no-untyped-def]
 def shown(strips: NDArray[np.uint8], radius_px: float) -> Look:
     """What the network is shown of raw strips, and told: see CHANNELS and GLOBALS."""
     seen, contrast, share = _shown(strips)
-    told = [np.log(radius_px / TYPICAL_RADIUS_PX), 0.5 * np.log(contrast / TYPICAL_CONTRAST + 0.05), share]
-    return seen, np.array(told, dtype=np.float32)
+    return seen, np.array([*size_and_contrast(radius_px, contrast), share], dtype=np.float32)

@@ -168,9 +168,18 @@ def lines_around(answers, shrunk, zoom, shift, outline):  # type: ignore[no-unty
 @njit(cache=True, nogil=True, fastmath=True)
 def contrasted(pixels, drawn):  # type: ignore[no-untyped-def]
     """A raw look with colours less their mean, in units of their deviation (PLAIN,S,S), and that deviation."""
-    rows, columns = pixels.shape[:2]
-    plain = np.zeros((PLAIN, rows, columns), dtype=np.float32)
+    plain = np.zeros((PLAIN, *pixels.shape[:2]), dtype=np.float32)
     plain[4:] = drawn
+    return plain, relative_colours(pixels, plain)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def relative_colours(pixels, plain):  # type: ignore[no-untyped-def]
+    """Write colours (H,W,4) less their mean in units of their deviation, which it returns; 1 where the 4th is not 0.
+
+    ``plain`` (4 or more,H,W) float32 is 0 there before.
+    """
+    rows, columns = pixels.shape[:2]
     sums = np.zeros(3)
     count = 1.0
     for v in range(rows):
@@ -190,7 +199,7 @@ def contrasted(pixels, drawn):  # type: ignore[no-untyped-def]
                     square += value * value
     contrast = np.sqrt(square / (3.0 * count) + 1e-6)
     plain[:3] /= np.float32(contrast + LEAST_CONTRAST)
-    return plain, contrast
+    return contrast
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -297,8 +306,13 @@ def _slope_at(plane, v, u, slope):  # type: ignore[no-untyped-def]
 
 def overall(radius_px: float, contrast: float, known: Array, explained: float) -> NDArray[np.float32]:
     """What the network is told of a pose as a whole (GLOBALS,): see there."""
-    both = [np.log(radius_px / TYPICAL_RADIUS_PX), 0.5 * np.log(contrast / TYPICAL_CONTRAST + 0.05)]
+    both = size_and_contrast(radius_px, contrast)
     return np.concatenate([both, (known - MEANS) / DEVIATIONS, [explained]]).astype(np.float32)
+
+
+def size_and_contrast(radius_px: float, contrast: float) -> tuple[float, float]:
+    """Of a part in the picture and of the look at it, as networks are told: logarithms against typical ones."""
+    return np.log(radius_px / TYPICAL_RADIUS_PX), 0.5 * np.log(contrast / TYPICAL_CONTRAST + 0.05)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
