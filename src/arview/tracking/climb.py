@@ -12,6 +12,7 @@ from numba import njit
 
 from arview.tracking.matching import best_shift, collect_points
 from arview.tracking.refine import nearest_view
+from arview.tracking.templates import FIRST_POINTS, SECTORS, SPARED_SHARE, least_pair
 
 
 @njit(cache=True, nogil=True)
@@ -107,8 +108,13 @@ def climb(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def outline_score(maps, points, angles, roll, radius_px, nearness, x0, y0, shift_px, shift_step, room, sums):  # type: ignore[no-untyped-def]
-    """Mean response 0–1 of an outline (N,3), (N,) at a roll, size and place, and the best shift dx, dy in px."""
+def outline_score(  # type: ignore[no-untyped-def]
+    maps, points, angles, roll, radius_px, nearness, x0, y0, shift_px, shift_step, is_sparing, room, sums, sectors
+):  # fmt: skip
+    """Mean response 0–1 of an outline (N,3), (N,) at a roll, size and place, and the best shift dx, dy in px.
+
+    ``is_sparing`` as in `match_templates`.
+    """
     a, b = np.float32(radius_px * np.cos(roll)), np.float32(radius_px * np.sin(roll))
     turn = int(np.round(roll * (256.0 / np.pi))) + 16
     left, top = np.float32(x0 + 0.5), np.float32(y0 + 0.5)
@@ -118,14 +124,36 @@ def outline_score(maps, points, angles, roll, radius_px, nearness, x0, y0, shift
         room[0, i] = int(np.floor(a * x - b * y + left))
         room[1, i] = int(np.floor(b * x + a * y + top))
         room[2, i] = ((angles[i] + turn) >> 5) & 7
-    best, dx, dy = best_shift(maps, room, points.shape[0], shift_px, shift_step, sums)
-    return best / (255.0 * points.shape[0]), dx, dy
+    count = points.shape[0]
+    best, dx, dy = best_shift(maps, room, count, shift_px, shift_step, sums)
+    if not is_sparing:
+        return best / (255.0 * count), dx, dy
+    return _sum_but_a_pair(maps, room, count, dx, dy, sectors) / (255.0 * count * (1.0 - SPARED_SHARE)), dx, dy
+
+
+@njit(cache=True, nogil=True)
+def _sum_but_a_pair(maps, room, count, dx, dy, sums):  # type: ignore[no-untyped-def]
+    """Sum of the responses under the points of an outline at a shift, but of the pair of sectors with the least."""
+    height, width = maps.shape[1], maps.shape[2]
+    each = FIRST_POINTS // SECTORS
+    others = (count - FIRST_POINTS) // SECTORS
+    total = 0
+    for sector in range(SECTORS):
+        one = 0
+        for k in range(each + others):
+            i = sector * each + k if k < each else FIRST_POINTS + sector * others + k - each
+            x, y = room[0, i] + dx, room[1, i] + dy
+            if 0 <= x < width and 0 <= y < height:
+                one += np.int64(maps[room[2, i], y, x])
+        sums[sector] = one
+        total += one
+    return total - least_pair(sums)
 
 
 @njit(cache=True, nogil=True)
 def climb_outlines(  # type: ignore[no-untyped-def]
     maps, points, angles, neighbours, turns, views, rolls, radii_px, places, focal_px, roll_step_rad, stretch_step,
-    rounds, shift_px, shift_step
+    rounds, shift_px, shift_step, is_sparing
 ):  # fmt: skip
     """Improve matches of outlines, each by itself, in the picture: view, roll, size and place.
 
@@ -139,6 +167,7 @@ def climb_outlines(  # type: ignore[no-untyped-def]
         roll_step_rad, stretch_step: steps of the roll and, as a share, of the size.
         rounds: over all steps.
         shift_px, shift_step: shifts of ± shift_px are tried.
+        is_sparing: see `match_templates`.
 
     Returns:
         scores (M,) 0–1, views (M,), rolls (M,), radii_px (M,), places (M,2).
@@ -146,6 +175,7 @@ def climb_outlines(  # type: ignore[no-untyped-def]
     steps = 2 * (shift_px // shift_step) + 1
     sums = np.empty((steps, steps), dtype=np.int32)
     room = np.empty((3, points.shape[1]), dtype=np.int64)
+    sectors = np.empty(SECTORS, dtype=np.int64)
     scores = np.empty(len(views))
     views, rolls, radii_px, places = views.copy(), rolls.copy(), radii_px.copy(), places.copy()
     count = neighbours.shape[1]
@@ -153,7 +183,7 @@ def climb_outlines(  # type: ignore[no-untyped-def]
         view, roll, radius = views[n], rolls[n], radii_px[n]
         best, dx, dy = outline_score(
             maps, points[view], angles[view], roll, radius, radius / focal_px, places[n, 0], places[n, 1],
-            shift_px, shift_step, room, sums,
+            shift_px, shift_step, is_sparing, room, sums, sectors,
         )  # fmt: skip
         x, y = places[n, 0] + dx, places[n, 1] + dy
         for _ in range(rounds):
@@ -168,7 +198,20 @@ def climb_outlines(  # type: ignore[no-untyped-def]
                     v = neighbours[view, step - 4]
                     r += turns[view, step - 4]
                 score, dx, dy = outline_score(
-                    maps, points[v], angles[v], r, s, s / focal_px, x, y, shift_px, shift_step, room, sums
+                    maps,
+                    points[v],
+                    angles[v],
+                    r,
+                    s,
+                    s / focal_px,
+                    x,
+                    y,
+                    shift_px,
+                    shift_step,
+                    is_sparing,
+                    room,
+                    sums,
+                    sectors,
                 )
                 if score > best:
                     best = score

@@ -92,6 +92,7 @@ class Effort:
         starts: of these, how many poses are searched around.
         kept: hypotheses left after each level of that search.
         scale_step: templates are matched at one of so many scales.
+        is_sparing: a quarter of the outline does not count, that of which the least is seen.
     """
 
     matches: int
@@ -100,10 +101,11 @@ class Effort:
     starts: int
     kept: tuple[int, ...]
     scale_step: int
+    is_sparing: bool
 
 
-QUICK = Effort(400, 200, 100, 16, (6, 4), 2)
-WIDE = Effort(2500, 1400, 700, 160, (60, 20), 1)
+QUICK = Effort(400, 200, 100, 16, (6, 4), 2, False)
+WIDE = Effort(2500, 1400, 700, 160, (60, 20), 1, True)
 """For clutter, in which thousands of wrong matches come before the right one."""
 
 
@@ -263,7 +265,7 @@ class FirstSearch:
         kept = ALIKE * -(-effort.matches // (self._groups * len(scales)))
         levels = list(zip(scales, phases, strict=True))
         jobs = [(*level, first, last) for level in levels for first, last in pairwise(halves)]
-        found = pool().map(lambda job: self._match(votes[job[0]], kept, picture, *job), jobs)
+        found = pool().map(lambda job: self._match(votes[job[0]], kept, effort.is_sparing, picture, *job), jobs)
         raw = [m for m in found if m is not None]
         if not raw:
             return NOTHING_LIKELY
@@ -271,8 +273,8 @@ class FirstSearch:
         if not len(matches.keys):
             return NOTHING_LIKELY
         for growth in GROWTHS[:-1]:
-            matches = self._improved(picture, matches, growth)
-        matches = self._improved(picture, matches.best(effort.improved), GROWTHS[-1])
+            matches = self._improved(picture, matches, growth, effort.is_sparing)
+        matches = self._improved(picture, matches.best(effort.improved), GROWTHS[-1], effort.is_sparing)
         if not len(matches.keys):
             return NOTHING_LIKELY
         matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.looked_at)
@@ -284,6 +286,7 @@ class FirstSearch:
         self,
         votes: NDArray[np.int64],
         kept: int,
+        is_sparing: bool,
         picture: Picture,
         step: int,
         phases: NDArray[np.uint8],
@@ -296,7 +299,7 @@ class FirstSearch:
         if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
             return None
         keys, templates, places = match_templates(
-            phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, LOWEST_SCORE, votes
+            phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, LOWEST_SCORE, votes, is_sparing
         )
         return Matches(
             keys, np.full(len(keys), step), bank.views[templates], bank.rolls[templates],
@@ -344,7 +347,7 @@ class FirstSearch:
         rank[by_group] = np.arange(len(first)) - np.repeat(starts, counts)
         return matches.of(first[np.argsort(rank, kind="stable")[:most]])
 
-    def _improved(self, picture: Picture, matches: Matches, growth: Growth) -> Matches:
+    def _improved(self, picture: Picture, matches: Matches, growth: Growth, is_sparing: bool) -> Matches:
         """The matches improved each by itself, on larger maps; those that leave the declared distances are dropped."""
         if not len(matches.keys):
             return matches
@@ -366,7 +369,7 @@ class FirstSearch:
             scores, views, rolls, radii, places = climb_outlines(
                 maps, shapes.points, shapes.angles, around.views, around.turns, some.views, some.rolls,
                 some.radii_px * scale, places, focal_px, growth.roll_step_rad, growth.stretch_step, GROWTH_ROUNDS,
-                SHIFT_PX, SHIFT_PX,
+                SHIFT_PX, SHIFT_PX, is_sparing,
             )  # fmt: skip
             keys = weighed(scores, shapes.lines[views])
             improved = Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)

@@ -30,6 +30,9 @@ from arview.tracking.solver import project_lines
 
 FIRST_POINTS = 32
 """So many points of a template are looked at everywhere, the others only where these bode well."""
+SECTORS = 8
+"""Of an outline, about its middle, equally many points in each. Two side by side may be spared."""
+SPARED_SHARE = 2.0 / SECTORS
 FIRST_MARGIN = 0.035
 """The mean of the first points may be so much lower than the score asked for."""
 TILE = 1024
@@ -66,7 +69,7 @@ class Outlines:
 
     Attributes:
         points: (V,N,3) float32 of outline and design edges, in halves of the part's diameter about its centre, in
-            the axes of the camera.
+            the axes of the camera; the first `FIRST_POINTS` sector by sector, then the others.
         angles: (V,N) uint8 of their normals, 256 to the half turn.
         rotations: (V,3,3) of ``cam_from_body``.
         lines: (V,) distinct lines shown.
@@ -116,8 +119,6 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> O
     """
     focal = 1000.0
     intrinsics = np.array([focal, focal, 0.0, 0.0, 0, 0, 0, 0, 0, 0])
-    # One order for all in which every beginning is spread over the whole.
-    order = np.random.default_rng(0).permutation(points)
     rows: list[tuple[Array, Array, Array, Array]] = []
     for index in _nearest_views(views, OUTLINE_SUBDIVISIONS):
         view = views.view(int(index))
@@ -133,6 +134,7 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> O
         body[depths <= 0], normals[depths <= 0] = body[depths > 0][0], normals[depths > 0][0]
         shown = body @ cam_from_body[:3, :3].T / (0.5 * views.diameter_mm)
         angles = np.arctan2(normals[:, 1], normals[:, 0]) / np.pi
+        order = _by_sector(shown)
         rows.append((shown[order], angles[order], cam_from_body[:3, :3], views.directions[index]))
     if not rows:
         raise InputError("guide views: no view shows an outline; check the model and the declared distances")
@@ -148,6 +150,25 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> O
         near=Neighbours(near, rolls_between(rotations[near], rotations[:, None])),
         far=Neighbours(far, rolls_between(rotations[far], rotations[:, None])),
     )
+
+
+def _by_sector(shown: Array) -> NDArray[np.intp]:
+    """An order of points (N,2+): some of each of the sectors about the middle, spread over it, then the others."""
+    middle = shown[:, :2].mean(axis=0)
+    turn = np.argsort(np.arctan2(shown[:, 1] - middle[1], shown[:, 0] - middle[0]), kind="stable")
+    sectors = turn.reshape(SECTORS, -1)
+    mixed = sectors[:, np.random.default_rng(0).permutation(sectors.shape[1])]
+    first = FIRST_POINTS // SECTORS
+    return np.concatenate([mixed[:, :first].ravel(), mixed[:, first:].ravel()])
+
+
+@njit(cache=True, nogil=True)
+def least_pair(sums):  # type: ignore[no-untyped-def]
+    """The least that two sectors side by side have of the sums (SECTORS,) of all."""
+    least = sums[SECTORS - 1] + sums[0]
+    for sector in range(1, SECTORS):
+        least = min(least, sums[sector - 1] + sums[sector])
+    return least
 
 
 class ShownLines:
@@ -276,6 +297,25 @@ def _add_points(total, flat, source, shift, start, size, first, last):  # type: 
 
 
 @njit(cache=True, nogil=True)
+def _add_but_a_pair(total, own, least, flat, source, shift, start, size):  # type: ignore[no-untyped-def]
+    """Add the responses under the first points, but those of the pair of sectors that have the least."""
+    each = FIRST_POINTS // SECTORS
+    for sector in range(SECTORS):
+        one = own[sector]
+        one[:size] = 0
+        _add_points(one, flat, source, shift, start, size, sector * each, (sector + 1) * each)
+        for k in range(size):
+            total[k] += one[k]
+    least[:size] = 65535
+    for sector in range(SECTORS):
+        one, two = own[sector - 1], own[sector]
+        for k in range(size):
+            least[k] = min(least[k], np.uint16(one[k] + two[k]))
+    for k in range(size):
+        total[k] -= least[k]
+
+
+@njit(cache=True, nogil=True)
 def _bar(votes, kept):  # type: ignore[no-untyped-def]
     """The key that about ``kept`` of the matches counted in ``votes`` (1024,) reach."""
     above = 0
@@ -294,7 +334,9 @@ def _still_in(keys, groups, found, votes, kept):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def match_templates(phases, offsets, bins, gains, groups, first_template, last_template, kept, lowest, votes):  # type: ignore[no-untyped-def]
+def match_templates(
+    phases, offsets, bins, gains, groups, first_template, last_template, kept, lowest, votes, is_sparing
+):  # type: ignore[no-untyped-def]
     """The matches that stand out most, of each group of templates.
 
     Args:
@@ -305,6 +347,7 @@ def match_templates(phases, offsets, bins, gains, groups, first_template, last_t
         lowest: mean response below which a match is noise.
         votes: (GROUPS, 1024) int64, how many matches of a group have a key of so many `KEY_STEP`, over all calls that
             share it.
+        is_sparing: the two sectors side by side with the least do not count: something may hide them.
 
     Returns:
         keys (M,) by which matches compare, templates (M,), places (M,2) of the offsets' origin in full pixels.
@@ -321,8 +364,14 @@ def match_templates(phases, offsets, bins, gains, groups, first_template, last_t
     templates = np.empty(room, dtype=np.int32)
     cells = np.empty(room, dtype=np.int32)
     found = 0
-    full = 63.0 * points
-    first_full = 63.0 * FIRST_POINTS
+    own = np.empty((SECTORS, TILE), dtype=np.uint16)
+    least = np.empty(TILE, dtype=np.uint16)
+    sums = np.empty(SECTORS, dtype=np.int64)
+    each = FIRST_POINTS // SECTORS
+    others = (points - FIRST_POINTS) // SECTORS
+    counted = 1.0 - SPARED_SHARE if is_sparing else 1.0
+    full = 63.0 * points * counted
+    first_full = 63.0 * FIRST_POINTS * counted
     for t in range(first_template, last_template):
         reach_x = 0
         reach_y = 0
@@ -340,16 +389,19 @@ def match_templates(phases, offsets, bins, gains, groups, first_template, last_t
         for start in range(0, span, TILE):
             size = min(TILE, span - start)
             total[start : start + size] = 0
-            _add_points(total[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
+            if is_sparing:
+                _add_but_a_pair(total[start : start + size], own, least, flat, source, shift, start, size)
+            else:
+                _add_points(total[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
         # What this template scores anywhere in this picture.
         count = 0
-        sums = np.uint64(0)
+        anywhere = np.uint64(0)
         for start in range(0, span, SAMPLE_EVERY):
             size = min(SAMPLE, span - start)
             for k in range(start, start + size):
-                sums += np.uint64(total[k])
+                anywhere += np.uint64(total[k])
             count += size
-        usual = USUAL_SHARE * sums / (count * first_full)
+        usual = USUAL_SHARE * anywhere / (count * first_full)
         gain = gains[t]
         asked = max(lowest, usual + _bar(votes[groups[t]], kept) / gain)
         if asked > 1.0:
@@ -373,10 +425,16 @@ def match_templates(phases, offsets, bins, gains, groups, first_template, last_t
                     k + columns < span and total[k + columns] >= value
                 ):
                     continue
-                sum_all = np.int64(value)
-                for i in range(FIRST_POINTS, points):
-                    sum_all += np.int64(flat[source[i], shift[i] + k])
-                share = sum_all / full
+                sum_all = 0
+                for sector in range(SECTORS):
+                    one = 0
+                    for i in range(sector * each, (sector + 1) * each):
+                        one += np.int64(flat[source[i], shift[i] + k])
+                    for i in range(FIRST_POINTS + sector * others, FIRST_POINTS + (sector + 1) * others):
+                        one += np.int64(flat[source[i], shift[i] + k])
+                    sums[sector] = one
+                    sum_all += one
+                share = (sum_all - least_pair(sums)) / full if is_sparing else sum_all / full
                 if share < asked:
                     continue
                 if found == room:
