@@ -137,9 +137,9 @@ def _sum_but_a_pair(maps, room, count, dx, dy, sums):  # type: ignore[no-untyped
     height, width = maps.shape[1], maps.shape[2]
     each = FIRST_POINTS // SECTORS
     others = (count - FIRST_POINTS) // SECTORS
-    total = 0
+    total = np.int64(0)
     for sector in range(SECTORS):
-        one = 0
+        one = np.int64(0)
         for k in range(each + others):
             i = sector * each + k if k < each else FIRST_POINTS + sector * others + k - each
             x, y = room[0, i] + dx, room[1, i] + dy

@@ -106,7 +106,8 @@ class Effort:
 
 QUICK = Effort(400, 200, 100, 16, (6, 4), 2, False)
 WIDE = Effort(2500, 1400, 700, 160, (60, 20), 1, True)
-"""For clutter, in which thousands of wrong matches come before the right one."""
+"""For clutter, in which thousands of wrong matches come before the right one, and for what is partly hidden: of three
+parts behind things, 75 frames, a right pose is among the likely ones in 64 if a quarter is spared, in 55 if not."""
 
 
 @dataclass(frozen=True)

@@ -334,9 +334,9 @@ def _still_in(keys, groups, found, votes, kept):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def match_templates(
+def match_templates(  # type: ignore[no-untyped-def]
     phases, offsets, bins, gains, groups, first_template, last_template, kept, lowest, votes, is_sparing
-):  # type: ignore[no-untyped-def]
+):
     """The matches that stand out most, of each group of templates.
 
     Args:
@@ -425,9 +425,9 @@ def match_templates(
                     k + columns < span and total[k + columns] >= value
                 ):
                     continue
-                sum_all = 0
+                sum_all = np.int64(0)
                 for sector in range(SECTORS):
-                    one = 0
+                    one = np.int64(0)
                     for i in range(sector * each, (sector + 1) * each):
                         one += np.int64(flat[source[i], shift[i] + k])
                     for i in range(FIRST_POINTS + sector * others, FIRST_POINTS + (sector + 1) * others):

@@ -1,0 +1,60 @@
+"""A wide search does not count the quarter of an outline that is seen least."""
+
+import numpy as np
+import pytest
+
+from arview.tracking.climb import outline_score
+from arview.tracking.templates import FIRST_POINTS, SECTORS, _by_sector, least_pair
+
+RADIUS_PX = 40.0
+
+
+def ring(points: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """A circle's points in the order of outlines, and their angles, 256 to the half turn."""
+    turn = 2.0 * np.pi * (np.arange(points) + 0.5) / points
+    shown = np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)
+    order = _by_sector(shown)
+    return shown[order].astype(np.float32), (np.round(turn[order] / np.pi * 256.0).astype(int) % 256).astype(np.uint8)
+
+
+def score(hidden_deg: tuple[float, float], is_sparing: bool) -> float:
+    """Of a ring on maps that answer everywhere but in one stretch of directions about its middle."""
+    points, angles = ring()
+    y, x = np.mgrid[:128, :128] - 63.5
+    turn = np.rad2deg(np.arctan2(y, x)) % 360.0
+    seen = ~((hidden_deg[0] <= turn) & (turn < hidden_deg[1]))
+    maps = np.repeat((255 * seen).astype(np.uint8)[None], 8, axis=0)
+    sums = np.empty((1, 1), dtype=np.int32)
+    room = np.empty((3, len(points)), dtype=np.int64)
+    sectors = np.empty(SECTORS, dtype=np.int64)
+    found, dx, dy = outline_score(
+        maps, points, angles, 0.0, RADIUS_PX, 0.0, 63.5, 63.5, 0, 2, is_sparing, room, sums, sectors
+    )
+    assert (dx, dy) == (0, 0)
+    return float(found)
+
+
+def test_sectors_are_stretches_side_by_side() -> None:
+    points, _ = ring()
+    turn = np.rad2deg(np.arctan2(points[:, 1], points[:, 0]))
+    each = FIRST_POINTS // SECTORS
+    for sector in range(SECTORS):
+        first = turn[sector * each : (sector + 1) * each]
+        others = turn[FIRST_POINTS + sector * each : FIRST_POINTS + (sector + 1) * each]
+        assert np.ptp(np.concatenate([first, others])) < 360.0 / SECTORS
+
+
+def test_the_least_pair_may_lie_across_the_end() -> None:
+    assert least_pair(np.array([1, 9, 9, 9, 5, 5, 9, 2])) == 3
+    assert least_pair(np.array([9, 9, 1, 0, 9, 9, 9, 2])) == 1
+
+
+@pytest.mark.parametrize("start_deg", [0.0, 45.0, 135.0, 270.0])
+def test_a_hidden_quarter_costs_nothing_when_spared(start_deg: float) -> None:
+    hidden = (start_deg, start_deg + 90.0)
+    assert score(hidden, True) == pytest.approx(1.0, abs=0.05)
+    assert score(hidden, False) == pytest.approx(0.75, abs=0.05)
+
+
+def test_a_hidden_half_does() -> None:
+    assert score((0.0, 180.0), True) == pytest.approx(2.0 / 3.0, abs=0.05)
