@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from arview.tracking.climb import outline_score
-from arview.tracking.templates import FIRST_POINTS, SECTORS, _by_sector, least_pair
+from arview.tracking.templates import SECTORS, by_sector, least_pair, sector_of
 
 RADIUS_PX = 40.0
 
@@ -13,7 +13,7 @@ def ring(points: int = 64) -> tuple[np.ndarray, np.ndarray]:
     """A circle's points in the order of outlines, and their angles, 256 to the half turn."""
     turn = 2.0 * np.pi * (np.arange(points) + 0.5) / points
     shown = np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)
-    order = _by_sector(shown)
+    order = by_sector(shown)
     return shown[order].astype(np.float32), (np.round(turn[order] / np.pi * 256.0).astype(int) % 256).astype(np.uint8)
 
 
@@ -37,11 +37,10 @@ def score(hidden_deg: tuple[float, float], is_sparing: bool) -> float:
 def test_sectors_are_stretches_side_by_side() -> None:
     points, _ = ring()
     turn = np.rad2deg(np.arctan2(points[:, 1], points[:, 0]))
-    each = FIRST_POINTS // SECTORS
+    sectors = np.array([sector_of(place) for place in range(len(points))])
     for sector in range(SECTORS):
-        first = turn[sector * each : (sector + 1) * each]
-        others = turn[FIRST_POINTS + sector * each : FIRST_POINTS + (sector + 1) * each]
-        assert np.ptp(np.concatenate([first, others])) < 360.0 / SECTORS
+        assert np.count_nonzero(sectors == sector) == len(points) // SECTORS
+        assert np.ptp(turn[sectors == sector]) < 360.0 / SECTORS
 
 
 def test_the_least_pair_may_lie_across_the_end() -> None:

@@ -12,7 +12,7 @@ from numba import njit
 
 from arview.tracking.matching import best_shift, collect_points
 from arview.tracking.refine import nearest_view
-from arview.tracking.templates import FIRST_POINTS, SECTORS, SPARED_SHARE, least_pair
+from arview.tracking.templates import SECTORS, SPARED_SHARE, least_pair, sector_of
 
 
 @njit(cache=True, nogil=True)
@@ -135,19 +135,12 @@ def outline_score(  # type: ignore[no-untyped-def]
 def _sum_but_a_pair(maps, room, count, dx, dy, sums):  # type: ignore[no-untyped-def]
     """Sum of the responses under the points of an outline at a shift, but of the pair of sectors with the least."""
     height, width = maps.shape[1], maps.shape[2]
-    each = FIRST_POINTS // SECTORS
-    others = (count - FIRST_POINTS) // SECTORS
-    total = np.int64(0)
-    for sector in range(SECTORS):
-        one = np.int64(0)
-        for k in range(each + others):
-            i = sector * each + k if k < each else FIRST_POINTS + sector * others + k - each
-            x, y = room[0, i] + dx, room[1, i] + dy
-            if 0 <= x < width and 0 <= y < height:
-                one += np.int64(maps[room[2, i], y, x])
-        sums[sector] = one
-        total += one
-    return total - least_pair(sums)
+    sums[:] = 0
+    for i in range(count):
+        x, y = room[0, i] + dx, room[1, i] + dy
+        if 0 <= x < width and 0 <= y < height:
+            sums[sector_of(i)] += np.int64(maps[room[2, i], y, x])
+    return np.sum(sums) - least_pair(sums)
 
 
 @njit(cache=True, nogil=True)
@@ -198,21 +191,9 @@ def climb_outlines(  # type: ignore[no-untyped-def]
                     v = neighbours[view, step - 4]
                     r += turns[view, step - 4]
                 score, dx, dy = outline_score(
-                    maps,
-                    points[v],
-                    angles[v],
-                    r,
-                    s,
-                    s / focal_px,
-                    x,
-                    y,
-                    shift_px,
-                    shift_step,
-                    is_sparing,
-                    room,
-                    sums,
+                    maps, points[v], angles[v], r, s, s / focal_px, x, y, shift_px, shift_step, is_sparing, room, sums,
                     sectors,
-                )
+                )  # fmt: skip
                 if score > best:
                     best = score
                     view, roll, radius = v, r, s

@@ -36,7 +36,7 @@ from arview.tracking.threads import pool
 from arview.tracking.tracker import PartView
 
 POINTS = 64
-"""Points of an outline, a multiple of 4."""
+"""Points of an outline, a multiple of `FIRST_POINTS`, see `by_sector`."""
 GRID_PX = 4
 """Places that templates are matched at are so far apart."""
 LARGEST_SCALE = 1.5

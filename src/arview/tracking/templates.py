@@ -69,7 +69,7 @@ class Outlines:
 
     Attributes:
         points: (V,N,3) float32 of outline and design edges, in halves of the part's diameter about its centre, in
-            the axes of the camera; the first `FIRST_POINTS` sector by sector, then the others.
+            the axes of the camera; in the order `by_sector`.
         angles: (V,N) uint8 of their normals, 256 to the half turn.
         rotations: (V,3,3) of ``cam_from_body``.
         lines: (V,) distinct lines shown.
@@ -134,7 +134,7 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> O
         body[depths <= 0], normals[depths <= 0] = body[depths > 0][0], normals[depths > 0][0]
         shown = body @ cam_from_body[:3, :3].T / (0.5 * views.diameter_mm)
         angles = np.arctan2(normals[:, 1], normals[:, 0]) / np.pi
-        order = _by_sector(shown)
+        order = by_sector(shown)
         rows.append((shown[order], angles[order], cam_from_body[:3, :3], views.directions[index]))
     if not rows:
         raise InputError("guide views: no view shows an outline; check the model and the declared distances")
@@ -152,14 +152,22 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> O
     )
 
 
-def _by_sector(shown: Array) -> NDArray[np.intp]:
-    """An order of points (N,2+): some of each of the sectors about the middle, spread over it, then the others."""
+def by_sector(shown: Array) -> NDArray[np.intp]:
+    """An order of points (N,2+), N a multiple of `FIRST_POINTS`: of each so many, some of one sector after another.
+
+    Sectors lie about the middle; a point's is `sector_of` its place in the order.
+    """
     middle = shown[:, :2].mean(axis=0)
     turn = np.argsort(np.arctan2(shown[:, 1] - middle[1], shown[:, 0] - middle[0]), kind="stable")
     sectors = turn.reshape(SECTORS, -1)
     mixed = sectors[:, np.random.default_rng(0).permutation(sectors.shape[1])]
-    first = FIRST_POINTS // SECTORS
-    return np.concatenate([mixed[:, :first].ravel(), mixed[:, first:].ravel()])
+    return mixed.reshape(SECTORS, -1, FIRST_POINTS // SECTORS).swapaxes(0, 1).ravel()
+
+
+@njit(cache=True, nogil=True)
+def sector_of(place):  # type: ignore[no-untyped-def]
+    """The sector of a point by its place in the order of outlines."""
+    return place // (FIRST_POINTS // SECTORS) % SECTORS
 
 
 @njit(cache=True, nogil=True)
@@ -367,8 +375,6 @@ def match_templates(  # type: ignore[no-untyped-def]
     own = np.empty((SECTORS, TILE), dtype=np.uint16)
     least = np.empty(TILE, dtype=np.uint16)
     sums = np.empty(SECTORS, dtype=np.int64)
-    each = FIRST_POINTS // SECTORS
-    others = (points - FIRST_POINTS) // SECTORS
     counted = 1.0 - SPARED_SHARE if is_sparing else 1.0
     full = 63.0 * points * counted
     first_full = 63.0 * FIRST_POINTS * counted
@@ -425,16 +431,16 @@ def match_templates(  # type: ignore[no-untyped-def]
                     k + columns < span and total[k + columns] >= value
                 ):
                     continue
-                sum_all = np.int64(0)
-                for sector in range(SECTORS):
-                    one = np.int64(0)
-                    for i in range(sector * each, (sector + 1) * each):
-                        one += np.int64(flat[source[i], shift[i] + k])
-                    for i in range(FIRST_POINTS + sector * others, FIRST_POINTS + (sector + 1) * others):
-                        one += np.int64(flat[source[i], shift[i] + k])
-                    sums[sector] = one
-                    sum_all += one
-                share = (sum_all - least_pair(sums)) / full if is_sparing else sum_all / full
+                if is_sparing:
+                    sums[:] = 0
+                    for i in range(points):
+                        sums[sector_of(i)] += np.int64(flat[source[i], shift[i] + k])
+                    sum_all = np.sum(sums) - least_pair(sums)
+                else:
+                    sum_all = np.int64(value)
+                    for i in range(FIRST_POINTS, points):
+                        sum_all += np.int64(flat[source[i], shift[i] + k])
+                share = sum_all / full
                 if share < asked:
                     continue
                 if found == room:
