@@ -196,3 +196,13 @@ def test_a_picture_without_the_part_moves_a_pose_little() -> None:
     pose, _, explained = shaded(blob(), noise, TRUTH)
     assert explained < 0.2
     assert np.rad2deg(rotation_angle_rad(pose, TRUTH)) < 3.0
+
+
+def test_a_pose_that_nothing_determines_stays_as_it_is() -> None:
+    surface, corners = surface_of(blob()), corners_of(blob())
+    flat = np.full((CAMERA.height, CAMERA.width), 90, dtype=np.uint8)
+    look = look_at(flat, CAMERA, blob().diameter_mm, TRUTH)
+    assert look is not None
+    pose, information, explained = shade(*look, surface, corners, blob().diameter_mm, TRUTH, np.zeros((6, 6)), GAIN)
+    np.testing.assert_array_equal(pose, TRUTH)
+    assert not information.any() and explained == -1.0

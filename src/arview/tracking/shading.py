@@ -47,6 +47,8 @@ LARGEST_TURN_RAD = 0.12
 """Of one round."""
 LEAST_DEVIATION = 1.0
 """Grey levels: nothing is explained better than this."""
+LEAST_DETERMINED = 1e-9
+"""Least information along any direction, against that along the others, with which a pose is moved."""
 
 
 CREASE_DEG = 40.0
@@ -167,7 +169,7 @@ def shade(  # type: ignore[no-untyped-def]
 
     Returns:
         ``cam_from_body`` (4,4) and information (6,6) with the shading's, and the share of the brightness of the
-        surface that is explained; as before, and -1, where too little of the surface is seen.
+        surface that is explained; as before, and -1, where too little of the surface is seen, or nothing determines the pose.
     """
     pose = cam_from_body.copy()
     best = information.copy()
@@ -196,6 +198,8 @@ def shade(  # type: ignore[no-untyped-def]
         motion = _motion(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_mm)
         hessian, gradient, explained = _reduced(motion, functions, values, weights, light)
         best = information + gain * hessian
+        if not _determines(best):
+            return cam_from_body.copy(), information.copy(), -1.0
         slope = np.dot(information, relative_twist(cam_from_body, pose)) + gain * gradient
         step = -np.linalg.solve(best, slope)
         turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
@@ -203,6 +207,15 @@ def shade(  # type: ignore[no-untyped-def]
             step *= LARGEST_TURN_RAD / turn
         pose = apply_twist(pose, step)
     return pose, best, explained
+
+
+@njit(cache=True, nogil=True)
+def _determines(information):  # type: ignore[no-untyped-def]
+    """Whether information (6,6) leaves no direction open, its units taken out of it."""
+    sizes = np.sqrt(np.maximum(np.diag(information), 0.0))
+    if not np.all(np.isfinite(information)) or sizes.min() == 0.0:
+        return False
+    return np.linalg.eigvalsh(information / np.outer(sizes, sizes))[0] > LEAST_DETERMINED
 
 
 @njit(cache=True, nogil=True)
