@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import trange
 
-from arview.atomic import replacing
 from arview.tracking.denoiser import SHOWN_MEAN, SHOWN_RANGE
+from layers import write_picture_network
 from line_examples import read_lined_pictures
 from line_fitting import compressed, with_flat_things
 from pyramid import pyramid
@@ -59,11 +59,7 @@ def fit_denoiser(folder: Path, epochs: int, is_anew: bool = True) -> None:
     _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, pictures[::HELD_OUT], torch)
-    with replacing(folder / "denoiser.onnx") as file:
-        torch.onnx.export(
-            network, (torch.zeros(1, 3, 480, 640),), file, input_names=["picture"], output_names=["clean"], dynamo=False
-        )
-    print(f"wrote {folder / 'denoiser.onnx'}")
+    write_picture_network(network, folder / "denoiser.onnx", "clean", torch)
 
 
 def _fit(network: Any, pictures: Sequence[NDArray[np.uint8]], epochs: int, rate: float, torch: Any) -> None:

@@ -1,8 +1,11 @@
-"""Layers that the fitted networks of convolutions are made of."""
+"""Layers that the fitted networks of convolutions are made of, and how networks of pictures are written."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
+
+from arview.atomic import replacing
 
 
 def normalised(before: int, after: int, size: int, step: int, torch: Any) -> list[Any]:
@@ -28,3 +31,14 @@ def residual(width: int, torch: Any) -> Any:
             return torch.relu(before + self.change(before))
 
     return _Residual()
+
+
+def write_picture_network(network: Any, path: Path, answer: str, torch: Any) -> None:
+    """Write a network that takes pictures (1,3,H,W) of any size, and answers at half of it."""
+    sizes = {"picture": {2: "rows", 3: "columns"}, answer: {2: "half_rows", 3: "half_columns"}}
+    with replacing(path) as file:
+        torch.onnx.export(
+            network, (torch.zeros(1, 3, 480, 640),), file, input_names=["picture"], output_names=[answer],
+            dynamic_axes=sizes, dynamo=False,
+        )  # fmt: skip
+    print(f"wrote {path}")

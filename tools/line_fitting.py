@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
 from arview.tracking.denoiser import Denoiser
 from arview.tracking.line_network import CONTRAST, SHRINK
 from arview.tracking.matching import ORIENTATIONS
-from layers import normalised, residual
+from layers import normalised, residual, write_picture_network
 from line_examples import FINE, LinedPicture, read_lined_pictures
 from pyramid import pyramid
 from widening import GONE_ON, begin_as, in_use, torch_with_onnx
@@ -68,12 +67,7 @@ def fit_lines(folder: Path, epochs: int, is_anew: bool = True) -> None:
     _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, pictures[::HELD_OUT], torch)
-    with replacing(folder / "lines.onnx") as file:
-        torch.onnx.export(
-            torch.nn.Sequential(network, torch.nn.Sigmoid()), (torch.zeros(1, 3, 512, 640),), file,
-            input_names=["picture"], output_names=["lines"], dynamo=False,
-        )  # fmt: skip
-    print(f"wrote {folder / 'lines.onnx'}")
+    write_picture_network(torch.nn.Sequential(network, torch.nn.Sigmoid()), folder / "lines.onnx", "lines", torch)
 
 
 def _fit(network: Any, pictures: list[LinedPicture], epochs: int, rate: float, torch: Any) -> None:

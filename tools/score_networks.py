@@ -141,7 +141,7 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
 
 
 def write_network(network: Any, path: Path, shape: tuple[int, int, int], told: int, torch: Any) -> None:
-    """Write a network that is shown looks of a shape (channels, rows, columns) as `cv2.dnn` reads it."""
+    """Write a network that is shown looks of a shape (channels, rows, columns), any number of them."""
     with replacing(path) as file:
         torch.onnx.export(
             network, (torch.zeros(2, *shape), torch.zeros(2, told)), file,

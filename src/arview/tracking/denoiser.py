@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.tracking.networks import extended, read_network
+from arview.tracking.networks import Network, extended
 
 CELL_PX = 8
 """The network takes pictures of multiples of this."""
@@ -54,7 +54,7 @@ class Denoiser:
     """The network; one picture at a time."""
 
     def __init__(self) -> None:
-        self._network = read_network("denoiser.onnx")
+        self._network = Network("denoiser.onnx")
 
     def cleaned(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An RGB picture (H,W,3) without its grain; the same one if it has little."""
@@ -74,8 +74,7 @@ class Denoiser:
     def _grain(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(H,W,3) grey levels of grain in a picture of multiples of `CELL_PX`."""
         mean = (SHOWN_MEAN,) * 3
-        self._network.setInput(cv2.dnn.blobFromImage(image, 1.0 / SHOWN_RANGE, mean=mean))
-        said = self._network.forward()[0]
+        said = self._network(picture=cv2.dnn.blobFromImage(image, 1.0 / SHOWN_RANGE, mean=mean))[0]
         # Each place says it of four pixels, 3 colours × 2 rows × 2 columns.
         rows, columns = said.shape[1:]
         shuffled = said.reshape(3, 2, 2, rows, columns).transpose(3, 1, 4, 2, 0).reshape(image.shape)

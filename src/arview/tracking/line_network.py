@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.tracking.matching import ORIENTATIONS
-from arview.tracking.networks import extended, read_network
+from arview.tracking.networks import Network, extended
 from arview.tracking.refine import nearest_view
 from arview.tracking.solver import project_lines
 
@@ -39,7 +39,7 @@ class LineNetwork:
     """The network; one picture at a time."""
 
     def __init__(self) -> None:
-        self._network = read_network("lines.onnx")
+        self._network = Network("lines.onnx")
 
     def lines(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """How likely each place of an RGB picture (H,W,3) is on a line of each orientation, and on a solid.
@@ -57,8 +57,8 @@ class LineNetwork:
             height, width = image.shape[:2]
         mean = sum(cv2.mean(image)[:3]) / 3.0
         image = extended(image, CELL_PX)
-        self._network.setInput(cv2.dnn.blobFromImage(image, 1.0 / CONTRAST, mean=(mean, mean, mean)))
-        seen = self._network.forward()[0, :, : -(-height // SHRINK), : -(-width // SHRINK)]
+        answers = self._network(picture=cv2.dnn.blobFromImage(image, 1.0 / CONTRAST, mean=(mean, mean, mean)))
+        seen = answers[0, :, : -(-height // SHRINK), : -(-width // SHRINK)]
         lines = seen[:INSIDE]
         around = cv2.dilate(lines.max(axis=0), np.ones((AROUND_PX, AROUND_PX), dtype=np.uint8))
         clear = np.maximum(CLEAR_SHARE * cv2.blur(around, (AROUND_PX // 2, AROUND_PX // 2)), LEAST_CLEAR)

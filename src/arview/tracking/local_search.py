@@ -209,7 +209,6 @@ class LocalSearch:
         """The same with other options and at any distance, beside which this one can be used: see `seen_by`."""
         other = copy.copy(self)
         other.options, other._reach_mm = options, (0.0, math.inf)
-        other._line_network, other._denoiser = LineNetwork(), Denoiser()
         return other
 
     def seen_by(self, camera: Camera) -> LocalSearch:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import Array
-from arview.tracking.networks import read_network
+from arview.tracking.networks import Network
 
 RIGHTWARD, DOWNWARD = 6, 7
 """Channels with the parts of the surface's normal to the right and down: mirrors turn them round."""
@@ -33,7 +33,7 @@ class ScoreNetwork:
     """
 
     def __init__(self, name: str, mirrors: Sequence[tuple[bool, bool]] = ((False, False),)) -> None:
-        self._network = read_network(name)
+        self._network = Network(name)
         self._mirrors = mirrors
 
     def scores(self, looks: Sequence[Look], in_mirrors: bool = True) -> Array:
@@ -44,9 +44,8 @@ class ScoreNetwork:
             some = slice(first, first + MOST_AT_ONCE)
             seen, told = map(np.stack, zip(*looks[some], strict=True))
             forms = [mirrored(seen, *mirror) for mirror in mirrors]
-            self._network.setInput(np.concatenate(forms), "seen")
-            self._network.setInput(np.concatenate([told] * len(forms)), "both")
-            scores[some] = self._network.forward().reshape(len(forms), -1).mean(axis=0)
+            answers = self._network(seen=np.concatenate(forms), both=np.concatenate([told] * len(forms)))
+            scores[some] = answers.reshape(len(forms), -1).mean(axis=0)
         return scores
 
 

@@ -169,7 +169,8 @@ def shade(  # type: ignore[no-untyped-def]
 
     Returns:
         ``cam_from_body`` (4,4) and information (6,6) with the shading's, and the share of the brightness of the
-        surface that is explained; as before, and -1, where too little of the surface is seen, or nothing determines the pose.
+        surface that is explained; as before, and -1, where too little of the surface is seen, or nothing determines
+        the pose.
     """
     pose = cam_from_body.copy()
     best = information.copy()
