@@ -18,7 +18,6 @@ from arview.evaluation.semisynthetic import frames_without_part
 from arview.geometry import Array
 from arview.tracking import Detector
 from arview.tracking.first_search import QUICK, WIDE
-from arview.tracking.quality import found_terms
 from judge_examples import ALIKE, REFINED_NEAR, is_alike, is_near, pictures_of
 from photos import all_photos
 from recordings import scenes
@@ -83,8 +82,7 @@ def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Ou
         if not found:
             continue
         best = found[0]
-        leads = detector.leads(best, found[1:])
-        terms = found_terms(best.seen, best.own_logit, best.judgement, best.strips, leads)
+        terms = detector.terms(best, found[1:])
         if truth is None:
             yield Outcome(terms, False, part, weight)
             continue

@@ -25,7 +25,7 @@ from arview.tracking.components import ComponentCheck
 from arview.tracking.first_search import QUICK, WIDE, Candidate, Effort, FirstSearch, reach_mm
 from arview.tracking.local_search import Hypothesis, LocalOptions, LocalSearch
 from arview.tracking.picture import Picture
-from arview.tracking.quality import Leads, found_probability
+from arview.tracking.quality import Leads, found_probability, found_terms
 from arview.tracking.threads import pool
 from arview.tracking.why_not import Rejected
 
@@ -189,10 +189,12 @@ class Detector:
 
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
-        return [
-            found_probability(h.seen, h.own_logit, h.judgement, h.strips, self.leads(h, hypotheses[k + 1 :]))
-            for k, h in enumerate(hypotheses)
-        ]
+        return [found_probability(self.terms(h, hypotheses[k + 1 :])) for k, h in enumerate(hypotheses)]
+
+    def terms(self, best: Hypothesis, others: list[Hypothesis]) -> tuple[float, ...]:
+        """What speaks for a hypothesis before others, see `found_terms`."""
+        shown = best.lines / self.local.usual_lines
+        return found_terms(best.seen, best.own_logit, best.judgement, best.strips, self.leads(best, others), shown)
 
     def leads(self, best: Hypothesis, others: list[Hypothesis]) -> Leads:
         """Leads of a hypothesis over others for other poses; one a little aside of it is the same, badly settled."""

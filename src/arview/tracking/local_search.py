@@ -362,6 +362,11 @@ class LocalSearch:
         """Distinct lines of the view nearest to a pose."""
         return self._shown_lines.towards(-cam_from_body[:3, :3].T @ cam_from_body[:3, 3])
 
+    @property
+    def usual_lines(self) -> float:
+        """Distinct lines that the views show in the (geometric) mean."""
+        return self._shown_lines.usual
+
     def _are_in_reach(self, poses: Array) -> NDArray[np.bool_]:
         """Which poses (N,4,4) about the centre are in front of the camera and near and far enough."""
         low, high = self._reach_mm

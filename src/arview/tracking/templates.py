@@ -12,6 +12,7 @@ match must clear rises as better ones of its group are found, so that most of th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -190,7 +191,14 @@ class ShownLines:
 
     def towards(self, direction: Array) -> float:
         """Lines, at least 1, of that view of an icosphere which is nearest to a direction (3,)."""
-        index = int(self._counted[np.argmax(self._directions @ direction)])
+        return self._of(int(self._counted[np.argmax(self._directions @ direction)]))
+
+    @cached_property
+    def usual(self) -> float:
+        """Geometric mean over all of these views."""
+        return float(np.exp(np.mean(np.log([self._of(int(index)) for index in self._counted]))))
+
+    def _of(self, index: int) -> float:
         if index not in self._known:
             self._known[index] = max(view_lines(self._views.view(index), self._views.diameter_mm), 1.0)
         return self._known[index]
