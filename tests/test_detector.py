@@ -243,25 +243,27 @@ def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
     assert telling(steps(shared[:30], 0.6), steps(shared[:30], 0.0)) == 0.0
 
 
-def test_a_small_part_and_a_close_rival_are_doubted_and_a_pose_a_little_aside_is_no_rival() -> None:
+def test_a_small_part_a_plain_view_and_a_close_rival_are_doubted_and_a_pose_a_little_aside_is_no_rival() -> None:
     evidence = Evidence(0.6, 0.6, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
     weaker = Evidence(0.58, 0.58, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
 
-    def quality(distance_mm: float, rival_aside_mm: float | None, turn_deg: float) -> float:
-        pose = pose_from(30, 40, distance_mm)
+    def quality(distance_mm: float, rival_aside_mm: float | None, turn_deg: float, share: float = 1.0) -> float:
+        pose, lines = pose_from(30, 40, distance_mm), share * detector().local.usual_lines
         radius_px = detector().local.tracker.radius_px(pose)
-        hypotheses = [Hypothesis(pose, evidence, 4.0, 8.0, radius_px, verification=1.0, strips=1.0)]
+        hypotheses = [Hypothesis(pose, evidence, 4.0, lines, radius_px, verification=1.0, strips=1.0)]
         if rival_aside_mm is not None:
             other = pose_from(30 + turn_deg, 40, distance_mm)
             other[0, 3] += rival_aside_mm
-            hypotheses.append(Hypothesis(other, weaker, 4.0, 8.0, radius_px, verification=1.0, strips=1.0))
+            hypotheses.append(Hypothesis(other, weaker, 4.0, lines, radius_px, verification=1.0, strips=1.0))
         return detector().qualities(hypotheses)[0]
 
     alone = quality(500.0, None, 0.0)
     assert alone > 0.5
     assert quality(500.0, 5.0, 8.0) == alone
     assert quality(500.0, 5.0, 60.0) < 0.5 * alone and quality(500.0, 300.0, 8.0) < 0.5 * alone
-    assert quality(2000.0, None, 0.0) < 0.5
+    assert quality(2000.0, None, 0.0) < 0.8 * alone
+    # A view that shows less than others do fits by chance.
+    assert quality(500.0, None, 0.0, 0.3) < 0.5 < alone < quality(500.0, None, 0.0, 2.0)
 
 
 def test_the_poses_of_an_ambiguous_view_say_which_others_fit() -> None:

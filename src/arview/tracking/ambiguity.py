@@ -25,9 +25,9 @@ NEAR_SHARE, EXACT_SHARE = 0.9, 0.997
 LOOKED_AT_VIEWS, LOOKED_AT_POINTS = 60, 6000
 LEAD = 3.4
 """A pose whose logit is so much higher than a twin's is the right one without a closer look."""
-TELLING = 1.0
-"""It is, too, when the edges that only it has are borne out better by so many deviations, see `telling`: of 213 pairs
-of twins in semi-synthetic frames that were so far apart one was told wrongly."""
+TELLING = 1.25
+"""It is, too, when the edges that only it has are borne out better by so many deviations, see `telling`, together with
+what else tells (see `detector`)."""
 SHARED_PX, SHARED_COS = 3.0, 0.8
 """Edges of two poses this near, and so nearly parallel, tell nothing of which is right."""
 SPACING_PX, NEIGHBOURS = 12.0, 12

@@ -99,17 +99,20 @@ not fitted; it is hardly less likely from 0.8 to 1.3."""
 LEAST_VERIFIED = -4.0
 """Less than this the verifier does not say: on materials that it does not know it denies right poses, too."""
 FOUND_LINES = 6.2
-FOUND_WEIGHTS = (0.55, 0.13, 0.07, 0.60, 0.08, 0.41, 1.35, 1.95)
-FOUND_BIAS = -4.65
+FOUND_WEIGHTS = (0.59, 0.08, 0.03, 0.59, 0.08, 0.39, 1.40, 2.57, 2.65)
+FOUND_BIAS = -4.55
 """For the probability, in which lines count so much beside the verifier: logistic regression with weights that may not
 be negative, on the best hypotheses of the search in 504 pictures of 31 other solids where these were right and in 371
 without the part, many in crowds of others; on 198 frames of the recordings and 299 photos of others, which count twice;
 and on 1,000 photos and pictures of other parts for the semi-synthetic shapes and the recorded parts, which count half.
-As fitted the bias would be 1.4 higher: of 1,001 further such pictures 13 would be taken for the part. Fitted without
-one or another recording, its part is told as often. What the view shows is the strongest term beside the verifier:
-without it 9 of these are taken for it where as much is found."""
+As fitted the bias would be 1.6 higher: of 1,001 further such pictures more than 6 would be taken for the part, with it
+none. What the view shows is the strongest term beside the verifier: without it 9 were taken for the part."""
 LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
 """Larger leads say no more."""
+MOST_SHOWN = 0.3
+"""Nor does a view that shows more lines than the usual one, by this logarithm."""
+SMALL_PX = 60.0
+"""Parts of less than this half diameter fit by chance the more often the smaller they are."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,7 @@ def found_logit(evidence: Evidence, lines: float, radius_px: float) -> float:
 
 
 def found_terms(
-    seen: float, own_logit: float, judgement: float, strips: float, leads: Leads, shown: float
+    seen: float, own_logit: float, judgement: float, strips: float, leads: Leads, shown: float, radius_px: float
 ) -> tuple[float, ...]:
     """What speaks for the best hypothesis of a picture, for `found_probability`.
 
@@ -149,10 +152,12 @@ def found_terms(
         shown: distinct lines that its view shows, against what the part's views show in the (geometric) mean. A plain
             view fits by chance where no other does: of 82 likely poses without the part half were among the plainest
             eighth of views, of 702 right ones a fourteenth.
+        radius_px: half the part's diameter in the picture.
     """
     here, elsewhere = min(leads.here, LARGEST_HERE), min(leads.elsewhere, LARGEST_ELSEWHERE)
     is_alone = float(min(leads.here, leads.elsewhere) >= LARGEST_HERE)
-    return seen, own_logit, judgement, strips, here, elsewhere, is_alone, math.log(shown)
+    rich, small = min(math.log(shown), MOST_SHOWN), min(math.log(radius_px / SMALL_PX), 0.0)
+    return seen, own_logit, judgement, strips, here, elsewhere, is_alone, rich, small
 
 
 def found_probability(terms: tuple[float, ...]) -> float:
