@@ -100,12 +100,12 @@ LEAST_VERIFIED = -4.0
 """Less than this the verifier does not say: on materials that it does not know it denies right poses, too."""
 FOUND_LINES = 6.2
 FOUND_WEIGHTS = (0.59, 0.08, 0.03, 0.59, 0.08, 0.39, 1.40, 2.57, 2.65)
-FOUND_BIAS = -4.55
+FOUND_BIAS = -4.45
 """For the probability, in which lines count so much beside the verifier: logistic regression with weights that may not
 be negative, on the best hypotheses of the search in 504 pictures of 31 other solids where these were right and in 371
 without the part, many in crowds of others; on 198 frames of the recordings and 299 photos of others, which count twice;
 and on 1,000 photos and pictures of other parts for the semi-synthetic shapes and the recorded parts, which count half.
-As fitted the bias would be 1.6 higher: of 1,001 further such pictures more than 6 would be taken for the part, with it
+As fitted the bias would be 1.5 higher: of 1,001 further such pictures more than 6 would be taken for the part, with it
 none. What the view shows is the strongest term beside the verifier: without it 9 were taken for the part."""
 LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
 """Larger leads say no more."""
