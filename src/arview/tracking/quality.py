@@ -99,18 +99,18 @@ not fitted; it is hardly less likely from 0.8 to 1.3."""
 LEAST_VERIFIED = -4.0
 """Less than this the verifier does not say: on materials that it does not know it denies right poses, too."""
 FOUND_LINES = 6.2
-FOUND_WEIGHTS = (0.59, 0.08, 0.03, 0.59, 0.08, 0.39, 1.40, 2.57, 2.65)
-FOUND_BIAS = -4.45
+FOUND_WEIGHTS = (0.59, 0.07, 0.02, 0.60, 0.09, 0.39, 1.38, 3.37, 2.63)
+FOUND_BIAS = -4.24
 """For the probability, in which lines count so much beside the verifier: logistic regression with weights that may not
 be negative, on the best hypotheses of the search in 504 pictures of 31 other solids where these were right and in 371
 without the part, many in crowds of others; on 198 frames of the recordings and 299 photos of others, which count twice;
 and on 1,000 photos and pictures of other parts for the semi-synthetic shapes and the recorded parts, which count half.
-As fitted the bias would be 1.5 higher: of 1,001 further such pictures more than 6 would be taken for the part, with it
+As fitted the bias would be 1.25 higher: of 1,001 further such pictures some ten would be taken for the part, with it
 none. What the view shows is the strongest term beside the verifier: without it 9 were taken for the part."""
 LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
 """Larger leads say no more."""
-MOST_SHOWN = 0.3
-"""Nor does a view that shows more lines than the usual one, by this logarithm."""
+LEAST_SHOWN, MOST_SHOWN = -0.5, 0.3
+"""Nor does a view that shows fewer or more lines than the usual one by these logarithms."""
 SMALL_PX = 60.0
 """Parts of less than this half diameter fit by chance the more often the smaller they are."""
 
@@ -156,7 +156,7 @@ def found_terms(
     """
     here, elsewhere = min(leads.here, LARGEST_HERE), min(leads.elsewhere, LARGEST_ELSEWHERE)
     is_alone = float(min(leads.here, leads.elsewhere) >= LARGEST_HERE)
-    rich, small = min(math.log(shown), MOST_SHOWN), min(math.log(radius_px / SMALL_PX), 0.0)
+    rich, small = min(max(math.log(shown), LEAST_SHOWN), MOST_SHOWN), min(math.log(radius_px / SMALL_PX), 0.0)
     return seen, own_logit, judgement, strips, here, elsewhere, is_alone, rich, small
 
 
