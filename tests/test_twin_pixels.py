@@ -12,6 +12,8 @@ from arview.cad import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
+from arview.tracking.ambiguity import TELLING
+from arview.tracking.detector import MOST_PIXELS_TELL, PIXELS_TELL
 from arview.tracking.picture import Picture
 from arview.tracking.tracker import PartView, Tracker, TrackerOptions
 from arview.tracking.twin_pixels import TwinPixels
@@ -60,12 +62,15 @@ def test_the_right_twin_explains_the_pixels_better(noise: float) -> None:
 
 
 def test_what_hides_the_difference_leaves_the_matter_open() -> None:
-    truth = pose_from(40.0, 50.0, 400.0, plate(10.0))
-    assert leads(10.0, truth, truth).min() > 1.0
+    truth = pose_from(40.0, 80.0, 400.0, plate(10.0))
+    seen = leads(10.0, truth, truth).min()
     part = part_of(10.0)
     flat = np.clip(np.random.default_rng(0).normal(120.0, 4.0, (CAMERA.height, CAMERA.width, 3)), 0, 255)
     pixels = TwinPixels(Picture(flat.astype(np.uint8), CAMERA, 12), part, truth @ part.model_from_body)
-    assert max(abs(pixels.lead(turn)) for turn in SIXTHS) < 0.5
+    hidden = max(abs(pixels.lead(turn)) for turn in SIXTHS)
+    assert hidden < 0.4 * seen, (hidden, seen)
+    # Whatever they say, pixels alone do not decide.
+    assert PIXELS_TELL * MOST_PIXELS_TELL < TELLING
 
 
 def test_twins_that_differ_nowhere_are_equal() -> None:
