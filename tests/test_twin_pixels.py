@@ -61,14 +61,12 @@ def test_the_right_twin_explains_the_pixels_better(noise: float) -> None:
     assert np.mean(np.array(turned) < -1.0) > 0.8 and max(turned) < 6.0, np.round(turned, 1)
 
 
-def test_what_hides_the_difference_leaves_the_matter_open() -> None:
+def test_what_hides_the_difference_decides_nothing() -> None:
     truth = pose_from(40.0, 80.0, 400.0, plate(10.0))
-    seen = leads(10.0, truth, truth).min()
     part = part_of(10.0)
     flat = np.clip(np.random.default_rng(0).normal(120.0, 4.0, (CAMERA.height, CAMERA.width, 3)), 0, 255)
     pixels = TwinPixels(Picture(flat.astype(np.uint8), CAMERA, 12), part, truth @ part.model_from_body)
-    hidden = max(abs(pixels.lead(turn)) for turn in SIXTHS)
-    assert hidden < 0.4 * seen, (hidden, seen)
+    assert max(abs(pixels.lead(turn)) for turn in SIXTHS) < MOST_PIXELS_TELL
     # Whatever they say, pixels alone do not decide.
     assert PIXELS_TELL * MOST_PIXELS_TELL < TELLING
 
