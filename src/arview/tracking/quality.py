@@ -106,7 +106,7 @@ be negative, on the best hypotheses of the search in 504 pictures of 31 other so
 without the part, many in crowds of others; on 198 frames of the recordings and 299 photos of others, which count twice;
 and on 1,000 photos and pictures of other parts for the semi-synthetic shapes and the recorded parts, which count half.
 As fitted the bias would be 1.25 higher: of 1,001 further such pictures some ten would be taken for the part, with it
-none. What the view shows is the strongest term beside the verifier: without it 9 were taken for the part."""
+one. What the view shows is the strongest term beside the verifier: without it 9 were taken for the part."""
 LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
 """Larger leads say no more."""
 LEAST_SHOWN, MOST_SHOWN = -0.5, 0.3
