@@ -25,7 +25,7 @@ SIXTHS = [Rotation.from_euler("z", angle, degrees=True).as_matrix() for angle in
 
 @cache
 def plate(key_mm: float) -> Model:
-    """A six-sided plate of 120 mm with a block of its own colour at one of its sides; none of 0 mm."""
+    """A six-sided plate of 120 mm with a block at one of its sides; none of 0 mm."""
     parts = [component("plate", post((0, 0), 60, 0, 12, 6), GREY), component("hub", post((0, 0), 24, 12, 40, 6), GREY)]
     if key_mm:
         parts.append(component("key", box((36, -0.5 * key_mm, 12), (36 + key_mm, 0.5 * key_mm, 12 + key_mm)), GREY))

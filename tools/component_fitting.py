@@ -13,7 +13,7 @@ from arview.tracking.component_network import GLOBALS, SIDE_PX, overall
 from arview.tracking.verifier import CHANNELS, LINES
 from component_examples import Looked
 from judge_examples import read_examples
-from score_networks import fit, go_on_from, score_network, scored, write_network
+from score_networks import fit, go_on_from, score_network, scored, write_score_network
 from verifier_fitting import network_input
 from widening import GONE_ON, in_use, torch_with_onnx
 
@@ -55,7 +55,7 @@ def fit_components(folder: Path, epochs: int, is_anew: bool = True) -> None:
     _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, [one for one in examples if one.solid in held_out], torch)
-    write_network(network, folder / "components.onnx", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, torch)
+    write_score_network(network, folder / "components.onnx", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, torch)
 
 
 def _fit(network: Any, examples: Sequence[Looked], epochs: int, rate: float, torch: Any) -> None:

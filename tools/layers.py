@@ -36,9 +36,25 @@ def residual(width: int, torch: Any) -> Any:
 def write_picture_network(network: Any, path: Path, answer: str, torch: Any) -> None:
     """Write a network that takes pictures (1,3,H,W) of any size, and answers at half of it."""
     sizes = {"picture": {2: "rows", 3: "columns"}, answer: {2: "half_rows", 3: "half_columns"}}
+    write_network(network, path, {"picture": torch.zeros(1, 3, 480, 640)}, answer, sizes, torch)
+
+
+def write_network(
+    network: Any, path: Path, shown: dict[str, Any], answer: str, varying: dict[str, dict[int, str]], torch: Any
+) -> None:
+    """Write a network as ONNX.
+
+    Args:
+        network: to be written.
+        path: of the file.
+        shown: an example of each of its inputs by name, in order.
+        answer: name of its output.
+        varying: names of those dimensions of inputs and output that may be others than in the example.
+        torch: the module.
+    """
     with replacing(path) as file:
         torch.onnx.export(
-            network, (torch.zeros(1, 3, 480, 640),), file, input_names=["picture"], output_names=[answer],
-            dynamic_axes=sizes, dynamo=False,
+            network, tuple(shown.values()), file, input_names=list(shown), output_names=[answer],
+            dynamic_axes=varying, dynamo=False,
         )  # fmt: skip
     print(f"wrote {path}")

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
-from layers import normalised, residual
+from layers import normalised, residual, write_network
 from widening import begin_as, beginning_as
 
 LAST_WIDTH, DROPPED = 48, 0.2
@@ -117,7 +116,7 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
 
     Args:
         network: from `score_network`.
-        path: of the one written by `write_network`.
+        path: of the one written by `write_score_network`.
         seen: (N,C,S,S) what networks are shown in fitting.
         torch: the module.
 
@@ -140,12 +139,7 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
         last.bias.copy_(last_bias)
 
 
-def write_network(network: Any, path: Path, shape: tuple[int, int, int], told: int, torch: Any) -> None:
+def write_score_network(network: Any, path: Path, shape: tuple[int, int, int], told: int, torch: Any) -> None:
     """Write a network that is shown looks of a shape (channels, rows, columns), any number of them."""
-    with replacing(path) as file:
-        torch.onnx.export(
-            network, (torch.zeros(2, *shape), torch.zeros(2, told)), file,
-            input_names=["seen", "both"], output_names=["score"], dynamo=False,
-            dynamic_axes={"seen": {0: "poses"}, "both": {0: "poses"}, "score": {0: "poses"}},
-        )  # fmt: skip
-    print(f"wrote {path}")
+    shown = {"seen": torch.zeros(2, *shape), "both": torch.zeros(2, told)}
+    write_network(network, path, shown, "score", {name: {0: "poses"} for name in (*shown, "score")}, torch)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from arview.tracking.quality import VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES
 from arview.tracking.strips import CHANNELS, COLUMNS, GLOBALS, OUTLINE_ROWS, ROWS, shown
 from judge_examples import read_examples
-from score_networks import fit, go_on_from, score_network, scored, telling_loss, write_network
+from score_networks import fit, go_on_from, score_network, scored, telling_loss, write_score_network
 from strip_examples import Stripped
 from widening import GONE_ON, in_use, torch_with_onnx
 
@@ -64,7 +64,7 @@ def fit_strips(folder: Path, epochs: int, is_anew: bool = True) -> None:
     _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, [one for one in examples if one.solid in held_out], torch)
-    write_network(network, folder / "strips.onnx", (CHANNELS, ROWS, COLUMNS), GLOBALS, torch)
+    write_score_network(network, folder / "strips.onnx", (CHANNELS, ROWS, COLUMNS), GLOBALS, torch)
 
 
 def _fit(network: Any, examples: Sequence[Stripped], epochs: int, rate: float, torch: Any) -> None:

@@ -24,7 +24,7 @@ from arview.tracking.verifier import (
 )
 from component_examples import Looked
 from judge_examples import Looks, read_examples
-from score_networks import fit, go_on_from, score_network, scored, telling_loss, write_network
+from score_networks import fit, go_on_from, score_network, scored, telling_loss, write_score_network
 from widening import GONE_ON, in_use, torch_with_onnx
 
 WIDTHS = (24, 24, 48, 48, 96, 128)
@@ -69,7 +69,7 @@ def fit_verifier(folder: Path, epochs: int, is_anew: bool = True) -> None:
     _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
     network.eval()
     _report(network, [look for look in looks if look.solid in held_out], torch)
-    write_network(network, folder / "verifier.onnx", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, torch)
+    write_score_network(network, folder / "verifier.onnx", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, torch)
 
 
 def _fit(network: Any, looks: Sequence[Looks], epochs: int, rate: float, torch: Any) -> None:

@@ -97,6 +97,15 @@ def draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_id
             drawn[3, v, u] = min(max((1.0 / inverse_depth[v, u] - place[2]) / half_mm, -1.0), 1.0)
 
 
+def differing(one: NDArray[np.float32], other: NDArray[np.float32], normal: float, depth: float) -> NDArray[np.bool_]:
+    """Which pixels of two drawings (4,H,W) by `draw_surface` show something else: one the surface and one none, parts
+    of normals that differ by more, or depths.
+    """
+    off = np.abs(one - other)
+    is_one, is_other = one[2] != 0.0, other[2] != 0.0
+    return np.asarray((is_one != is_other) | (off[:3].max(axis=0) > normal) | (off[3] > depth))
+
+
 def reduced_surface(model: Model) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int16]]:
     """Points (V,3) in the model's frame, mm, faces (F,3) of its mesh, at most MOST_FACES, and their components (F,).
 

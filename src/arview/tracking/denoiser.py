@@ -51,7 +51,7 @@ def noise_level(image: NDArray[np.uint8]) -> float:
 
 
 class Denoiser:
-    """The network; one picture at a time."""
+    """The network; threads may share it."""
 
     def __init__(self) -> None:
         self._network = Network("denoiser.onnx")

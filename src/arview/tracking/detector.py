@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,9 +201,7 @@ class Detector:
     def terms(self, best: Hypothesis, others: list[Hypothesis]) -> tuple[float, ...]:
         """What speaks for a hypothesis before others, see `found_terms`."""
         leads, shown = self.leads(best, others), best.lines / self.local.usual_lines
-        return found_terms(
-            best.seen, best.own_logit, best.judgement, best.strips, leads, shown, max(best.radius_px, 1.0)
-        )
+        return found_terms(best.seen, best.own_logit, best.judgement, best.strips, leads, shown, best.radius_px)
 
     def leads(self, best: Hypothesis, others: list[Hypothesis]) -> Leads:
         """Leads of a hypothesis over others for other poses; one a little aside of it is the same, badly settled."""
@@ -243,25 +242,32 @@ class Detector:
         first = rivals[0]
         near = [h for h in rivals[1:] if h.logit_without_strips > first.logit_without_strips - LEAD]
         rivals = [first, *(h for h in near if self._is_turned(h, first, self.turns, ALIKE_DEG))]
+        if len(rivals) == 1:
+            return first, []
         tracker = self.local.tracker
-        seen = pool().map(lambda h: tracker.edge_steps(picture.gray, h.cam_from_body), rivals)
-        steps = {id(h): one for h, one in zip(rivals, seen, strict=True)}
-        looks = pool().map(lambda h: TwinPixels(picture, tracker.part, h.cam_from_body), rivals)
-        pixels = {id(h): look for h, look in zip(rivals, looks, strict=True)}
+        steps = list(pool().map(lambda h: tracker.edge_steps(picture.gray, h.cam_from_body), rivals))
+        pixels = cache(lambda k: TwinPixels(picture, tracker.part, rivals[k].cam_from_body))
 
-        def ahead(a: Hypothesis, b: Hypothesis) -> float:
-            lead = a.logit_without_strips - b.logit_without_strips
-            edges = telling(steps[id(a)], steps[id(b)])
-            ways = ((pixels[id(a)], self._turn_between(a, b)), (pixels[id(b)], self._turn_between(b, a)))
-            one, other = pool().map(lambda way: 0.0 if way[1] is None else way[0].lead(way[1]), ways)
+        def by_pixels(a: int, b: int) -> float:
+            turn = self._turn_between(rivals[a], rivals[b])
+            return 0.0 if turn is None else float(pixels(a).lead(turn))
+
+        @cache
+        def ahead(a: int, b: int) -> float:
+            if a > b:
+                return -ahead(b, a)
+            lead = rivals[a].logit_without_strips - rivals[b].logit_without_strips
+            one, other = pool().map(by_pixels, (a, b), (b, a))
             told = 0.5 * (one - other)
-            return edges + LEAD_TELLS * lead + PIXELS_TELL * min(max(told, -MOST_PIXELS_TELL), MOST_PIXELS_TELL)
+            told = PIXELS_TELL * min(max(told, -MOST_PIXELS_TELL), MOST_PIXELS_TELL)
+            return telling(steps[a], steps[b]) + LEAD_TELLS * lead + told
 
-        best = first
-        for rival in rivals[1:]:
-            if ahead(rival, best) > 0.0:
-                best = rival
-        twins = [h for h in rivals if h is not best and ahead(best, h) < TELLING]
+        leader = 0
+        for k in range(1, len(rivals)):
+            if ahead(k, leader) > 0.0:
+                leader = k
+        best = rivals[leader]
+        twins = [h for k, h in enumerate(rivals) if k != leader and ahead(leader, k) < TELLING]
         return best, [h for h in twins if not self._is_turned(h, best, self.same_turns, ALIKE_DEG)]
 
     def _turn_between(self, a: Hypothesis, b: Hypothesis) -> Array | None:

@@ -36,7 +36,7 @@ CONTRAST = 64.0
 
 
 class LineNetwork:
-    """The network; one picture at a time."""
+    """The network; threads may share it."""
 
     def __init__(self) -> None:
         self._network = Network("lines.onnx")

@@ -105,8 +105,8 @@ FOUND_BIAS = -4.24
 be negative, on the best hypotheses of the search in 504 pictures of 31 other solids where these were right and in 371
 without the part, many in crowds of others; on 198 frames of the recordings and 299 photos of others, which count twice;
 and on 1,000 photos and pictures of other parts for the semi-synthetic shapes and the recorded parts, which count half.
-As fitted the bias would be 1.25 higher: of 1,001 further such pictures some ten would be taken for the part, with it
-one. What the view shows is the strongest term beside the verifier: without it 9 were taken for the part."""
+As fitted the bias would be 1.25 higher: of 1,001 further such pictures 12 would be taken for the part, with it one
+or none. What the view shows is the strongest term beside the verifier: without it 9 were taken for the part."""
 LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
 """Larger leads say no more."""
 LEAST_SHOWN, MOST_SHOWN = -0.5, 0.3
@@ -156,7 +156,7 @@ def found_terms(
     """
     here, elsewhere = min(leads.here, LARGEST_HERE), min(leads.elsewhere, LARGEST_ELSEWHERE)
     is_alone = float(min(leads.here, leads.elsewhere) >= LARGEST_HERE)
-    rich, small = min(max(math.log(shown), LEAST_SHOWN), MOST_SHOWN), min(math.log(radius_px / SMALL_PX), 0.0)
+    rich, small = min(max(math.log(shown), LEAST_SHOWN), MOST_SHOWN), min(math.log(max(radius_px, 1.0) / SMALL_PX), 0.0)
     return seen, own_logit, judgement, strips, here, elsewhere, is_alone, rich, small
 
 

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from arview.geometry import Array, rigid
-from arview.guideviews.surface import draw_surface
+from arview.guideviews.surface import differing, draw_surface
 from arview.tracking.picture import Picture, steps_to
 from arview.tracking.solver import project
 from arview.tracking.tracker import PartView
@@ -74,9 +74,7 @@ class TwinPixels:
         if not self._colours.size:
             return 0.0
         drawn, inside = self._draw(rigid(self._pose[:3, :3] @ turn, self._pose[:3, 3]))
-        off = np.abs(self._drawn - drawn)
-        is_other = (off[:3].max(axis=0) > OTHER_NORMAL) | (off[3] > OTHER_DEPTH)
-        changed = ((self._inside != inside) | (self._inside & inside & is_other)).astype(np.uint8)
+        changed = differing(self._drawn, drawn, OTHER_NORMAL, OTHER_DEPTH).astype(np.uint8)
         changed = cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
         count = cv2.countNonZero(changed)
         if count < LEAST_PIXELS:

@@ -11,7 +11,7 @@ from arview.cad.symmetry import Symmetry
 from arview.camera import Camera
 from arview.evaluation.metrics import PoseError, PoseMeter, symmetry_group
 from arview.geometry import Array
-from arview.guideviews.surface import Surface, draw_surface
+from arview.guideviews.surface import Surface, differing, draw_surface
 from arview.render import ZBufferRenderer
 
 LEAST_PIXELS = 24
@@ -71,17 +71,16 @@ def changed_share(surface: Surface, diameter_mm: float, cam_from_body: Array, tr
     """
     place = true_cam_from_body[:3, 3]
     focal_px = np.full(2, RADIUS_PX / (0.5 * diameter_mm) * place[2])
-    shown, inside = [], []
+    shown = []
     for pose in (cam_from_body, true_cam_from_body):
         drawn = np.empty((4, SIDE_PX, SIDE_PX), dtype=np.float32)
         face_ids = np.empty((SIDE_PX, SIDE_PX), dtype=np.int32)
         center_px = 0.5 * (SIDE_PX - 1) + focal_px * (pose[:2, 3] / pose[2, 3] - place[:2] / place[2])
         draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids)
         shown.append(drawn)
-        inside.append(face_ids >= 0)
-    off = np.abs(shown[0] - shown[1])
-    is_other = (inside[0] != inside[1]) | (off[:3].max(axis=0) > OTHER_NORMAL) | (off[3] > OTHER_DEPTH)
-    return int(np.count_nonzero(is_other)) / max(1, int(np.count_nonzero(inside[1])))
+    one, true = shown
+    is_other = differing(one, true, OTHER_NORMAL, OTHER_DEPTH)
+    return int(np.count_nonzero(is_other)) / max(1, int(np.count_nonzero(true[2])))
 
 
 def least_error(meter: PoseMeter, estimate: Array, truths: tuple[Array, ...]) -> PoseError:
