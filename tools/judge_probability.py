@@ -21,11 +21,15 @@ from arview.tracking.first_search import QUICK, WIDE
 from judge_examples import ALIKE, REFINED_NEAR, is_alike, is_near, pictures_of
 from photos import all_photos
 from recordings import scenes
-from sections import recorded_views
+from sections import Sections, recorded_views
 
-RECORDED_EACH, RECORDED_WEIGHT = 20, 2.0
-"""Frames of each recording, and as many photos without its part; each counts for so many."""
-SHRINK = 0.1
+RECORDED_EACH, PHOTOS_EACH, RECORDED_WEIGHT = 40, 60, 2.0
+"""Frames of each recording, and photos without its part; each counts for so many."""
+OTHERS_EACH, OTHERS_WEIGHT = 91, 0.5
+"""Pictures without it of each shape and recorded part, and what each counts."""
+PHOTOS_SEED, OTHERS_SEED = 1001, 5000
+"""Others than those of the evaluation."""
+SHRINK = 0.02
 """Penalty on squared weights, in deviations of what they are of."""
 FOLDS = 5
 FALSE = (15, 10, 5, 3)
@@ -47,13 +51,15 @@ class Outcome:
 def fit_probability(seeds: range, photos: Sequence[Path]) -> None:
     """Print the weights of what speaks for a pose, in the order of `found_terms`, and how many are told then.
 
+    The bias in use is lowered from that of the fit until pictures like those of `_others` give hardly a false alarm.
+
     Pictures with the part in which the best hypothesis is wrong are left out: most are twins of the right pose.
     """
     solids = (
         (str(seed), 1.0, pictures_of(seed, photos, (QUICK, WIDE))) for seed in tqdm(seeds, desc="solids", disable=None)
     )
     recorded = ((name, RECORDED_WEIGHT, _recorded(name)) for name in scenes())
-    outcomes = [outcome for part in chain(solids, recorded) for outcome in _outcomes(*part)]
+    outcomes = [outcome for part in chain(solids, recorded, _others()) for outcome in _outcomes(*part)]
     if len({outcome.is_right for outcome in outcomes}) < 2:
         raise InputError("fit_judge: too few pictures to fit a probability to; ask for more solids")
     terms = np.array([outcome.terms for outcome in outcomes])
@@ -99,8 +105,17 @@ def _recorded(name: str) -> Iterator[Seen]:
         if frame.cam_from_model is not None:
             yield detector, scene.image(frame), frame.cam_from_model @ detector.local.tracker.part.model_from_body
     camera = scene.camera
-    for _, image in frames_without_part(all_photos(None, name), (), camera.width, camera.height, RECORDED_EACH, 1):
+    others = all_photos(None, name)
+    for _, image in frames_without_part(others, (), camera.width, camera.height, PHOTOS_EACH, PHOTOS_SEED):
         yield detector, image, None
+
+
+def _others() -> Iterator[tuple[str, float, Iterator[Seen]]]:
+    """Every shape and recorded part, with pictures without it such as those of the evaluation."""
+    sections = Sections(scenes(), {}, Path("out/sequences"))
+    for number, name in enumerate([*sections.shapes, *sections.recorded]):
+        without = sections.pictures_without(name, OTHERS_EACH, OTHERS_SEED + number)
+        yield name, OTHERS_WEIGHT, ((detector, image, None) for detector, _, image in without)
 
 
 def _fitted(terms: Array, is_right: NDArray[np.bool_], weights: Array) -> Array:

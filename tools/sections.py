@@ -161,13 +161,8 @@ class Sections:
         false: dict[str, list[str]] = {}
         looked = 0
         for number, name in enumerate(watched(parts, "false-alarms")):
-            detector, camera = self._detector_of(name)
-            # Recorded parts are seen in the backgrounds of the semi-synthetic scenes.
-            others = [other for other in self.shapes if other != name] if name in self.shapes else []
-            scenes = [self.scene(other, "regular") for other in others]
-            photos = all_photos(self.backgrounds, name)
             false[name] = []
-            for origin, image in frames_without_part(photos, scenes, camera.width, camera.height, each, number):
+            for detector, origin, image in self.pictures_without(name, each, number):
                 looked += 1
                 if detector.detect(image, max_results=1):
                     false[name].append(origin)
@@ -176,6 +171,16 @@ class Sections:
         named = ", ".join(f"{name} {len(origins)}" for name, origins in false.items() if origins)
         text = f"{count} of {looked}" + (f" ({named})" if named else "")
         return [Line("false alarms", f"{len(parts)} parts", text, "none", count == 0)]
+
+    def pictures_without(self, name: str, count: int, seed: int) -> Iterator[tuple[Detector, str, Image]]:
+        """The detector of a part, and some pictures without it: photos and, for the shapes, pictures of others."""
+        detector, camera = self._detector_of(name)
+        # Recorded parts are seen in the backgrounds of the semi-synthetic scenes.
+        others = [other for other in self.shapes if other != name] if name in self.shapes else []
+        scenes = [self.scene(other, "regular") for other in others]
+        photos = all_photos(self.backgrounds, name)
+        for origin, image in frames_without_part(photos, scenes, camera.width, camera.height, count, seed):
+            yield detector, origin, image
 
     def _detector_of(self, name: str) -> tuple[Detector, Any]:
         if name in self.recorded:
