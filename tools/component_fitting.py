@@ -13,16 +13,17 @@ from arview.tracking.component_network import GLOBALS, SIDE_PX, overall
 from arview.tracking.verifier import CHANNELS, LINES
 from component_examples import Looked
 from judge_examples import read_examples
-from score_networks import fit, go_on_from, score_network, scored, write_score_network
+from score_networks import Design, fit, fit_score_network, scored
 from verifier_fitting import network_input
-from widening import GONE_ON, in_use, torch_with_onnx
+from widening import torch_with_onnx
 
-WIDTHS = (24, 24, 48, 48, 64, 64)
-"""Of the convolutions."""
-DEEPENED = (3, 5)
-"""A residual block follows these of them."""
+DESIGN = Design(
+    "components", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (24, 24, 48, 48, 64, 64), deepened=(3, 5), rate=2e-3
+)
 BATCH = 128
-RATE, DECAY = 2e-3, 2e-2
+DECAY = 2e-2
+SEEN_OF_EACH = 8
+"""Components of a picture in which a network that is gone on with sees how it is to begin."""
 HELD_OUT = 8
 """Every so manieth assembly is not fitted to, but for telling how well others are seen."""
 FALSE_SHARES = (0.002, 0.005, 0.01, 0.03)
@@ -44,35 +45,36 @@ def fit_components(folder: Path, epochs: int, is_anew: bool = True) -> None:
     """
     torch = torch_with_onnx()
     examples, held_out = read_examples(folder, "components_*.pkl", HELD_OUT)
-    torch.manual_seed(0)
-    network = score_network(torch, CHANNELS + LINES, GLOBALS, WIDTHS, DEEPENED)
     fitted = [one for one in examples if one.solid not in held_out]
-    if not is_anew:
-        rng = np.random.default_rng(0)
-        some = [fitted[i] for i in rng.integers(len(fitted), size=60)]
-        seen = [_inputs(one, range(min(8, len(one.is_wrong))), rng)[0] for one in some]
-        go_on_from(network, in_use("components.onnx"), np.concatenate(seen), torch)
-    _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
-    network.eval()
-    _report(network, [one for one in examples if one.solid in held_out], torch)
-    write_score_network(network, folder / "components.onnx", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, torch)
+
+    def seen(some: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float32]:
+        of_each = ((fitted[i], range(min(SEEN_OF_EACH, len(fitted[i].is_wrong)))) for i in some)
+        return np.concatenate([_inputs(one, index, rng)[0] for one, index in of_each])
+
+    fit_score_network(
+        DESIGN, folder, is_anew, seen, len(fitted),
+        lambda network, rate: _fit(network, fitted, epochs, rate, torch),
+        lambda network: _report(network, [one for one in examples if one.solid in held_out], torch),
+        torch,
+    )  # fmt: skip
 
 
 def _fit(network: Any, examples: Sequence[Looked], epochs: int, rate: float, torch: Any) -> None:
-    rng = np.random.default_rng(0)
-    network.train().to(memory_format=torch.channels_last)
     places = [(one, k) for one in examples for k in range(len(one.is_wrong))]
     share = float(np.mean([one.is_wrong[k] for one, k in places]))
 
-    def loss_of(some: NDArray[np.intp]) -> Any:
+    def shown(some: NDArray[np.intp], rng: np.random.Generator) -> Any:
         chosen = [places[i] for i in some]
-        seen, both = map(np.concatenate, zip(*(_inputs(one, [index], rng) for one, index in chosen), strict=True))
-        wrong = torch.tensor([float(one.is_wrong[index]) for one, index in chosen])
+        inputs = map(np.concatenate, zip(*(_inputs(one, [index], rng) for one, index in chosen), strict=True))
+        return *inputs, torch.tensor([float(one.is_wrong[index]) for one, index in chosen])
+
+    def loss_of(some: Any) -> Any:
+        seen, both, wrong = some
         weight = torch.where(wrong > 0, 0.5 / share, 0.5 / (1.0 - share))
         found = scored(network, seen, both, torch)
         return torch.nn.functional.binary_cross_entropy_with_logits(found, wrong, weight)
 
-    fit("components", network.parameters(), (len(places), BATCH, epochs), rate, DECAY, loss_of, rng, torch)
+    fit("components", network.parameters(), (len(places), BATCH, epochs), rate, DECAY, shown, loss_of, torch)
 
 
 def _inputs(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from layers import normalised, residual, write_network
-from widening import begin_as, beginning_as
+from widening import GONE_ON, begin_as, beginning_as, in_use
 
 LAST_WIDTH, DROPPED = 48, 0.2
+BEGUN = 60
+"""In so many examples a network that is gone on with sees how it is to begin."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """What a network that scores looks is like.
+
+    Attributes:
+        name: of its file, less the suffix.
+        shape: (channels, rows, columns) of a look.
+        told: what else it is told of one.
+        widths: of its convolutions; a residual block follows those in ``deepened``.
+        rate: at which it is fitted anew.
+    """
+
+    name: str
+    shape: tuple[int, int, int]
+    told: int
+    widths: tuple[int, ...]
+    deepened: tuple[int, ...]
+    rate: float
+
+
+def fit_score_network(
+    design: Design,
+    folder: Path,
+    is_anew: bool,
+    seen: Callable[[NDArray[np.intp], np.random.Generator], NDArray[np.float32]],
+    count: int,
+    fit_at: Callable[[Any, float], None],
+    report: Callable[[Any], None],
+    torch: Any,
+) -> None:
+    """Fit a network, say how well it does, and write it to a folder.
+
+    Args:
+        design: of the network.
+        folder: to write it to.
+        is_anew: not going on from the network in use.
+        seen: what networks are shown of some of ``count`` examples, by their numbers.
+        fit_at: fits a network at a rate.
+        report: says how well it does.
+        torch: the module.
+
+    Raises:
+        InputError: not anew, and the network in use is of another kind.
+    """
+    torch.manual_seed(0)
+    network = score_network(torch, design.shape[0], design.told, design.widths, design.deepened)
+    if not is_anew:
+        rng = np.random.default_rng(0)
+        go_on_from(network, in_use(f"{design.name}.onnx"), seen(rng.integers(count, size=BEGUN), rng), torch)
+    network.train().to(memory_format=torch.channels_last)
+    fit_at(network, design.rate if is_anew else GONE_ON * design.rate)
+    network.eval()
+    report(network)
+    _write(network, folder / f"{design.name}.onnx", design, torch)
 
 
 def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...], deepened: Collection[int] = ()) -> Any:
@@ -54,8 +114,8 @@ def fit(
     steps: tuple[int, int, int],
     rate: float,
     decay: float,
-    loss_of: Callable[[NDArray[np.intp]], Any],
-    rng: np.random.Generator,
+    shown: Callable[[NDArray[np.intp], np.random.Generator], Any],
+    loss_of: Callable[[Any], Any],
     torch: Any,
 ) -> None:
     """Bring a loss down by weights, and say after each epoch how far.
@@ -65,8 +125,9 @@ def fit(
         weights: of the network, and of what else is fitted.
         steps: examples, how many of them a step takes, and how often each is taken.
         rate, decay: the highest rate, reached soon and gone at the end; of the weights.
-        loss_of: of some examples, by their numbers.
-        rng: orders them.
+        shown: what of some examples, by their numbers, is looked at, with random numbers to alter it by; made while
+            the step before is taken.
+        loss_of: of that.
         torch: the module.
     """
     count, at_once, epochs = steps
@@ -76,16 +137,28 @@ def fit(
     total = epochs * each
     rising = max(0.05, 2.0 / total)  # of one step alone torch divides by zero
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total, pct_start=min(rising, 1.0))
-    for epoch in range(epochs):
-        order, losses = rng.permutation(count), []
-        for k in range(each):
-            loss = loss_of(order[k * at_once : (k + 1) * at_once])
+    rng, altering = (np.random.default_rng([0, k]) for k in range(2))
+    orders = [rng.permutation(count) for _ in range(epochs)]
+
+    def made(step: int) -> Any:
+        epoch, k = divmod(step, each)
+        return shown(orders[epoch][k * at_once : (k + 1) * at_once], altering)
+
+    with ThreadPoolExecutor(1) as maker:
+        following, losses = maker.submit(made, 0), []
+        for step in range(total):
+            some = following.result()
+            if step + 1 < total:
+                following = maker.submit(made, step + 1)
+            loss = loss_of(some)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
             schedule.step()
             losses.append(loss.item())
-        print(f"{name}, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
+            if (step + 1) % each == 0:
+                print(f"{name}, epoch {(step + 1) // each} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
+                losses.clear()
 
 
 def scored(network: Any, seen: NDArray[np.float32], told: NDArray[np.float32], torch: Any) -> Any:
@@ -116,7 +189,7 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
 
     Args:
         network: from `score_network`.
-        path: of the one written by `write_score_network`.
+        path: of the written one.
         seen: (N,C,S,S) what networks are shown in fitting.
         torch: the module.
 
@@ -139,7 +212,7 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
         last.bias.copy_(last_bias)
 
 
-def write_score_network(network: Any, path: Path, shape: tuple[int, int, int], told: int, torch: Any) -> None:
-    """Write a network that is shown looks of a shape (channels, rows, columns), any number of them."""
-    shown = {"seen": torch.zeros(2, *shape), "both": torch.zeros(2, told)}
+def _write(network: Any, path: Path, design: Design, torch: Any) -> None:
+    """Write a network that is shown any number of looks at once."""
+    shown = {"seen": torch.zeros(2, *design.shape), "both": torch.zeros(2, design.told)}
     write_network(network, path, shown, "score", {name: {0: "poses"} for name in (*shown, "score")}, torch)

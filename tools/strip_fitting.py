@@ -18,21 +18,18 @@ from numpy.typing import NDArray
 from arview.tracking.quality import VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES
 from arview.tracking.strips import CHANNELS, COLUMNS, GLOBALS, OUTLINE_ROWS, ROWS, shown
 from judge_examples import read_examples
-from score_networks import fit, go_on_from, score_network, scored, telling_loss, write_score_network
+from score_networks import Design, fit, fit_score_network, scored, telling_loss
 from strip_examples import Stripped
-from widening import GONE_ON, in_use, torch_with_onnx
+from widening import torch_with_onnx
 
-WIDTHS = (24, 24, 48, 48, 64)
-"""Of the convolutions."""
-DEEPENED = (3,)
-"""These are followed by a residual block."""
+DESIGN = Design("strips", (CHANNELS, ROWS, COLUMNS), GLOBALS, (24, 24, 48, 48, 64), deepened=(3,), rate=2e-3)
 PICTURES, POSES = 8, 12
 """A step looks at so many poses of so many pictures."""
 LISTWISE_WEIGHT = 0.5
 """Beside telling right from wrong in all pictures, the right pose of each is to be told from its others."""
 OTHERS = (1.0, VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES)
 """What else is known counts so at first: the network is to say what is missing."""
-RATE, DECAY = 2e-3, 2e-2
+DECAY = 2e-2
 UNSURE = 0.3
 """Share of pictures in which the line network sees less, and as many in which it sees less of solids."""
 HELD_OUT = 8
@@ -54,38 +51,39 @@ def fit_strips(folder: Path, epochs: int, is_anew: bool = True) -> None:
     """
     torch = torch_with_onnx()
     examples, held_out = read_examples(folder, "strips_*.pkl", HELD_OUT)
-    torch.manual_seed(0)
-    network = score_network(torch, CHANNELS, GLOBALS, WIDTHS, DEEPENED)
     fitted = [one for one in examples if one.solid not in held_out and one.is_told.any()]
-    if not is_anew:
-        rng = np.random.default_rng(0)
-        some = [_inputs(fitted[i], _chosen(fitted[i], rng), rng)[0] for i in rng.integers(len(fitted), size=60)]
-        go_on_from(network, in_use("strips.onnx"), np.concatenate(some), torch)
-    _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
-    network.eval()
-    _report(network, [one for one in examples if one.solid in held_out], torch)
-    write_score_network(network, folder / "strips.onnx", (CHANNELS, ROWS, COLUMNS), GLOBALS, torch)
+
+    def seen(some: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float32]:
+        return np.concatenate([_inputs(fitted[i], _chosen(fitted[i], rng), rng)[0] for i in some])
+
+    fit_score_network(
+        DESIGN, folder, is_anew, seen, len(fitted),
+        lambda network, rate: _fit(network, fitted, epochs, rate, torch),
+        lambda network: _report(network, [one for one in examples if one.solid in held_out], torch),
+        torch,
+    )  # fmt: skip
 
 
 def _fit(network: Any, examples: Sequence[Stripped], epochs: int, rate: float, torch: Any) -> None:
-    rng = np.random.default_rng(0)
     others = torch.nn.Linear(len(OTHERS), 1)
     with torch.no_grad():
         others.weight.copy_(torch.tensor([OTHERS]))
         others.bias.zero_()
-    network.train().to(memory_format=torch.channels_last)
 
-    def loss_of(some: NDArray[np.intp]) -> Any:
+    def shown_of(some: NDArray[np.intp], rng: np.random.Generator) -> Any:
         chosen = [(examples[i], _chosen(examples[i], rng)) for i in some]
-        seen, told = map(np.concatenate, zip(*(_inputs(one, index, rng) for one, index in chosen), strict=True))
+        inputs = map(np.concatenate, zip(*(_inputs(one, index, rng) for one, index in chosen), strict=True))
         known = torch.from_numpy(np.concatenate([one.known[index] for one, index in chosen]).astype(np.float32))
-        truth = [torch.from_numpy(one.is_right[index]) for one, index in chosen]
+        return *inputs, known, [torch.from_numpy(one.is_right[index]) for one, index in chosen]
+
+    def loss_of(some: Any) -> Any:
+        seen, told, known, truth = some
         alone = scored(network, seen, told, torch)
         beside = alone + others(known)[:, 0]
         return sum(telling_loss(scores, truth, LISTWISE_WEIGHT / PICTURES, torch) for scores in (alone, beside))
 
     weights = [*network.parameters(), *others.parameters()]
-    fit("strips", weights, (len(examples), PICTURES, epochs), rate, DECAY, loss_of, rng, torch)
+    fit("strips", weights, (len(examples), PICTURES, epochs), rate, DECAY, shown_of, loss_of, torch)
 
 
 def _chosen(one: Stripped, rng: np.random.Generator) -> list[int]:

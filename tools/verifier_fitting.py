@@ -24,20 +24,19 @@ from arview.tracking.verifier import (
 )
 from component_examples import Looked
 from judge_examples import Looks, read_examples
-from score_networks import fit, go_on_from, score_network, scored, telling_loss, write_score_network
-from widening import GONE_ON, in_use, torch_with_onnx
+from score_networks import Design, fit, fit_score_network, scored, telling_loss
+from widening import torch_with_onnx
 
-WIDTHS = (24, 24, 48, 48, 96, 128)
-"""Of the convolutions."""
-DEEPENED = (3, 5)
-"""These are followed by a residual block."""
+DESIGN = Design(
+    "verifier", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (32, 32, 64, 64, 128, 192), deepened=(3, 5), rate=2e-3
+)
 PICTURES, POSES = 6, 20
 """A step looks at so many poses of so many pictures, a third of them right where there are any."""
 REFINED_WEIGHT = 3.0
 """Refined poses are taken so much oftener than others."""
 LISTWISE_WEIGHT = 0.3
 """Beside telling right from wrong in all pictures, the right pose of each is to be told from its others."""
-RATE, DECAY = 2e-3, 2e-2
+DECAY = 2e-2
 UNSURE = 0.3
 """Share of pictures in which the line network sees less, and as many in which it sees less of solids."""
 HELD_OUT = 8
@@ -59,30 +58,30 @@ def fit_verifier(folder: Path, epochs: int, is_anew: bool = True) -> None:
     """
     torch = torch_with_onnx()
     looks, held_out = read_examples(folder, "looks_*.pkl", HELD_OUT)
-    torch.manual_seed(0)
-    network = score_network(torch, CHANNELS + LINES, GLOBALS, WIDTHS, DEEPENED)
     fitted = [look for look in looks if look.solid not in held_out]
-    if not is_anew:
-        rng = np.random.default_rng(0)
-        some = [_inputs(fitted[i], _chosen(fitted[i], rng), rng)[0] for i in rng.integers(len(fitted), size=60)]
-        go_on_from(network, in_use("verifier.onnx"), np.concatenate(some), torch)
-    _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
-    network.eval()
-    _report(network, [look for look in looks if look.solid in held_out], torch)
-    write_score_network(network, folder / "verifier.onnx", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, torch)
+
+    def seen(some: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float32]:
+        return np.concatenate([_inputs(fitted[i], _chosen(fitted[i], rng), rng)[0] for i in some])
+
+    fit_score_network(
+        DESIGN, folder, is_anew, seen, len(fitted),
+        lambda network, rate: _fit(network, fitted, epochs, rate, torch),
+        lambda network: _report(network, [look for look in looks if look.solid in held_out], torch),
+        torch,
+    )  # fmt: skip
 
 
 def _fit(network: Any, looks: Sequence[Looks], epochs: int, rate: float, torch: Any) -> None:
-    rng = np.random.default_rng(0)
-    network.train().to(memory_format=torch.channels_last)
-
-    def loss_of(some: NDArray[np.intp]) -> Any:
+    def shown(some: NDArray[np.intp], rng: np.random.Generator) -> Any:
         chosen = [(looks[i], _chosen(looks[i], rng)) for i in some]
-        seen, both = map(np.concatenate, zip(*(_inputs(look, index, rng) for look, index in chosen), strict=True))
-        truth = [torch.from_numpy(look.is_right[index]) for look, index in chosen]
+        inputs = map(np.concatenate, zip(*(_inputs(look, index, rng) for look, index in chosen), strict=True))
+        return *inputs, [torch.from_numpy(look.is_right[index]) for look, index in chosen]
+
+    def loss_of(some: Any) -> Any:
+        seen, both, truth = some
         return telling_loss(scored(network, seen, both, torch), truth, LISTWISE_WEIGHT / PICTURES, torch)
 
-    fit("verifier", network.parameters(), (len(looks), PICTURES, epochs), rate, DECAY, loss_of, rng, torch)
+    fit("verifier", network.parameters(), (len(looks), PICTURES, epochs), rate, DECAY, shown, loss_of, torch)
 
 
 def _chosen(look: Looks, rng: np.random.Generator) -> list[int]:
