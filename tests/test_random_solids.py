@@ -7,7 +7,7 @@ import pytest
 
 from arview.evaluation.semisynthetic.random_solids import random_solid
 
-SEEDS = range(21)
+SEEDS = range(30)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

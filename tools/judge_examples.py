@@ -39,7 +39,7 @@ from arview.tracking.judge import RADII_PX, describe
 from arview.tracking.local_search import Hypothesis
 from arview.tracking.picture import Picture
 from arview.tracking.verifier import raw_look
-from line_examples import crowded_picture
+from line_examples import coloured, crowded_picture, recoloured
 from seeded_files import still_to_make
 
 FRAMES_EACH = 4
@@ -52,6 +52,9 @@ CROWDS_EACH, CROWDS_WITHOUT_EACH = 6, 4
 """Crowds of other solids with and without it, as on a bench."""
 OTHERS_EACH = 8
 """Solids that crowds are made of."""
+RECOLOURED_SHARE, DARK_SHARE = 0.5, 0.4
+"""In so many variants a solid has other colours than its own, and in so many of these it is nearly black."""
+DARK = (0.03, 0.15)
 PRINTED_SHARE = 0.5
 """So many solids are printed on: a photo shines through them."""
 UNSHARP_SHARE = 0.2
@@ -162,7 +165,8 @@ def _pictures_of(
     views = cached_guide_views(solid, full_sphere_range(*ANYWHERE.distance_mm))
     detector = Detector(views, CAMERA, DetectorOptions(efforts=efforts))
     for variant in VARIANTS:
-        for frame in _rendered(solid, occluder, variant, FRAMES_EACH, photos, rng):
+        shown = _in_other_colours(solid, rng) if rng.random() < RECOLOURED_SHARE else solid
+        for frame in _rendered(shown, occluder, variant, FRAMES_EACH, photos, rng):
             if frame.visible >= 0.5:
                 image = _printed_on(frame, photos, rng) if rng.random() < PRINTED_SHARE else frame.image
                 yield detector, image, frame.cam_from_model @ detector.local.tracker.part.model_from_body
@@ -256,6 +260,13 @@ def _rendered(
     )
     photo = read_photo(photos[rng.integers(len(photos))])
     return list(render_sequence(solid, trajectory(solid, options), photo, options, CAMERA, occluder))
+
+
+def _in_other_colours(solid: Model, rng: np.random.Generator) -> Model:
+    if rng.random() < DARK_SHARE:
+        grey = rng.uniform(*DARK)
+        return coloured(solid, grey * rng.uniform(0.8, 1.2, (len(solid.components), 3)))
+    return recoloured(solid, rng)
 
 
 def _printed_on(frame: SequenceFrame, photos: Sequence[Path], rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from arview.atomic import replacing
 from arview.errors import InputError
 from arview.tracking.judge import FEATURES, GLOBALS, OUTLINE_LINES, SEEN, STRETCHES, Network
+from arview.tracking.judge import network as in_use_network
 from judge_examples import Group, read_examples
+from widening import GONE_ON
 
 WIDTH, LAST_WIDTH = 16, 32
 """Of the layers for each line, and of that for all together."""
@@ -25,8 +27,10 @@ HELD_OUT = 10
 """Every so manieth solid is not fitted to, but for telling how well others are judged."""
 
 
-def fit_networks(folder: Path, epochs: int) -> None:
+def fit_networks(folder: Path, epochs: int, is_anew: bool = True) -> None:
     """Fit all networks to the examples in a folder, write judge.npz there, and say how well they do.
+
+    ``is_anew``: not going on from those in use.
 
     Raises:
         InputError: no examples, or no torch.
@@ -39,7 +43,9 @@ def fit_networks(folder: Path, epochs: int) -> None:
     torch.manual_seed(0)
     stored: dict[str, NDArray[np.float32]] = {}
     for stage, names in (("rough", ("rough",)), ("refined", ("fine", "close"))):
-        networks, weight = _fit([g for g in groups if g.stage == stage], held_out, names, epochs, torch)
+        networks = {name: _network(torch) if is_anew else _as_in_use(name, torch) for name in names}
+        rate = RATE if is_anew else GONE_ON * RATE
+        weight = _fit(networks, [g for g in groups if g.stage == stage], held_out, epochs, rate, torch)
         print(f"{stage}: weight of the hand-made evidence {weight:.2f}")
         for name, network in networks.items():
             for field, layer in zip(Network._fields[::2], network.layers(), strict=True):
@@ -51,17 +57,16 @@ def fit_networks(folder: Path, epochs: int) -> None:
 
 
 def _fit(
-    groups: Sequence[Group], held_out: set[int], names: Sequence[str], epochs: int, torch: Any
-) -> tuple[dict[str, Any], float]:
-    """The networks, and the weight of the hand-made evidence beside them."""
+    networks: dict[str, Any], groups: Sequence[Group], held_out: set[int], epochs: int, rate: float, torch: Any
+) -> float:
+    """Fit networks whose scores are added; the weight of the hand-made evidence beside them."""
     shown = [g for g in groups if g.is_right.any() and g.solid not in held_out]
     without = [g for g in groups if not g.is_right.any() and g.solid not in held_out]
-    networks = {name: _network(torch) for name in names}
     weight, bias = (torch.nn.Parameter(torch.tensor(value)) for value in (0.7, -3.0))
     parameters = [weight, bias, *(p for network in networks.values() for p in network.parameters())]
-    optimiser = torch.optim.AdamW(parameters, RATE / 2, weight_decay=DECAY)
+    optimiser = torch.optim.AdamW(parameters, rate / 2, weight_decay=DECAY)
     steps = max(1, len(shown) // BATCH)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * steps)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps)
     rng = np.random.default_rng(0)
 
     def scores(group: Group) -> Any:
@@ -91,7 +96,7 @@ def _fit(
             optimiser.step()
             schedule.step()
             losses.append(loss.item())
-        print(f"{', '.join(names)}, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
+        print(f"{', '.join(networks)}, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
     for network in networks.values():
         network.eval()
     left = [g for g in groups if g.solid in held_out and g.is_right.any()]
@@ -99,7 +104,18 @@ def _fit(
         first = sum(bool(g.is_right[int(scores(g).argmax())]) for g in left)
     by_hand = sum(bool(g.is_right[int(g.logits.argmax())]) for g in left)
     print(f"{len(left)} pictures of {len(held_out)} other solids: a right pose first in {first}, by hand in {by_hand}")
-    return networks, float(weight)
+    return float(weight.detach())
+
+
+def _as_in_use(name: str, torch: Any) -> Any:
+    """One of the networks as it is in use."""
+    network = _network(torch)
+    stored = in_use_network(name)
+    with torch.no_grad():
+        for layer, weight, bias in zip(network.layers(), stored[::2], stored[1::2], strict=True):
+            layer.weight.copy_(torch.from_numpy(weight.T.copy()))
+            layer.bias.copy_(torch.from_numpy(bias.copy()))
+    return network
 
 
 def _network(torch: Any) -> Any:

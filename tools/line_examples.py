@@ -180,7 +180,7 @@ def covered_picture(
     """A picture with one of some solids, of whatever colour, drawn over a place."""
     solid = solids[rng.integers(len(solids))]
     if rng.random() < RECOLOURED:
-        solid = _recoloured(solid, rng)
+        solid = recoloured(solid, rng)
     photo = read_photo(photos[rng.integers(len(photos))])
     placed = [(solid, _pose_at(solid, place_px, radius_px, rng))]
     return drawn_before(picture, photo, placed, photos, rng)[0]
@@ -233,7 +233,7 @@ def _placed(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Mod
     for number in range(rng.choice(NOT_ALONE, p=ALONE)):
         solid = solids[rng.integers(len(solids))]
         if rng.random() < RECOLOURED:
-            solid = _recoloured(solid, rng)
+            solid = recoloured(solid, rng)
         radius_px = float(np.exp(rng.uniform(*np.log(OTHER_RADIUS_PX if number else RADIUS_PX))))
         center_px = rng.uniform(-20.0, size + 20.0)
         if number and rng.random() < 0.7:
@@ -260,9 +260,9 @@ def _crowd(
         solid = solids[rng.integers(len(solids))]
         if steel is not None and rng.random() < 0.7:
             colors = steel * rng.uniform(0.7, 1.3, (len(solid.components), 1)) + rng.normal(0.0, 0.03, 3)
-            solid = _coloured(solid, colors)
+            solid = coloured(solid, colors)
         elif rng.random() < RECOLOURED:
-            solid = _recoloured(solid, rng)
+            solid = recoloured(solid, rng)
         radius_px = float(np.exp(rng.uniform(*np.log(MEMBER_RADIUS_PX if number else CROWD_RADIUS_PX))))
         center_px = np.clip(rng.normal(middle_px, spread_px), 0.08 * size, 0.92 * size)
         placed.append((solid, _pose_at(solid, center_px, radius_px, rng)))
@@ -315,14 +315,15 @@ def _patterned(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArra
     return np.asarray(picture * (1.0 - share) + cv2.warpPerspective(surface, way, size) * share)
 
 
-def _recoloured(solid: Model, rng: np.random.Generator) -> Model:
+def recoloured(solid: Model, rng: np.random.Generator) -> Model:
+    """A solid in other colours, all of its components in one or some in their own."""
     base, gray = rng.uniform(0.15, 0.9, 3), rng.uniform()
     base = gray * base.mean() + (1.0 - gray) * base
     others = [rng.uniform(0.1, 0.9) + rng.normal(0.0, 0.1, 3) for _ in solid.components]
-    return _coloured(solid, np.stack([base if rng.random() < 0.5 else other for other in others]))
+    return coloured(solid, np.stack([base if rng.random() < 0.5 else other for other in others]))
 
 
-def _coloured(solid: Model, colors: Array) -> Model:
+def coloured(solid: Model, colors: Array) -> Model:
     """A solid with other colours (C,3) of its components."""
     limited = [tuple(color) for color in np.clip(colors, 0.03, 0.97).tolist()]
     components = zip(solid.components, limited, strict=True)

@@ -27,7 +27,8 @@ ONE_COLOUR = 0.5
 
 
 def random_solid(seed: int) -> Model:
-    """A random solid: a plate with things on it, a smooth body, a stepped prism, a turned part or a frame.
+    """A random solid: a plate with things on it, a smooth body, a stepped prism, a turned part, a frame, or a part of
+    many small features.
 
     The same seed gives the same solid.
 
@@ -36,7 +37,7 @@ def random_solid(seed: int) -> Model:
     """
     rng = np.random.default_rng(seed)
     size = rng.uniform(*HALF_SIZE_MM)
-    kinds = (_plate, _plate, _smooth, _stepped, _turned, _frame, _smooth_with_things)
+    kinds = (_plate, _plate, _smooth, _stepped, _turned, _frame, _smooth_with_things, _finned, _finned, _studded)
     meshes = kinds[seed % len(kinds)](size, rng)
     whole, is_one = _colour(rng), rng.random() < ONE_COLOUR
     parts = [
@@ -111,6 +112,74 @@ def _frame(size: float, rng: Rng) -> list[Mesh]:
     ]
     kept = [wall for wall in walls if rng.random() < 0.8] or walls[:2]
     return kept + _things(0, 5, 0.6 * w, 0.6 * d, thick, size, rng)
+
+
+def _finned(size: float, rng: Rng) -> list[Mesh]:
+    """A slab with groups of small holes, thin ribs and pins: from afar, or from below, nearly plain."""
+    a, b, thick = size, size * rng.uniform(0.4, 1.0), size * rng.uniform(0.05, 0.35)
+    holes: list[Loop] = []
+    for x, y in _spots(rng.integers(0, 4), 0.9 * a, 0.9 * b, size, rng):
+        radius = size * rng.uniform(0.012, 0.035)
+        if all(np.hypot(*(np.mean(hole, axis=0) - (x, y))) > 0.1 * size for hole in holes):
+            holes.append(circle((x, y), radius, 16))
+    meshes = [prism(rectangle((-a, -b), (a, b)), tuple(holes), 0.0, thick)]
+    for _ in range(rng.integers(0, 3)):
+        count, wide = rng.integers(3, 13), size * rng.uniform(0.01, 0.03)
+        pitch = rng.uniform(3.0, 8.0) * wide
+        x0, y0 = rng.uniform(-0.9 * a, 0.9 * a), rng.uniform(-0.9 * b, 0.2 * b)
+        y1, rise = min(0.95 * b, y0 + size * rng.uniform(0.3, 1.2)), size * rng.uniform(0.04, 0.35)
+        for x in np.arange(x0, 0.95 * a - wide, pitch)[:count]:
+            top = thick + rise * (rng.uniform(0.6, 1.0) if rng.random() < 0.3 else 1.0)
+            meshes.append(box((x, y0, thick), (x + wide, y1, top)))
+    meshes += _studs(rng.integers(0, 4), a, b, thick, size, rng)
+    if rng.random() < 0.3:
+        meshes += _things(1, 3, 0.6 * a, 0.6 * b, thick, size, rng)
+    if rng.random() < 0.25:
+        upside_down = rigid(exp_so3([np.pi, 0, 0]), np.zeros(3))
+        meshes += [moved(mesh, upside_down) for mesh in _studs(1, a, b, 0.0, size, rng)]
+    return meshes
+
+
+def _studded(size: float, rng: Rng) -> list[Mesh]:
+    """A block with groups of small studs on some of its sides."""
+    half = size * rng.uniform(0.3, 1.0, 3)
+    meshes = [box(-half, half)]
+    for axis, sign in [(axis, sign) for axis in range(3) for sign in (-1.0, 1.0) if rng.random() < 0.6]:
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        outward = np.zeros((3, 3))
+        outward[i, 0], outward[j, 1], outward[axis, 2] = 1.0, sign, sign
+        place = rigid(outward, np.zeros(3))
+        meshes += [moved(mesh, place) for mesh in _studs(1, half[i], half[j], half[axis], size, rng)]
+    return meshes + [_turned_about(mesh, rng) for mesh in _things(0, 3, 0.3 * size, 0.3 * size, 0.3 * size, size, rng)]
+
+
+def _studs(groups: int, reach_x: float, reach_y: float, low: float, size: float, rng: Rng) -> list[Mesh]:
+    """Groups of small pins or boxes on a plane."""
+    made = []
+    for _ in range(groups):
+        wide, rise = size * rng.uniform(0.01, 0.04), size * rng.uniform(0.01, 0.2)
+        are_round = rng.random() < 0.6
+        for x, y in _spots(1, 0.9 * reach_x, 0.9 * reach_y, size, rng):
+            if are_round:
+                made.append(cylinder((x, y), wide, low, low + rise, 12))
+            else:
+                made.append(box((x - wide, y - 0.6 * wide, low), (x + wide, y + 0.6 * wide, low + rise)))
+    return made
+
+
+def _spots(groups: int, reach_x: float, reach_y: float, size: float, rng: Rng) -> list[tuple[float, float]]:
+    """Places in rows and columns, of which some lack, so many groups of them."""
+    spots = []
+    for _ in range(groups):
+        pitch, columns, rows = size * rng.uniform(0.09, 0.2), rng.integers(1, 10), rng.integers(1, 5)
+        x0, y0 = rng.uniform(-reach_x, reach_x), rng.uniform(-reach_y, reach_y)
+        if rng.random() < 0.3:
+            columns, rows = rows, columns
+        for k in range(columns * rows):
+            x, y = x0 + pitch * (k % columns), y0 + pitch * (k // columns)
+            if abs(x) < reach_x and abs(y) < reach_y and rng.random() < 0.93:
+                spots.append((float(x), float(y)))
+    return spots
 
 
 def _things(fewest: int, below: int, reach_x: float, reach_y: float, low: float, size: float, rng: Rng) -> list[Mesh]:
