@@ -6,12 +6,13 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from layers import normalised, residual, write_network
+from layers import normalised, residual, write_mean, write_network
 from widening import GONE_ON, begin_as, beginning_as, in_use
 
 LAST_WIDTH, DROPPED = 48, 0.2
@@ -51,13 +52,17 @@ def fit_score_network(
 ) -> None:
     """Fit a network, say how well it does, and write it to a folder.
 
+    One that is gone on with is written halfway between where it began and where the fit ended: what is gone on with is
+    fitted to fewer examples than before, and forgets some of the others, real ones among them (Wortsman et al., "Robust
+    fine-tuning of zero-shot models", CVPR 2022).
+
     Args:
         design: of the network.
         folder: to write it to.
         is_anew: not going on from the network in use.
         seen: what networks are shown of some of ``count`` examples, by their numbers.
         fit_at: fits a network at a rate.
-        report: says how well it does.
+        report: says how well it does; of one that is gone on with, at the fit's end.
         torch: the module.
 
     Raises:
@@ -68,11 +73,18 @@ def fit_score_network(
     if not is_anew:
         rng = np.random.default_rng(0)
         go_on_from(network, in_use(f"{design.name}.onnx"), seen(rng.integers(count, size=BEGUN), rng), torch)
-    network.train().to(memory_format=torch.channels_last)
-    fit_at(network, design.rate if is_anew else GONE_ON * design.rate)
-    network.eval()
-    report(network)
-    _write(network, folder / f"{design.name}.onnx", design, torch)
+    path = folder / f"{design.name}.onnx"
+    with TemporaryDirectory() as room:
+        begun = Path(room) / "begun.onnx"
+        if not is_anew:
+            _write(network.eval(), begun, design, torch)
+        network.train().to(memory_format=torch.channels_last)
+        fit_at(network, design.rate if is_anew else GONE_ON * design.rate)
+        network.eval()
+        report(network)
+        _write(network, path, design, torch)
+        if not is_anew:
+            write_mean(begun, path)
 
 
 def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...], deepened: Collection[int] = ()) -> Any:

@@ -28,7 +28,7 @@ from score_networks import Design, fit, fit_score_network, scored, telling_loss
 from widening import torch_with_onnx
 
 DESIGN = Design(
-    "verifier", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (32, 32, 64, 64, 128, 192), deepened=(3, 5), rate=2e-3
+    "verifier", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (24, 24, 48, 48, 96, 128), deepened=(3, 5), rate=2e-3
 )
 PICTURES, POSES = 6, 20
 """A step looks at so many poses of so many pictures, a third of them right where there are any."""
