@@ -118,7 +118,7 @@ def _finned(size: float, rng: Rng) -> list[Mesh]:
     """A slab with groups of small holes, thin ribs and pins: from afar, or from below, nearly plain."""
     a, b, thick = size, size * rng.uniform(0.4, 1.0), size * rng.uniform(0.05, 0.35)
     holes: list[Loop] = []
-    for x, y in _spots(rng.integers(0, 4), 0.9 * a, 0.9 * b, size, rng):
+    for x, y in _spots(int(rng.integers(0, 4)), 0.9 * a, 0.9 * b, size, rng):
         radius = size * rng.uniform(0.012, 0.035)
         if all(np.hypot(*(np.mean(hole, axis=0) - (x, y))) > 0.1 * size for hole in holes):
             holes.append(circle((x, y), radius, 16))
@@ -131,7 +131,7 @@ def _finned(size: float, rng: Rng) -> list[Mesh]:
         for x in np.arange(x0, 0.95 * a - wide, pitch)[:count]:
             top = thick + rise * (rng.uniform(0.6, 1.0) if rng.random() < 0.3 else 1.0)
             meshes.append(box((x, y0, thick), (x + wide, y1, top)))
-    meshes += _studs(rng.integers(0, 4), a, b, thick, size, rng)
+    meshes += _studs(int(rng.integers(0, 4)), a, b, thick, size, rng)
     if rng.random() < 0.3:
         meshes += _things(1, 3, 0.6 * a, 0.6 * b, thick, size, rng)
     if rng.random() < 0.25:
