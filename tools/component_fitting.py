@@ -13,7 +13,7 @@ from arview.tracking.component_network import GLOBALS, SIDE_PX, overall
 from arview.tracking.verifier import CHANNELS, LINES
 from component_examples import Looked
 from judge_examples import read_examples
-from score_networks import Design, fit, fit_score_network, scored
+from score_networks import Design, Shown, fit, fit_score_network, scored, together
 from verifier_fitting import network_input
 from widening import torch_with_onnx
 
@@ -44,17 +44,11 @@ def fit_components(folder: Path, epochs: int, is_anew: bool = True) -> None:
         InputError: no examples, or no torch or onnx.
     """
     torch = torch_with_onnx()
-    examples, held_out = read_examples(folder, "components_*.pkl", HELD_OUT)
-    fitted = [one for one in examples if one.solid not in held_out]
-
-    def seen(some: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float32]:
-        of_each = ((fitted[i], range(min(SEEN_OF_EACH, len(fitted[i].is_wrong)))) for i in some)
-        return np.concatenate([_inputs(one, index, rng)[0] for one, index in of_each])
-
+    fitted, left = read_examples(folder, "components_*.pkl", HELD_OUT)
     fit_score_network(
-        DESIGN, folder, is_anew, seen, len(fitted),
+        DESIGN, folder, fitted, is_anew, _altered,
         lambda network, rate: _fit(network, fitted, epochs, rate, torch),
-        lambda network: _report(network, [one for one in examples if one.solid in held_out], torch),
+        lambda network: _report(network, left, torch),
         torch,
     )  # fmt: skip
 
@@ -65,8 +59,8 @@ def _fit(network: Any, examples: Sequence[Looked], epochs: int, rate: float, tor
 
     def shown(some: NDArray[np.intp], rng: np.random.Generator) -> Any:
         chosen = [places[i] for i in some]
-        inputs = map(np.concatenate, zip(*(_inputs(one, [index], rng) for one, index in chosen), strict=True))
-        return *inputs, torch.tensor([float(one.is_wrong[index]) for one, index in chosen])
+        wrong = torch.tensor([float(one.is_wrong[index]) for one, index in chosen])
+        return *together(_inputs(one, [index], rng) for one, index in chosen), wrong
 
     def loss_of(some: Any) -> Any:
         seen, both, wrong = some
@@ -77,9 +71,11 @@ def _fit(network: Any, examples: Sequence[Looked], epochs: int, rate: float, tor
     fit("components", network.parameters(), (len(places), BATCH, epochs), rate, DECAY, shown, loss_of, torch)
 
 
-def _inputs(
-    one: Looked, index: Sequence[int], rng: np.random.Generator | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _altered(one: Looked, rng: np.random.Generator) -> Shown:
+    return _inputs(one, range(min(SEEN_OF_EACH, len(one.is_wrong))), rng)
+
+
+def _inputs(one: Looked, index: Sequence[int], rng: np.random.Generator | None = None) -> Shown:
     """Looks as the network takes them; with random numbers altered."""
     shown, contrasts, explained = network_input(one, index, rng)
     sizes_px = [float(one.sizes_px[k]) for k in index]

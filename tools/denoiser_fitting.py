@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import trange
+from tqdm import tqdm
 
+from ahead import made_ahead
 from arview.tracking.denoiser import SHOWN_MEAN, SHOWN_RANGE
 from layers import write_picture_network
 from line_examples import read_lined_pictures
@@ -72,19 +72,17 @@ def _fit(network: Any, pictures: Sequence[NDArray[np.uint8]], epochs: int, rate:
         rng = np.random.default_rng([step, 8])
         return _stacked([_pair(pictures[k], rng) for k in rng.integers(len(pictures), size=CROPS)], torch)
 
-    with ThreadPoolExecutor(1) as maker:
-        following = maker.submit(made, 0)
-        for step in trange(epochs * steps, desc="denoiser", disable=None):
-            (shown, truth), following = following.result(), maker.submit(made, step + 1)
-            with torch.autocast("cpu", torch.bfloat16):
-                said = network(_as_shown(shown).contiguous(memory_format=torch.channels_last))
-            error = (_cleaned(shown, said.float(), torch) - truth) / RESIDUAL_UNIT
-            loss = torch.sqrt(error**2 + ROUND**2).mean()
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
-            optimiser.step()
-            schedule.step()
+    total = epochs * steps
+    for shown, truth in tqdm(made_ahead(made, total), total=total, desc="denoiser", disable=None):
+        with torch.autocast("cpu", torch.bfloat16):
+            said = network(_as_shown(shown).contiguous(memory_format=torch.channels_last))
+        error = (_cleaned(shown, said.float(), torch) - truth) / RESIDUAL_UNIT
+        loss = torch.sqrt(error**2 + ROUND**2).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
+        optimiser.step()
+        schedule.step()
 
 
 def _stacked(pairs: Sequence[Pair], torch: Any) -> tuple[Any, Any]:

@@ -55,6 +55,7 @@ OTHERS_EACH = 8
 RECOLOURED_SHARE, DARK_SHARE = 0.5, 0.4
 """In so many variants a solid has other colours than its own, and in so many of these it is nearly black."""
 DARK = (0.03, 0.15)
+"""Of such a grey."""
 PRINTED_SHARE = 0.5
 """So many solids are printed on: a photo shines through them."""
 UNSHARP_SHARE = 0.2
@@ -131,8 +132,8 @@ def collect_examples(seeds: range, photos: Sequence[Path], folder: Path) -> None
                 pickle.dump([example for example in examples if isinstance(example, kind)], file)
 
 
-def read_examples(folder: Path, pattern: str, every: int) -> tuple[list[Any], set[int]]:
-    """The examples in a folder's files of a pattern, and the solids, one of so many, that are not to be fitted to.
+def read_examples(folder: Path, pattern: str, every: int) -> tuple[list[Any], list[Any]]:
+    """The examples in a folder's files of a pattern: to be fitted to, and those of one solid of so many, which are not.
 
     Raises:
         InputError: no examples.
@@ -141,7 +142,9 @@ def read_examples(folder: Path, pattern: str, every: int) -> tuple[list[Any], se
     if not examples:
         raise InputError(f"{folder}: no examples; run tools/fit_judge collect first")
     solids = sorted({example.solid for example in examples})
-    return examples, set(solids[::every]) if len(solids) > 1 else set()
+    held_out = set(solids[::every]) if len(solids) > 1 else set()
+    fitted, left = ([e for e in examples if (e.solid in held_out) == is_left] for is_left in (False, True))
+    return fitted, left
 
 
 def pictures_of(

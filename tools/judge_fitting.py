@@ -39,13 +39,14 @@ def fit_networks(folder: Path, epochs: int, is_anew: bool = True) -> None:
         import torch
     except ImportError as error:
         raise InputError("fit_judge: torch is not installed; pip install torch") from error
-    groups, held_out = read_examples(folder, "solid_*.pkl", HELD_OUT)
+    fitted, left = read_examples(folder, "solid_*.pkl", HELD_OUT)
     torch.manual_seed(0)
     stored: dict[str, NDArray[np.float32]] = {}
     for stage, names in (("rough", ("rough",)), ("refined", ("fine", "close"))):
         networks = {name: _network(torch) if is_anew else _as_in_use(name, torch) for name in names}
         rate = RATE if is_anew else GONE_ON * RATE
-        weight = _fit(networks, [g for g in groups if g.stage == stage], held_out, epochs, rate, torch)
+        of_stage = ([g for g in groups if g.stage == stage] for groups in (fitted, left))
+        weight = _fit(networks, *of_stage, epochs, rate, torch)
         print(f"{stage}: weight of the hand-made evidence {weight:.2f}")
         for name, network in networks.items():
             for field, layer in zip(Network._fields[::2], network.layers(), strict=True):
@@ -57,11 +58,11 @@ def fit_networks(folder: Path, epochs: int, is_anew: bool = True) -> None:
 
 
 def _fit(
-    networks: dict[str, Any], groups: Sequence[Group], held_out: set[int], epochs: int, rate: float, torch: Any
+    networks: dict[str, Any], fitted: Sequence[Group], left: Sequence[Group], epochs: int, rate: float, torch: Any
 ) -> float:
     """Fit networks whose scores are added; the weight of the hand-made evidence beside them."""
-    shown = [g for g in groups if g.is_right.any() and g.solid not in held_out]
-    without = [g for g in groups if not g.is_right.any() and g.solid not in held_out]
+    shown = [g for g in fitted if g.is_right.any()]
+    without = [g for g in fitted if not g.is_right.any()]
     weight, bias = (torch.nn.Parameter(torch.tensor(value)) for value in (0.7, -3.0))
     parameters = [weight, bias, *(p for network in networks.values() for p in network.parameters())]
     optimiser = torch.optim.AdamW(parameters, rate / 2, weight_decay=DECAY)
@@ -99,11 +100,12 @@ def _fit(
         print(f"{', '.join(networks)}, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
     for network in networks.values():
         network.eval()
-    left = [g for g in groups if g.solid in held_out and g.is_right.any()]
+    told = [g for g in left if g.is_right.any()]
     with torch.no_grad():
-        first = sum(bool(g.is_right[int(scores(g).argmax())]) for g in left)
-    by_hand = sum(bool(g.is_right[int(g.logits.argmax())]) for g in left)
-    print(f"{len(left)} pictures of {len(held_out)} other solids: a right pose first in {first}, by hand in {by_hand}")
+        first = sum(bool(g.is_right[int(scores(g).argmax())]) for g in told)
+    by_hand = sum(bool(g.is_right[int(g.logits.argmax())]) for g in told)
+    others = f"{len(told)} pictures of {len({g.solid for g in left})} other solids"
+    print(f"{others}: a right pose first in {first}, by hand in {by_hand}")
     return float(weight.detach())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -44,34 +45,43 @@ def write_picture_network(network: Any, path: Path, answer: str, torch: Any) -> 
 def write_network(
     network: Any, path: Path, shown: dict[str, Any], answer: str, varying: dict[str, dict[int, str]], torch: Any
 ) -> None:
-    """Write a network as ONNX.
+    """Write a network as ONNX, see `exported`, and say so."""
+    write(exported(network, shown, answer, varying, torch), path)
+
+
+def write(model: bytes, path: Path) -> None:
+    """Write a network in ONNX, and say so."""
+    with replacing(path) as file:
+        file.write(model)
+    print(f"wrote {path}")
+
+
+def exported(network: Any, shown: dict[str, Any], answer: str, varying: dict[str, dict[int, str]], torch: Any) -> bytes:
+    """A network in ONNX.
 
     Args:
-        network: to be written.
-        path: of the file.
+        network: the one.
         shown: an example of each of its inputs by name, in order.
         answer: name of its output.
         varying: names of those dimensions of inputs and output that may be others than in the example.
         torch: the module.
     """
-    with replacing(path) as file:
-        torch.onnx.export(
-            network, tuple(shown.values()), file, input_names=list(shown), output_names=[answer],
-            dynamic_axes=varying, dynamo=False,
-        )  # fmt: skip
-    print(f"wrote {path}")
+    file = BytesIO()
+    torch.onnx.export(
+        network, tuple(shown.values()), file, input_names=list(shown), output_names=[answer],
+        dynamic_axes=varying, dynamo=False,
+    )  # fmt: skip
+    return file.getvalue()
 
 
-def write_mean(begun: Path, fitted: Path) -> None:
-    """Write over a fitted network the mean of it and of what it began as: both as written by `write_network`."""
+def halfway(begun: bytes, fitted: bytes) -> bytes:
+    """The mean of what a network began as and of the fitted one, both `exported`."""
     import onnx
 
-    mean = onnx.load(fitted)
-    first = {one.name: onnx.numpy_helper.to_array(one) for one in onnx.load(begun).graph.initializer}
+    mean = onnx.load_from_string(fitted)
+    first = {one.name: onnx.numpy_helper.to_array(one) for one in onnx.load_from_string(begun).graph.initializer}
     for one in mean.graph.initializer:
         last = onnx.numpy_helper.to_array(one)
         if np.issubdtype(last.dtype, np.floating):
             one.CopyFrom(onnx.numpy_helper.from_array((0.5 * (first[one.name] + last)).astype(last.dtype), one.name))
-    with replacing(fitted) as file:
-        file.write(mean.SerializeToString())
-    print(f"wrote {fitted}, halfway")
+    return bytes(mean.SerializeToString())

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from layers import normalised, residual, write_mean, write_network
+from ahead import made_ahead
+from layers import exported, halfway, normalised, residual, write
 from widening import GONE_ON, begin_as, beginning_as, in_use
 
 LAST_WIDTH, DROPPED = 48, 0.2
+Example = TypeVar("Example")
+Shown = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Looks (N,C,H,W), and what else the network is told of them (N,G)."""
 BEGUN = 60
 """In so many examples a network that is gone on with sees how it is to begin."""
 
@@ -43,9 +46,9 @@ class Design:
 def fit_score_network(
     design: Design,
     folder: Path,
+    fitted: Sequence[Example],
     is_anew: bool,
-    seen: Callable[[NDArray[np.intp], np.random.Generator], NDArray[np.float32]],
-    count: int,
+    altered: Callable[[Example, np.random.Generator], Shown],
     fit_at: Callable[[Any, float], None],
     report: Callable[[Any], None],
     torch: Any,
@@ -59,8 +62,9 @@ def fit_score_network(
     Args:
         design: of the network.
         folder: to write it to.
+        fitted: examples.
         is_anew: not going on from the network in use.
-        seen: what networks are shown of some of ``count`` examples, by their numbers.
+        altered: what networks are shown of an example in fitting.
         fit_at: fits a network at a rate.
         report: says how well it does; of one that is gone on with, at the fit's end.
         torch: the module.
@@ -70,21 +74,24 @@ def fit_score_network(
     """
     torch.manual_seed(0)
     network = score_network(torch, design.shape[0], design.told, design.widths, design.deepened)
+    begun = None
     if not is_anew:
         rng = np.random.default_rng(0)
-        go_on_from(network, in_use(f"{design.name}.onnx"), seen(rng.integers(count, size=BEGUN), rng), torch)
-    path = folder / f"{design.name}.onnx"
-    with TemporaryDirectory() as room:
-        begun = Path(room) / "begun.onnx"
-        if not is_anew:
-            _write(network.eval(), begun, design, torch)
-        network.train().to(memory_format=torch.channels_last)
-        fit_at(network, design.rate if is_anew else GONE_ON * design.rate)
-        network.eval()
-        report(network)
-        _write(network, path, design, torch)
-        if not is_anew:
-            write_mean(begun, path)
+        some = [altered(fitted[i], rng)[0] for i in rng.integers(len(fitted), size=BEGUN)]
+        go_on_from(network, in_use(f"{design.name}.onnx"), np.concatenate(some), torch)
+        begun = _exported(network, design, torch)
+    network.train().to(memory_format=torch.channels_last)
+    fit_at(network, design.rate if is_anew else GONE_ON * design.rate)
+    network.eval()
+    report(network)
+    ended = _exported(network, design, torch)
+    write(ended if begun is None else halfway(begun, ended), folder / f"{design.name}.onnx")
+
+
+def together(looks: Iterable[Shown]) -> Shown:
+    """What a network is shown of some examples, as one."""
+    seen, told = map(np.concatenate, zip(*looks, strict=True))
+    return seen, told
 
 
 def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...], deepened: Collection[int] = ()) -> Any:
@@ -156,21 +163,17 @@ def fit(
         epoch, k = divmod(step, each)
         return shown(orders[epoch][k * at_once : (k + 1) * at_once], altering)
 
-    with ThreadPoolExecutor(1) as maker:
-        following, losses = maker.submit(made, 0), []
-        for step in range(total):
-            some = following.result()
-            if step + 1 < total:
-                following = maker.submit(made, step + 1)
+    following = made_ahead(made, total)
+    for epoch in range(epochs):
+        losses = []
+        for some in islice(following, each):
             loss = loss_of(some)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
             schedule.step()
             losses.append(loss.item())
-            if (step + 1) % each == 0:
-                print(f"{name}, epoch {(step + 1) // each} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
-                losses.clear()
+        print(f"{name}, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
 
 
 def scored(network: Any, seen: NDArray[np.float32], told: NDArray[np.float32], torch: Any) -> Any:
@@ -224,7 +227,8 @@ def go_on_from(network: Any, path: Path, seen: NDArray[np.float32], torch: Any) 
         last.bias.copy_(last_bias)
 
 
-def _write(network: Any, path: Path, design: Design, torch: Any) -> None:
-    """Write a network that is shown any number of looks at once."""
+def _exported(network: Any, design: Design, torch: Any) -> bytes:
+    """A network that is shown any number of looks at once, in ONNX."""
     shown = {"seen": torch.zeros(2, *design.shape), "both": torch.zeros(2, design.told)}
-    write_network(network, path, shown, "score", {name: {0: "poses"} for name in (*shown, "score")}, torch)
+    varying = {name: {0: "poses"} for name in (*shown, "score")}
+    return exported(network.eval(), shown, "score", varying, torch)

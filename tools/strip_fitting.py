@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from arview.tracking.quality import VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES
 from arview.tracking.strips import CHANNELS, COLUMNS, GLOBALS, OUTLINE_ROWS, ROWS, shown
 from judge_examples import read_examples
-from score_networks import Design, fit, fit_score_network, scored, telling_loss
+from score_networks import Design, Shown, fit, fit_score_network, scored, telling_loss, together
 from strip_examples import Stripped
 from widening import torch_with_onnx
 
@@ -50,16 +50,12 @@ def fit_strips(folder: Path, epochs: int, is_anew: bool = True) -> None:
         InputError: no examples, or no torch or onnx.
     """
     torch = torch_with_onnx()
-    examples, held_out = read_examples(folder, "strips_*.pkl", HELD_OUT)
-    fitted = [one for one in examples if one.solid not in held_out and one.is_told.any()]
-
-    def seen(some: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float32]:
-        return np.concatenate([_inputs(fitted[i], _chosen(fitted[i], rng), rng)[0] for i in some])
-
+    examples, left = read_examples(folder, "strips_*.pkl", HELD_OUT)
+    fitted = [one for one in examples if one.is_told.any()]
     fit_score_network(
-        DESIGN, folder, is_anew, seen, len(fitted),
+        DESIGN, folder, fitted, is_anew, _altered,
         lambda network, rate: _fit(network, fitted, epochs, rate, torch),
-        lambda network: _report(network, [one for one in examples if one.solid in held_out], torch),
+        lambda network: _report(network, left, torch),
         torch,
     )  # fmt: skip
 
@@ -72,9 +68,9 @@ def _fit(network: Any, examples: Sequence[Stripped], epochs: int, rate: float, t
 
     def shown_of(some: NDArray[np.intp], rng: np.random.Generator) -> Any:
         chosen = [(examples[i], _chosen(examples[i], rng)) for i in some]
-        inputs = map(np.concatenate, zip(*(_inputs(one, index, rng) for one, index in chosen), strict=True))
         known = torch.from_numpy(np.concatenate([one.known[index] for one, index in chosen]).astype(np.float32))
-        return *inputs, known, [torch.from_numpy(one.is_right[index]) for one, index in chosen]
+        truth = [torch.from_numpy(one.is_right[index]) for one, index in chosen]
+        return *together(_inputs(one, index, rng) for one, index in chosen), known, truth
 
     def loss_of(some: Any) -> Any:
         seen, told, known, truth = some
@@ -86,15 +82,17 @@ def _fit(network: Any, examples: Sequence[Stripped], epochs: int, rate: float, t
     fit("strips", weights, (len(examples), PICTURES, epochs), rate, DECAY, shown_of, loss_of, torch)
 
 
+def _altered(one: Stripped, rng: np.random.Generator) -> Shown:
+    return _inputs(one, _chosen(one, rng), rng)
+
+
 def _chosen(one: Stripped, rng: np.random.Generator) -> list[int]:
     """Some poses of a picture of which it is known whether they are right."""
     index = np.flatnonzero(one.is_told)
     return sorted(rng.permutation(index)[:POSES].tolist())
 
 
-def _inputs(
-    one: Stripped, index: Sequence[int], rng: np.random.Generator | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _inputs(one: Stripped, index: Sequence[int], rng: np.random.Generator | None = None) -> Shown:
     """Poses of a picture as the network takes them; with random numbers altered."""
     strips = one.strips[list(index)]
     if rng is not None:

@@ -24,7 +24,7 @@ from arview.tracking.verifier import (
 )
 from component_examples import Looked
 from judge_examples import Looks, read_examples
-from score_networks import Design, fit, fit_score_network, scored, telling_loss
+from score_networks import Design, Shown, fit, fit_score_network, scored, telling_loss, together
 from widening import torch_with_onnx
 
 DESIGN = Design(
@@ -57,16 +57,11 @@ def fit_verifier(folder: Path, epochs: int, is_anew: bool = True) -> None:
         InputError: no examples, or no torch or onnx.
     """
     torch = torch_with_onnx()
-    looks, held_out = read_examples(folder, "looks_*.pkl", HELD_OUT)
-    fitted = [look for look in looks if look.solid not in held_out]
-
-    def seen(some: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float32]:
-        return np.concatenate([_inputs(fitted[i], _chosen(fitted[i], rng), rng)[0] for i in some])
-
+    fitted, left = read_examples(folder, "looks_*.pkl", HELD_OUT)
     fit_score_network(
-        DESIGN, folder, is_anew, seen, len(fitted),
+        DESIGN, folder, fitted, is_anew, _altered,
         lambda network, rate: _fit(network, fitted, epochs, rate, torch),
-        lambda network: _report(network, [look for look in looks if look.solid in held_out], torch),
+        lambda network: _report(network, left, torch),
         torch,
     )  # fmt: skip
 
@@ -74,14 +69,18 @@ def fit_verifier(folder: Path, epochs: int, is_anew: bool = True) -> None:
 def _fit(network: Any, looks: Sequence[Looks], epochs: int, rate: float, torch: Any) -> None:
     def shown(some: NDArray[np.intp], rng: np.random.Generator) -> Any:
         chosen = [(looks[i], _chosen(looks[i], rng)) for i in some]
-        inputs = map(np.concatenate, zip(*(_inputs(look, index, rng) for look, index in chosen), strict=True))
-        return *inputs, [torch.from_numpy(look.is_right[index]) for look, index in chosen]
+        truth = [torch.from_numpy(look.is_right[index]) for look, index in chosen]
+        return *together(_inputs(look, index, rng) for look, index in chosen), truth
 
     def loss_of(some: Any) -> Any:
         seen, both, truth = some
         return telling_loss(scored(network, seen, both, torch), truth, LISTWISE_WEIGHT / PICTURES, torch)
 
     fit("verifier", network.parameters(), (len(looks), PICTURES, epochs), rate, DECAY, shown, loss_of, torch)
+
+
+def _altered(look: Looks, rng: np.random.Generator) -> Shown:
+    return _inputs(look, _chosen(look, rng), rng)
 
 
 def _chosen(look: Looks, rng: np.random.Generator) -> list[int]:
@@ -96,9 +95,7 @@ def _chosen(look: Looks, rng: np.random.Generator) -> list[int]:
     return index
 
 
-def _inputs(
-    look: Looks, index: Sequence[int], rng: np.random.Generator | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _inputs(look: Looks, index: Sequence[int], rng: np.random.Generator | None = None) -> Shown:
     """Poses of a picture as the network takes them; with random numbers altered, all of them alike."""
     shown, contrasts, explained = network_input(look, index, rng)
     both = []

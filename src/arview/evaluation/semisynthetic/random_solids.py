@@ -57,9 +57,7 @@ def _plate(size: float, rng: Rng) -> list[Mesh]:
         holes = tuple(circle(center, size * rng.uniform(0.03, 0.1)) for center in centers)
     meshes = [prism(outline, holes, 0.0, thick), *_things(2, 9, 0.65 * a, 0.65 * b, thick, size, rng)]
     if rng.random() < 0.4:
-        upside_down = rigid(exp_so3([np.pi, 0, 0]), np.zeros(3))
-        below = _things(1, 4, 0.6 * a, 0.6 * b, 0.0, size, rng)
-        meshes += [moved(mesh, upside_down) for mesh in below]
+        meshes += _upside_down(_things(1, 4, 0.6 * a, 0.6 * b, 0.0, size, rng))
     return meshes
 
 
@@ -118,7 +116,7 @@ def _finned(size: float, rng: Rng) -> list[Mesh]:
     """A slab with groups of small holes, thin ribs and pins: from afar, or from below, nearly plain."""
     a, b, thick = size, size * rng.uniform(0.4, 1.0), size * rng.uniform(0.05, 0.35)
     holes: list[Loop] = []
-    for x, y in _spots(int(rng.integers(0, 4)), 0.9 * a, 0.9 * b, size, rng):
+    for x, y in [spot for _ in range(rng.integers(0, 4)) for spot in _spots(0.9 * a, 0.9 * b, size, rng)]:
         radius = size * rng.uniform(0.012, 0.035)
         if all(np.hypot(*(np.mean(hole, axis=0) - (x, y))) > 0.1 * size for hole in holes):
             holes.append(circle((x, y), radius, 16))
@@ -131,12 +129,12 @@ def _finned(size: float, rng: Rng) -> list[Mesh]:
         for x in np.arange(x0, 0.95 * a - wide, pitch)[:count]:
             top = thick + rise * (rng.uniform(0.6, 1.0) if rng.random() < 0.3 else 1.0)
             meshes.append(box((x, y0, thick), (x + wide, y1, top)))
-    meshes += _studs(int(rng.integers(0, 4)), a, b, thick, size, rng)
+    for _ in range(rng.integers(0, 4)):
+        meshes += _studs(a, b, thick, size, rng)
     if rng.random() < 0.3:
         meshes += _things(1, 3, 0.6 * a, 0.6 * b, thick, size, rng)
     if rng.random() < 0.25:
-        upside_down = rigid(exp_so3([np.pi, 0, 0]), np.zeros(3))
-        meshes += [moved(mesh, upside_down) for mesh in _studs(1, a, b, 0.0, size, rng)]
+        meshes += _upside_down(_studs(a, b, 0.0, size, rng))
     return meshes
 
 
@@ -149,36 +147,31 @@ def _studded(size: float, rng: Rng) -> list[Mesh]:
         outward = np.zeros((3, 3))
         outward[i, 0], outward[j, 1], outward[axis, 2] = 1.0, sign, sign
         place = rigid(outward, np.zeros(3))
-        meshes += [moved(mesh, place) for mesh in _studs(1, half[i], half[j], half[axis], size, rng)]
+        meshes += [moved(mesh, place) for mesh in _studs(half[i], half[j], half[axis], size, rng)]
     return meshes + [_turned_about(mesh, rng) for mesh in _things(0, 3, 0.3 * size, 0.3 * size, 0.3 * size, size, rng)]
 
 
-def _studs(groups: int, reach_x: float, reach_y: float, low: float, size: float, rng: Rng) -> list[Mesh]:
-    """Groups of small pins or boxes on a plane."""
-    made = []
-    for _ in range(groups):
-        wide, rise = size * rng.uniform(0.01, 0.04), size * rng.uniform(0.01, 0.2)
-        are_round = rng.random() < 0.6
-        for x, y in _spots(1, 0.9 * reach_x, 0.9 * reach_y, size, rng):
-            if are_round:
-                made.append(cylinder((x, y), wide, low, low + rise, 12))
-            else:
-                made.append(box((x - wide, y - 0.6 * wide, low), (x + wide, y + 0.6 * wide, low + rise)))
-    return made
+def _studs(reach_x: float, reach_y: float, low: float, size: float, rng: Rng) -> list[Mesh]:
+    """A group of small pins or boxes on a plane."""
+    wide, top = size * rng.uniform(0.01, 0.04), low + size * rng.uniform(0.01, 0.2)
+    are_round = rng.random() < 0.6
+    spots = _spots(0.9 * reach_x, 0.9 * reach_y, size, rng)
+    if are_round:
+        return [cylinder(spot, wide, low, top, 12) for spot in spots]
+    return [box((x - wide, y - 0.6 * wide, low), (x + wide, y + 0.6 * wide, top)) for x, y in spots]
 
 
-def _spots(groups: int, reach_x: float, reach_y: float, size: float, rng: Rng) -> list[tuple[float, float]]:
-    """Places in rows and columns, of which some lack, so many groups of them."""
+def _spots(reach_x: float, reach_y: float, size: float, rng: Rng) -> list[tuple[float, float]]:
+    """Places in rows and columns, of which some lack."""
+    pitch, columns, rows = size * rng.uniform(0.09, 0.2), rng.integers(1, 10), rng.integers(1, 5)
+    x0, y0 = rng.uniform(-reach_x, reach_x), rng.uniform(-reach_y, reach_y)
+    if rng.random() < 0.3:
+        columns, rows = rows, columns
     spots = []
-    for _ in range(groups):
-        pitch, columns, rows = size * rng.uniform(0.09, 0.2), rng.integers(1, 10), rng.integers(1, 5)
-        x0, y0 = rng.uniform(-reach_x, reach_x), rng.uniform(-reach_y, reach_y)
-        if rng.random() < 0.3:
-            columns, rows = rows, columns
-        for k in range(columns * rows):
-            x, y = x0 + pitch * (k % columns), y0 + pitch * (k // columns)
-            if abs(x) < reach_x and abs(y) < reach_y and rng.random() < 0.93:
-                spots.append((float(x), float(y)))
+    for k in range(columns * rows):
+        x, y = x0 + pitch * (k % columns), y0 + pitch * (k // columns)
+        if abs(x) < reach_x and abs(y) < reach_y and rng.random() < 0.93:
+            spots.append((float(x), float(y)))
     return spots
 
 
@@ -207,6 +200,11 @@ def _polygon(radius_x: float, radius_y: float, rng: Rng) -> Loop:
         angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, rng.integers(4, 9)))
         if np.max(np.diff(np.append(angles, angles[0] + 2.0 * np.pi))) < 2.4:
             return np.stack([radius_x * np.cos(angles), radius_y * np.sin(angles)], axis=1)
+
+
+def _upside_down(meshes: list[Mesh]) -> list[Mesh]:
+    turn = rigid(exp_so3([np.pi, 0, 0]), np.zeros(3))
+    return [moved(mesh, turn) for mesh in meshes]
 
 
 def _turned_about(mesh: Mesh, rng: Rng) -> Mesh:
