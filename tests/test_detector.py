@@ -285,6 +285,10 @@ def test_rough_poses_are_tried_by_themselves() -> None:
     assert len(found) == 1 and error(found[0].cam_from_model, truth)[2] < 1.5
     away = pose_from(30, 40, 520, roll_deg=180.0)
     assert detector().detect_near(image, [away]) == []
+    tried_first = detector().detect(image, guesses=[near])
+    assert len(tried_first) == 1 and np.array_equal(tried_first[0].cam_from_model, found[0].cam_from_model)
+    searched = detector().detect(image, guesses=[away])
+    assert searched and error(searched[0].cam_from_model, truth)[2] < 1.5
 
 
 def test_what_hides_half_of_the_part_does_not_pull_the_pose_away() -> None:

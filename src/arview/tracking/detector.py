@@ -139,25 +139,35 @@ class Detector:
             views, self.local.tracker.part, camera, o.radius_px, o.roll_step_deg, o.subdivisions, self.symmetries.exact
         )
 
-    def detect(self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True) -> list[Detection]:
+    def detect(
+        self,
+        image: NDArray[np.uint8],
+        max_results: int = 3,
+        is_thorough: bool = True,
+        guesses: Sequence[Array] = (),
+    ) -> list[Detection]:
         """Poses of the part in a frame, best first; an empty list when it is not found.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             max_results: at most so many, all above the quality threshold and apart from each other.
             is_thorough: search on among less likely matches when the likeliest come to nothing.
+            guesses: rough poses (4,4) ``cam_from_model``; where one of them leads to the part, that is all.
         """
         picture = self.local.picture(image)
+        if found := self._found_near(picture, guesses):
+            return found
         least = self.options.min_quality if is_thorough else max(SURE_QUALITY, self.options.min_quality)
         return self._found(picture, self.hypotheses(picture, is_thorough), max_results, least)
 
     def detect_near(self, image: NDArray[np.uint8], guesses: Sequence[Array]) -> list[Detection]:
         """The best pose (or none) that one of some rough poses (4,4) ``cam_from_model`` leads to."""
-        picture = self.local.picture(image)
+        return self._found_near(self.local.picture(image), guesses)
+
+    def _found_near(self, picture: Picture, guesses: Sequence[Array]) -> list[Detection]:
         starts = [Candidate(1.0, guess @ self.local.tracker.part.model_from_body) for guess in guesses]
-        return self._found(
-            picture, self.local.settled(picture, self.local.climbed(picture, starts)), 1, self.options.min_quality
-        )
+        settled = self.local.settled(picture, self.local.climbed(picture, starts)) if starts else []
+        return self._found(picture, settled, 1, self.options.min_quality)
 
     def _found(self, picture: Picture, settled: list[Hypothesis], max_results: int, least: float) -> list[Detection]:
         """The hypotheses of at least a quality, best first."""

@@ -332,13 +332,12 @@ class TrackingSession:
             proposals = self.learned.propose(image)
         least = o.likely_look if rests else 0.0
         guesses = [proposal.cam_from_model for proposal in proposals if proposal.score >= least]
-        found = self.detector.detect_near(image, guesses) if guesses else []
-        if found or rests:
-            return found
+        if rests:
+            return self.detector.detect_near(image, guesses) if guesses else []
         # The wide search takes long: not in every frame.
         turn = self._lost_frames % (2 * o.search_every)
         is_thorough = turn == 1 if self.state == TrackingState.SEARCHING else turn == 0
-        return self.detector.detect(image, max_results=1, is_thorough=is_thorough)
+        return self.detector.detect(image, max_results=1, is_thorough=is_thorough, guesses=guesses)
 
     def _align(self, image: NDArray[np.uint8], guide_cam_from_model: Array) -> tuple[Estimate | None, str]:
         """Look whether the part has been brought near the guide pose; what is found must hold a second frame."""
