@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from arview.geometry import Array, apply
 from arview.guideviews.surface import Surface, draw_surface
-from arview.tracking.score_network import Look, ScoreNetwork
+from arview.tracking.score_network import Look, ScoreNetwork, size_and_contrast
 from arview.tracking.solver import project
 from arview.tracking.verifier import BAND_PX, DRAWN, contrasted, lines_around, with_gradients, with_lines
 
@@ -34,8 +34,8 @@ MOST_SHARE = 1.6
 JUMP = 0.03
 """A jump in depth, in half diameters of the part, is drawn as an edge, as normals that turn by more than 30° are."""
 TURN_COS = 0.866
-TYPICAL_SIZE_PX, TYPICAL_CONTRAST = 30.0, 40.0
-"""Sizes and contrasts count relative to these."""
+TYPICAL_SIZE_PX = 30.0
+"""Sizes count relative to this."""
 MIRRORS = ((False, False), (True, False), (False, True), (True, True))
 """Forms in which a look is scored: of 4,454 wrong components of assemblies not fitted to 59 % are then above 99 % of
 the right ones, with the first form alone 57 %. The verifier of poses gains nothing from it.
@@ -84,8 +84,7 @@ def shown(look: ComponentLook) -> Look:
 
 def overall(size_px: float, contrast: float, explained: float) -> NDArray[np.float32]:
     """What the network is told of a component as a whole (GLOBALS,): see there."""
-    both = [np.log(size_px / TYPICAL_SIZE_PX), 0.5 * np.log(contrast / TYPICAL_CONTRAST + 0.05), explained]
-    return np.array(both, dtype=np.float32)
+    return np.array([*size_and_contrast(size_px / TYPICAL_SIZE_PX, contrast), explained], dtype=np.float32)
 
 
 def component_looks(

@@ -19,6 +19,8 @@ RIGHTWARD, DOWNWARD = 6, 7
 """Channels with the parts of the surface's normal to the right and down: mirrors turn them round."""
 MOST_AT_ONCE = 8
 """Looks that a network is given together."""
+TYPICAL_CONTRAST = 40.0
+"""Contrasts count relative to this."""
 
 Look = tuple[NDArray[np.float32], NDArray[np.float32]]
 """What a network is shown (C,H,W), and what else it is told (G,)."""
@@ -55,3 +57,13 @@ def mirrored(seen: NDArray[np.float32], across: bool = True, down: bool = False)
     other[:, RIGHTWARD] *= -1.0 if across else 1.0
     other[:, DOWNWARD] *= -1.0 if down else 1.0
     return other
+
+
+def size_and_contrast(size: float, contrast: float) -> tuple[float, float]:
+    """Of what is looked at in the picture and of the look, as networks are told: logarithms against typical ones.
+
+    Args:
+        size: relative to a typical one.
+        contrast: deviation of the colours, grey levels.
+    """
+    return np.log(size), 0.5 * np.log(contrast / TYPICAL_CONTRAST + 0.05)

@@ -19,11 +19,11 @@ from arview.geometry import Array
 from arview.tracking.judge import chosen_lines
 from arview.tracking.line_network import INSIDE, LONGEST_SIDE_PX
 from arview.tracking.picture import Picture, steps_to
-from arview.tracking.score_network import Look, ScoreNetwork
+from arview.tracking.score_network import Look, ScoreNetwork, size_and_contrast
 from arview.tracking.solver import project_lines
 from arview.tracking.threads import pool
 from arview.tracking.tracker import PartView
-from arview.tracking.verifier import relative_colours, size_and_contrast
+from arview.tracking.verifier import TYPICAL_RADIUS_PX, relative_colours
 
 OUTLINE_ROWS, INNER_ROWS = 96, 48
 """Lines at most across the outline, and across design edges inside."""
@@ -153,4 +153,4 @@ def _shown(strips):  # type: ignore[no-untyped-def]
 def shown(strips: NDArray[np.uint8], radius_px: float) -> Look:
     """What the network is shown of raw strips, and told: see CHANNELS and GLOBALS."""
     seen, contrast, share = _shown(strips)
-    return seen, np.array([*size_and_contrast(radius_px, contrast), share], dtype=np.float32)
+    return seen, np.array([*size_and_contrast(radius_px / TYPICAL_RADIUS_PX, contrast), share], dtype=np.float32)

@@ -22,7 +22,7 @@ from arview.guideviews.surface import draw_surface
 from arview.tracking.line_network import INSIDE
 from arview.tracking.picture import Picture, steps_to
 from arview.tracking.refine import nearest_view
-from arview.tracking.score_network import Look, ScoreNetwork
+from arview.tracking.score_network import Look, ScoreNetwork, size_and_contrast
 from arview.tracking.solver import project_lines
 from arview.tracking.threads import pool
 from arview.tracking.tracker import PartView
@@ -61,8 +61,8 @@ LEAST_GRADIENT = 0.02
 """In such deviations per pixel: added to the mean gradient."""
 BESIDE = 0.6
 """Gradients count as the outline's within such a distance of it, in BAND_PX."""
-TYPICAL_RADIUS_PX, TYPICAL_CONTRAST = 80.0, 40.0
-"""Half diameters and contrasts count relative to these."""
+TYPICAL_RADIUS_PX = 80.0
+"""Half diameters count relative to this."""
 MEANS, DEVIATIONS = np.array([2.0, 1.0, 0.5]), np.array([4.0, 3.0, 1.0 / 3.0])
 """Of what is known of a pose."""
 _ORIGIN, _ANY_DIRECTION = np.zeros((1, 3), np.float32), np.array([[1.0, 0.0, 0.0]], np.float32)
@@ -306,13 +306,8 @@ def _slope_at(plane, v, u, slope):  # type: ignore[no-untyped-def]
 
 def overall(radius_px: float, contrast: float, known: Array, explained: float) -> NDArray[np.float32]:
     """What the network is told of a pose as a whole (GLOBALS,): see there."""
-    both = size_and_contrast(radius_px, contrast)
+    both = size_and_contrast(radius_px / TYPICAL_RADIUS_PX, contrast)
     return np.concatenate([both, (known - MEANS) / DEVIATIONS, [explained]]).astype(np.float32)
-
-
-def size_and_contrast(radius_px: float, contrast: float) -> tuple[float, float]:
-    """Of a part in the picture and of the look at it, as networks are told: logarithms against typical ones."""
-    return np.log(radius_px / TYPICAL_RADIUS_PX), 0.5 * np.log(contrast / TYPICAL_CONTRAST + 0.05)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
