@@ -58,6 +58,10 @@ DARK = (0.03, 0.15)
 """Of such a grey."""
 PRINTED_SHARE = 0.5
 """So many solids are printed on: a photo shines through them."""
+SHADOWED_SHARE = 0.4
+"""So many solids cast a soft shadow on what is behind them, as parts do that lie on something."""
+SHADOW_ASIDE, SHADOW_SOFT, SHADOW_DARK = 0.2, (0.01, 0.1), (0.2, 0.8)
+"""So far aside at most and so soft, in the square root of the pixels it covers; and how dark."""
 UNSHARP_SHARE = 0.2
 """So many pictures are taken with a moving hand or out of focus."""
 MOVED_PX, DEFOCUSED_PX, GRAIN = (3.0, 14.0), (0.8, 2.4), (1.0, 4.0)
@@ -172,9 +176,10 @@ def _pictures_of(
         for frame in _rendered(shown, occluder, variant, FRAMES_EACH, photos, rng):
             if frame.visible >= 0.5:
                 image = _printed_on(frame, photos, rng) if rng.random() < PRINTED_SHARE else frame.image
-                yield detector, image, frame.cam_from_model @ detector.local.tracker.part.model_from_body
+                truth = frame.cam_from_model @ detector.local.tracker.part.model_from_body
+                yield detector, _shadowed(image, frame.mask, rng), truth
         for frame in _rendered(other, occluder, variant, WITHOUT_EACH // len(VARIANTS), photos, rng):
-            yield detector, frame.image, None
+            yield detector, _shadowed(frame.image, frame.mask, rng), None
     others = some_solids(seed)
     for k in range(CROWDS_EACH + CROWDS_WITHOUT_EACH):
         options = SequenceOptions("regular", 1, int(rng.integers(1 << 30)), motion=ANYWHERE)
@@ -277,6 +282,19 @@ def _printed_on(frame: SequenceFrame, photos: Sequence[Path], rng: np.random.Gen
     share = rng.uniform(0.3, 1.0) * frame.mask[..., None]
     printed = frame.image * (1.0 - share + share * photo / 110.0)
     return np.asarray(np.clip(printed, 0, 255).astype(np.uint8))
+
+
+def _shadowed(image: NDArray[np.uint8], mask: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A picture with, now and then, the shadow that what a mask (H,W) covers casts on the rest."""
+    size_px = float(np.sqrt(mask.sum()))
+    if rng.random() >= SHADOWED_SHARE or size_px < 1.0:
+        return image
+    aside_px = size_px * rng.uniform(-SHADOW_ASIDE, SHADOW_ASIDE, 2)
+    way = np.array([[1.0, 0.0, aside_px[0]], [0.0, 1.0, aside_px[1]]])
+    shadow = cv2.warpAffine(mask, way, mask.shape[::-1])
+    shadow = cv2.GaussianBlur(shadow, (0, 0), size_px * rng.uniform(*SHADOW_SOFT))
+    light = 1.0 - rng.uniform(*SHADOW_DARK) * (1.0 - mask) * shadow
+    return np.asarray(np.round(image * light[..., None]).astype(np.uint8))
 
 
 def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Array | None) -> Iterator[Group | Looks]:
