@@ -101,7 +101,7 @@ def judge(
         name, step, some = look
         return np.asarray(
             judge_poses(
-                picture.gradients(step), part.arrays, poses[some], np.log(view_lines[some]), part.views.diameter_mm,
+                picture.gradients(step), part.distinct, poses[some], np.log(view_lines[some]), part.views.diameter_mm,
                 network(name),
             )
         )  # fmt: skip
@@ -121,7 +121,7 @@ def describe(
     for step, some in _looks(picture, part, poses, radius_px):
         for k in some:
             describe_pose(
-                picture.gradients(step), part.arrays, poses[k], np.log(view_lines[k]), part.views.diameter_mm,
+                picture.gradients(step), part.distinct, poses[k], np.log(view_lines[k]), part.views.diameter_mm,
                 lines[k], both[k],
             )  # fmt: skip
     return lines, both

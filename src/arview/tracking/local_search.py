@@ -240,7 +240,7 @@ class LocalSearch:
         def search(job: tuple[int, Array]) -> tuple[Array, Array]:
             maps, intrinsics = picture.maps(job[0])
             found: tuple[Array, Array] = climb(
-                maps, self.tracker.part.arrays, job[1], intrinsics, 0.01 * self.views.diameter_mm,
+                maps, self.tracker.part.distinct, job[1], intrinsics, 0.01 * self.views.diameter_mm,
                 np.deg2rad(level.turn_step_deg), level.stretch_step, level.rounds, level.halvings, 2, 2,
                 level.points, level.points,
             )  # fmt: skip
@@ -294,7 +294,7 @@ class LocalSearch:
         poses = np.stack([h.cam_from_body for h in found])
         scores = self._verifier.scores(picture, poses, known).tolist()
         strips = self._strips.scores(picture, poses).tolist()
-        seen, part, step_mm = picture.lines(), self.tracker.part.arrays, 0.01 * self.views.diameter_mm
+        seen, part, step_mm = picture.lines(), self.tracker.part.distinct, 0.01 * self.views.diameter_mm
         supports = [line_support(seen.answers, part, pose, seen.intrinsics, step_mm) for pose in poses]
         return [
             replace(h, verification=score, line_support=float(support), strips=across)

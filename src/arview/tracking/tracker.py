@@ -22,6 +22,7 @@ from arview.geometry import Array, invert, rigid, rotation_angle_rad
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.tracking.ambiguity import EdgeSteps
+from arview.tracking.crowding import is_crowded
 from arview.tracking.feature import FeatureModality, Matches
 from arview.tracking.nonlocal_search import NonlocalSearch
 from arview.tracking.patch import Pyramid
@@ -209,7 +210,8 @@ class PartView:
     """A guide-view set as the kernels need it: flat float32 arrays about the model's centre.
 
     ``arrays`` holds directions (N,3), contour starts (N+1), points, normals, runs, edge starts (N+1), points,
-    tangents, kinds; ``surface`` is its mesh, of which enough may be curved for `shading`.
+    tangents, kinds; ``distinct`` is the same without the design edges that are crowded, see `is_crowded`. ``surface``
+    is its mesh, of which enough may be curved for `shading`.
     """
 
     def __init__(self, views: GuideViewSet) -> None:
@@ -230,6 +232,9 @@ class PartView:
             raw["edge_tangents"] * unit16,
             np.array(raw["edge_kinds"]),
         )
+        kinds = self.arrays[-1].copy()
+        kinds[is_crowded(views)] &= np.uint8(255 - EDGE_SHARP)
+        self.distinct = (*self.arrays[:-1], kinds)
         self.surface = views.surface
         self.is_curved = curved_share(self.surface) >= LEAST_CURVED
         self.corner_normals = corner_normals(self.surface)
