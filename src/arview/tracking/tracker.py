@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -210,8 +210,7 @@ class PartView:
     """A guide-view set as the kernels need it: flat float32 arrays about the model's centre.
 
     ``arrays`` holds directions (N,3), contour starts (N+1), points, normals, runs, edge starts (N+1), points,
-    tangents, kinds; ``distinct`` is the same without the design edges that are crowded, see `is_crowded`. ``surface``
-    is its mesh, of which enough may be curved for `shading`.
+    tangents, kinds; ``surface`` is its mesh, of which enough may be curved for `shading`.
     """
 
     def __init__(self, views: GuideViewSet) -> None:
@@ -232,12 +231,16 @@ class PartView:
             raw["edge_tangents"] * unit16,
             np.array(raw["edge_kinds"]),
         )
-        kinds = self.arrays[-1].copy()
-        kinds[is_crowded(views)] &= np.uint8(255 - EDGE_SHARP)
-        self.distinct = (*self.arrays[:-1], kinds)
         self.surface = views.surface
         self.is_curved = curved_share(self.surface) >= LEAST_CURVED
         self.corner_normals = corner_normals(self.surface)
+
+    @cached_property
+    def distinct(self) -> tuple[NDArray[Any], ...]:
+        """``arrays`` without the design edges that are crowded, see `is_crowded`; worked out when first asked for."""
+        kinds = self.arrays[-1].copy()
+        kinds[is_crowded(self.views)] &= np.uint8(255 - EDGE_SHARP)
+        return (*self.arrays[:-1], kinds)
 
 
 def intrinsics_of(camera: Camera) -> Array:
