@@ -129,6 +129,22 @@ def test_symmetries_are_discovered() -> None:
     assert len(find_symmetries(assembly_views()).near) == 0
 
 
+def test_fifths_are_discovered() -> None:
+    angles = np.deg2rad(72.0 * np.arange(5) + 10.0)
+    grey = (0.5, 0.5, 0.5)
+    places = [(38 * np.cos(a), 38 * np.sin(a)) for a in angles]
+    wheel = [component(f"stud_{k}", post(place, 8, 12, 30), grey) for k, place in enumerate(places)]
+    wheel += [component("disc", post((0, 0), 60, 0, 12, 60), grey), component("hub", post((0, 0), 14, 12, 40), grey)]
+    key = component("key", box((48, -4, 12), (56, 4, 18)), grey)
+    for parts, kind in ((wheel, "exact"), ([*wheel, key], "near")):
+        views = make_guide_views(make_model("wheel", tuple(parts)), ViewRange((200.0, 500.0)), GuideViewOptions(2))
+        found = find_symmetries(views)
+        turns = getattr(found, kind)
+        assert len(found.exact) + len(found.near) == len(turns) == 4
+        angles_deg = np.rad2deg(np.arctan2(turns[:, 1, 0], turns[:, 0, 0])) % 360.0
+        np.testing.assert_allclose(np.sort(angles_deg), [72.0, 144.0, 216.0, 288.0])
+
+
 def cube_turns() -> np.ndarray:
     """The 24 turns of a cube onto itself."""
     signed = [np.diag(signs) @ np.eye(3)[list(order)] for order in permutations(range(3)) for signs in SIGNS]

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from arview.evaluation.semisynthetic.random_solids import random_solid
+from arview.cad import Model
+from arview.evaluation.semisynthetic.random_solids import random_solid, random_twin
 
 SEEDS = range(30)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_solid_is_made_of_closed_bodies_of_a_parts_size(seed: int) -> None:
-    solid = random_solid(seed)
+@pytest.mark.parametrize("made", [random_solid, random_twin])
+def test_a_solid_is_made_of_closed_bodies_of_a_parts_size(made: Callable[[int], Model], seed: int) -> None:
+    try:
+        solid = made(seed)
+    except ValueError:
+        assert made is random_twin and seed in (21, 23)
+        return
     assert 60.0 < solid.diameter_mm < 350.0
     for component in solid.components:
         corners = component.vertices_in_model[component.faces]
@@ -31,3 +40,22 @@ def test_the_same_seed_gives_the_same_solid_and_another_another() -> None:
         for a, b in zip(one.components, again.components, strict=True)
     )
     assert one.diameter_mm != other.diameter_mm
+
+
+def test_most_of_a_twin_half_a_turn_or_another_takes_onto_itself_but_not_all_of_it() -> None:
+    seen = 0
+    for seed in SEEDS:
+        try:
+            solid = random_twin(seed)
+        except ValueError:
+            continue
+        points = np.concatenate([c.vertices_in_model for c in solid.components])
+        away_mm = []
+        for angle in np.deg2rad([72.0, 90.0, 120.0, 180.0, 45.0, 60.0]):
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            away_mm.append(cKDTree(points).query(np.column_stack([points[:, :2] @ turn.T, points[:, 2]]))[0])
+        most_deep = 0.05 * np.ptp(points[:, 0])
+        shares = np.array([[np.mean(one < limit) for limit in (most_deep, 0.01)] for one in away_mm])
+        assert shares[:, 0].max() > 0.6 and shares[:, 1].max() < 1.0, (seed, shares)
+        seen += 1
+    assert seen > 25

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -152,20 +152,23 @@ def read_examples(folder: Path, pattern: str, every: int) -> tuple[list[Any], li
 
 
 def pictures_of(
-    seed: int, photos: Sequence[Path], efforts: tuple[Effort, ...]
+    seed: int, photos: Sequence[Path], efforts: tuple[Effort, ...], solid_of: Callable[[int], Model] = random_solid
 ) -> Iterator[tuple[Detector, NDArray[np.uint8], Array | None]]:
-    """A detector of a solid, and pictures of it with the true ``cam_from_body``, or without it and none."""
+    """A detector of a solid, and pictures of it with the true ``cam_from_body``, or without it and none.
+
+    ``solid_of`` makes the solid of its seed; those beside it are any.
+    """
     rng = np.random.default_rng([seed, 4])
-    for detector, image, truth in _pictures_of(seed, photos, efforts):
+    for detector, image, truth in _pictures_of(seed, photos, efforts, solid_of):
         yield detector, _unsharp(image, rng) if rng.random() < UNSHARP_SHARE else image, truth
 
 
 def _pictures_of(
-    seed: int, photos: Sequence[Path], efforts: tuple[Effort, ...]
+    seed: int, photos: Sequence[Path], efforts: tuple[Effort, ...], solid_of: Callable[[int], Model]
 ) -> Iterator[tuple[Detector, NDArray[np.uint8], Array | None]]:
     """The same, all as sharp as sequences are."""
     try:
-        solid, occluder, other = (random_solid(seed + k) for k in (0, OCCLUDER, OTHER_SOLID))
+        solid, occluder, other = solid_of(seed), random_solid(seed + OCCLUDER), random_solid(seed + OTHER_SOLID)
     except ValueError:  # outlines that cross each other
         return
     rng = np.random.default_rng([seed, 2])

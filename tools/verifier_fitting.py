@@ -25,10 +25,11 @@ from arview.tracking.verifier import (
 from component_examples import Looked
 from judge_examples import Looks, read_examples
 from score_networks import Design, Shown, fit, fit_score_network, scored, telling_loss, together
+from twin_examples import Twins
 from widening import torch_with_onnx
 
 DESIGN = Design(
-    "verifier", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (24, 24, 48, 48, 96, 128), deepened=(3, 5), rate=2e-3
+    "verifier", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (32, 32, 64, 64, 128, 192), deepened=(3, 5), rate=2e-3
 )
 PICTURES, POSES = 6, 20
 """A step looks at so many poses of so many pictures, a third of them right where there are any."""
@@ -107,7 +108,7 @@ def _inputs(look: Looks, index: Sequence[int], rng: np.random.Generator | None =
 
 
 def network_input(
-    looked: Looks | Looked, index: Sequence[int], rng: np.random.Generator | None
+    looked: Looks | Looked | Twins, index: Sequence[int], rng: np.random.Generator | None
 ) -> tuple[NDArray[np.float32], list[float], list[float]]:
     """Some looks of a picture as networks take them, with their contrasts and shares explained; perhaps altered."""
     plain, contrasts = zip(

@@ -22,7 +22,7 @@ class Network:
     def __init__(self, name: str) -> None:
         self._session = _session(name)
 
-    def __call__(self, **shown: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, **shown: NDArray[np.float32] | NDArray[np.int64]) -> NDArray[np.float32]:
         """The answer to what it is shown, by the names of its inputs."""
         return np.asarray(self._session.run(None, shown)[0])
 

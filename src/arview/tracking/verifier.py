@@ -98,37 +98,69 @@ class Verifier:
         return self._network.scores(list(pool().map(look, poses, radii_px.tolist(), known)))
 
 
-def raw_look(
-    picture: Picture, part: PartView, pose: Array, radius_px: float
-) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
-    """The picture around a pose (S,S,4), RGB and 255 inside of it; the part (6,S,S), see DRAWN; (3,S,S), see LINES.
+class Window:
+    """A square of a picture around a pose, and what the CAD says is in it there and at poses nearby.
 
     Args:
         picture, part: what is looked for, and where.
-        pose: (4,4) ``cam_from_body``.
+        pose: (4,4) ``cam_from_body`` that it is around.
         radius_px: half the part's diameter in the picture there, see `Picture.radii_px`.
+        side_px: of the square.
+        drawn_px: half the part's diameter in it.
+
+    Attributes:
+        pixels: (S,S,4) uint8, RGB and 255 inside of the picture.
     """
-    gradients = picture.gradients(int(steps_to(RADIUS_PX, np.array([radius_px]))[0]))
-    intrinsics = gradients.intrinsics
-    height, width = gradients.colours.shape[:2]
-    center = project_lines(_ORIGIN, _ANY_DIRECTION, True, pose, intrinsics, 1.0)[0][0]
-    zoom = RADIUS_PX / radius_px * picture.focal_px / intrinsics[0]
-    middle = 0.5 * (SIDE_PX - 1)
-    way = np.array([[zoom, 0.0, middle - zoom * center[0]], [0.0, zoom, middle - zoom * center[1]]])
-    crop = cv2.warpAffine(gradients.colours, way, (SIDE_PX, SIDE_PX), flags=cv2.INTER_LINEAR)
-    columns, rows = ((np.arange(SIDE_PX) - shift) / zoom for shift in way[:, 2])
-    is_inside = np.outer(
-        np.abs(rows - 0.5 * (height - 1)) <= 0.5 * height, np.abs(columns - 0.5 * (width - 1)) <= 0.5 * width
-    )
-    diameter_mm = part.views.diameter_mm
-    drawn = np.empty((DRAWN, SIDE_PX, SIDE_PX), dtype=np.float32)
-    draw_lines(part.arrays, pose, intrinsics, 0.01 * diameter_mm, zoom, way[:, 2], drawn[:2])
-    face_ids = np.empty((SIDE_PX, SIDE_PX), dtype=np.int32)
-    draw_surface(part.surface, pose, zoom * intrinsics[:2], np.full(2, middle), diameter_mm, drawn[2:], face_ids)
-    is_far = drawn[0] > 1.0
-    drawn[0][is_far] = np.where(face_ids[is_far] >= 0, -1.0, 1.0)
-    lines = lines_around(gradients.lines, gradients.lines.shape[2] / width, zoom, way[:, 2], drawn[0])
-    return np.dstack([crop, 255 * is_inside.astype(np.uint8)]), drawn, lines
+
+    def __init__(
+        self,
+        picture: Picture,
+        part: PartView,
+        pose: Array,
+        radius_px: float,
+        side_px: int = SIDE_PX,
+        drawn_px: float = RADIUS_PX,
+    ) -> None:
+        self._part, self._side_px = part, side_px
+        self._gradients = picture.gradients(int(steps_to(drawn_px, np.array([radius_px]))[0]))
+        intrinsics = self._gradients.intrinsics
+        height, width = self._gradients.colours.shape[:2]
+        self._zoom = drawn_px / radius_px * picture.focal_px / intrinsics[0]
+        self._shift_px = 0.5 * (side_px - 1) - self._zoom * self._center_px(pose)
+        way = np.column_stack([self._zoom * np.eye(2), self._shift_px])
+        crop = cv2.warpAffine(self._gradients.colours, way, (side_px, side_px), flags=cv2.INTER_LINEAR)
+        columns, rows = ((np.arange(side_px) - shift) / self._zoom for shift in self._shift_px)
+        is_inside = np.outer(
+            np.abs(rows - 0.5 * (height - 1)) <= 0.5 * height, np.abs(columns - 0.5 * (width - 1)) <= 0.5 * width
+        )
+        self.pixels: NDArray[np.uint8] = np.dstack([crop, 255 * is_inside.astype(np.uint8)])
+
+    def look(self, pose: Array) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """The part (6,S,S) at a pose, see DRAWN, and the lines (3,S,S) around it, see LINES."""
+        intrinsics, side = self._gradients.intrinsics, self._side_px
+        diameter_mm = self._part.views.diameter_mm
+        drawn = np.empty((DRAWN, side, side), dtype=np.float32)
+        draw_lines(self._part.arrays, pose, intrinsics, 0.01 * diameter_mm, self._zoom, self._shift_px, drawn[:2])
+        face_ids = np.empty((side, side), dtype=np.int32)
+        center_px = self._zoom * self._center_px(pose) + self._shift_px
+        draw_surface(self._part.surface, pose, self._zoom * intrinsics[:2], center_px, diameter_mm, drawn[2:], face_ids)
+        is_far = drawn[0] > 1.0
+        drawn[0][is_far] = np.where(face_ids[is_far] >= 0, -1.0, 1.0)
+        seen = self._gradients.lines
+        shrunk = seen.shape[2] / self._gradients.colours.shape[1]
+        return drawn, lines_around(seen, shrunk, self._zoom, self._shift_px, drawn[0])
+
+    def _center_px(self, pose: Array) -> Array:
+        intrinsics = self._gradients.intrinsics
+        return np.asarray(project_lines(_ORIGIN, _ANY_DIRECTION, True, pose, intrinsics, 1.0)[0][0])
+
+
+def raw_look(
+    picture: Picture, part: PartView, pose: Array, radius_px: float
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
+    """The picture around a pose (4,4) ``cam_from_body``, and what is drawn and seen there: see `Window`."""
+    window = Window(picture, part, pose, radius_px)
+    return window.pixels, *window.look(pose)
 
 
 def with_lines(shown: NDArray[np.float32], lines: NDArray[np.uint8]) -> NDArray[np.float32]:

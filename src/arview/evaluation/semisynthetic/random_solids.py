@@ -47,6 +47,22 @@ def random_solid(seed: int) -> Model:
     return make_model(f"random_{seed}", tuple(parts))
 
 
+def random_twin(seed: int) -> Model:
+    """A random solid that some turns take onto itself but for a feature or two: a disc or a plate with things on it.
+
+    The same seed gives the same solid.
+
+    Raises:
+        ValueError: this seed's outlines cross each other; take another.
+    """
+    rng = np.random.default_rng([seed, 1])
+    size = rng.uniform(*HALF_SIZE_MM)
+    meshes = (_even_disc if rng.random() < 0.6 else _even_plate)(size, rng)
+    colour = _colour(rng)
+    parts = [Component(f"body_{k}", v, f.astype(np.int32), colour) for k, (v, f) in enumerate(meshes)]
+    return make_model(f"twin_{seed}", tuple(parts))
+
+
 def _plate(size: float, rng: Rng) -> list[Mesh]:
     a, b, thick = size, size * rng.uniform(0.5, 1.0), size * rng.uniform(0.06, 0.25)
     is_rectangle = rng.random() < 0.6
@@ -149,6 +165,94 @@ def _studded(size: float, rng: Rng) -> list[Mesh]:
         place = rigid(outward, np.zeros(3))
         meshes += [moved(mesh, place) for mesh in _studs(half[i], half[j], half[axis], size, rng)]
     return meshes + [_turned_about(mesh, rng) for mesh in _things(0, 3, 0.3 * size, 0.3 * size, 0.3 * size, size, rng)]
+
+
+def _even_disc(size: float, rng: Rng) -> list[Mesh]:
+    """A disc with holes and things in even rings and a hub, and what breaks its symmetry."""
+    count = int(rng.choice((0, 2, 3, 4, 5, 6, 6, 8)))
+    thick, angles = size * rng.uniform(0.06, 0.35), 2.0 * np.pi * (np.arange(count) + 0.5) / max(1, count)
+    rim = circle((0, 0), size, 4 * int(rng.integers(1, 4)) if rng.random() < 0.2 else 180)
+    hub, ring = size * rng.uniform(0.15, 0.5), size * rng.uniform(0.65, 0.8)
+    wide = size * rng.uniform(0.04, 0.12)
+    spots = [(float(ring * np.cos(a)), float(ring * np.sin(a))) for a in angles]
+    is_holed, is_thinged = rng.random() < 0.7, rng.random() < 0.25
+    widths = [wide] * count
+    breaks = rng.permutation(5)[: rng.integers(1, 3)]
+    if 0 in breaks or (count == 0 and 1 in breaks) or not (is_holed or is_thinged):
+        rim = _notched(rim, size * rng.uniform(0.05, 0.2), size * rng.uniform(0.05, 0.18))
+    if 1 in breaks and count:
+        spots, widths = spots[1:], widths[1:]
+    elif 2 in breaks and count:
+        widths[0] *= rng.choice((0.6, 1.5))
+    holes = [circle(spot, w, 24) for spot, w in zip(spots, widths, strict=True)] if is_holed else []
+    if 3 in breaks:
+        holes.append(circle((ring, 0.0), wide * rng.uniform(0.4, 1.0), 24))
+    bore = hub * rng.uniform(0.3, 0.8)
+    is_bored = rng.random() < 0.6
+    if is_bored:
+        holes.append(circle((0, 0), bore, 48))
+    meshes = [prism(rim, tuple(holes), 0.0, thick)]
+    if rng.random() < 0.85:
+        top = thick + size * rng.uniform(0.1, 0.9)
+        meshes.append(tube((0, 0), hub, bore, thick, top) if is_bored else cylinder((0, 0), hub, thick, top))
+    if rng.random() < 0.3:
+        meshes.append(tube((0, 0), hub * 1.2, hub, thick, thick + size * rng.uniform(0.05, 0.2)))
+    if rng.random() < 0.3:
+        meshes.append(tube((0, 0), 1.1 * hub, bore, -size * rng.uniform(0.05, 0.4), 0.0))
+    if is_thinged and not is_holed:
+        high = thick + size * rng.uniform(0.05, 0.3)
+        meshes += [cylinder(spot, w, thick, high, 20) for spot, w in zip(spots, widths, strict=True)]
+    if 4 in breaks:
+        meshes += _small_thing(0.5 * (hub + ring), thick, size, rng)
+    return meshes
+
+
+def _even_plate(size: float, rng: Rng) -> list[Mesh]:
+    """A plate that half a turn takes onto itself, with pairs of things and holes, and what breaks its symmetry."""
+    a, b, thick = size, size * rng.uniform(0.3, 1.0), size * rng.uniform(0.06, 0.4)
+    outline = rectangle((-a, -b), (a, b))
+    breaks = rng.permutation(4)[: rng.integers(1, 3)]
+    if 0 in breaks:
+        cut_a, cut_b = rng.uniform(0.1, 0.4) * b, rng.uniform(0.1, 0.4) * b
+        outline = np.concatenate([outline[:2], [(a, b - cut_b), (a - cut_a, b)], outline[3:]])
+    wide = min(0.12 * size, 0.15 * b) * rng.uniform(0.4, 1.0)
+    corners = [(x * (a - 2.0 * wide), y * (b - 2.0 * wide)) for x, y in ((-1, -1), (1, 1), (-1, 1), (1, -1))]
+    corners = corners[: 2 * int(rng.integers(1, 3))]
+    widths = [wide] * len(corners)
+    if 1 in breaks:
+        corners, widths = corners[1:], widths[1:]
+    elif 2 in breaks:
+        widths[0] *= rng.choice((0.5, 1.4))
+    if rng.random() < 0.7 and 0 not in breaks:
+        meshes = [prism(outline, tuple(circle(c, w, 24) for c, w in zip(corners, widths, strict=True)), 0.0, thick)]
+    else:
+        meshes = [prism(outline, (), 0.0, thick)]
+        high = thick + size * rng.uniform(0.05, 0.5)
+        meshes += [cylinder(c, w, thick, high, 20) for c, w in zip(corners, widths, strict=True)]
+    half_turn = rigid(exp_so3([0.0, 0.0, np.pi]), np.zeros(3))
+    for mesh in _things(0, 4, 0.4 * a, 0.4 * b, thick, size, rng):
+        meshes += [mesh, moved(mesh, half_turn)]
+    if 3 in breaks:
+        meshes += _small_thing(0.7 * b, thick, size, rng)
+    return meshes
+
+
+def _small_thing(place: float, low: float, size: float, rng: Rng) -> list[Mesh]:
+    """A small box or post on a plane at a distance from its middle."""
+    wide, top = size * rng.uniform(0.04, 0.12), low + size * rng.uniform(0.03, 0.25)
+    if rng.random() < 0.5:
+        return [cylinder((place, 0.0), wide, low, top, 20)]
+    return [box((place - wide, -0.7 * wide, low), (place + wide, 0.7 * wide, top))]
+
+
+def _notched(rim: Loop, wide: float, deep: float) -> Loop:
+    """A round outline with a rectangle cut out of it where it crosses +X."""
+    radius = float(np.linalg.norm(rim, axis=1).max())
+    inside = (np.abs(rim[:, 1]) < 0.5 * wide) & (rim[:, 0] > 0.0)
+    edge = np.sqrt(radius**2 - 0.25 * wide**2)
+    notch = np.array([(edge, -wide), (radius - deep, -wide), (radius - deep, wide), (edge, wide)]) * (1.0, 0.5)
+    angles = np.arctan2(rim[~inside, 1], rim[~inside, 0]) % (2.0 * np.pi)
+    return np.concatenate([notch[2:], rim[~inside][np.argsort(angles)], notch[:2]])
 
 
 def _studs(reach_x: float, reach_y: float, low: float, size: float, rng: Rng) -> list[Mesh]:

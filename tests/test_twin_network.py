@@ -1,4 +1,4 @@
-"""Pixels in which twins differ: they speak for the right one, and say nothing where they cannot know."""
+"""The network that tells twins apart: it is for the right one, and says little where it cannot know."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from arview.cad import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
-from arview.tracking.ambiguity import TELLING
-from arview.tracking.detector import MOST_PIXELS_TELL, PIXELS_TELL
+from arview.tracking.line_network import LineNetwork
 from arview.tracking.picture import Picture
 from arview.tracking.tracker import PartView, Tracker, TrackerOptions
-from arview.tracking.twin_pixels import TwinPixels
+from arview.tracking.twin_network import TwinNetwork
 from synthetic import CAMERA, box, component, picture, pose_from, post
 
 GREY = (0.55, 0.55, 0.6)
-SIXTHS = [Rotation.from_euler("z", angle, degrees=True).as_matrix() for angle in range(60, 360, 60)]
+TURNS = [Rotation.from_euler("z", angle, degrees=True).as_matrix() for angle in range(0, 360, 60)]
 
 
 @cache
@@ -38,42 +37,47 @@ def part_of(key_mm: float) -> PartView:
     return Tracker(views, CAMERA, TrackerOptions(use_feature=False)).part
 
 
-def leads(key_mm: float, pose: Array, base: Array, **drawn: object) -> Array:
-    """Leads of a pose of the centre over its sixths, in a picture of the part at a pose."""
-    part = part_of(key_mm)
-    seen = Picture(picture(pose, plate(key_mm), **drawn), CAMERA, 12)  # type: ignore[arg-type]
-    pixels = TwinPixels(seen, part, base @ part.model_from_body)
-    return np.array([pixels.lead(turn) for turn in SIXTHS])
+def twins_of(truth: Array, key_mm: float) -> list[Array]:
+    """``cam_from_body`` of a true ``cam_from_model``, itself first, and what its sixths make of it."""
+    body = truth @ part_of(key_mm).model_from_body
+    return [rigid(body[:3, :3] @ turn, body[:3, 3]) for turn in TURNS]
+
+
+def leads(key_mm: float, truth: Array, poses: list[Array], **drawn: object) -> Array:
+    seen = picture(truth, plate(key_mm), **drawn)  # type: ignore[arg-type]
+    return TwinNetwork(part_of(key_mm)).leads(Picture(seen, CAMERA, 12, LineNetwork()), poses)
 
 
 @pytest.mark.parametrize("noise", [2.0, 10.0])
-def test_the_right_twin_explains_the_pixels_better(noise: float) -> None:
-    part = part_of(10.0)
-    right, turned = [], []
-    for k in range(12):
+def test_the_right_twin_is_ahead_of_the_others(noise: float) -> None:
+    right = []
+    for k in range(10):
         truth = pose_from(30.0 * k, 35.0 + 4.0 * k, 400.0, plate(10.0), 20.0 * k)
-        right += leads(10.0, truth, truth, seed=k, scene=k, noise=noise).tolist()
-        body = truth @ part.model_from_body
-        twin = rigid(body[:3, :3] @ SIXTHS[k % 5], body[:3, 3]) @ part.body_from_model
-        # The turn that leads back.
-        turned.append(leads(10.0, truth, twin, seed=k, scene=k, noise=noise)[4 - k % 5])
-    assert np.mean(np.array(right) > 1.0) > 0.9 and min(right) > -6.0, np.round(right, 1)
-    assert np.mean(np.array(turned) < -1.0) > 0.8 and max(turned) < 6.0, np.round(turned, 1)
+        told = leads(10.0, truth, twins_of(truth, 10.0), seed=k, scene=k, noise=noise)
+        np.testing.assert_array_equal(told, -told.T)
+        right += told[0, 1:].tolist()
+    assert np.mean(np.array(right) > 1.0) > 0.9, np.round(right, 1)
+
+
+def test_it_does_not_matter_which_pose_comes_first() -> None:
+    truth = pose_from(40.0, 50.0, 400.0, plate(10.0))
+    poses = twins_of(truth, 10.0)
+    forth, back = (leads(10.0, truth, some) for some in (poses, poses[::-1]))
+    # The window is around the first.
+    np.testing.assert_allclose(forth, back[::-1, ::-1], atol=0.5)
 
 
 def test_what_hides_the_difference_decides_nothing() -> None:
     truth = pose_from(40.0, 80.0, 400.0, plate(10.0))
-    part = part_of(10.0)
     flat = np.clip(np.random.default_rng(0).normal(120.0, 4.0, (CAMERA.height, CAMERA.width, 3)), 0, 255)
-    pixels = TwinPixels(Picture(flat.astype(np.uint8), CAMERA, 12), part, truth @ part.model_from_body)
-    assert max(abs(pixels.lead(turn)) for turn in SIXTHS) < MOST_PIXELS_TELL
-    # Whatever they say, pixels alone do not decide.
-    assert PIXELS_TELL * MOST_PIXELS_TELL < TELLING
+    seen = Picture(flat.astype(np.uint8), CAMERA, 12, LineNetwork())
+    told = TwinNetwork(part_of(10.0)).leads(seen, twins_of(truth, 10.0))
+    assert np.abs(told).max() < 2.0, np.round(told, 1)
 
 
 def test_twins_that_differ_nowhere_are_equal() -> None:
     truth = pose_from(40.0, 50.0, 400.0, plate(0.0))
-    np.testing.assert_array_equal(leads(0.0, truth, truth), 0.0)
+    assert np.abs(leads(0.0, truth, twins_of(truth, 0.0))).max() < 0.5
 
 
 def test_a_part_that_is_mostly_outside_the_picture_is_looked_at_as_far_as_it_is_seen() -> None:
@@ -81,4 +85,4 @@ def test_a_part_that_is_mostly_outside_the_picture_is_looked_at_as_far_as_it_is_
     for aside_mm in (150.0, 250.0, 2000.0):
         moved = truth.copy()
         moved[0, 3] += aside_mm
-        assert np.all(np.isfinite(leads(10.0, moved, moved)))
+        assert np.all(np.isfinite(leads(10.0, moved, twins_of(moved, 10.0))))
