@@ -30,8 +30,8 @@ LEAD = 3.4
 """A pose whose logit is so much higher than a twin's is the right one without a closer look."""
 TELLING = 2.0
 """It is, too, when all that tells of two twins speaks for it by so much, see `Detector`: of 189 pictures of nearly
-symmetric random solids the pose is right and alone in 100 with it, right in 35 and wrong in 18 with alternatives of
-which one is right, and wrong in 36, in 27 of which no pose near the right one was found."""
+symmetric random solids the pose is right and alone in 100 with it, right among alternatives in 35, wrong with the right
+one among its alternatives in 18, and wrong in 36; in 27 of all the right one is not among what is compared."""
 SHARED_PX, SHARED_COS = 3.0, 0.8
 """Edges of two poses this near, and so nearly parallel, tell nothing of which is right."""
 SPACING_PX, NEIGHBOURS = 12.0, 12
