@@ -90,6 +90,7 @@ def twin_network(torch: Any) -> Any:
                 layers += [*normalised(before, width, 5 if k == 0 else 3, 2 - k % 2, torch), nn.ReLU()]
                 before = width
             self.alone = nn.Sequential(*layers)
+            self.register_buffer("least_apart", torch.tensor(LEAST_APART).reshape(4, 1, 1))
             first, second, third = PAIR_WIDTHS
             self.paired = nn.Sequential(
                 *normalised(2 * before, first, 1, 1, torch), nn.ReLU(),
@@ -102,7 +103,7 @@ def twin_network(torch: Any) -> Any:
 
         def forward(self, seen: Any, one: Any, other: Any) -> Any:
             features, surface = self.alone(seen), seen[:, SURFACE]
-            apart = (surface[one] - surface[other]).abs() / torch.tensor(LEAST_APART).reshape(4, 1, 1)
+            apart = (surface[one] - surface[other]).abs() / self.least_apart
             apart = (apart.amax(1, keepdim=True) - 1.0).clamp(0.0, 1.0)
             apart = nn.functional.max_pool2d(apart, 8)
             # All at once, both ways round: of pairs that are all right before wrong normalisation alone would tell.
