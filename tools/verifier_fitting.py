@@ -29,7 +29,7 @@ from twin_examples import Twins
 from widening import torch_with_onnx
 
 DESIGN = Design(
-    "verifier", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (32, 32, 64, 64, 128, 192), deepened=(3, 5), rate=2e-3
+    "verifier", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (24, 24, 48, 48, 96, 128), deepened=(3, 5), rate=2e-3
 )
 PICTURES, POSES = 6, 20
 """A step looks at so many poses of so many pictures, a third of them right where there are any."""
