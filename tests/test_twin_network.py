@@ -12,6 +12,7 @@ from arview.cad import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
+from arview.tracking.ambiguity import TELLING
 from arview.tracking.line_network import LineNetwork
 from arview.tracking.picture import Picture
 from arview.tracking.tracker import PartView, Tracker, TrackerOptions
@@ -50,13 +51,15 @@ def leads(key_mm: float, truth: Array, poses: list[Array], **drawn: object) -> A
 
 @pytest.mark.parametrize("noise", [2.0, 10.0])
 def test_the_right_twin_is_ahead_of_the_others(noise: float) -> None:
-    right = []
-    for k in range(10):
+    right, steep = [], []
+    for k in range(12):
         truth = pose_from(30.0 * k, 35.0 + 4.0 * k, 400.0, plate(10.0), 20.0 * k)
         told = leads(10.0, truth, twins_of(truth, 10.0), seed=k, scene=k, noise=noise)
         np.testing.assert_array_equal(told, -told.T)
-        right += told[0, 1:].tolist()
-    assert np.mean(np.array(right) > 1.0) > 0.9, np.round(right, 1)
+        # From straight above a block of the plate's colour is hardly to be seen.
+        (right if k < 10 else steep).extend(told[0, 1:].tolist())
+    assert np.mean(np.array(right) > 1.0) > 0.9 and min(right) > -6.0, np.round(right, 1)
+    assert min(steep) > -4.0, np.round(steep, 1)
 
 
 def test_it_does_not_matter_which_pose_comes_first() -> None:
@@ -72,12 +75,12 @@ def test_what_hides_the_difference_decides_nothing() -> None:
     flat = np.clip(np.random.default_rng(0).normal(120.0, 4.0, (CAMERA.height, CAMERA.width, 3)), 0, 255)
     seen = Picture(flat.astype(np.uint8), CAMERA, 12, LineNetwork())
     told = TwinNetwork(part_of(10.0)).leads(seen, twins_of(truth, 10.0))
-    assert np.abs(told).max() < 2.0, np.round(told, 1)
+    assert np.abs(told).max() < TELLING, np.round(told, 1)
 
 
 def test_twins_that_differ_nowhere_are_equal() -> None:
     truth = pose_from(40.0, 50.0, 400.0, plate(0.0))
-    assert np.abs(leads(0.0, truth, twins_of(truth, 0.0))).max() < 0.5
+    np.testing.assert_array_equal(leads(0.0, truth, twins_of(truth, 0.0)), 0.0)
 
 
 def test_a_part_that_is_mostly_outside_the_picture_is_looked_at_as_far_as_it_is_seen() -> None:
