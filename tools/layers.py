@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,17 @@ def normalised(before: int, after: int, size: int, step: int, torch: Any) -> lis
     """A convolution and its normalisation."""
     nn = torch.nn
     return [nn.Conv2d(before, after, size, step, size // 2, bias=False), nn.BatchNorm2d(after)]
+
+
+def halving(before: int, widths: Sequence[int], deepened: Collection[int], torch: Any) -> list[Any]:
+    """Convolutions of some widths, every other of which halves the picture; a residual block follows those deepened."""
+    layers: list[Any] = []
+    for k, width in enumerate(widths):
+        layers += [*normalised(before, width, 5 if k == 0 else 3, 2 - k % 2, torch), torch.nn.ReLU()]
+        if k in deepened:
+            layers.append(residual(width, torch))
+        before = width
+    return layers
 
 
 def residual(width: int, torch: Any) -> Any:

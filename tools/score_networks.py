@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahead import made_ahead
-from layers import exported, halfway, normalised, residual, write
+from layers import exported, halfway, halving, write
 from widening import GONE_ON, begin_as, beginning_as, in_use
 
 LAST_WIDTH, DROPPED = 48, 0.2
@@ -108,16 +108,9 @@ def score_network(torch: Any, channels: int, told: int, widths: tuple[int, ...],
     class _Network(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
-            layers: list[Any] = []
-            before = channels
-            for k, width in enumerate(widths):
-                layers += [*normalised(before, width, 5 if k == 0 else 3, 2 - k % 2, torch), nn.ReLU()]
-                if k in deepened:
-                    layers.append(residual(width, torch))
-                before = width
-            self.convolutions = nn.Sequential(*layers)
+            self.convolutions = nn.Sequential(*halving(channels, widths, deepened, torch))
             self.together = nn.Sequential(
-                nn.Linear(2 * before + told, LAST_WIDTH), nn.ReLU(), nn.Dropout(DROPPED), nn.Linear(LAST_WIDTH, 1)
+                nn.Linear(2 * widths[-1] + told, LAST_WIDTH), nn.ReLU(), nn.Dropout(DROPPED), nn.Linear(LAST_WIDTH, 1)
             )
 
         def forward(self, seen: Any, both: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from arview.tracking.twin_network import SHOWN, SIDE_PX
 from judge_examples import read_examples
-from layers import exported, normalised, write
+from layers import exported, halving, normalised, write
 from score_networks import fit
 from twin_examples import Twins
 from verifier_fitting import network_input
@@ -84,16 +83,11 @@ def twin_network(torch: Any) -> Any:
     class _TwinNetwork(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
-            layers: list[Any] = []
-            before = SHOWN
-            for k, width in enumerate(WIDTHS):
-                layers += [*normalised(before, width, 5 if k == 0 else 3, 2 - k % 2, torch), nn.ReLU()]
-                before = width
-            self.alone = nn.Sequential(*layers)
+            self.alone = nn.Sequential(*halving(SHOWN, WIDTHS, (), torch))
             self.register_buffer("least_apart", torch.tensor(LEAST_APART).reshape(4, 1, 1))
             first, second, third = PAIR_WIDTHS
             self.paired = nn.Sequential(
-                *normalised(2 * before, first, 1, 1, torch), nn.ReLU(),
+                *normalised(2 * WIDTHS[-1], first, 1, 1, torch), nn.ReLU(),
                 *normalised(first, second, 3, 2, torch), nn.ReLU(),
                 *normalised(second, third, 3, 1, torch), nn.ReLU(),
             )  # fmt: skip
@@ -129,11 +123,11 @@ def _report(network: Any, examples: Sequence[Twins], torch: Any) -> None:
     """Say in how many pictures a right pose is ahead of all others."""
     matrices = []
     for twins in examples:
-        index = list(range(len(twins.logits)))
-        one, other = (np.array(side) for side in zip(*combinations(index, 2), strict=True))
-        leads = np.zeros((len(index), len(index)))
+        count = len(twins.logits)
+        one, other = np.triu_indices(count, 1)
+        leads = np.zeros((count, count))
         with torch.no_grad():
-            seen = network_input(twins, index, None)[0]
+            seen = network_input(twins, range(count), None)[0]
             leads[one, other] = network(*map(torch.from_numpy, (seen, one, other))).numpy()
         matrices.append((leads - leads.T, twins.logits[:, None] - twins.logits, twins.is_right))
     pairs = np.concatenate([found[right][:, ~right].ravel() for found, _, right in matrices])

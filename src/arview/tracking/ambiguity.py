@@ -24,7 +24,7 @@ NEAR_MM, EXACT_MM = 0.025, 0.012
 """Edges this near to others, in diameters, look alike in a picture; this near they are the same."""
 NEAR_SHARE, EXACT_SHARE = 0.9, 0.997
 """Shares of the edges that a near and an exact symmetry take onto others."""
-FIFTHS_DEG = (72.0, 144.0, 216.0, 288.0)
+USUAL_DEG, FIFTHS_DEG = sorted({*range(30, 360, 30), *range(45, 360, 45)}), range(72, 360, 72)
 LOOKED_AT_VIEWS, LOOKED_AT_POINTS = 60, 6000
 LEAD = 3.4
 """A pose whose logit is so much higher than a twin's is the right one without a closer look."""
@@ -56,32 +56,24 @@ def find_symmetries(views: GuideViewSet) -> Symmetries:
     """Turns of a part onto itself, found on the edges of its guide views; the identity is not among them."""
     points = _edge_points(views)
     tree = cKDTree(points)
-    exact: list[Array] = []
-    near: list[Array] = []
 
-    def kept(turns: Array) -> tuple[list[Array], list[Array]]:
-        """Those of some turns that are exact symmetries, and near ones."""
-        away_mm = [
-            tree.query(points[::4] @ turn.T, distance_upper_bound=NEAR_MM * views.diameter_mm)[0] for turn in turns
-        ]
-        are_exact = [np.mean(away < EXACT_MM * views.diameter_mm) >= EXACT_SHARE for away in away_mm]
-        are_near = [np.mean(np.isfinite(away)) >= NEAR_SHARE for away in away_mm]
-        found = list(zip(turns, are_exact, are_near, strict=True))
-        return [t for t, is_exact, _ in found if is_exact], [
-            t for t, is_exact, is_near in found if is_near and not is_exact
-        ]
+    def among(turns: Array) -> Symmetries:
+        exact, near = [], []
+        for turn in turns:
+            distance, _ = tree.query(points[::4] @ turn.T, distance_upper_bound=NEAR_MM * views.diameter_mm)
+            if np.mean(distance < EXACT_MM * views.diameter_mm) >= EXACT_SHARE:
+                exact.append(turn)
+            elif np.mean(np.isfinite(distance)) >= NEAR_SHARE:
+                near.append(turn)
+        return Symmetries(np.array(exact).reshape(-1, 3, 3), np.array(near).reshape(-1, 3, 3))
 
-    for axis in np.eye(3):
-        found = kept(_about(axis, {*range(30, 360, 30), *range(45, 360, 45)}))
-        fifths = kept(_about(axis, FIFTHS_DEG)) if sum(map(len, found)) < len(FIFTHS_DEG) else ([], [])
-        # What is a fifth is nearly five twelfths, too.
-        found = max(found, fifths, key=lambda turns: sum(map(len, turns)))
-        exact += found[0]
-        near += found[1]
-    found = kept(_diagonal_turns())
-    exact += found[0]
-    near += found[1]
-    return Symmetries(np.array(exact).reshape(-1, 3, 3), np.array(near).reshape(-1, 3, 3))
+    def about(axis: Array) -> Symmetries:
+        # What is a fifth is nearly five twelfths, too: one or the other.
+        usual, fifths = (among(_about(axis, angles_deg)) for angles_deg in (USUAL_DEG, FIFTHS_DEG))
+        return max(usual, fifths, key=lambda found: len(found.exact) + len(found.near))
+
+    groups = [*map(about, np.eye(3)), among(_diagonal_turns())]
+    return Symmetries(np.concatenate([some.exact for some in groups]), np.concatenate([some.near for some in groups]))
 
 
 def _edge_points(views: GuideViewSet) -> Array:
@@ -101,7 +93,7 @@ def _edge_points(views: GuideViewSet) -> Array:
 
 def _about(axis: Array, angles_deg: Iterable[float]) -> Array:
     """(N,3,3) turns about an axis."""
-    return np.stack([exp_so3(axis * np.deg2rad(angle)) for angle in sorted(angles_deg)])
+    return np.stack([exp_so3(axis * np.deg2rad(angle)) for angle in angles_deg])
 
 
 def _diagonal_turns() -> Array:

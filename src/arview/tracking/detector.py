@@ -28,6 +28,7 @@ from arview.tracking.local_search import Hypothesis, LocalOptions, LocalSearch
 from arview.tracking.picture import Picture
 from arview.tracking.quality import Leads, found_probability, found_terms
 from arview.tracking.threads import pool
+from arview.tracking.twin_network import TwinNetwork
 from arview.tracking.why_not import Rejected
 
 SURE_QUALITY = 0.6
@@ -129,6 +130,7 @@ class Detector:
         self.best_rejected: Rejected | None = None
         self.local = local or local_search_for(views, camera, o)
         self._components = ComponentCheck(views, model, camera) if model and len(model.components) > 1 else None
+        self._twins = TwinNetwork(self.local.tracker.part)
         self.symmetries = find_symmetries(views)
         self.same_turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
         self.turns = np.concatenate([self.same_turns, self.symmetries.near])
@@ -264,7 +266,7 @@ class Detector:
         """By how much each of some twins is borne out better than each other (N,N)."""
         tracker = self.local.tracker
         logits = np.array([h.logit_without_strips for h in rivals])
-        ahead = self.local.twins.leads(picture, [h.cam_from_body for h in rivals])
+        ahead = self._twins.leads(picture, [h.cam_from_body for h in rivals])
         ahead += LEAD_TELLS * (logits[:, None] - logits)
         steps = list(pool().map(lambda h: tracker.edge_steps(picture.gray, h.cam_from_body), rivals))
         for a, b in combinations(range(len(rivals)), 2):

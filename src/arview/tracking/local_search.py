@@ -40,7 +40,6 @@ from arview.tracking.strips import Strips
 from arview.tracking.templates import ShownLines, choose_apart
 from arview.tracking.threads import pool
 from arview.tracking.tracker import NEAR_STAGES, SETTLING_STAGES, Stage, Tracker, TrackerOptions
-from arview.tracking.twin_network import TwinNetwork
 from arview.tracking.verifier import Verifier
 
 
@@ -199,7 +198,6 @@ class LocalSearch:
         self._denoiser = Denoiser()
         self._verifier = Verifier(self.tracker.part)
         self._strips = Strips(self.tracker.part)
-        self.twins = TwinNetwork(self.tracker.part)
         self._shown_lines = ShownLines(views)
 
     def picture(self, image: NDArray[np.uint8]) -> Picture:

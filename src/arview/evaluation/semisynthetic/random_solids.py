@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from arview.cad import Component, Model, make_model
@@ -20,6 +22,8 @@ from arview.evaluation.semisynthetic.solids import (
 from arview.geometry import Array, exp_so3, rigid
 
 Rng = np.random.Generator
+Color = tuple[float, float, float]
+Spot = tuple[float, float]
 HALF_SIZE_MM = (36.0, 85.0)
 """About half the size of the solids."""
 ONE_COLOUR = 0.5
@@ -40,11 +44,7 @@ def random_solid(seed: int) -> Model:
     kinds = (_plate, _plate, _smooth, _stepped, _turned, _frame, _smooth_with_things, _finned, _finned, _studded)
     meshes = kinds[seed % len(kinds)](size, rng)
     whole, is_one = _colour(rng), rng.random() < ONE_COLOUR
-    parts = [
-        Component(f"body_{k}", vertices, faces.astype(np.int32), whole if is_one else _colour(rng))
-        for k, (vertices, faces) in enumerate(meshes)
-    ]
-    return make_model(f"random_{seed}", tuple(parts))
+    return _model(f"random_{seed}", meshes, lambda: whole if is_one else _colour(rng))
 
 
 def random_twin(seed: int) -> Model:
@@ -58,9 +58,16 @@ def random_twin(seed: int) -> Model:
     rng = np.random.default_rng([seed, 1])
     size = rng.uniform(*HALF_SIZE_MM)
     meshes = (_even_disc if rng.random() < 0.6 else _even_plate)(size, rng)
-    colour = _colour(rng)
-    parts = [Component(f"body_{k}", v, f.astype(np.int32), colour) for k, (v, f) in enumerate(meshes)]
-    return make_model(f"twin_{seed}", tuple(parts))
+    whole = _colour(rng)
+    return _model(f"twin_{seed}", meshes, lambda: whole)
+
+
+def _model(name: str, meshes: list[Mesh], colour: Callable[[], Color]) -> Model:
+    """Of bodies, each of the next colour."""
+    parts = [
+        Component(f"body_{k}", vertices, faces.astype(np.int32), colour()) for k, (vertices, faces) in enumerate(meshes)
+    ]
+    return make_model(name, tuple(parts))
 
 
 def _plate(size: float, rng: Rng) -> list[Mesh]:
@@ -176,15 +183,11 @@ def _even_disc(size: float, rng: Rng) -> list[Mesh]:
     wide = size * rng.uniform(0.04, 0.12)
     spots = [(float(ring * np.cos(a)), float(ring * np.sin(a))) for a in angles]
     is_holed, is_thinged = rng.random() < 0.7, rng.random() < 0.25
-    widths = [wide] * count
     breaks = rng.permutation(5)[: rng.integers(1, 3)]
     if 0 in breaks or (count == 0 and 1 in breaks) or not (is_holed or is_thinged):
         rim = _notched(rim, size * rng.uniform(0.05, 0.2), size * rng.uniform(0.05, 0.18))
-    if 1 in breaks and count:
-        spots, widths = spots[1:], widths[1:]
-    elif 2 in breaks and count:
-        widths[0] *= rng.choice((0.6, 1.5))
-    holes = [circle(spot, w, 24) for spot, w in zip(spots, widths, strict=True)] if is_holed else []
+    round_things = _uneven(spots, wide, 1 in breaks, 2 in breaks, (0.6, 1.5), rng)
+    holes = [circle(*thing, 24) for thing in round_things] if is_holed else []
     if 3 in breaks:
         holes.append(circle((ring, 0.0), wide * rng.uniform(0.4, 1.0), 24))
     bore = hub * rng.uniform(0.3, 0.8)
@@ -201,7 +204,7 @@ def _even_disc(size: float, rng: Rng) -> list[Mesh]:
         meshes.append(tube((0, 0), 1.1 * hub, bore, -size * rng.uniform(0.05, 0.4), 0.0))
     if is_thinged and not is_holed:
         high = thick + size * rng.uniform(0.05, 0.3)
-        meshes += [cylinder(spot, w, thick, high, 20) for spot, w in zip(spots, widths, strict=True)]
+        meshes += [cylinder(*thing, thick, high, 20) for thing in round_things]
     if 4 in breaks:
         meshes += _small_thing(0.5 * (hub + ring), thick, size, rng)
     return meshes
@@ -218,23 +221,29 @@ def _even_plate(size: float, rng: Rng) -> list[Mesh]:
     wide = min(0.12 * size, 0.15 * b) * rng.uniform(0.4, 1.0)
     corners = [(x * (a - 2.0 * wide), y * (b - 2.0 * wide)) for x, y in ((-1, -1), (1, 1), (-1, 1), (1, -1))]
     corners = corners[: 2 * int(rng.integers(1, 3))]
-    widths = [wide] * len(corners)
-    if 1 in breaks:
-        corners, widths = corners[1:], widths[1:]
-    elif 2 in breaks:
-        widths[0] *= rng.choice((0.5, 1.4))
+    round_things = _uneven(corners, wide, 1 in breaks, 2 in breaks, (0.5, 1.4), rng)
     if rng.random() < 0.7 and 0 not in breaks:
-        meshes = [prism(outline, tuple(circle(c, w, 24) for c, w in zip(corners, widths, strict=True)), 0.0, thick)]
+        meshes = [prism(outline, tuple(circle(*thing, 24) for thing in round_things), 0.0, thick)]
     else:
         meshes = [prism(outline, (), 0.0, thick)]
         high = thick + size * rng.uniform(0.05, 0.5)
-        meshes += [cylinder(c, w, thick, high, 20) for c, w in zip(corners, widths, strict=True)]
+        meshes += [cylinder(*thing, thick, high, 20) for thing in round_things]
     half_turn = rigid(exp_so3([0.0, 0.0, np.pi]), np.zeros(3))
     for mesh in _things(0, 4, 0.4 * a, 0.4 * b, thick, size, rng):
         meshes += [mesh, moved(mesh, half_turn)]
     if 3 in breaks:
         meshes += _small_thing(0.7 * b, thick, size, rng)
     return meshes
+
+
+def _uneven(
+    spots: list[Spot], wide: float, is_one_missing: bool, is_one_other: bool, factors: tuple[float, float], rng: Rng
+) -> list[tuple[Spot, float]]:
+    """Places and radii, all the same but that the first is missing, or else wider or narrower by one of two factors."""
+    if is_one_missing:
+        return [(spot, wide) for spot in spots[1:]]
+    first = wide * rng.choice(factors) if is_one_other and spots else wide
+    return [(spot, wide if k else first) for k, spot in enumerate(spots)]
 
 
 def _small_thing(place: float, low: float, size: float, rng: Rng) -> list[Mesh]:
@@ -265,7 +274,7 @@ def _studs(reach_x: float, reach_y: float, low: float, size: float, rng: Rng) ->
     return [box((x - wide, y - 0.6 * wide, low), (x + wide, y + 0.6 * wide, top)) for x, y in spots]
 
 
-def _spots(reach_x: float, reach_y: float, size: float, rng: Rng) -> list[tuple[float, float]]:
+def _spots(reach_x: float, reach_y: float, size: float, rng: Rng) -> list[Spot]:
     """Places in rows and columns, of which some lack."""
     pitch, columns, rows = size * rng.uniform(0.09, 0.2), rng.integers(1, 10), rng.integers(1, 5)
     x0, y0 = rng.uniform(-reach_x, reach_x), rng.uniform(-reach_y, reach_y)
@@ -317,7 +326,7 @@ def _turned_about(mesh: Mesh, rng: Rng) -> Mesh:
     return moved(mesh, rigid(exp_so3(0.5 * np.pi * rng.integers(4) * axis), np.zeros(3)))
 
 
-def _colour(rng: Rng) -> tuple[float, float, float]:
+def _colour(rng: Rng) -> Color:
     """Mostly greys, some soft and a few strong colours."""
     kind = rng.random()
     if kind < 0.8:
