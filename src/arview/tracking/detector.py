@@ -251,7 +251,12 @@ class Detector:
         )
         first = rivals[0]
         near = [h for h in rivals[1:] if h.logit_without_strips > first.logit_without_strips - LEAD]
-        rivals = [first, *(h for h in near if self._is_turned(h, first, self.turns, ALIKE_DEG))]
+        rivals = [first]
+        for hypothesis in near:
+            # One a little aside of another is the same, badly settled: what speaks for either has told them apart.
+            is_alike = self._is_turned(hypothesis, first, self.same_turns, ALIKE_DEG)
+            if not is_alike and self._is_turned(hypothesis, first, self.turns, ALIKE_DEG):
+                rivals.append(hypothesis)
         if len(rivals) == 1:
             return first, []
         rivals = rivals[:MOST_RIVALS]
