@@ -395,7 +395,7 @@ def test_a_quick_search_ends_the_matter_only_when_it_is_sure(monkeypatch: pytest
         return likely(of, effort)
 
     monkeypatch.setattr(detector().search, "likely", watched)
-    for quality, expected in ((SURE_QUALITY, [QUICK]), (SURE_QUALITY - 0.01, [QUICK, WIDE])):
+    for quality, expected in ((SURE_QUALITY, [QUICK]), (SURE_QUALITY - 0.01, [QUICK, WIDE, OTHER, WHOLE])):
         monkeypatch.setattr(detector(), "qualities", lambda found, quality=quality: [quality] * len(found))
         efforts.clear()
         assert detector().hypotheses(seen)

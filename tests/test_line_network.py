@@ -138,3 +138,6 @@ def test_a_picture_mixes_both_in_its_maps_and_without_a_network_has_gradients_on
     assert np.abs(mixed[inside] - wanted).max() <= 1.0
     assert mixed[:, :12].max() == 0  # the rim stays empty
     assert not plain.lines().answers.any()
+    np.testing.assert_array_equal(lined.without_lines.maps(-4)[0], by_gradients)
+    np.testing.assert_array_equal(lined.maps(-4)[0], mixed)  # as it was
+    assert lined.lines().answers.any() and lined.gradients(-4).lines.any()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
+from functools import cached_property
 from threading import Lock
 from typing import NamedTuple
 
@@ -97,6 +99,13 @@ class Picture:
         self._seen: SeenLines | None = None
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
         self._gradients: dict[int, Gradients] = {}
+
+    @cached_property
+    def without_lines(self) -> Picture:
+        """The same, but that gradients alone count in its maps."""
+        other = copy.copy(self)
+        other._network, other._lines, other._seen, other._maps, other._gradients = None, [], None, {}, {}
+        return other
 
     def radii_px(self, diameter_mm: float, poses: Array) -> Array:
         """Half the diameter (N,) of a part in the picture at poses (N,4,4) about its centre."""

@@ -100,7 +100,7 @@ LEAST_VERIFIED = -4.0
 """Less than this the verifier does not say: on materials that it does not know it denies right poses, too."""
 FOUND_LINES = 6.2
 FOUND_WEIGHTS = (0.59, 0.07, 0.02, 0.60, 0.09, 0.39, 1.38, 3.37, 2.63)
-FOUND_BIAS = -4.24
+FOUND_BIAS = -3.7
 """For the probability, in which lines count so much beside the verifier: logistic regression with weights that may not
 be negative, on the best hypotheses of the search in 504 pictures of 31 other solids where these were right and in 371
 without the part, many in crowds of others; on 198 frames of the recordings and 299 photos of others, which count twice;
@@ -109,7 +109,7 @@ As fitted the bias would be 1.25 higher: of 1,001 further such pictures 12 would
 or none. What the view shows is the strongest term beside the verifier: without it 9 were taken for the part."""
 LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
 """Larger leads say no more."""
-LEAST_SHOWN, MOST_SHOWN = -0.5, 0.3
+LEAST_SHOWN, MOST_SHOWN = -0.75, 0.3
 """Nor does a view that shows fewer or more lines than the usual one by these logarithms."""
 SMALL_PX = 60.0
 """Parts of less than this half diameter fit by chance the more often the smaller they are."""
