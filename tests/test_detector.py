@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import permutations, product
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
@@ -21,9 +23,11 @@ from arview.tracking.detector import SURE_QUALITY
 from arview.tracking.first_search import (
     FARTHER,
     NEARER,
+    OTHER,
     QUICK,
     RESPONSE_WORTH,
     WANTED_SIDE,
+    WHOLE,
     WIDE,
     Candidate,
     Effort,
@@ -235,6 +239,27 @@ def test_a_key_decides_between_twins_and_where_it_cannot_be_seen_the_view_is_amb
             wrong_by = [error(pose, truth, model)[2] for pose in poses]
             right += wrong_by[0] < 3.0 and len(poses) == 1 if is_told else len(poses) > 1 and min(wrong_by) < 3.0
     assert right >= 4
+
+
+def test_a_pose_settled_a_little_aside_is_no_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = pose_from(30, 40, 500.0)
+    seen = detector().local.picture(picture(truth))
+    right = detector().hypotheses(seen)[0]
+    turn = Rotation.from_rotvec(np.deg2rad([0.0, 10.0, 0.0])).as_matrix()
+    aside = replace(right, cam_from_body=right.cam_from_body @ rigid(turn, np.zeros(3)), strips=right.strips - 2.0)
+    against = np.array([[0.0, -9.0], [9.0, 0.0]])
+    monkeypatch.setattr(detector(), "_ahead", lambda of, rivals: against[: len(rivals), : len(rivals)])
+    monkeypatch.setattr(detector().local, "finished", lambda of, starts: [])
+    best, twins = detector()._told_apart(seen, right, [aside])
+    assert best is right and not twins
+
+
+def test_a_search_by_gradients_alone_takes_no_heed_of_the_line_network() -> None:
+    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
+    without = Picture(seen.image, CAMERA, seen.pad_px)
+    for one, other in zip(detector().search.likely(seen, OTHER), detector().search.likely(without, WHOLE), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(detector().search.likely(seen, WHOLE).responses, one)
 
 
 def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
