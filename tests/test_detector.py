@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.errors import InputError
-from arview.geometry import apply, are_near, rigid
+from arview.geometry import apply, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.guideviews.sphere import icosphere_directions
 from arview.pose import TrackingState
@@ -260,6 +260,38 @@ def test_a_search_by_gradients_alone_takes_no_heed_of_the_line_network() -> None
     for one, other in zip(detector().search.likely(seen, OTHER), detector().search.likely(without, WHOLE), strict=True):
         np.testing.assert_array_equal(one, other)
     assert not np.array_equal(detector().search.likely(seen, WHOLE).responses, one)
+
+
+def lid() -> Model:
+    """A round lid with six pins and a small block beside one: the outline is hardly another at any turn."""
+    parts = [component("disc", post((0, 0), 60, 0, 14, 60), (0.55, 0.55, 0.6))]
+    for k in range(6):
+        place = 42.0 * np.array([np.cos(np.pi * k / 3), np.sin(np.pi * k / 3)])
+        parts.append(component(f"pin_{k}", post(tuple(place), 8.0, 14, 26, 24), (0.3, 0.3, 0.32)))
+    parts.append(component("key", box((18, -6, 14), (30, 6, 22)), (0.25, 0.25, 0.27)))
+    return make_model("lid", tuple(parts))
+
+
+def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
+    model = lid()
+    views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
+    sought = Detector(views, CAMERA)
+    np.testing.assert_allclose(np.abs(sought.symmetries.axes), [[0.0, 0.0, 1.0]])
+    part = sought.local.tracker.part
+    for k in range(4):
+        truth = pose_from(20.0 + 80.0 * k, 45.0, 380.0, model)
+        seen = sought.local.picture(picture(truth, model, seed=k, scene=k))
+        spun = truth @ part.model_from_body @ rigid(exp_so3(np.deg2rad([0.0, 0.0, 23.0])), np.zeros(3))
+        starts = sought._spun(seen, spun)
+        assert min(error(start @ part.body_from_model, truth, model)[2] for start in starts[:3]) < 6.0
+        best = sought.local.verified(seen, sought.local.finished(seen, [spun]))[0]
+        found, _ = sought._told_apart(seen, best, [])
+        assert error(found.cam_from_body @ part.body_from_model, truth, model)[2] < 2.0
+
+
+def test_a_part_with_few_near_turns_is_not_spun() -> None:
+    assert not len(detector().symmetries.axes)
+    assert detector()._spun(detector().local.picture(picture(pose_from(30, 40, 500.0))), np.eye(4)) == []
 
 
 def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:

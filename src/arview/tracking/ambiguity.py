@@ -10,7 +10,7 @@ box are not discovered.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ TELLING = 2.0
 """It is, too, when all that tells of two twins speaks for it by so much, see `Detector`: of 189 pictures of nearly
 symmetric random solids the pose is right and alone in 100 with it, right among alternatives in 35, wrong with the right
 one among its alternatives in 18, and wrong in 36; in 27 of all the right one is not among what is compared."""
+MANY_TURNS = 3
+"""About one axis."""
 SHARED_PX, SHARED_COS = 3.0, 0.8
 """Edges of two poses this near, and so nearly parallel, tell nothing of which is right."""
 SPACING_PX, NEIGHBOURS = 12.0, 12
@@ -46,10 +48,15 @@ DECIDED = 0.25
 
 @dataclass(frozen=True)
 class Symmetries:
-    """Turns (N,3,3) of the part about its middle: ``exact`` ones change nothing, ``near`` ones hardly anything."""
+    """Turns (N,3,3) of the part about its middle: ``exact`` ones change nothing, ``near`` ones hardly anything.
+
+    ``axes`` (A,3) are those about which there are many, near ones among them: an outline that is nearly round holds a
+    pose at any turn about its axis.
+    """
 
     exact: Array
     near: Array
+    axes: Array
 
 
 def find_symmetries(views: GuideViewSet) -> Symmetries:
@@ -65,15 +72,18 @@ def find_symmetries(views: GuideViewSet) -> Symmetries:
                 exact.append(turn)
             elif np.mean(np.isfinite(distance)) >= NEAR_SHARE:
                 near.append(turn)
-        return Symmetries(np.array(exact).reshape(-1, 3, 3), np.array(near).reshape(-1, 3, 3))
+        return Symmetries(np.array(exact).reshape(-1, 3, 3), np.array(near).reshape(-1, 3, 3), np.empty((0, 3)))
 
     def about(axis: Array) -> Symmetries:
         # What is a fifth is nearly five twelfths, too: one or the other.
         usual, fifths = (among(_about(axis, angles_deg)) for angles_deg in (USUAL_DEG, FIFTHS_DEG))
-        return max(usual, fifths, key=lambda found: len(found.exact) + len(found.near))
+        found = max(usual, fifths, key=lambda found: len(found.exact) + len(found.near))
+        is_many = len(found.near) > 0 and len(found.exact) + len(found.near) >= MANY_TURNS
+        return replace(found, axes=axis[None]) if is_many else found
 
     groups = [*map(about, np.eye(3)), among(_diagonal_turns())]
-    return Symmetries(np.concatenate([some.exact for some in groups]), np.concatenate([some.near for some in groups]))
+    exact, near, axes = (np.concatenate([getattr(some, of.name) for some in groups]) for of in fields(Symmetries))
+    return Symmetries(exact, near, axes)
 
 
 def _edge_points(views: GuideViewSet) -> Array:

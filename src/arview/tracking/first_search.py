@@ -112,8 +112,9 @@ WIDE = Effort(2500, 1400, 700, 160, (60, 20), 1, True)
 parts behind things, 75 frames, a right pose is among the likely ones in 64 if a quarter is spared, in 55 if not."""
 OTHER = replace(WIDE, is_sparing=False, with_lines=False)
 WHOLE = replace(WIDE, is_sparing=False)
-"""For what these miss: parts in plain sight that are small or of little contrast, and materials that the line network
-does not know. Of 58 semi-synthetic frames in which the others do not find the part %s."""
+"""For what these miss: what is in plain sight but of little contrast, and what the line network does not know. Of the
+58 of 600 semi-synthetic frames in which the two before do not find the part, it is found in 10 with these, and none is
+taken for another pose; of 1,001 pictures without the part fewer are taken for it, for there are more rivals."""
 
 
 @dataclass(frozen=True)

@@ -105,12 +105,14 @@ FOUND_BIAS = -3.7
 be negative, on the best hypotheses of the search in 504 pictures of 31 other solids where these were right and in 371
 without the part, many in crowds of others; on 198 frames of the recordings and 299 photos of others, which count twice;
 and on 1,000 photos and pictures of other parts for the semi-synthetic shapes and the recorded parts, which count half.
-As fitted the bias would be 1.25 higher: of 1,001 further such pictures 12 would be taken for the part, with it one
-or none. What the view shows is the strongest term beside the verifier: without it 9 were taken for the part."""
+What the view shows is the strongest term beside the verifier. The bias is told by further 1,001 such pictures, of which
+hardly one may be taken for the part: in all four searches it is 2."""
 LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
 """Larger leads say no more."""
 LEAST_SHOWN, MOST_SHOWN = -0.75, 0.3
-"""Nor does a view that shows fewer or more lines than the usual one by these logarithms."""
+"""Nor does a view that shows fewer or more lines than the usual one by these logarithms. With -0.5 as the least, the
+back of a plate was taken for another plate: of 253 pictures of random solids 219 instead of 229 are found with as few
+false alarms."""
 SMALL_PX = 60.0
 """Parts of less than this half diameter fit by chance the more often the smaller they are."""
 
