@@ -21,9 +21,9 @@ from arview.tracking import Detector, DetectorOptions, TrackingSession
 from arview.tracking.ambiguity import EdgeSteps, find_symmetries, telling
 from arview.tracking.detector import SURE_QUALITY
 from arview.tracking.first_search import (
+    BY_GRADIENTS,
     FARTHER,
     NEARER,
-    OTHER,
     QUICK,
     RESPONSE_WORTH,
     WANTED_SIDE,
@@ -257,7 +257,9 @@ def test_a_pose_settled_a_little_aside_is_no_twin(monkeypatch: pytest.MonkeyPatc
 def test_a_search_by_gradients_alone_takes_no_heed_of_the_line_network() -> None:
     seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
     without = Picture(seen.image, CAMERA, seen.pad_px)
-    for one, other in zip(detector().search.likely(seen, OTHER), detector().search.likely(without, WHOLE), strict=True):
+    for one, other in zip(
+        detector().search.likely(seen, BY_GRADIENTS), detector().search.likely(without, WHOLE), strict=True
+    ):
         np.testing.assert_array_equal(one, other)
     assert not np.array_equal(detector().search.likely(seen, WHOLE).responses, one)
 
@@ -452,7 +454,7 @@ def test_a_quick_search_ends_the_matter_only_when_it_is_sure(monkeypatch: pytest
         return likely(of, effort)
 
     monkeypatch.setattr(detector().search, "likely", watched)
-    for quality, expected in ((SURE_QUALITY, [QUICK]), (SURE_QUALITY - 0.01, [QUICK, WIDE, OTHER, WHOLE])):
+    for quality, expected in ((SURE_QUALITY, [QUICK]), (SURE_QUALITY - 0.01, [QUICK, WIDE, BY_GRADIENTS, WHOLE])):
         monkeypatch.setattr(detector(), "qualities", lambda found, quality=quality: [quality] * len(found))
         efforts.clear()
         assert detector().hypotheses(seen)

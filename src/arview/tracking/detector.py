@@ -23,7 +23,7 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
 from arview.tracking.ambiguity import LEAD, TELLING, find_symmetries, telling
 from arview.tracking.components import ComponentCheck
-from arview.tracking.first_search import OTHER, QUICK, WHOLE, WIDE, Candidate, Effort, FirstSearch, reach_mm
+from arview.tracking.first_search import BY_GRADIENTS, QUICK, WHOLE, WIDE, Candidate, Effort, FirstSearch, reach_mm
 from arview.tracking.local_search import Hypothesis, LocalOptions, LocalSearch
 from arview.tracking.picture import Picture
 from arview.tracking.quality import Leads, found_probability, found_terms
@@ -66,7 +66,7 @@ class DetectorOptions:
     radius_px: float = 20.0
     roll_step_deg: float = 18.0
     subdivisions: int = 2
-    efforts: tuple[Effort, ...] = (QUICK, WIDE, OTHER, WHOLE)
+    efforts: tuple[Effort, ...] = (QUICK, WIDE, BY_GRADIENTS, WHOLE)
     local: LocalOptions = field(default_factory=LocalOptions)
     min_quality: float = 0.5
 

@@ -110,11 +110,11 @@ QUICK = Effort(400, 200, 100, 16, (6, 4), 2, False)
 WIDE = Effort(2500, 1400, 700, 160, (60, 20), 1, True)
 """For clutter, in which thousands of wrong matches come before the right one, and for what is partly hidden: of three
 parts behind things, 75 frames, a right pose is among the likely ones in 64 if a quarter is spared, in 55 if not."""
-OTHER = replace(WIDE, is_sparing=False, with_lines=False)
+BY_GRADIENTS = replace(WIDE, is_sparing=False, with_lines=False)
 WHOLE = replace(WIDE, is_sparing=False)
 """For what these miss: what is in plain sight but of little contrast, and what the line network does not know. Of the
-52 of 600 semi-synthetic frames in which the two before find nothing, the part is found in 10 with these, and in none at a
-wrong pose; of 1,001 pictures without the part 3 instead of 4 are taken for it, for a wrong pose has more rivals."""
+52 of 600 semi-synthetic frames in which the two before find nothing, the part is found in 10 with these, and in none at
+a wrong pose; of 1,001 pictures without the part 3 instead of 4 are taken for it, for a wrong pose has more rivals."""
 
 
 @dataclass(frozen=True)
