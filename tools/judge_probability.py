@@ -16,8 +16,7 @@ from arview.errors import InputError
 from arview.evaluation.protocols import spread_frames
 from arview.evaluation.semisynthetic import frames_without_part
 from arview.geometry import Array
-from arview.tracking import Detector
-from arview.tracking.first_search import QUICK, WIDE
+from arview.tracking import Detector, DetectorOptions
 from judge_examples import ALIKE, REFINED_NEAR, is_alike, is_near, pictures_of
 from photos import all_photos
 from recordings import scenes
@@ -55,9 +54,8 @@ def fit_probability(seeds: range, photos: Sequence[Path]) -> None:
 
     Pictures with the part in which the best hypothesis is wrong are left out: most are twins of the right pose.
     """
-    solids = (
-        (str(seed), 1.0, pictures_of(seed, photos, (QUICK, WIDE))) for seed in tqdm(seeds, desc="solids", disable=None)
-    )
+    efforts = DetectorOptions().efforts
+    solids = ((str(seed), 1.0, pictures_of(seed, photos, efforts)) for seed in tqdm(seeds, desc="solids", disable=None))
     recorded = ((name, RECORDED_WEIGHT, _recorded(name)) for name in scenes())
     outcomes = [outcome for part in chain(solids, recorded, _others()) for outcome in _outcomes(*part)]
     if len({outcome.is_right for outcome in outcomes}) < 2:
