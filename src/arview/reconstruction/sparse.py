@@ -172,8 +172,10 @@ def _write_database(
 def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tell: Progress) -> list[Any]:
     """The reconstructions that COLMAP's incremental mapper finds."""
     pycolmap = import_pycolmap()
+    # In one thread: in several COLMAP starts from whichever good pair is found first, another one from run to run.
+    # Threads save no time here (24 photos: 1.2 s either way), its small adjustments run in one all the same.
     mapping = pycolmap.IncrementalPipelineOptions(
-        random_seed=options.seed, min_model_size=3, extract_colors=False, num_threads=options.threads or -1
+        random_seed=options.seed, min_model_size=3, extract_colors=False, num_threads=1
     )
     with pycolmap.Database.open(str(path)) as database:
         cameras = database.read_all_cameras()
