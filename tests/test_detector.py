@@ -8,12 +8,11 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.errors import InputError
-from arview.geometry import apply, are_near, exp_so3, rigid
+from arview.geometry import apply, are_near, exp_so3, rigid, turned
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.guideviews.sphere import icosphere_directions
 from arview.pose import TrackingState
@@ -245,8 +244,8 @@ def test_a_pose_settled_a_little_aside_is_no_twin(monkeypatch: pytest.MonkeyPatc
     truth = pose_from(30, 40, 500.0)
     seen = detector().local.picture(picture(truth))
     right = detector().hypotheses(seen)[0]
-    turn = Rotation.from_rotvec(np.deg2rad([0.0, 10.0, 0.0])).as_matrix()
-    aside = replace(right, cam_from_body=right.cam_from_body @ rigid(turn, np.zeros(3)), strips=right.strips - 2.0)
+    (pose,) = turned(right.cam_from_body, [exp_so3(np.deg2rad([0.0, 10.0, 0.0]))])
+    aside = replace(right, cam_from_body=pose, strips=right.strips - 2.0)
     against = np.array([[0.0, -9.0], [9.0, 0.0]])
     monkeypatch.setattr(detector(), "_ahead", lambda of, rivals: against[: len(rivals), : len(rivals)])
     monkeypatch.setattr(detector().local, "finished", lambda of, starts: [])
@@ -283,7 +282,7 @@ def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
     for k in range(4):
         truth = pose_from(20.0 + 80.0 * k, 45.0, 380.0, model)
         seen = sought.local.picture(picture(truth, model, seed=k, scene=k))
-        spun = truth @ part.model_from_body @ rigid(exp_so3(np.deg2rad([0.0, 0.0, 23.0])), np.zeros(3))
+        (spun,) = turned(truth @ part.model_from_body, [exp_so3(np.deg2rad([0.0, 0.0, 23.0]))])
         starts = sought._spun(seen, spun)
         assert min(error(start @ part.body_from_model, truth, model)[2] for start in starts[:3]) < 6.0
         best = sought.local.verified(seen, sought.local.finished(seen, [spun]))[0]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from arview.atomic import replacing
 from arview.geometry import Array
-from arview.tracking import Detector
-from arview.tracking.first_search import QUICK, WIDE, Candidate
+from arview.tracking import Detector, DetectorOptions
+from arview.tracking.first_search import Candidate
 from arview.tracking.local_search import Hypothesis
 from arview.tracking.strips import raw_strips
 from judge_examples import REFINED_APART, REFINED_NEAR, pictures_of, told
@@ -51,7 +51,7 @@ def collect_strips(seeds: range, photos: Sequence[Path], folder: Path) -> None:
     """Write the verified poses of each solid's pictures to a file of its own, unless it is there."""
     for seed, path in still_to_make(seeds, folder, "strips_{}.pkl", "solids"):
         examples = []
-        for detector, image, truth in pictures_of(seed, photos, (QUICK, WIDE)):
+        for detector, image, truth in pictures_of(seed, photos, DetectorOptions().efforts):
             detector.local.options = replace(detector.local.options, verified=VERIFIED)
             example = strips_of(seed, detector, image, truth)
             examples += [example] if example is not None else []

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from arview.atomic import replacing
 from arview.evaluation.semisynthetic.random_solids import random_solid, random_twin
-from arview.geometry import Array, exp_so3, rigid
+from arview.geometry import Array, exp_so3, log_so3, rigid, turned
 from arview.tracking import Detector
 from arview.tracking.first_search import QUICK
 from arview.tracking.local_search import Hypothesis
@@ -93,11 +93,10 @@ def _turned(detector: Detector, truth: Array, rng: np.random.Generator) -> list[
     for _ in range(ASIDE):
         axis = rng.normal(size=3)
         if len(near) and rng.random() < 0.7:
-            values, vectors = np.linalg.eig(near[rng.integers(len(near))])
-            axis = vectors[:, int(np.argmin(np.abs(values - 1.0)))].real
+            axis = log_so3(near[rng.integers(len(near))])
         angle = np.deg2rad(rng.uniform(*ASIDE_DEG)) * rng.choice((-1.0, 1.0))
         turns.append(turns[rng.integers(1 + len(near))] @ exp_so3(angle * axis / np.linalg.norm(axis)))
-    return [rigid(truth[:3, :3] @ turn, truth[:3, 3]) for turn in turns]
+    return turned(truth, turns)
 
 
 def _off(pose: Array, diameter_mm: float, rng: np.random.Generator) -> Array:

@@ -6,6 +6,8 @@ A twist is (6,) = (rotation vector in rad, translation); perturbations are appli
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -112,6 +114,11 @@ def are_near(a: Array, b: Array, reach: float, angle_deg: float) -> bool:
     # cos of the angle between them from the trace: cheap, it is asked often.
     cosine = 0.5 * (float(np.sum(a[:3, :3] * b[:3, :3])) - 1.0)
     return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) < reach and cosine > np.cos(np.deg2rad(angle_deg)))
+
+
+def turned(b_from_a: Array, turns: Iterable[Array]) -> list[Array]:
+    """A pose (4,4) after each of some turns (3,3) of ``a`` about its origin."""
+    return [rigid(b_from_a[:3, :3] @ turn, b_from_a[:3, 3]) for turn in turns]
 
 
 def turn_ball(reach_deg: float, step_deg: float) -> Array:

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.geometry import Array, exp_so3, rigid
+from arview.geometry import Array, turned
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
-from arview.tracking.ambiguity import LEAD, TELLING, find_symmetries, telling
+from arview.tracking.ambiguity import LEAD, TELLING, find_symmetries, telling, turns_about
 from arview.tracking.components import ComponentCheck
 from arview.tracking.first_search import BY_GRADIENTS, QUICK, WHOLE, WIDE, Candidate, Effort, FirstSearch, reach_mm
 from arview.tracking.local_search import Hypothesis, LocalOptions, LocalSearch
@@ -38,7 +38,7 @@ ALIKE_ASIDE, ALIKE_ALONG, ALIKE_DEG = 0.12, 0.15, 20.0
 """Hypotheses this near, across in diameters and along as a share of the distance, are no rivals of each other."""
 MOST_RIVALS = 12
 """Of more twins the likeliest are told apart."""
-SPINS_RAD = np.deg2rad(np.arange(0.0, 360.0, 5.0))
+SPINS_DEG = range(0, 360, 5)
 """Turns about the axis of a nearly round part that are looked at."""
 MOST_SPUN = 6
 """Of those so many are refined: in 98 pictures of a flange the right one is among the first four by its edges in 90."""
@@ -247,8 +247,7 @@ class Detector:
         the same pose.
         """
         pose = best.cam_from_body
-        starts = [rigid(pose[:3, :3] @ turn, pose[:3, 3]) for turn in self.symmetries.near]
-        starts += self._spun(picture, pose)
+        starts = turned(pose, self.symmetries.near) + self._spun(picture, pose)
         reach_mm = 0.25 * self.views.diameter_mm
         rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
         rivals = self.local.ordered(
@@ -256,16 +255,9 @@ class Detector:
         )
         first = rivals[0]
         near = [h for h in rivals[1:] if h.logit_without_strips > first.logit_without_strips - LEAD]
-        rivals = [first]
-        for hypothesis in near:
-            # One a little aside of another is the same, badly settled: what speaks for either has told them apart.
-            is_alike = self._is_turned(hypothesis, first, self.same_turns, ALIKE_DEG)
-            is_twin = not is_alike and self._is_turned(hypothesis, first, self.turns, ALIKE_DEG)
-            if is_twin or self._is_spun(hypothesis, first):
-                rivals.append(hypothesis)
+        rivals = [first, *(h for h in near if self._is_twin(h, first) or self._is_spun(h, first))][:MOST_RIVALS]
         if len(rivals) == 1:
             return first, []
-        rivals = rivals[:MOST_RIVALS]
         ahead = self._ahead(picture, rivals)
         # Ahead of all others, or by the least behind any.
         leader = int(np.argmax((ahead + np.diag(np.full(len(rivals), np.inf))).min(axis=1)))
@@ -280,17 +272,25 @@ class Detector:
         """
         tracker = self.local.tracker
 
-        def seen(turned: Array) -> float:
-            support = tracker.edge_steps(picture.gray, turned).support
+        def seen(spun: Array) -> float:
+            support = tracker.edge_steps(picture.gray, spun).support
             return float(support.mean()) if len(support) else 0.0
 
         starts = []
         for axis in self.symmetries.axes:
-            turned = [rigid(pose[:3, :3] @ exp_so3(axis * angle), pose[:3, 3]) for angle in SPINS_RAD]
-            support = np.array(list(pool().map(seen, turned)))
+            poses = turned(pose, turns_about(axis, SPINS_DEG))
+            support = np.array(list(pool().map(seen, poses)))
             peaks = np.flatnonzero((support >= np.roll(support, 1)) & (support > np.roll(support, -1)))
-            starts += [turned[k] for k in peaks[np.argsort(-support[peaks], kind="stable")][:MOST_SPUN]]
+            starts += [poses[k] for k in peaks[np.argsort(-support[peaks], kind="stable")][:MOST_SPUN]]
         return starts
+
+    def _is_twin(self, a: Hypothesis, b: Hypothesis) -> bool:
+        """Whether one of the turns that nearly take the part onto itself brings a pose to another, or near it.
+
+        One a little aside of another is the same, badly settled: what speaks for either tells them apart.
+        """
+        is_alike = self._is_turned(a, b, self.same_turns, ALIKE_DEG)
+        return not is_alike and self._is_turned(a, b, self.turns, ALIKE_DEG)
 
     def _is_spun(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two are turned against each other about an axis about which the part is nearly round, if at all."""
