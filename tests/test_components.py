@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import cache, partial
 
 import numpy as np
@@ -158,6 +159,26 @@ def test_a_moved_component_stays_named_where_it_looks_right_along_the_way_it_mov
     assert watched(-4.0, 3.0) == ()
 
 
+def test_what_blurred_pictures_said_is_soon_taken_back_from_the_same_direction(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    count = len(assembly().components)
+    flags, shares = np.zeros(count, dtype=bool), np.zeros(count)
+    said = itertools.chain([3.0, 3.0], itertools.repeat(-2.5))
+
+    def look(*_: object) -> Look:
+        against = np.where(np.arange(count) == 2, next(said), -3.0)
+        return Look(against, flags, flags, shares, shares, shares, shares)
+
+    monkeypatch.setattr(seen, "look", look)
+    blank, pose = np.zeros((480, 640, 3), np.uint8), pose_from(0, 45, 520)
+    for _ in range(2):
+        seen.update(blank, pose)
+    assert len(seen.mismatches) == 1
+    for _ in range(4 * SUSPICIOUS_FRAMES):
+        seen.update(blank, pose)
+    assert seen.mismatches == () and seen.doubtful == ()
+
+
 @pytest.mark.parametrize(("second", "is_named"), [(3.0, True), (-1.2, False)])
 def test_one_frame_of_a_watched_part_names_nothing(
     monkeypatch: pytest.MonkeyPatch, second: float, is_named: bool
@@ -208,6 +229,24 @@ def test_what_is_hidden_at_first_is_named_later_even_at_a_fast_turn() -> None:
     assert named(watch(frames).mismatches) == {"block_2"}
 
 
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_component_is_unseen_until_it_is_seen_at_its_place(is_there: bool) -> None:
+    model = None if is_there else changed(block_2=None)
+    poses = [pose_from(-70 + 10 * k, 45, 520) for k in range(14)]
+    cards = [card_over("block_2", pose, 50) if k < 3 else None for k, pose in enumerate(poses)]
+    frames = [(picture(p, model, seed=k, card=card), p) for k, (p, card) in enumerate(zip(poses, cards, strict=True))]
+    seen = watch([])
+    assert set(seen.unseen) == set(assembly_views().component_names)
+    for image, pose in frames[:3]:
+        seen.update(image, pose)
+    assert "block_2" in seen.unseen and len(seen.unseen) < len(assembly_views().component_names)
+    for image, pose in frames[3:]:
+        for _ in range(SUSPICIOUS_FRAMES):
+            seen.update(image, pose)
+    assert ("block_2" in seen.unseen) != is_there
+    assert not set(seen.unseen) - {"block_2"}
+
+
 def test_a_sure_part_is_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     looks = []
     seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
@@ -224,7 +263,7 @@ def test_a_part_of_one_component_has_nothing_to_mismatch() -> None:
     pose = pose_from(30, 40, 520)
     alone.update(picture(pose), pose)
     assert alone.single_look(picture(None), pose) == ()
-    assert alone.mismatches == () and alone.doubtful == ()
+    assert alone.mismatches == () and alone.doubtful == () and alone.unseen == ()
 
 
 def test_a_session_never_calls_a_look_alike_tracked() -> None:

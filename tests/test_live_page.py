@@ -339,6 +339,12 @@ def test_outline_to_align_with(chromium: Any, inspection: Path) -> None:
         assert 800 < is_yellow.sum() < 0.2 * is_yellow.size
 
 
+def test_the_bar_says_what_has_not_been_seen_yet(chromium: Any, server: Running) -> None:
+    with opened(chromium, server, WATCH) as page:
+        until(page, "window.drawn?.pose?.state === 'tracked' && window.drawn.pose.unseen.length > 0")
+        until(page, lambda: "surely seen yet: " in page.inner_text("#state"))
+
+
 def test_screen_that_watches(chromium: Any, server: Running) -> None:
     with opened(chromium, server) as page:
         until(page, "document.body.dataset.state === 'tracked'")

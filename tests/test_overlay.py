@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from arview.overlay import OverlayOptions, OverlayRenderer, labels, paint
 from arview.overlay.ghost import CELL_PX
 from arview.overlay.layout import LabelLayout, LabelRequest, PlacedLabel
 from arview.overlay.options import VERDICT_RGB
-from arview.overlay.status import age_text
+from arview.overlay.status import StatusLine, age_text
 from arview.pose import Pose, TrackingState
 
 PLATE = Path(__file__).parents[2] / "shared" / "data" / "sequences" / "plate"
@@ -251,6 +252,32 @@ def test_without_a_pose_only_the_status_line_is_drawn(plate: Model, record: Insp
     assert changed(searching).any()
     none = OverlayRenderer(plate, CAMERA, record, OverlayOptions(show_status=False))
     assert not changed(none.draw(GREY, lost)).any()
+
+
+def test_the_status_line_says_what_has_not_been_seen_yet(plate: Model, record: Inspection) -> None:
+    renderer = OverlayRenderer(plate, CAMERA, record)
+    seen = pose(orbit(20.0))
+    plain, one, many = (
+        renderer.draw(GREY, replace(seen, unseen=names), 30.0, NOW)[-60:] for names in ((), ("nut",), tuple("abcdef"))
+    )
+    assert (one != plain).any() and (many != one).any()
+    assert replace(seen, unseen=("nut",)).remark == "not surely seen yet: nut"
+    assert replace(seen, unseen=tuple("abcdef")).remark == "not surely seen yet: 6 components"
+    lost = replace(pose(None, TrackingState.LOST, "too dark"), unseen=("nut",))
+    assert lost.remark == "too dark"
+
+
+def test_on_one_row_what_has_not_been_seen_gives_way_to_the_errors(plate: Model, record: Inspection) -> None:
+    line = StatusLine(1600, 480, 18, record, None)
+    assert line.rows == 1
+    bars = []
+    for names in ((), ("nut",), ("n" * 300,)):
+        bars.append(np.full((480, 1600, 3), 127, np.uint8))
+        line.draw(bars[-1], replace(pose(orbit(20.0)), unseen=names), 30.0, NOW)
+    plain, one, long = bars
+    right = slice(1600 - 500, None)
+    assert (one != plain).any() and (long != one).any()
+    assert (one[:, right] == plain[:, right]).all() and (long[:, right] == plain[:, right]).all()
 
 
 @pytest.mark.parametrize(

@@ -212,10 +212,13 @@ class Sections:
         on = f"{', '.join(models)}: {total} frames"
         after = f"{len(walks)} of them, walked round for {LOOK_ALIKE_FRAMES / 30.0:.0f} s"
         text = f"{percent(named, total)} named, {percent(silent, total)} not found"
+        unnamed = [r for r in results if r.state == TrackingState.TRACKED and not r.mismatches]
+        pending = sum(any(part in r.unseen for part in r.components) for r in unnamed)
+        cleanly = f"{clean} of {total}; {len(unnamed)} tracked, {pending} of them with the wrong one not yet seen"
         all_named = percent(named_walks, len(walks))
         return [
             Line("lookalike named", on, text, "≥ 90 %", total > 0 and named >= 0.9 * total),
-            Line("lookalike clean lock", on, f"{clean} of {total}", "none", total > 0 and clean == 0),
+            Line("lookalike clean lock", on, cleanly, "none", total > 0 and clean == 0),
             Line("lookalike named at last", after, all_named, "≥ 90 %", named_walks >= 0.9 * len(walks) > 0),
             Line(
                 "lookalike clean at last",
@@ -269,7 +272,8 @@ class LookAlikeWalk:
             pose = self.session.process(image, frame.index, frame.index / 30.0)
         found = pose.mismatches
         is_named = any(part in words(text) for text in found for part in self.look_alike.components)
-        return LookAlikeResult(self.look_alike.name, frame.index, str(pose.state), is_named, found)
+        wrong = tuple(self.look_alike.components)
+        return LookAlikeResult(self.look_alike.name, frame.index, str(pose.state), is_named, found, pose.unseen, wrong)
 
 
 @dataclass(frozen=True)
@@ -281,6 +285,8 @@ class LookAlikeResult:
     state: str
     is_named: bool
     mismatches: tuple[str, ...]
+    unseen: tuple[str, ...]
+    components: tuple[str, ...]
 
     @property
     def is_locked(self) -> bool:
@@ -289,8 +295,8 @@ class LookAlikeResult:
 
     @property
     def is_clean(self) -> bool:
-        """True when it was taken for the right part."""
-        return self.state == TrackingState.TRACKED and not self.mismatches
+        """True when it was taken for the right part, with all of its components seen."""
+        return self.state == TrackingState.TRACKED and not self.mismatches and not self.unseen
 
 
 def _plain_error(meter: PoseMeter, estimate: Array, frame: SceneFrame) -> PoseError:

@@ -74,6 +74,7 @@ class AnnotateSummary:
         seconds: from the first frame asked for to the finished files.
         states: frames by tracking state.
         reasons: frames by state and reason, of the frames that have one.
+        never_seen: components that no frame has shown surely, see `Pose.unseen`; none without a pose.
         ms: (F,) time of detection and tracking of each frame.
         ended_reason: why the source ended before its time, or empty.
         is_interrupted: stopped by Ctrl-C; the files hold what was done until then.
@@ -84,6 +85,7 @@ class AnnotateSummary:
     seconds: float
     states: dict[str, int]
     reasons: dict[str, dict[str, int]]
+    never_seen: tuple[str, ...]
     ms: tuple[float, ...]
     ended_reason: str
     is_interrupted: bool
@@ -129,6 +131,7 @@ def annotate(
     states: Counter[str] = Counter()
     reasons: dict[str, Counter[str]] = {}
     ms: list[float] = []
+    never_seen: tuple[str, ...] | None = None
     is_interrupted = False
     began = time.perf_counter()
     try:
@@ -148,6 +151,8 @@ def annotate(
                 states[str(pose.state)] += 1
                 if pose.reason:
                     reasons.setdefault(str(pose.state), Counter())[pose.reason] += 1
+                if pose.cam_from_model is not None:
+                    never_seen = tuple(name for name in pose.unseen if never_seen is None or name in never_seen)
                 ms.append(pose.ms)
                 if progress:
                     progress(len(ms), pose)
@@ -178,6 +183,7 @@ def annotate(
         seconds=time.perf_counter() - began,
         states=dict(states),
         reasons={state: dict(counts) for state, counts in reasons.items()},
+        never_seen=never_seen or (),
         ms=tuple(ms),
         ended_reason=source.ended_reason,
         is_interrupted=is_interrupted,
@@ -270,8 +276,8 @@ class PoseWriter:
     """Writes poses as JSON lines under a temporary name; `close` gives the file its name.
 
     A line holds ``index``, ``time_s``, ``state``, ``quality``, ``cam_from_model`` (4×4 row-major, mm, or
-    null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches`` (list) and
-    ``alternatives`` (list of 4×4 poses that fit as well).
+    null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches`` (list),
+    ``unseen`` (components not seen yet) and ``alternatives`` (list of 4×4 poses that fit as well).
 
     Raises:
         OutputError: the file cannot be written.
@@ -328,6 +334,7 @@ def pose_line(pose: Pose) -> str:
             "ms": round(pose.ms, 4),
             "reason": pose.reason,
             "mismatches": list(pose.mismatches),
+            "unseen": list(pose.unseen),
             "alternatives": [alternative.tolist() for alternative in pose.alternatives],
         },
         allow_nan=False,

@@ -17,6 +17,10 @@ class TrackingState(StrEnum):
     LOST = "lost"
 
 
+MOST_NAMED = 3
+"""More components are counted, not named, in a status line."""
+
+
 @dataclass(frozen=True)
 class Pose:
     """The answer for one frame.
@@ -33,6 +37,8 @@ class Pose:
         reason: for ``searching``, ``critical`` and ``lost``: why, in words.
         mismatches: what is not as the CAD says, e.g. ``mismatch: nut_2 not seen where expected``; a part with
             any is never ``tracked`` but ``critical``: it may be another part of the family.
+        unseen: names of components that no look so far has shown surely at their place, because they are hidden or face
+            away, or because too little of them shows; one of them may be missing or elsewhere and nobody knows yet.
         alternatives: other poses (4,4) that the frames so far bear out as well; not empty: the view is ambiguous.
         guide_cam_from_model: (4,4) where the user should bring the part; None unless the session waits for that.
     """
@@ -46,5 +52,14 @@ class Pose:
     ms: float = 0.0
     reason: str = ""
     mismatches: tuple[str, ...] = ()
+    unseen: tuple[str, ...] = ()
     alternatives: tuple[Array, ...] = ()
     guide_cam_from_model: Array | None = None
+
+    @property
+    def remark(self) -> str:
+        """What a status line says beside the state: the reason, or which components have not been seen yet."""
+        if self.state is not TrackingState.TRACKED or not self.unseen:
+            return self.reason
+        few = ", ".join(self.unseen) if len(self.unseen) <= MOST_NAMED else f"{len(self.unseen)} components"
+        return f"not surely seen yet: {few}"

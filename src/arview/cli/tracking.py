@@ -190,7 +190,7 @@ CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP c
 (field of view along the longer side), exif, or profile:NAME (of `arview calibrate --profile`; profile alone
 takes the one for what the source says of its camera). Each line of a poses file is a JSON object: index, time_s,
 state, quality, cam_from_model (4x4 row-major, mm), covariance (6x6), ms, reason (why not tracked),
-mismatches.
+mismatches, unseen (components that have not been seen yet), alternatives (poses that fit as well).
 Ctrl-C ends the run and finishes the files.""",
 )
 @click.argument("source")
@@ -339,6 +339,8 @@ def _print_annotated(summary: AnnotateSummary, written: list[Path]) -> None:
     )
     for state, reasons in sorted(summary.reasons.items()):
         click.echo(f"{state} {sum(reasons.values())} frames: {reasons_text(reasons)}")
+    if summary.never_seen:
+        click.echo(f"not seen surely in any frame: {', '.join(summary.never_seen)}")
 
 
 # --- evaluate -------------------------------------------------------------------------------------------

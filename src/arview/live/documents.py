@@ -30,6 +30,7 @@ def pose_document(tracked: Tracked, now_s: float) -> Document:
         "quality": round(pose.quality, 3),
         "reason": pose.reason,
         "mismatches": list(pose.mismatches),
+        "unseen": list(pose.unseen),
         "ambiguous": len(pose.alternatives),
         "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.ravel().tolist(),
         "guide_cam_from_model": None if guide is None else guide.ravel().tolist(),

@@ -41,6 +41,8 @@ def _about(subject: Subject, tracked: Tracked) -> Document:
         "state": str(pose.state),
         "quality": pose.quality,
         "reason": pose.reason,
+        "mismatches": list(pose.mismatches),
+        "unseen": list(pose.unseen),
         "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.tolist(),
         "camera": camera_document(tracked.camera),
         "is_camera_guessed": subject.options.camera is None,

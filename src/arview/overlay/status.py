@@ -17,6 +17,8 @@ _STATE_RGB: dict[TrackingState, Rgb] = {
 }
 _WHITE = (240, 244, 248)
 _MUTED = (176, 186, 200)
+LEAST_REMARK = 6
+"""In less room than so many letters' height a remark is left out."""
 _COUNT_ORDER = (Verdict.FAIL, Verdict.UNDECIDED, Verdict.PASS, Verdict.NOT_MEASURED)
 
 
@@ -49,10 +51,12 @@ class StatusLine:
         """Draw the bar on the image in place."""
         top = self._height - self.height_px
         paint.put_sprite(image, self._panel, 0, top)
-        tracking = self._tracking_items(pose, fps)
         about_part = self._inspection_items(now or datetime.now(UTC))
+        # What has not been seen yet gives way to the part's errors; why it is not tracked matters more than these.
+        gives_way = self.rows == 1 and pose.state is TrackingState.TRACKED
+        tracking = self._tracking_items(pose, fps, self._length(about_part) + self._gap() if gives_way else 0)
         if self.rows == 1 and self._length([*tracking, *about_part]) > self._width - 3 * self._size:
-            about_part = []  # a long reason for being lost matters more
+            about_part = []
         y = top + round(0.16 * self._size)
         state_x = self._pad + round(1.1 * self._size)
         paint.dot(
@@ -67,15 +71,16 @@ class StatusLine:
         else:
             self._row(image, about_part, self._pad, y + self._row_px)
 
-    def _tracking_items(self, pose: Pose, fps: float | None) -> list[tuple[str, Rgb]]:
+    def _tracking_items(self, pose: Pose, fps: float | None, taken_px: int) -> list[tuple[str, Rgb]]:
+        """State, quality, rate and, as far as there is room beside what is taken, a remark."""
         items = [(pose.state.value.upper(), _STATE_RGB[pose.state])]
         if pose.cam_from_model is not None:
             items.append((f"quality {pose.quality:.2f}", _WHITE))
         if fps is not None:
             items.append((f"{fps:.0f} fps", _WHITE))
-        if pose.state is not TrackingState.TRACKED and pose.reason:
-            used = self._length(items) + 4 * self._size
-            items.append((paint.shortened(pose.reason, self._size, self._width - used), _MUTED))
+        room = self._width - self._length(items) - 4 * self._size - taken_px
+        if pose.remark and room > LEAST_REMARK * self._size:
+            items.append((paint.shortened(pose.remark, self._size, room), _MUTED))
         return items
 
     def _inspection_items(self, now: datetime | None) -> list[tuple[str, Rgb]]:

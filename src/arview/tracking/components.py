@@ -93,6 +93,10 @@ NAMED, CLEARED = 2.4, 0.1
 """Evidence above which a component is named, and below which it no longer is nor is in doubt. Of 255 frames of
 look-alikes 233 are named and 7 in order by these; of 1,091 of right assemblies, with noise and an occluder, in none
 one is named and 28 are in doubt or hardly seen."""
+SEEN = -4.0
+"""Evidence below which a component has been seen surely: it is not there in one of 50. Of 7 look-alikes in 255 single
+pictures that are in order by the bounds above the wrong component is above it in all, and above -3 in six; of right
+assemblies of 11 components 4 are above it in a single picture, and none after 144 frames of a tumbling part."""
 LARGEST_NEWS = 2.3
 """What one look says against a component it does not name: of one that comes into view only a little shows at first."""
 SUSPECT = 1.0
@@ -102,12 +106,14 @@ BOUND = 6.0
 SINGLE = 1.8
 """A single picture's ratio above which a component is named."""
 CLEARING = 0.5
-"""What speaks for a component that was named counts so much: one that was moved looks right along the way it moved."""
+"""What a direction says for a component that was named counts so much: one that was moved looks right along the way it
+moved."""
 FORGETTING = 0.01
 """Share of the evidence that is lost with every look."""
 NEW_DIRECTION_DEG = 6.0
 REPEATED_NEWS, LEAST_NEWS = 0.35, 0.03
-"""Looks from about the same direction say the same: the n-th that says so counts 0.35ⁿ⁻¹, but no less than 3 %."""
+"""Looks from about the same direction say the same: the n-th adds 0.35ⁿ⁻¹ to what their average counts, but from the
+fifth on 3 %."""
 EAGER_LOOKS = 2
 """So many frames after a lock are looked at, and no component is named before: noise is another in each."""
 SURE = -1.0
@@ -118,6 +124,8 @@ SUSPICIOUS_FRAMES, OPEN_FRAMES, REST_FRAMES = 6, 15, 45
 The first two hold for new directions; from one that was looked from before it takes one step longer. A direction that
 shows a component not seen yet counts as one from which it may be wrong.
 """
+FRESH_LOOKS = 6
+"""A direction is new in so many looks while a component may be wrong: the first ones may have been blurred."""
 KEPT_SHEETS = 64
 
 
@@ -624,16 +632,23 @@ class ComponentCheck:
         names = self.views.component_names
         return tuple(names[index] for index in np.flatnonzero((self._evidence > CLEARED) & ~self._is_named))
 
+    @property
+    def unseen(self) -> tuple[str, ...]:
+        """Names of components that no look so far has shown surely at their place; none of a part of one component."""
+        if len(self.model.components) < 2:
+            return ()
+        return tuple(self.views.component_names[index] for index in np.flatnonzero(~self._is_seen))
+
     def reset(self) -> None:
         """Forget what was seen: another part may be in view."""
         count = len(self.views.component_names)
         self._evidence = np.zeros(count)
-        self._is_named = np.zeros(count, dtype=bool)
+        self._is_named, self._is_seen = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
         self._looks = 0
         self._rested = 0
         self._has_suspects, self._was_shown = False, np.zeros(count, dtype=bool)
         self._directions = np.zeros((0, 3))
-        self._visits = np.zeros((0, 2, count))
+        self._looks_from, self._said_from = np.zeros((0, count)), np.zeros((0, count))
 
     def update(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
         """Take in a frame with a good pose; only frames that may tell something new are looked at."""
@@ -644,10 +659,9 @@ class ComponentCheck:
         self._looks += 1
         self._rested = 0
         self._has_suspects, self._was_shown = bool(look.is_suspect.any()), look.is_shown
-        news = self._news(cam_from_model, look.against)
-        news = np.where(self._is_named & (look.against < 0.0), CLEARING * news, news)
-        told = news * np.minimum(look.against, LARGEST_NEWS)
+        told = self._told(cam_from_model, np.minimum(look.against, LARGEST_NEWS))
         self._evidence = np.clip((1.0 - FORGETTING) * self._evidence + told, -BOUND, BOUND)
+        self._is_seen = self._evidence < np.where(self._is_seen, CLEARED, SEEN)
         if self._looks >= EAGER_LOOKS:
             self._is_named = self._evidence > np.where(self._is_named, CLEARED, NAMED)
 
@@ -672,7 +686,9 @@ class ComponentCheck:
             step = 0
         if self._rested < waits[step]:
             return False
-        return self._rested >= waits[step + 1] or self._nearest_seen(cam_from_model) < 0
+        nearest = self._nearest_seen(cam_from_model)
+        is_fresh = nearest < 0 or (step == 0 and self._looks_from[nearest].max() < FRESH_LOOKS)
+        return is_fresh or self._rested >= waits[step + 1]
 
     def _shows_new(self, cam_from_model: Array) -> bool:
         """Whether this direction shows a component that has not been seen and that the last look could not show."""
@@ -840,20 +856,36 @@ class ComponentCheck:
             return -1
         return int(np.argmax(cosines))
 
-    def _news(self, cam_from_model: Array, against: Array) -> Array:
-        """(C,) how much a look counts for each component: less the oftener this direction has said so before."""
+    def _told(self, cam_from_model: Array, against: Array) -> Array:
+        """(C,) by how much a look changes the evidence: what its direction says on the average, less what it had said.
+
+        Looks from one direction see the same, but for noise and blur: they are averaged, and many say little more than
+        one. What is said for a component that is named counts less, unless it takes back what its direction had said.
+        """
         nearest = self._nearest_seen(cam_from_model)
         if nearest < 0:
             self._directions = np.concatenate([self._directions[-63:], self._direction(cam_from_model)[None]])
-            self._visits = np.concatenate([self._visits[-63:], np.zeros((1, 2, len(against)))])
-        said = np.stack([against < 0.0, against > 0.0])
-        news = np.where(said, np.maximum(REPEATED_NEWS ** self._visits[nearest], LEAST_NEWS), 0.0).sum(axis=0)
-        self._visits[nearest] += said
-        return np.asarray(news)
+            none = np.zeros((1, len(against)))
+            self._looks_from = np.concatenate([self._looks_from[-63:], none])
+            self._said_from = np.concatenate([self._said_from[-63:], none])
+        looks, said = self._looks_from[nearest], self._said_from[nearest]
+        before = _worth_of(looks, said)
+        looks += against != 0.0
+        said += against
+        after = _worth_of(looks, said)
+        after = np.where(self._is_named & (after < 0.0), CLEARING * after, after)
+        before = np.where(self._is_named & (before < 0.0), CLEARING * before, before)
+        return np.asarray(after - before)
 
     def _messages(self, is_wrong: NDArray[np.bool_]) -> tuple[str, ...]:
         names = self.views.component_names
         return tuple(f"mismatch: {names[index]} not seen where expected" for index in np.flatnonzero(is_wrong))
+
+
+def _worth_of(looks: Array, said: Array) -> Array:
+    """What looks from one direction say together (C,), by their number and the sum of what they said."""
+    count = (1.0 - REPEATED_NEWS**looks) / (1.0 - REPEATED_NEWS) + LEAST_NEWS * np.maximum(looks - 4.0, 0.0)
+    return np.asarray(count * said / np.maximum(looks, 1.0))
 
 
 def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:

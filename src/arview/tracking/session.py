@@ -208,6 +208,7 @@ class TrackingSession:
             ms=ms,
             reason=reason,
             mismatches=self.components.mismatches,
+            unseen=self.components.unseen,
             alternatives=tuple(estimate.cam_from_model @ turn for turn in self._rivals.model_from_twins),
         )
 
@@ -235,7 +236,7 @@ class TrackingSession:
         reasons = [reason, *self.components.mismatches] if reason else [*self.components.mismatches]
         doubtful = self.components.doubtful
         if doubtful and not reasons:
-            reasons = [f"not yet seen: {', '.join(doubtful)}"]
+            reasons = [f"in doubt: {', '.join(doubtful)}"]
         if reasons:
             self.state = TrackingState.CRITICAL
         return "; ".join(reasons)

@@ -154,13 +154,16 @@ function refreshState(shown = player?.shown) {
     return bar.say("align", "bring the part into the yellow outline");
   }
   const why = {
-    tracked: [],
+    tracked: answer.unseen.length ? [notYetSeen(answer.unseen)] : [],
     critical: [answer.reason || "the position is not sure"],
     searching: [answer.reason || "for the part in the picture"],
     lost: [answer.reason || "the part is not seen any more"],
   }[answer.state];
   bar.say(answer.state, [...why, ...answer.mismatches].join("; "));
 }
+
+const MOST_NAMED = 3;
+const notYetSeen = (names) => `not surely seen yet: ${names.length > MOST_NAMED ? `${names.length} components` : names.join(", ")}`;
 
 const sayWhen = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);
 
