@@ -283,7 +283,7 @@ def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
         truth = pose_from(20.0 + 80.0 * k, 45.0, 380.0, model)
         seen = sought.local.picture(picture(truth, model, seed=k, scene=k))
         (spun,) = turned(truth @ part.model_from_body, [exp_so3(np.deg2rad([0.0, 0.0, 23.0]))])
-        starts = sought.spun(seen, spun)
+        starts = sought._spun(seen, spun)
         assert min(error(start @ part.body_from_model, truth, model)[2] for start in starts[:3]) < 6.0
         best = sought.local.verified(seen, sought.local.finished(seen, [spun]))[0]
         found, _ = sought._told_apart(seen, best, [])
@@ -292,7 +292,7 @@ def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
 
 def test_a_part_with_few_near_turns_is_not_spun() -> None:
     assert not len(detector().symmetries.axes)
-    assert detector().spun(detector().local.picture(picture(pose_from(30, 40, 500.0))), np.eye(4)) == []
+    assert detector()._spun(detector().local.picture(picture(pose_from(30, 40, 500.0))), np.eye(4)) == []
 
 
 def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:

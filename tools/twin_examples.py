@@ -21,9 +21,8 @@ from arview.tracking.twin_network import raw_looks
 from judge_examples import REFINED_APART, REFINED_NEAR, is_near, pictures_of
 from seeded_files import still_to_make
 
-TWINS, ASIDE, MOST = 6, 4, 10
-"""So many twins of the true pose are looked at and so many others turned from it; and so many in all that are left. Of
-nearly round solids those are too that the detector spins to."""
+TWINS, ASIDE, MOST = 6, 4, 8
+"""So many twins of the true pose are looked at and so many others turned from it; and so many in all that are left."""
 OFF_DEG, OFF_SHARE = 3.0, 0.01
 """All are this far off at first, about, in rotation and in diameters: what is looked at is refined."""
 ASIDE_DEG = (8.0, 50.0)
@@ -73,7 +72,6 @@ def twins_of(seed: int, detector: Detector, picture: Picture, truth: Array, rng:
     """What becomes of poses turned from the true ``cam_from_body`` in a picture; empty where none is right or wrong."""
     local = detector.local
     starts = [_off(start, detector.views.diameter_mm, rng) for start in _turned(detector, truth, rng)]
-    starts += detector.spun(picture, truth)
     found = local.ordered(local.verified(picture, local.ordered(local.finished(picture, starts), 5.0)), 5.0, MOST)
     poses = np.array([h.cam_from_body for h in found]).reshape(-1, 4, 4)
     limits = (REFINED_NEAR, REFINED_APART)

@@ -247,7 +247,7 @@ class Detector:
         the same pose.
         """
         pose = best.cam_from_body
-        starts = turned(pose, self.symmetries.near) + self.spun(picture, pose)
+        starts = turned(pose, self.symmetries.near) + self._spun(picture, pose)
         reach_mm = 0.25 * self.views.diameter_mm
         rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
         rivals = self.local.ordered(
@@ -265,7 +265,7 @@ class Detector:
         twins = [h for k, h in enumerate(rivals) if k != leader and ahead[leader, k] < TELLING]
         return best, [h for h in twins if not self._is_turned(h, best, self.same_turns, ALIKE_DEG)]
 
-    def spun(self, picture: Picture, pose: Array) -> list[Array]:
+    def _spun(self, picture: Picture, pose: Array) -> list[Array]:
         """A pose turned about each axis about which the part is nearly round, to where its edges are seen best.
 
         Such an outline holds at any turn; what breaks it are a few small edges, which no search is led by.
