@@ -212,9 +212,8 @@ class Sections:
         on = f"{', '.join(models)}: {total} frames"
         after = f"{len(walks)} of them, walked round for {LOOK_ALIKE_FRAMES / 30.0:.0f} s"
         text = f"{percent(named, total)} named, {percent(silent, total)} not found"
-        unnamed = [r for r in results if r.state == TrackingState.TRACKED and not r.mismatches]
-        pending = sum(any(part in r.unseen for part in r.components) for r in unnamed)
-        cleanly = f"{clean} of {total}; {len(unnamed)} tracked, {pending} of them with the wrong one not yet seen"
+        unnamed = sum(r.is_unnamed for r in results)
+        cleanly = f"{clean} of {total}; {unnamed} with those whose wrong component is said to be unseen"
         all_named = percent(named_walks, len(walks))
         return [
             Line("lookalike named", on, text, "≥ 90 %", total > 0 and named >= 0.9 * total),
@@ -294,9 +293,14 @@ class LookAlikeResult:
         return self.state in (TrackingState.TRACKED, TrackingState.CRITICAL)
 
     @property
+    def is_unnamed(self) -> bool:
+        """True when it was tracked and nothing named, whatever has not been seen yet."""
+        return self.state == TrackingState.TRACKED and not self.mismatches
+
+    @property
     def is_clean(self) -> bool:
-        """True when it was taken for the right part, with all of its components seen."""
-        return self.state == TrackingState.TRACKED and not self.mismatches and not self.unseen
+        """True when it was taken for the right part: nothing was named, and what is wrong passed for seen."""
+        return self.is_unnamed and not any(part in self.unseen for part in self.components)
 
 
 def _plain_error(meter: PoseMeter, estimate: Array, frame: SceneFrame) -> PoseError:

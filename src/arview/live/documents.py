@@ -29,6 +29,7 @@ def pose_document(tracked: Tracked, now_s: float) -> Document:
         "state": str(pose.state),
         "quality": round(pose.quality, 3),
         "reason": pose.reason,
+        "remark": pose.remark,
         "mismatches": list(pose.mismatches),
         "unseen": list(pose.unseen),
         "ambiguous": len(pose.alternatives),

@@ -18,7 +18,7 @@ _STATE_RGB: dict[TrackingState, Rgb] = {
 _WHITE = (240, 244, 248)
 _MUTED = (176, 186, 200)
 LEAST_REMARK = 6
-"""In less room than so many letters' height a remark is left out."""
+"""In less room than so many letters' height a remark that gives way is left out."""
 _COUNT_ORDER = (Verdict.FAIL, Verdict.UNDECIDED, Verdict.PASS, Verdict.NOT_MEASURED)
 
 
@@ -79,7 +79,7 @@ class StatusLine:
         if fps is not None:
             items.append((f"{fps:.0f} fps", _WHITE))
         room = self._width - self._length(items) - 4 * self._size - taken_px
-        if pose.remark and room > LEAST_REMARK * self._size:
+        if pose.remark and (not taken_px or room > LEAST_REMARK * self._size):
             items.append((paint.shortened(pose.remark, self._size, room), _MUTED))
         return items
 

@@ -869,23 +869,24 @@ class ComponentCheck:
             self._looks_from = np.concatenate([self._looks_from[-63:], none])
             self._said_from = np.concatenate([self._said_from[-63:], none])
         looks, said = self._looks_from[nearest], self._said_from[nearest]
-        before = _worth_of(looks, said)
+        clearing = np.where(self._is_named, CLEARING, 1.0)
+        before = _worth_of(looks, said, clearing)
         looks += against != 0.0
         said += against
-        after = _worth_of(looks, said)
-        after = np.where(self._is_named & (after < 0.0), CLEARING * after, after)
-        before = np.where(self._is_named & (before < 0.0), CLEARING * before, before)
-        return np.asarray(after - before)
+        return _worth_of(looks, said, clearing) - before
 
     def _messages(self, is_wrong: NDArray[np.bool_]) -> tuple[str, ...]:
         names = self.views.component_names
         return tuple(f"mismatch: {names[index]} not seen where expected" for index in np.flatnonzero(is_wrong))
 
 
-def _worth_of(looks: Array, said: Array) -> Array:
-    """What looks from one direction say together (C,), by their number and the sum of what they said."""
+def _worth_of(looks: Array, said: Array, clearing: Array) -> Array:
+    """What looks from one direction say together (C,), by their number and the sum of what they said.
+
+    What speaks for a component counts by ``clearing``.
+    """
     count = (1.0 - REPEATED_NEWS**looks) / (1.0 - REPEATED_NEWS) + LEAST_NEWS * np.maximum(looks - 4.0, 0.0)
-    return np.asarray(count * said / np.maximum(looks, 1.0))
+    return np.asarray(count * np.where(said < 0.0, clearing, 1.0) * said / np.maximum(looks, 1.0))
 
 
 def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:

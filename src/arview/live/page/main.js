@@ -153,17 +153,14 @@ function refreshState(shown = player?.shown) {
   if (answer.guide_cam_from_model && !answer.cam_from_model) {
     return bar.say("align", "bring the part into the yellow outline");
   }
-  const why = {
-    tracked: answer.unseen.length ? [notYetSeen(answer.unseen)] : [],
-    critical: [answer.reason || "the position is not sure"],
-    searching: [answer.reason || "for the part in the picture"],
-    lost: [answer.reason || "the part is not seen any more"],
+  const otherwise = {
+    critical: "the position is not sure",
+    searching: "for the part in the picture",
+    lost: "the part is not seen any more",
   }[answer.state];
-  bar.say(answer.state, [...why, ...answer.mismatches].join("; "));
+  const why = answer.remark || otherwise;
+  bar.say(answer.state, [...(why ? [why] : []), ...answer.mismatches].join("; "));
 }
-
-const MOST_NAMED = 3;
-const notYetSeen = (names) => `not surely seen yet: ${names.length > MOST_NAMED ? `${names.length} components` : names.join(", ")}`;
 
 const sayWhen = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);
 
