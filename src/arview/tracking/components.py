@@ -91,8 +91,8 @@ LARGEST_RATIO = 4.0
 """A single look says no more than this."""
 NAMED, CLEARED = 2.4, 0.1
 """Evidence above which a component is named, and below which it no longer is nor is in doubt. Of 255 frames of
-look-alikes 233 are named and 7 in order by these; of 1,091 of right assemblies, with noise and an occluder, in none
-one is named and 28 are in doubt or hardly seen."""
+look-alikes 230 are named and 7 in order by these; of 1,091 of right assemblies, with noise and an occluder, in none
+one is named and 29 are in doubt, hardly seen or ambiguous."""
 SEEN = -4.0
 """Evidence below which a component has been seen surely: it is not there in one of 50. Of 7 look-alikes in 255 single
 pictures that are in order by the bounds above the wrong component is above it in all, and above -3 in six; of right
