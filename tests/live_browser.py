@@ -22,9 +22,9 @@ from PIL import Image as PilImage
 
 from arview.cad import load_part
 from arview.camera import Camera
-from arview.camera_files import load_camera
+from arview.camera.read import load_camera
 from arview.geometry import Array
-from arview.render import open_renderer
+from arview.rendering.renderers import open_renderer
 from arview.video import Image, open_source
 from live_sample import CLIP, PART, SAMPLE
 

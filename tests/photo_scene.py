@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from arview.cad.model import Component, Model, make_model
 from arview.camera import Camera
 from arview.geometry import Array, apply, invert, look_at
-from arview.raster import rasterise
+from arview.rendering.rasterizer import rasterise
 from cad_files import box
 
 Picture = NDArray[np.uint8]

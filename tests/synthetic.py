@@ -18,7 +18,7 @@ from arview.cad.view_range import ViewRange
 from arview.camera import Camera
 from arview.geometry import Array, apply, exp_se3, exp_so3, look_at, rigid, rotation_angle_rad
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
-from arview.raster import rasterise
+from arview.rendering.rasterizer import rasterise
 from cad_files import box
 
 CAMERA = Camera(640, 480, 720.0, 722.0, 318.0, 242.0)

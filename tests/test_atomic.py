@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
 
 
 def test_a_file_takes_the_place_of_the_old_one(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ from click.testing import CliRunner
 from arview.cli import main
 from arview.errors import InputError
 from arview.inspection import Inspection, Provenance, load_inspection, save_inspection
-from arview.line.batch import BatchOptions, JobResult, Work, carry_out, run_batch
-from arview.line.job import InspectJob
-from arview.line.jobs_file import JOBS_FILE_EXAMPLE, BatchJob, load_jobs
+from arview.workflow.batch import BatchOptions, JobResult, Work, carry_out, run_batch
+from arview.workflow.job import InspectJob
+from arview.workflow.jobs_file import JOBS_FILE_EXAMPLE, BatchJob, load_jobs
 from inspections import CREATED, deviation
 
 pytest.importorskip("distributed")

@@ -24,13 +24,19 @@ from arview.calibration.solve import Solution, picture_grid, pixel_difference, p
 from arview.calibration.verdict import Grade, judge
 from arview.calibration.views import BoardFinder, BoardView
 from arview.camera import Camera
-from arview.camera_files import load_camera
-from arview.camera_profiles import exif_of_video, lens_record, list_profiles, profile_name, same_lens
-from arview.camera_write import FORMATS, write_camera
+from arview.camera.exif import PhotoExif, read_exif
+from arview.camera.profiles import (
+    exif_of_video,
+    lens_record,
+    list_profiles,
+    profile_name,
+    same_lens,
+)
+from arview.camera.read import load_camera
+from arview.camera.write import FORMATS, write_camera
 from arview.cli import main
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.photo_exif import PhotoExif, read_exif
 from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.scale import Board, parse_board
 from arview.reconstruction.scale.targets import cv_board

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from arview.camera import Camera
-from arview.camera_files import guess_camera, load_camera, save_camera
+from arview.camera.exif import read_exif
+from arview.camera.read import guess_camera, load_camera, save_camera
 from arview.errors import ArviewError, InputError, MismatchError, OutputError
-from arview.photo_exif import read_exif
 
 CAMERA = Camera(640, 480, 600.5, 601.25, 320.75, 239.5, np.array([-0.21, 0.07, 0.001, -0.002, 0.03]))
 DATA = Path(__file__).parents[2] / "shared" / "data"

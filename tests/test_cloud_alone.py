@@ -15,11 +15,11 @@ from arview.cli import main
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, load_inspection
-from arview.measurement.cloud_datums import measure_datums_in_cloud
+from arview.measurement.cloud.global_registration import GlobalOptions, find_model
+from arview.measurement.cloud.surface import Surface
+from arview.measurement.datums.cloud_datums import measure_datums_in_cloud
 from arview.measurement.folder import in_model_frame, read_cloud
-from arview.measurement.global_registration import GlobalOptions, find_model
 from arview.measurement.run import measure
-from arview.measurement.surface import Surface
 from arview.reconstruction.dense import write_ply
 from arview.reconstruction.types import DenseCloud
 from cad_files import box
@@ -204,7 +204,7 @@ EDGE = Datum("C", "edge", "plate", (0.0, -60.0, 0.0), (1.0, 0.0, 0.0))
 
 
 def solved(datums: tuple[Datum, ...], equations: list[object]) -> tuple[list[str], Array]:
-    from arview.measurement.alignment import align
+    from arview.measurement.datums.alignment import align
 
     found = align(equations, np.zeros(3), 100.0)  # type: ignore[arg-type]
     return [one.locked for one in found.datums], found.rough_from_datum
@@ -229,7 +229,7 @@ def test_cylinder_and_edge_in_a_cloud() -> None:
 
 
 def test_cylinder_and_edge_in_photos(tmp_path: Path) -> None:
-    from arview.measurement.datums import measure_datums
+    from arview.measurement.datums.photo_datums import measure_datums
     from arview.measurement.photo.views import views_of
     from photo_scene import CAMERA, photograph, ring
 

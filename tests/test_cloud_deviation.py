@@ -14,21 +14,21 @@ from arview.cad.part import ComponentSettings, Part, load_part
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import apply, look_at
-from arview.measurement import cloud_points
-from arview.measurement.cloud_deviation import measure_components_in_cloud
-from arview.measurement.cloud_points import CloudPoints, grid_average, prepare_cloud
-from arview.measurement.distance_map import (
+from arview.measurement.cloud import points as cloud_points
+from arview.measurement.cloud.deviation import measure_components_in_cloud
+from arview.measurement.cloud.distance_map import (
     distance_map,
     full_width_at_half_maximum,
     histogram_picture,
     map_picture,
     write_distance_ply,
 )
-from arview.measurement.foreign import find_foreign
-from arview.measurement.registration import move_about
-from arview.measurement.surface import Surface
+from arview.measurement.cloud.foreign_objects import find_foreign
+from arview.measurement.cloud.points import CloudPoints, grid_average, prepare_cloud
+from arview.measurement.cloud.registration import move_about
+from arview.measurement.cloud.surface import Surface
+from arview.measurement.cloud.visibility import Views
 from arview.measurement.types import Move, NotMeasured
-from arview.measurement.visibility import Views
 from arview.reconstruction.types import DenseCloud, PosedPhoto
 
 PLATE = Path(__file__).parents[2] / "shared" / "data" / "plate"

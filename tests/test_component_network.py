@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
-from arview.geometry import Array, apply
-from arview.tracking.component_network import (
+from arview.assembly.presence_net import (
     GLOBALS,
     RADIUS_PX,
     SIDE_PX,
@@ -21,9 +19,12 @@ from arview.tracking.component_network import (
     component_looks,
     shown,
 )
-from arview.tracking.line_network import LineNetwork
-from arview.tracking.tracker import PartView, intrinsics_of
-from arview.tracking.verifier import BAND_PX, CHANNELS, LINES
+from arview.cad.model import Model
+from arview.detection.features.edge_net import LineNetwork
+from arview.detection.scoring.pose_verifier import BAND_PX, CHANNELS, LINES
+from arview.geometry import Array, apply
+from arview.refinement.projection import intrinsics_of
+from arview.refinement.view_model import PartView
 from synthetic import CAMERA, assembly, assembly_views, changed, picture, pose_from
 
 PART = PartView(assembly_views())

@@ -9,10 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from arview.assembly.monitor import (
+    EDGES_ALONE,
+    OPEN_FRAMES,
+    SUSPICIOUS_FRAMES,
+    ComponentCheck,
+    Look,
+    together,
+)
 from arview.cad.model import Model
 from arview.geometry import Array, apply
 from arview.tracking import TrackingSession
-from arview.tracking.components import EDGES_ALONE, OPEN_FRAMES, SUSPICIOUS_FRAMES, ComponentCheck, Look, together
 from synthetic import CAMERA, assembly, assembly_views, block, path, picture, pose_from, wrong
 from synthetic import changed as changed_from
 

@@ -13,8 +13,7 @@ from arview.evaluation.semisynthetic.solids import Mesh, box, circle, prism, rec
 from arview.geometry import Array
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.tracking.crowding import APART, is_crowded
-from arview.tracking.tracker import PartView
+from arview.refinement.view_model import APART, PartView, is_crowded
 
 SMALL, LARGE = ((-35.0, -15.0), (-35.0, 15.0), (-25.0, 0.0)), (20.0, 0.0)
 SMALL_MM, LARGE_MM = 1.5, 14.0

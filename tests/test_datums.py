@@ -9,7 +9,7 @@ import pytest
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.measurement.alignment import (
+from arview.measurement.datums.alignment import (
     Alignment,
     AlignmentOptions,
     Equations,

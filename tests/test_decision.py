@@ -26,7 +26,12 @@ from arview.inspection import (
     load_inspection,
     save_inspection,
 )
-from arview.measurement.decision import DecisionOptions, decide, worst, zone_diameter_mm
+from arview.measurement.uncertainty.decision import (
+    DecisionOptions,
+    decide,
+    worst,
+    zone_diameter_mm,
+)
 
 PASS, FAIL, UNDECIDED = Verdict.PASS, Verdict.FAIL, Verdict.UNDECIDED
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.tracking import denoiser
-from arview.tracking.denoiser import LEAST_NOISE, Denoiser, noise_level
-from arview.tracking.local_search import LocalSearch
+from arview.detection.features import denoiser
+from arview.detection.features.denoiser import LEAST_NOISE, Denoiser, noise_level
+from arview.detection.search.local_search import LocalSearch
 from synthetic import CAMERA, assembly_views, background, pose_from
 from synthetic import picture as drawn
 

@@ -15,9 +15,9 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.evaluation.clouds import distances_to_mesh, sample_mesh, score_cloud, views_of
 from arview.geometry import Array, apply, look_at
-from arview.raster import rasterise
 from arview.reconstruction.dense import Cad, DenseOptions, read_map, read_ply, reconstruct_dense, write_map, write_ply
 from arview.reconstruction.types import DenseCloud, PosedPhoto, SparseModel
+from arview.rendering.rasterizer import rasterise
 
 CAMERA = Camera(400, 300, 520.0, 520.0, 199.5, 149.5, np.array([-0.06, 0.01, 0.0, 0.0, 0.0]))
 PLATE, BOX = (120.0, 90.0, 8.0), (36.0, 26.0, 22.0)

@@ -11,15 +11,10 @@ import pytest
 
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
-from arview.errors import InputError
-from arview.geometry import apply, are_near, exp_so3, rigid, turned
-from arview.guideviews import GuideViewOptions, make_guide_views
-from arview.guideviews.sphere import icosphere_directions
-from arview.pose import TrackingState
-from arview.tracking import Detector, DetectorOptions, TrackingSession
-from arview.tracking.ambiguity import EdgeSteps, find_symmetries, telling
-from arview.tracking.detector import SURE_QUALITY
-from arview.tracking.first_search import (
+from arview.detection import Detector, DetectorOptions
+from arview.detection.detector import SURE_QUALITY
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.search.global_search import (
     BY_GRADIENTS,
     FARTHER,
     NEARER,
@@ -33,9 +28,15 @@ from arview.tracking.first_search import (
     Likely,
     are_wanted,
 )
-from arview.tracking.local_search import BEFORE_WORTH, Hypothesis
-from arview.tracking.picture import Picture
-from arview.tracking.quality import Evidence
+from arview.detection.search.local_search import BEFORE_WORTH, Hypothesis
+from arview.detection.symmetry import find_symmetries, telling
+from arview.errors import InputError
+from arview.geometry import apply, are_near, exp_so3, rigid, turned
+from arview.guideviews import GuideViewOptions, make_guide_views
+from arview.guideviews.sphere import icosphere_directions
+from arview.pose import TrackingState
+from arview.refinement.evidence import EdgeSteps, Evidence
+from arview.tracking import TrackingSession
 from cad_files import box
 from synthetic import (
     CAMERA,
@@ -199,9 +200,9 @@ def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
         truth = pose_from(*place, block(), rng.uniform(-180, 180))
         detections = sought.detect(picture(truth, block(), seed=k, scene=k % 9, noise=3.0), max_results=1)
         if detections:
-            body = detections[0].cam_from_model @ sought.local.tracker.part.model_from_body
+            body = detections[0].cam_from_model @ sought.local.refiner.part.model_from_body
             alike = [
-                body @ rigid(t, np.zeros(3)) @ sought.local.tracker.part.body_from_model for t in sought.same_turns
+                body @ rigid(t, np.zeros(3)) @ sought.local.refiner.part.body_from_model for t in sought.same_turns
             ]
             mm, _, deg = min((error(one, truth, block()) for one in alike), key=lambda of: of[2])
             found += mm < 8.0 and deg < 2.0
@@ -278,7 +279,7 @@ def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
     views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
     sought = Detector(views, CAMERA)
     np.testing.assert_allclose(np.abs(sought.symmetries.axes), [[0.0, 0.0, 1.0]])
-    part = sought.local.tracker.part
+    part = sought.local.refiner.part
     for k in range(4):
         truth = pose_from(20.0 + 80.0 * k, 45.0, 380.0, model)
         seen = sought.local.picture(picture(truth, model, seed=k, scene=k))
@@ -325,7 +326,7 @@ def test_a_small_part_a_plain_view_and_a_close_rival_are_doubted_and_a_pose_a_li
 
     def quality(distance_mm: float, rival_aside_mm: float | None, turn_deg: float, share: float = 1.0) -> float:
         pose, lines = pose_from(30, 40, distance_mm), share * detector().local.usual_lines
-        radius_px = detector().local.tracker.radius_px(pose)
+        radius_px = detector().local.refiner.radius_px(pose)
         hypotheses = [Hypothesis(pose, evidence, 4.0, lines, radius_px, verification=1.0, strips=1.0)]
         if rival_aside_mm is not None:
             other = pose_from(30 + turn_deg, 40, distance_mm)
@@ -415,7 +416,7 @@ def test_no_search_looks_beyond_the_declared_distances() -> None:
 
 def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None:
     seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
-    pose = pose_from(10, 20, 480.0) @ detector().local.tracker.part.model_from_body
+    pose = pose_from(10, 20, 480.0) @ detector().local.refiner.part.model_from_body
     responses = np.array([0.2, 0.7, 0.4])
     alike = Likely(np.stack([pose] * 3), np.full(3, 12.0), responses)
     found = detector().search.judged(seen, alike)

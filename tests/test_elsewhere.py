@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from arview.assembly.monitor import ComponentCheck
+from arview.assembly.placement_search import Places, other_places
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.geometry import exp_so3
 from arview.guideviews import GuideViewOptions, make_guide_views
-from arview.tracking.components import ComponentCheck
-from arview.tracking.elsewhere import Places, other_places
 from cad_files import box
 from synthetic import CAMERA, assembly, block, changed, component, picture, pose_from, post, wrong
 

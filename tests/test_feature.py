@@ -7,10 +7,10 @@ import pytest
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import apply, exp_se3, invert, look_at, rotation_angle_rad
-from arview.tracking.feature import FeatureModality, add_features
-from arview.tracking.keyframe import FeatureOptions
-from arview.tracking.raycast import RayCaster
-from arview.tracking.solver import apply_twist, solve_step
+from arview.refinement.gauss_newton import apply_twist, solve_step
+from arview.refinement.modalities.keyframes import FeatureOptions
+from arview.refinement.modalities.texture import FeatureModality, add_features
+from arview.rendering.raycast import RayCaster
 
 HALF = np.array([60.0, 40.0, 25.0])
 CAMERA = Camera(640, 480, 700.0, 705.0, 322.0, 237.0)

@@ -20,9 +20,9 @@ from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.overlay import OverlayOptions, OverlayRenderer
 from arview.pose import Pose, TrackingState
 from arview.tracking import SessionOptions, TrackingSession
-from arview.tracking.guide import guide_names, guide_pose
+from arview.tracking.guide_pose import guide_names, guide_pose
+from arview.tracking.guided_init import Snap
 from arview.tracking.session import ALIGN
-from arview.tracking.snap import Snap
 from cad_files import box, obj_text
 from synthetic import CAMERA, RANGE, assembly, assembly_views, block, error, picture, pose_from
 

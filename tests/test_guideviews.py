@@ -21,7 +21,7 @@ from arview.guideviews.sphere import icosphere_directions, view_poses
 from arview.guideviews.surface import MOST_FACES, reduced_surface
 from arview.guideviews.uniqueness import assess
 from arview.guideviews.views import guide_camera
-from arview.render import ZBufferRenderer
+from arview.rendering.renderers import ZBufferRenderer
 from synthetic import assembly, block, bracket
 
 COARSE = GuideViewOptions(subdivisions=1, renderer="zbuffer")

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from arview.camera import Camera
-from arview.camera_files import save_camera
+from arview.camera.exif import PhotoExif, focal_length_px, read_exif, sensor_width_mm
+from arview.camera.read import save_camera
 from arview.errors import InputError, MismatchError
-from arview.photo_exif import PhotoExif, focal_length_px, read_exif, sensor_width_mm
 from arview.reconstruction.intake import VideoIntakeOptions, intake_frames, intake_photos, intake_video, read_photo
 from arview.reconstruction.intake.checks import CheckOptions, blur_and_texture, same_views, thumbnail
 from arview.reconstruction.intake.lenses import Lens, lenses_of

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from arview.geometry import Array, exp_so3, rigid
-from arview.guideviews import GuideViewSet
-from arview.tracking.judge import (
+from arview.detection.features.edge_net import LineNetwork
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.scoring.profile_ranker import (
     FINE,
     INNER_LINES,
     OUTLINE_LINES,
@@ -21,9 +21,9 @@ from arview.tracking.judge import (
     judge,
     network,
 )
-from arview.tracking.line_network import LineNetwork
-from arview.tracking.picture import Picture
-from arview.tracking.tracker import PartView
+from arview.geometry import Array, exp_so3, rigid
+from arview.guideviews import GuideViewSet
+from arview.refinement.view_model import PartView
 from synthetic import CAMERA, assembly_views, pose_from, turned_about
 from synthetic import picture as drawn
 

@@ -14,9 +14,9 @@ from arview.errors import InputError, MismatchError, OutputError
 from arview.geometry import Array, apply, rotation_angle_rad
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.pose import TrackingState
+from arview.refinement.evidence import Evidence
 from arview.tracking import Estimate, SessionOptions, TrackingSession
-from arview.tracking.learned import SIDE, LearnedOptions, LearnedViews
-from arview.tracking.quality import Evidence
+from arview.tracking.appearance_memory import SIDE, LearnedOptions, LearnedViews
 from synthetic import CAMERA, RANGE, assembly, assembly_views, bracket, error, path, picture, pose_from
 
 SIDES = [(azimuth, elevation) for azimuth in (-40, 0, 40) for elevation in (30, 55)]

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-import arview.line.run
 import arview.measurement.folder
 import arview.measurement.run
+import arview.workflow.run
 from arview.cli import main
+from arview.core.stage_cache import Stages, content_key
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.history import HistoryStore
 from arview.inspection import Inspection, Verdict, load_inspection
-from arview.line.clock import STEPS, Clock, Moment, clock_text
-from arview.line.lock import alone
 from arview.reconstruction.intake import Intake
 from arview.reconstruction.run import Reconstruction
-from arview.reconstruction.stages import Stages, content_key
+from arview.workflow.clock import STEPS, Clock, Moment, clock_text
+from arview.workflow.lock import alone
 from cad_files import box
 from inspections import deviation, inspection, not_measured
 from video_files import numbered, write_clip
@@ -50,10 +50,10 @@ class Bench:
         (folder / "photos").mkdir()
         for i in range(4):
             (folder / "photos" / f"{i}.jpg").write_bytes(bytes([i]) * 100)
-        patch.setattr(arview.line.run, "reconstruct", self.reconstruct)
+        patch.setattr(arview.workflow.run, "reconstruct", self.reconstruct)
         patch.setattr(arview.measurement.run, "measure", self.measure)
         patch.setattr(arview.measurement.folder, "read_folder", lambda folder: None)
-        patch.setattr(arview.line.run, "make_film", self.film)
+        patch.setattr(arview.workflow.run, "make_film", self.film)
 
     def at(self, what: str) -> None:
         if what in self.fails:

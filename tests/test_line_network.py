@@ -10,13 +10,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from arview.detection.features.edge_net import (
+    INSIDE,
+    LONGEST_SIDE_PX,
+    LineNetwork,
+    halved_lines,
+    lines_at,
+)
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.features.response_maps import (
+    ORIENTATIONS,
+    orientation_bins,
+    response_maps,
+)
 from arview.geometry import Array, apply
-from arview.raster import rasterise
-from arview.tracking.line_network import INSIDE, LONGEST_SIDE_PX, LineNetwork, halved_lines, lines_at
-from arview.tracking.matching import ORIENTATIONS, orientation_bins, response_maps
-from arview.tracking.picture import Picture
-from arview.tracking.solver import project_lines
-from arview.tracking.tracker import PartView
+from arview.refinement.projection import project_lines
+from arview.refinement.view_model import PartView
+from arview.rendering.rasterizer import rasterise
 from synthetic import CAMERA, assembly, assembly_views, background, pose_from
 from synthetic import picture as drawn
 

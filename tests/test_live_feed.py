@@ -19,7 +19,7 @@ import pytest
 from arview.cad import load_part
 from arview.cad.model import Model
 from arview.camera import Camera
-from arview.camera_files import guess_camera
+from arview.camera.read import guess_camera
 from arview.errors import InputError, MismatchError
 from arview.inspection import load_inspection, save_inspection
 from arview.live.documents import _source_name, pose_document

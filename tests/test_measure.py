@@ -20,11 +20,11 @@ from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, Verdict, load_inspection
 from arview.measurement import folder as folder_module
 from arview.measurement import run
-from arview.measurement.datums import base_plane, find_rim, plane_samples
+from arview.measurement.datums.photo_datums import base_plane, find_rim, plane_samples
 from arview.measurement.folder import MetricReconstruction, read_folder
 from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure
-from arview.measurement.uncertainty import UncertaintyOptions
+from arview.measurement.uncertainty.budget import UncertaintyOptions
 from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from cad_files import box, obj_text

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from arview.annotation import QUEUED_FRAMES, PoseWriter, annotate, pose_line
 from arview.errors import InputError, OutputError
-from arview.pipeline import QUEUED_FRAMES, PoseWriter, annotate, pose_line
 from arview.pose import Pose, TrackingState
 from arview.video import Frame, FrameSource, Image, VideoSink, open_source
 from video_files import number_of, numbered

@@ -6,8 +6,12 @@ import trimesh
 
 from arview.errors import InputError
 from arview.geometry import apply, invert
-from arview.measurement.cloud_registration import CloudRegistrationOptions, TargetCloud, register_clouds
-from arview.measurement.registration import (
+from arview.measurement.cloud.point_registration import (
+    CloudRegistrationOptions,
+    TargetCloud,
+    register_clouds,
+)
+from arview.measurement.cloud.registration import (
     RegistrationOptions,
     degrees_of_freedom,
     move_about,
@@ -15,9 +19,9 @@ from arview.measurement.registration import (
     register_to_surface,
     twist_about,
 )
-from arview.measurement.shape_fits import fit_circle, fit_cylinder, fit_plane
+from arview.measurement.cloud.shape_fits import fit_circle, fit_cylinder, fit_plane
+from arview.measurement.cloud.surface import Surface
 from arview.measurement.studies.common import post
-from arview.measurement.surface import Surface
 
 SHIFT = np.array([0.8, -0.6, 0.0])
 QUICK = RegistrationOptions(noise_points=0)

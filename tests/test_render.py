@@ -13,8 +13,13 @@ from arview.cad.model import Component, Model, make_model
 from arview.camera import Camera
 from arview.errors import InputError, MissingDependencyError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
-from arview.raster import rasterise
-from arview.render import PyrenderRenderer, Rendering, ZBufferRenderer, open_renderer
+from arview.rendering.rasterizer import rasterise
+from arview.rendering.renderers import (
+    PyrenderRenderer,
+    Rendering,
+    ZBufferRenderer,
+    open_renderer,
+)
 from cad_files import box
 from synthetic import assembly, pose_from
 

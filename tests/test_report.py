@@ -22,11 +22,15 @@ from arview.errors import MismatchError, MissingDependencyError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, save_inspection
 from arview.measurement import folder as folder_module
-from arview.measurement.distance_map import distance_map, read_distance_ply, write_distance_ply
+from arview.measurement.cloud.distance_map import (
+    distance_map,
+    read_distance_ply,
+    write_distance_ply,
+)
 from arview.measurement.folder import MetricReconstruction
-from arview.raster import rasterise
 from arview.reconstruction.scale.types import Consistency, ScaleResult
 from arview.reconstruction.types import DenseCloud, PosedPhoto, SparseModel
+from arview.rendering.rasterizer import rasterise
 from arview.report import gather, make_report
 from arview.report import make as make_module
 from arview.report.pictures import CropOptions, make_gallery, overview

@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from arview.detection.detector import local_search_for
+from arview.detection.search.local_search import (
+    FINE_TOLERANCE_PX,
+    Candidate,
+    LocalSearch,
+)
 from arview.geometry import Array, exp_so3, rigid
+from arview.refinement.schedules import LAST_STAGES
 from arview.tracking import Tracker, TrackerOptions
-from arview.tracking.detector import local_search_for
-from arview.tracking.local_search import FINE_TOLERANCE_PX, Candidate, LocalSearch
-from arview.tracking.second_look import SecondLook
-from arview.tracking.tracker import LAST_STAGES, strangeness
+from arview.tracking.motion import squared_motion_distance
+from arview.tracking.pose_recheck import SecondLook
 from synthetic import CAMERA, assembly, assembly_views, error, half_hidden, path, picture, pose_from, wrong
 
 SLOW = path(12)
@@ -31,17 +36,17 @@ def second_look() -> SecondLook:
 
 
 def in_body(cam_from_model: Array) -> Array:
-    return cam_from_model @ local().tracker.part.model_from_body
+    return cam_from_model @ local().refiner.part.model_from_body
 
 
 def in_model(cam_from_body: Array) -> Array:
-    return cam_from_body @ local().tracker.part.body_from_model
+    return cam_from_body @ local().refiner.part.body_from_model
 
 
 def stuck(image: NDArray[np.uint8], cam_from_model: Array) -> Array:
     """Where the tracker's last stages end from a pose: what edges nearby bear out."""
     gray = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (3, 3))
-    return local().tracker.refine_fresh(image, gray, in_body(cam_from_model), LAST_STAGES)
+    return local().refiner.refine_fresh(image, gray, in_body(cam_from_model), LAST_STAGES)
 
 
 @pytest.mark.parametrize("noise", [3.0, 12.0])
@@ -177,5 +182,5 @@ def test_strangeness_is_one_at_45_degrees_and_grows_with_the_square() -> None:
     diameter_mm = assembly_views().diameter_mm
     for turn_deg, expected in ((45.0, 1.0), (22.5, 0.25)):
         turned = rigid(exp_so3(np.deg2rad([0.0, turn_deg, 0.0])) @ pose[:3, :3], pose[:3, 3])
-        assert strangeness(turned, pose, diameter_mm) == pytest.approx(expected, rel=0.01)
-    assert strangeness(pose, pose, diameter_mm) == 0.0
+        assert squared_motion_distance(turned, pose, diameter_mm) == pytest.approx(expected, rel=0.01)
+    assert squared_motion_distance(pose, pose, diameter_mm) == 0.0

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from arview.cad import Model, Symmetry, make_model
+from arview.detection import Detection
 from arview.errors import InputError, OutputError
 from arview.evaluation import PoseError, PoseMeter, SceneFrame, load_scene
 from arview.evaluation.protocols import (
@@ -49,8 +50,7 @@ from arview.evaluation.semisynthetic.shading import corner_normals, muted
 from arview.evaluation.semisynthetic.solids import circle, cylinder, prism, rectangle, triangulate
 from arview.geometry import Array, apply, exp_so3, look_at, rigid, rotation_angle_rad
 from arview.guideviews.surface import Surface, reduced_surface, surface_about
-from arview.render import ZBufferRenderer
-from arview.tracking import Detection
+from arview.rendering.renderers import ZBufferRenderer
 from arview.video import Image
 from cad_files import box
 from synthetic import background, component

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from arview.cad.model import Component, Model, make_model
 from arview.geometry import Array, apply, rigid, rotation_angle_rad
 from arview.guideviews.surface import Surface, draw_surface, reduced_surface, surface_about
-from arview.raster import rasterise
-from arview.tracking.shading import (
+from arview.refinement.gauss_newton import apply_twist
+from arview.refinement.modalities.shading import (
     COEFFICIENTS,
     GAIN,
     LEAST_CURVED,
@@ -27,7 +27,7 @@ from arview.tracking.shading import (
     look_at,
     shade,
 )
-from arview.tracking.solver import apply_twist
+from arview.rendering.rasterizer import rasterise
 from synthetic import CAMERA, assembly
 
 TRUTH = rigid(Rotation.from_euler("xyz", (20, -35, 50), degrees=True).as_matrix(), np.array([15.0, -10.0, 420.0]))

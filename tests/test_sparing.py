@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
-from arview.tracking.climb import outline_score
-from arview.tracking.templates import SECTORS, by_sector, least_pair, sector_of
+from arview.detection.search.pattern_search import outline_score
+from arview.detection.search.template_bank import (
+    SECTORS,
+    by_sector,
+    least_pair,
+    sector_of,
+)
 
 RADIUS_PX = 40.0
 

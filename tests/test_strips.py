@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.geometry import Array, rigid
-from arview.tracking.line_network import LineNetwork
-from arview.tracking.picture import Picture
-from arview.tracking.strips import (
+from arview.detection.features.edge_net import LineNetwork
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.scoring.contour_verifier import (
     CHANNELS,
     COLUMNS,
     OUTLINE_ROWS,
@@ -24,7 +23,8 @@ from arview.tracking.strips import (
     raw_strips,
     shown,
 )
-from arview.tracking.tracker import PartView
+from arview.geometry import Array, rigid
+from arview.refinement.view_model import PartView
 from synthetic import CAMERA, assembly_views, background, half_hidden, pose_from, turned_about
 from synthetic import picture as drawn
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from arview.errors import InputError
-from arview.measurement.surface import Surface
+from arview.measurement.cloud.surface import Surface
 
 
 @pytest.fixture(scope="module")

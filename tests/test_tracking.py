@@ -15,9 +15,10 @@ from arview.errors import InputError, MismatchError
 from arview.geometry import Array, invert, log_se3, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.pose import Pose, TrackingState
+from arview.refinement.modalities.edge import smoothed
+from arview.refinement.schedules import TRACK_STAGES
 from arview.tracking import Estimate, SessionOptions, Tracker, TrackerOptions, TrackingSession
-from arview.tracking.nonlocal_search import NonlocalSearch
-from arview.tracking.tracker import TRACK_STAGES, smoothed
+from arview.tracking.wide_search import NonlocalSearch
 from synthetic import (
     CAMERA,
     assembly,

@@ -10,13 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from arview.cad import Model, make_model
 from arview.cad.view_range import ViewRange
+from arview.detection.features.edge_net import LineNetwork
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.scoring.pair_comparator import TwinNetwork
+from arview.detection.symmetry import TELLING
 from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
-from arview.tracking.ambiguity import TELLING
-from arview.tracking.line_network import LineNetwork
-from arview.tracking.picture import Picture
-from arview.tracking.tracker import PartView, Tracker, TrackerOptions
-from arview.tracking.twin_network import TwinNetwork
+from arview.refinement.view_model import PartView
+from arview.tracking.tracker import Tracker, TrackerOptions
 from synthetic import CAMERA, box, component, picture, pose_from, post
 
 GREY = (0.55, 0.55, 0.6)

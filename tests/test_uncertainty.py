@@ -11,11 +11,15 @@ import pytest
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_se3
-from arview.measurement.alignment import Alignment, align, move_equations, point_from_move, surface_equations
-from arview.measurement.combine import agreements, combine, quantile_of_length
-from arview.measurement.rice import rice_density, rice_estimate, rice_mean
+from arview.measurement.datums.alignment import (
+    Alignment,
+    align,
+    move_equations,
+    point_from_move,
+    surface_equations,
+)
 from arview.measurement.types import Method, Move
-from arview.measurement.uncertainty import (
+from arview.measurement.uncertainty.budget import (
     PosePropagation,
     UncertaintyOptions,
     length_of,
@@ -24,6 +28,12 @@ from arview.measurement.uncertainty import (
     total_budget,
     which_see,
 )
+from arview.measurement.uncertainty.combine import (
+    agreements,
+    combine,
+    quantile_of_length,
+)
+from arview.measurement.uncertainty.rice import rice_density, rice_estimate, rice_mean
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from photo_scene import CAMERA, bench, ring
 

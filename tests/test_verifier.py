@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.geometry import Array, apply
-from arview.raster import rasterise
-from arview.tracking.line_network import LineNetwork
-from arview.tracking.picture import Picture
-from arview.tracking.tracker import PartView
-from arview.tracking.verifier import (
+from arview.detection.features.edge_net import LineNetwork
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.scoring.pose_verifier import (
     BAND_PX,
     CHANNELS,
     PLAIN,
@@ -25,6 +22,9 @@ from arview.tracking.verifier import (
     raw_look,
     with_gradients,
 )
+from arview.geometry import Array, apply
+from arview.refinement.view_model import PartView
+from arview.rendering.rasterizer import rasterise
 from synthetic import CAMERA, assembly, assembly_views, background, half_hidden, pose_from, turned_about
 from synthetic import picture as drawn
 

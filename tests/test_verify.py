@@ -13,13 +13,19 @@ import pytest
 from click.testing import CliRunner
 from scipy.stats import binom
 
+from arview.acceptance.conformity import UHeld, parse_limit, record_of, verify
+from arview.acceptance.lengths import (
+    KnownLength,
+    Mark,
+    Measured,
+    read_known,
+    read_measured,
+)
+from arview.acceptance.plot import draw
 from arview.cli import main
 from arview.errors import InputError
 from arview.geometry import apply, exp_so3, rigid
 from arview.inspection import ComponentDeviation, Details, Inspection, Provenance, Verdict, save_inspection
-from arview.verification.judge import UHeld, parse_limit, record_of, verify
-from arview.verification.lengths import KnownLength, Mark, Measured, read_known, read_measured
-from arview.verification.plot import draw
 
 RNG_PLACES = np.random.default_rng(7).uniform(-150.0, 150.0, (16, 3))
 NAMES = [f"post_{k}" for k in range(16)]

@@ -7,12 +7,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from arview.annotation import reasons_text
+from arview.detection.detector import Rejected
 from arview.geometry import Array
-from arview.pipeline import reasons_text
 from arview.pose import TrackingState
+from arview.refinement.evidence import Evidence
 from arview.tracking import Estimate, TrackingSession
-from arview.tracking.quality import Evidence
-from arview.tracking.why_not import BLURRED, NOTHING, Rejected, edge_widths_px, poor_picture, why_lost, why_not
+from arview.tracking.diagnosis import (
+    BLURRED,
+    NOTHING,
+    edge_widths_px,
+    poor_picture,
+    why_lost,
+    why_not,
+)
 from synthetic import CAMERA, RANGE, assembly, assembly_views, background, picture, pose_from
 
 TRUTH = pose_from(30, 40, 520)

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
+from arview.assembly.presence_net import component_looks
 from arview.cad.model import Component, Model, make_model
+from arview.core.atomic import replacing
+from arview.detection.features.edge_net import LineNetwork
 from arview.evaluation.semisynthetic import CAMERA, VARIANTS, SequenceOptions, render_sequence, trajectory
 from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.evaluation.semisynthetic.look_alikes import look_alikes
 from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews.surface import reduced_surface, surface_about
-from arview.tracking.component_network import component_looks
-from arview.tracking.line_network import LineNetwork
-from arview.tracking.tracker import intrinsics_of
+from arview.refinement.projection import intrinsics_of
 from judge_examples import ANYWHERE, OCCLUDER, noisy, some_solids
 from line_examples import covered_picture, crowded_picture, lone_picture
 from seeded_files import still_to_make

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.tracking.component_network import GLOBALS, SIDE_PX, overall
-from arview.tracking.verifier import CHANNELS, LINES
+from arview.assembly.presence_net import GLOBALS, SIDE_PX, overall
+from arview.detection.scoring.pose_verifier import CHANNELS, LINES
 from component_examples import Looked
 from judge_examples import read_examples
 from score_networks import Design, Shown, fit, fit_score_network, scored, together

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ahead import made_ahead
-from arview.tracking.denoiser import SHOWN_MEAN, SHOWN_RANGE
+from arview.detection.features.denoiser import SHOWN_MEAN, SHOWN_RANGE
 from layers import write_picture_network
 from line_examples import read_lined_pictures
 from line_fitting import compressed, with_flat_things
@@ -155,7 +155,7 @@ def _report(network: Any, pictures: Sequence[NDArray[np.uint8]], torch: Any) -> 
 
 
 def _network(torch: Any) -> Any:
-    """The network of `arview.tracking.denoiser`."""
+    """The network of `arview.detection.features.denoiser`."""
     nn = torch.nn
 
     def convolution(before: int, after: int, size: int = 3, step: int = 1) -> Any:

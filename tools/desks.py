@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
 from arview.errors import InputError
 from arview.evaluation.semisynthetic import photos_in
 from arview.evaluation.semisynthetic.backgrounds import read_photo

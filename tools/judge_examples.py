@@ -12,8 +12,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
 from arview.cad import Model
+from arview.core.atomic import replacing
+from arview.detection import Detector
+from arview.detection.detector import DetectorOptions
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.scoring.pose_verifier import raw_look
+from arview.detection.scoring.profile_ranker import RADII_PX, describe
+from arview.detection.search.global_search import WIDE, Candidate, Effort
+from arview.detection.search.local_search import Hypothesis
 from arview.errors import InputError
 from arview.evaluation.protocols import full_sphere_range
 from arview.evaluation.semisynthetic import (
@@ -31,14 +38,7 @@ from arview.evaluation.semisynthetic.ambiguity import changed_share
 from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, exp_so3, rigid
-from arview.guideview_cache import cached_guide_views
-from arview.tracking import Detector
-from arview.tracking.detector import DetectorOptions
-from arview.tracking.first_search import WIDE, Candidate, Effort
-from arview.tracking.judge import RADII_PX, describe
-from arview.tracking.local_search import Hypothesis
-from arview.tracking.picture import Picture
-from arview.tracking.verifier import raw_look
+from arview.guideviews.cache import cached_guide_views
 from line_examples import coloured, crowded_picture, recoloured
 from seeded_files import still_to_make
 
@@ -179,7 +179,7 @@ def _pictures_of(
         for frame in _rendered(shown, occluder, variant, FRAMES_EACH, photos, rng):
             if frame.visible >= 0.5:
                 image = _printed_on(frame, photos, rng) if rng.random() < PRINTED_SHARE else frame.image
-                truth = frame.cam_from_model @ detector.local.tracker.part.model_from_body
+                truth = frame.cam_from_model @ detector.local.refiner.part.model_from_body
                 yield detector, _shadowed(image, frame.mask, rng), truth
         for frame in _rendered(other, occluder, variant, WITHOUT_EACH // len(VARIANTS), photos, rng):
             yield detector, _shadowed(frame.image, frame.mask, rng), None
@@ -189,7 +189,7 @@ def _pictures_of(
         pose = trajectory(solid, options)[0] if k < CROWDS_EACH else None
         clean, visible = crowded_picture(others, None if pose is None else (solid, pose), photos, rng)
         if pose is None or visible >= 0.5:
-            truth = None if pose is None else pose @ detector.local.tracker.part.model_from_body
+            truth = None if pose is None else pose @ detector.local.refiner.part.model_from_body
             yield detector, noisy(clean, rng), truth
     for _, image in frames_without_part(photos, (), CAMERA.width, CAMERA.height, WITHOUT_EACH, seed):
         yield detector, image, None
@@ -248,7 +248,7 @@ def is_alike(detector: Detector, poses: Array, truth: Array, share: float, diffe
         share: of the diameter and the distance, see `is_near`.
         differing: share of the part's pixels that may show something else.
     """
-    surface, diameter_mm = detector.local.tracker.part.surface, detector.views.diameter_mm
+    surface, diameter_mm = detector.local.refiner.part.surface, detector.views.diameter_mm
     at = _is_at(detector, poses, truth, share)
     for k in np.flatnonzero(at):
         at[k] = changed_share(surface, diameter_mm, rigid(poses[k, :3, :3], truth[:3, 3]), truth) < differing
@@ -375,7 +375,7 @@ def _looks(
     index = np.flatnonzero(is_told & (poses[:, 2, 3] > 0))
     if not len(index):
         return
-    part = detector.local.tracker.part
+    part = detector.local.refiner.part
     poses = poses[index]
     radii_px = picture.radii_px(part.views.diameter_mm, poses)
     pixels, drawn, lines = zip(
@@ -416,7 +416,7 @@ def _group(
     view_lines = np.array([detector.local.view_lines(pose) for pose in poses])
     lines, both = {}, {}
     for name in ("fine", "close") if hypotheses else ("rough",):
-        seen, both[name] = describe(picture, detector.local.tracker.part, poses, view_lines, RADII_PX[name])
+        seen, both[name] = describe(picture, detector.local.refiner.part, poses, view_lines, RADII_PX[name])
         lines[name] = np.round(255.0 * seen).astype(np.uint8)
     logits = np.array([h.own_logit for h in hypotheses] or np.zeros(len(poses)), dtype=np.float32)
     return Group(seed, stage, lines, both, logits, is_right)

@@ -9,10 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
+from arview.detection.scoring.profile_ranker import (
+    FEATURES,
+    GLOBALS,
+    OUTLINE_LINES,
+    SEEN,
+    STRETCHES,
+    Network,
+)
+from arview.detection.scoring.profile_ranker import network as in_use_network
 from arview.errors import InputError
-from arview.tracking.judge import FEATURES, GLOBALS, OUTLINE_LINES, SEEN, STRETCHES, Network
-from arview.tracking.judge import network as in_use_network
 from judge_examples import Group, read_examples
 from widening import GONE_ON
 
@@ -121,7 +128,7 @@ def _as_in_use(name: str, torch: Any) -> Any:
 
 
 def _network(torch: Any) -> Any:
-    """The network of `arview.tracking.judge` as torch fits it."""
+    """The network of `arview.detection.scoring.profile_ranker` as torch fits it."""
     nn = torch.nn
 
     class _Network(nn.Module):  # type: ignore[misc, name-defined]

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from tqdm import tqdm
 
+from arview.detection import Detector, DetectorOptions
 from arview.errors import InputError
 from arview.evaluation.protocols import spread_frames
 from arview.evaluation.semisynthetic import frames_without_part
 from arview.geometry import Array
-from arview.tracking import Detector, DetectorOptions
 from judge_examples import ALIKE, REFINED_NEAR, is_alike, is_near, pictures_of
 from photos import all_photos
 from recordings import scenes
@@ -101,7 +101,7 @@ def _recorded(name: str) -> Iterator[Seen]:
     detector = Detector(recorded_views(scene), scene.camera)
     for frame in spread_frames(scene, RECORDED_EACH):
         if frame.cam_from_model is not None:
-            yield detector, scene.image(frame), frame.cam_from_model @ detector.local.tracker.part.model_from_body
+            yield detector, scene.image(frame), frame.cam_from_model @ detector.local.refiner.part.model_from_body
     camera = scene.camera
     others = all_photos(None, name)
     for _, image in frames_without_part(others, (), camera.width, camera.height, PHOTOS_EACH, PHOTOS_SEED):

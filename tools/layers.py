@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
 
 
 def normalised(before: int, after: int, size: int, step: int, torch: Any) -> list[Any]:

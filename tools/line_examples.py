@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from arview.atomic import replacing
 from arview.cad.model import Component, Model, make_model
+from arview.core.atomic import replacing
 from arview.errors import InputError
 from arview.evaluation.semisynthetic import CAMERA
 from arview.evaluation.semisynthetic.backgrounds import read_photo, surroundings
@@ -22,7 +22,7 @@ from arview.evaluation.semisynthetic.sequence import FILL_LIGHT, JOIN_BLUR_PX, K
 from arview.evaluation.semisynthetic.shading import Light, ShadedModel, Surface
 from arview.evaluation.semisynthetic.solids import box
 from arview.geometry import Array, apply, rigid
-from arview.raster import rasterise
+from arview.rendering.rasterizer import rasterise
 from arview.video import Image
 from seeded_files import still_to_make
 

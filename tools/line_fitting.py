@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.tracking.denoiser import Denoiser
-from arview.tracking.line_network import CONTRAST, SHRINK
-from arview.tracking.matching import ORIENTATIONS
+from arview.detection.features.denoiser import Denoiser
+from arview.detection.features.edge_net import CONTRAST, SHRINK
+from arview.detection.features.response_maps import ORIENTATIONS
 from layers import normalised, residual, write_picture_network
 from line_examples import FINE, LinedPicture, read_lined_pictures
 from pyramid import pyramid
@@ -253,7 +253,7 @@ def _report(network: Any, pictures: list[LinedPicture], torch: Any) -> None:
 
 
 def _network(torch: Any) -> Any:
-    """The network of `arview.tracking.line_network`."""
+    """The network of `arview.detection.features.edge_net`."""
     nn = torch.nn
 
     def convolution(before: int, after: int, size: int = 3, step: int = 1) -> Any:

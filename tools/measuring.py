@@ -17,11 +17,11 @@ import numpy as np
 from arview.cad import load_part
 from arview.geometry import Array, apply, rigid, rotation_angle_rad
 from arview.inspection import ComponentDeviation, Details, MethodResult, Verdict, load_inspection
-from arview.measurement.alignment import align
-from arview.measurement.datums import DatumOptions, measure_datums
-from arview.measurement.decision import decide
+from arview.measurement.datums.alignment import align
+from arview.measurement.datums.photo_datums import DatumOptions, measure_datums
 from arview.measurement.folder import read_folder
 from arview.measurement.photo import load_views
+from arview.measurement.uncertainty.decision import decide
 from lines import Line
 from reconstructing import timed_run
 from recordings import PhotoSet

@@ -10,8 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import apply
-from arview.measurement.cloud_registration import CloudRegistrationOptions, TargetCloud, register_clouds
-from arview.measurement.registration import register_to_surface
+from arview.measurement.cloud.point_registration import (
+    CloudRegistrationOptions,
+    TargetCloud,
+    register_clouds,
+)
+from arview.measurement.cloud.registration import register_to_surface
 from arview.measurement.studies.common import EXACT, post
 from recordings import skip
 

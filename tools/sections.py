@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from arview.cad import Model, ViewRange, load_part
+from arview.detection import Detector
 from arview.evaluation import PoseError, PoseMeter, Scene, SceneFrame, load_scene
 from arview.evaluation.protocols import (
     Tally,
@@ -38,10 +39,10 @@ from arview.evaluation.semisynthetic import (
     shape_job,
 )
 from arview.geometry import Array, apply
-from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewSet
+from arview.guideviews.cache import cached_guide_views
 from arview.pose import TrackingState
-from arview.tracking import Detector, TrackingSession
+from arview.tracking import TrackingSession
 from arview.video import Image
 from lines import Line, timing, watched
 from photos import all_photos, background_photos

@@ -9,7 +9,7 @@ import numpy as np
 from arview.evaluation import PoseMeter, Scene, scene_guide_views
 from arview.geometry import Array, apply, exp_so3, rigid, rotation_angle_rad
 from arview.tracking import SessionOptions
-from arview.tracking.snap import Snap
+from arview.tracking.guided_init import Snap
 from arview.video import Image
 from lines import Line, timing, watched
 from sections import BOXES, box_symmetries

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
+from arview.detection import Detector, DetectorOptions
+from arview.detection.scoring.contour_verifier import raw_strips
+from arview.detection.search.global_search import Candidate
+from arview.detection.search.local_search import Hypothesis
 from arview.geometry import Array
-from arview.tracking import Detector, DetectorOptions
-from arview.tracking.first_search import Candidate
-from arview.tracking.local_search import Hypothesis
-from arview.tracking.strips import raw_strips
 from judge_examples import REFINED_APART, REFINED_NEAR, pictures_of, told
 from seeded_files import still_to_make
 
@@ -71,7 +71,7 @@ def strips_of(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
     right, is_told = told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
     return Stripped(
         seed,
-        np.stack([raw_strips(picture, local.tracker.part, pose) for pose in poses]),
+        np.stack([raw_strips(picture, local.refiner.part, pose) for pose in poses]),
         picture.radii_px(detector.views.diameter_mm, poses),
         np.array([(h.verification, h.own_logit, h.judgement, h.line_support) for h in both], dtype=np.float64),
         right,

@@ -15,8 +15,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.tracking.quality import VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES
-from arview.tracking.strips import CHANNELS, COLUMNS, GLOBALS, OUTLINE_ROWS, ROWS, shown
+from arview.detection.confidence import (
+    VERIFIED_EVIDENCE,
+    VERIFIED_JUDGEMENT,
+    VERIFIED_LINES,
+)
+from arview.detection.scoring.contour_verifier import (
+    CHANNELS,
+    COLUMNS,
+    GLOBALS,
+    OUTLINE_ROWS,
+    ROWS,
+    shown,
+)
 from judge_examples import read_examples
 from score_networks import Design, Shown, fit, fit_score_network, scored, telling_loss, together
 from strip_examples import Stripped

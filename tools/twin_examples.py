@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
+from arview.detection import Detector
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.scoring.pair_comparator import raw_looks
+from arview.detection.search.global_search import QUICK
+from arview.detection.search.local_search import Hypothesis
 from arview.evaluation.semisynthetic.random_solids import random_solid, random_twin
 from arview.geometry import Array, exp_so3, log_so3, rigid, turned
-from arview.tracking import Detector
-from arview.tracking.first_search import QUICK
-from arview.tracking.local_search import Hypothesis
-from arview.tracking.picture import Picture
-from arview.tracking.twin_network import raw_looks
 from judge_examples import REFINED_APART, REFINED_NEAR, is_near, pictures_of
 from seeded_files import still_to_make
 
@@ -81,7 +81,7 @@ def twins_of(seed: int, detector: Detector, picture: Picture, truth: Array, rng:
     right = right[right | ~near]
     if not right.any() or right.all():
         return []
-    pixels, drawn, lines = raw_looks(picture, local.tracker.part, [h.cam_from_body for h in kept])
+    pixels, drawn, lines = raw_looks(picture, local.refiner.part, [h.cam_from_body for h in kept])
     logits = np.array([h.logit_without_strips for h in kept])
     return [Twins(seed, pixels, np.round(127.0 * drawn).astype(np.int8), lines, logits, right)]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.tracking.twin_network import SHOWN, SIDE_PX
+from arview.detection.scoring.pair_comparator import SHOWN, SIDE_PX
 from judge_examples import read_examples
 from layers import exported, halving, normalised, write
 from score_networks import fit

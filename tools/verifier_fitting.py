@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.tracking.score_network import DOWNWARD, RIGHTWARD, mirrored
-from arview.tracking.verifier import (
+from arview.detection.scoring.pose_verifier import (
     CHANNELS,
     GLOBALS,
     LINES,
@@ -22,6 +21,7 @@ from arview.tracking.verifier import (
     overall,
     with_gradients,
 )
+from arview.detection.scoring.score_net import DOWNWARD, RIGHTWARD, mirrored
 from component_examples import Looked
 from judge_examples import Looks, read_examples
 from score_networks import Design, Shown, fit, fit_score_network, scored, telling_loss, together

@@ -8,8 +8,8 @@ import numpy as np
 
 from arview.calibration.run import Calibration
 from arview.calibration.solve import picture_grid, pixel_uncertainty
+from arview.core.figures import INK, figure
 from arview.errors import InputError
-from arview.figures import INK, figure
 
 FORMATS = ("png", "svg", "pdf")
 _ARROW = 0.08

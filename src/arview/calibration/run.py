@@ -17,7 +17,7 @@ from arview.calibration.solve import PARAMETERS, K, Solution, SolveOptions, solv
 from arview.calibration.verdict import Judgement, VerdictOptions, judge
 from arview.calibration.views import Sightings, find_views
 from arview.camera import Camera
-from arview.camera_profiles import lens_record
+from arview.camera.profiles import lens_record
 from arview.errors import InputError
 from arview.reconstruction.scale import Board
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.photo_exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
 from arview.reconstruction.scale import Board
 from arview.reconstruction.scale.targets import cv_board
 
@@ -206,7 +206,7 @@ def _look_at_photos(
 
 
 def _exif_of_all(paths: Sequence[Path], names: Sequence[str]) -> tuple[dict[str, PhotoExif], dict[str, str]]:
-    from arview.photo_exif import read_exif
+    from arview.camera.exif import read_exif
 
     exifs, rejected = {}, {}
     for path, name in zip(paths, names, strict=True):
@@ -268,7 +268,7 @@ def _is_video(path: Path) -> bool:
 def _look_at_video(path: Path, finder: BoardFinder, progress: Callable[[int, int], None] | None) -> Sightings:
     import cv2
 
-    from arview.camera_profiles import exif_of_video
+    from arview.camera.profiles import exif_of_video
     from arview.video import open_source
 
     with open_source(path) as source:

@@ -13,7 +13,7 @@ from arview.cli.common import main, say
 from arview.cli.inspect import EXIT_CANNOT_MEASURE, EXIT_CODES, VerdictCommand
 
 if TYPE_CHECKING:
-    from arview.line.batch import JobResult
+    from arview.workflow.batch import JobResult
 
 
 @main.command(
@@ -75,8 +75,8 @@ def batch(
     """Inspect all parts that JOBS.toml names."""
     from tqdm import tqdm
 
-    from arview.line.batch import BatchOptions, run_batch
-    from arview.line.jobs_file import load_jobs
+    from arview.workflow.batch import BatchOptions, run_batch
+    from arview.workflow.jobs_file import load_jobs
 
     jobs = load_jobs(jobs_path)
     if store is not None:
@@ -119,7 +119,7 @@ def _line(result: JobResult) -> str:
 def _add(results: list[JobResult], store: str, station: str | None) -> None:
     """Add what was measured to the store; what is there already stays as it is."""
     from arview.history import HistoryStore
-    from arview.line.storage import read
+    from arview.workflow.storage import read
 
     with HistoryStore(store) as opened, tempfile.TemporaryDirectory() as folder:
         new = 0

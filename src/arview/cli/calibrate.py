@@ -129,8 +129,8 @@ def lens(
     from arview.calibration.choose import ChoiceOptions
     from arview.calibration.run import calibrate as run
     from arview.calibration.run import record_of
-    from arview.camera_profiles import profile_name, profile_path
-    from arview.camera_write import holds_distortion, write_camera
+    from arview.camera.profiles import profile_name, profile_path
+    from arview.camera.write import holds_distortion, write_camera
     from arview.reconstruction.scale import parse_board
 
     if not outputs and profile is None:
@@ -179,7 +179,7 @@ def lens(
 @calibrate.command(short_help="The calibrations that are kept.")
 def profiles() -> None:
     """List the profiles that `--profile` has kept, and where they are."""
-    from arview.camera_profiles import list_profiles, profile_folder
+    from arview.camera.profiles import list_profiles, profile_folder
 
     found = list_profiles()
     for one in found:
@@ -189,7 +189,7 @@ def profiles() -> None:
 
 
 def _format_and_path(text: str) -> tuple[str, str]:
-    from arview.camera_write import FORMATS, format_of
+    from arview.camera.write import FORMATS, format_of
 
     kind, colon, path = text.partition(":")
     if colon and kind in FORMATS:

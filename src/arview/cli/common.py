@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from arview import __version__
-from arview.atomic import replacing
+from arview.core.atomic import replacing
 from arview.errors import ArviewError, OutputError
 
 EXIT_ERROR, EXIT_BUG, EXIT_INTERRUPTED = 2, 1, 130

@@ -12,7 +12,7 @@ from arview.cli.common import UNIT, main, say, say_bug
 from arview.errors import ArviewError, CannotMeasureError
 
 if TYPE_CHECKING:
-    from arview.line.run import Outcome
+    from arview.workflow.run import Outcome
 
 EXIT_CODES = {"pass": 0, "fail": 1, "undecided": 2, "not_measured": 3}
 EXIT_CANNOT_MEASURE = 3
@@ -129,8 +129,8 @@ def inspect(
     unit: str | None,
 ) -> None:
     """Inspect one part: reconstruct PHOTOS, measure, judge; write report, coloured cloud and annotated VIDEO."""
-    from arview.line.job import InspectJob
-    from arview.line.run import inspect_part
+    from arview.workflow.job import InspectJob
+    from arview.workflow.run import inspect_part
 
     job = InspectJob(
         part_path, photos, video, serial, camera, video_camera, scale_file, unit, tolerance, guard, max_frames, seed,
@@ -185,7 +185,7 @@ def line_bar(has_film: bool, is_from_video: bool, has_pdf: bool) -> Iterator[Cal
     """One bar for all stages, with the time left; shown only on a terminal."""
     from tqdm import tqdm
 
-    from arview.line.clock import Clock, Moment, clock_text
+    from arview.workflow.clock import Clock, Moment, clock_text
 
     with tqdm(total=100.0, disable=None, leave=False, bar_format="{desc} {percentage:3.0f} % |{bar}|") as bar:
 

@@ -96,10 +96,10 @@ def measure(
     from arview.cad import load_part
     from arview.inspection import save_inspection
     from arview.measurement import run
-    from arview.measurement.decision import DecisionOptions
     from arview.measurement.folder import read_cloud, read_folder
     from arview.measurement.options import MeasureOptions
-    from arview.measurement.uncertainty import UncertaintyOptions
+    from arview.measurement.uncertainty.budget import UncertaintyOptions
+    from arview.measurement.uncertainty.decision import DecisionOptions
 
     if (folder is None) == (cloud_path is None):
         raise InputError("give either OUT, the folder of `arview reconstruct`, or --cloud FILE")

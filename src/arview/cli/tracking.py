@@ -14,9 +14,9 @@ from arview.cli.common import EXIT_INTERRUPTED, RENDERER, UNIT, main, output_pat
 from arview.errors import InputError, OutputError
 
 if TYPE_CHECKING:
+    from arview.annotation import AnnotateSummary
     from arview.camera import Camera
     from arview.geometry import Array
-    from arview.pipeline import AnnotateSummary
     from arview.tracking import SessionOptions
     from arview.video import FrameSource
 
@@ -75,7 +75,7 @@ def check(part: str, unit: str | None, camera_spec: str | None) -> None:
     geometry. Findings are not errors: the exit code is 0.
     """
     from arview.cad import check_part, load_part
-    from arview.camera_files import load_camera
+    from arview.camera.read import load_camera
     from arview.guideviews.findings import uniqueness_findings
 
     loaded = load_part(part, unit)
@@ -241,15 +241,15 @@ def annotate(
 
     SOURCE is a video file, a picture, a folder or glob of pictures, a camera number or an RTSP/HTTP address.
     """
-    from arview import pipeline
+    from arview import annotation as pipeline
     from arview.cad import load_part
-    from arview.guideview_cache import cached_guide_views
     from arview.guideviews import GuideViewOptions, load_guide_views
+    from arview.guideviews.cache import cached_guide_views
     from arview.inspection import load_inspection
     from arview.overlay import OverlayOptions, OverlayRenderer
     from arview.overlay.options import EdgeMode
     from arview.tracking import TrackingSession
-    from arview.tracking.guide import GUIDE_PREFIX, guide_pose
+    from arview.tracking.guide_pose import GUIDE_PREFIX, guide_pose
     from arview.video import VideoSink, open_source
 
     if output is None and poses_path is None:
@@ -299,7 +299,7 @@ def annotate(
             overlay = OverlayRenderer(part.model, camera, inspection, looks)
             sink = VideoSink(video_path, frames.width, frames.height, frames.fps, frames)
         with progress_bar("frames", frames.frame_count) as progress:
-            summary = pipeline.annotate(
+            summary = annotation.annotate(
                 frames,
                 session,
                 overlay,
@@ -321,7 +321,7 @@ def annotate(
 
 
 def _print_annotated(summary: AnnotateSummary, written: list[Path]) -> None:
-    from arview.pipeline import reasons_text
+    from arview.annotation import reasons_text
 
     if summary.ended_reason:
         say(f"warning: {summary.ended_reason}")
@@ -432,7 +432,7 @@ def _session_options(modalities: tuple[str, ...]) -> SessionOptions:
 
 def _camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
     """Camera of a source's frames; a guessed one is announced."""
-    from arview.camera_files import guess_camera, load_camera
+    from arview.camera.read import guess_camera, load_camera
 
     if spec is not None:
         return load_camera(spec, frames.width, frames.height, source, frames.quarter_turns_clockwise)

@@ -10,7 +10,7 @@ import click
 from arview.cli.common import main, output_path, say, write_bytes
 
 if TYPE_CHECKING:
-    from arview.verification.judge import LengthResult, Verification
+    from arview.acceptance.conformity import LengthResult, Verification
 
 EXIT_FAIL, EXIT_UNDECIDED = 3, 4
 _SHOWN = 12
@@ -50,9 +50,9 @@ Exit codes: 0 passed, 3 a length fails or U did not hold, 4 undecided, 2 bad inp
 @click.option("--all", "shows_all", is_flag=True, help=f"Print every length, not only the {_SHOWN} worst.")
 def verify(measured: str, known: str, mpe: str | None, output: str | None, plot: str | None, shows_all: bool) -> None:
     """Test what was MEASURED against KNOWN lengths: errors, limit, and whether the stated U held."""
-    from arview.verification.judge import parse_limit, record_of
-    from arview.verification.judge import verify as run
-    from arview.verification.lengths import read_known, read_measured
+    from arview.acceptance.conformity import parse_limit, record_of
+    from arview.acceptance.conformity import verify as run
+    from arview.acceptance.lengths import read_known, read_measured
 
     limit = None if mpe is None else parse_limit(mpe)
     target = None if output is None else output_path(output, [measured, known])
@@ -64,7 +64,7 @@ def verify(measured: str, known: str, mpe: str | None, output: str | None, plot:
         write_bytes(target, (json.dumps(record_of(test), indent=2, ensure_ascii=False) + "\n").encode())
         click.echo(f"wrote {target}")
     if picture is not None:
-        from arview.verification.plot import draw
+        from arview.acceptance.plot import draw
 
         write_bytes(picture, draw(test, picture.suffix.lower().removeprefix(".")))
         click.echo(f"wrote {picture}")
@@ -74,7 +74,7 @@ def verify(measured: str, known: str, mpe: str | None, output: str | None, plot:
 
 
 def _print(test: Verification, shows_all: bool) -> None:
-    from arview.verification.judge import FULL_TEST, UHeld
+    from arview.acceptance.conformity import FULL_TEST, UHeld
 
     for name, reason in list(test.left_out.items())[:_SHOWN]:
         say(f"left out {name}: {reason}")

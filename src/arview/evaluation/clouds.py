@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply
-from arview.raster import rasterise
+from arview.rendering.rasterizer import rasterise
 
 _SPACING_MM = 0.5
 """Of the samples of the mesh. Completeness is judged on them; distances are measured to the triangles."""

@@ -15,11 +15,11 @@ from arview.evaluation.bop import Scene, SceneFrame
 from arview.evaluation.metrics import PoseError, PoseMeter
 from arview.evaluation.ranges import covering_range
 from arview.geometry import Array
-from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewOptions, GuideViewSet
+from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose, TrackingState
 from arview.tracking import SessionOptions, TrackingSession
-from arview.tracking.guide import GUIDE_PREFIX, guide_pose
+from arview.tracking.guide_pose import GUIDE_PREFIX, guide_pose
 from arview.video import Image
 
 COARSE = (50.0, 5.0)

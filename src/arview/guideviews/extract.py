@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, MeshEdges, sample_visible_edges
-from arview.render import Rendering
+from arview.rendering.renderers import Rendering
 
 SNAP_PX = 1.6
 """A contour pixel is moved onto a mesh edge sample at most this far away."""

@@ -13,7 +13,7 @@ from arview.guideviews.findings import azimuths_deg, elevations_deg, most_confus
 from arview.guideviews.mesh_edges import EDGE_SHARP
 from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, PLAIN_LINES, Uniqueness, assess
 from arview.guideviews.views import GuideViewSet
-from arview.render import ZBufferRenderer
+from arview.rendering.renderers import ZBufferRenderer
 
 PAPER = (250, 250, 250)
 INK = (40, 40, 40)

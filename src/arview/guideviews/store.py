@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
 from arview.errors import InputError, OutputError
 
 _MAGIC = b"ARVIEW-GUIDEVIEWS\n"

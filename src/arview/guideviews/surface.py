@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.geometry import Array
-from arview.raster import fill_buffers
+from arview.rendering.rasterizer import fill_buffers
 
 MOST_FACES = 20_000
 """A mesh with more is reduced."""

@@ -22,7 +22,11 @@ from arview.guideviews.mesh_edges import mesh_edges
 from arview.guideviews.sphere import directions_in_range, view_poses
 from arview.guideviews.store import read_arrays, write_arrays
 from arview.guideviews.surface import Surface, reduced_surface, surface_about
-from arview.render import PyrenderRenderer, ZBufferRenderer, open_renderer
+from arview.rendering.renderers import (
+    PyrenderRenderer,
+    ZBufferRenderer,
+    open_renderer,
+)
 
 FORMAT_VERSION = 2
 _UNIT16 = 32767.0

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from arview.core.figures import INK, figure
 from arview.errors import InputError
-from arview.figures import INK, figure
 from arview.history.series import Series
 from arview.history.statistics import Capability, ControlChart
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import jsonschema
 
-from arview.atomic import replacing
 from arview.cad.model import Model
+from arview.core.atomic import replacing
 from arview.errors import InputError, MismatchError, OutputError
 from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport, from_json, to_json
 from arview.inspection.record import (

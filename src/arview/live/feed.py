@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from arview.camera import Camera
-from arview.camera_files import guess_camera
+from arview.camera.read import guess_camera
 from arview.errors import ArviewError
 from arview.live.frames import Incoming, Picture, to_jpeg
 from arview.live.newest import NewestSlot

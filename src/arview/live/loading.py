@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from arview.cad import load_part
-from arview.camera_files import guess_camera
+from arview.camera.read import guess_camera
 from arview.errors import ArviewError, MismatchError
-from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewOptions, load_guide_views
+from arview.guideviews.cache import cached_guide_views
 from arview.live.options import LiveOptions
 from arview.live.subject import Subject
 

@@ -20,7 +20,7 @@ class LiveOptions:
     """
 
     source: str = PHONE  # "phone": each page sends its own camera; else a spec of arview.video.open_source
-    camera: str | None = None  # spec of arview.camera_files.load_camera; None: guessed, and said so on the page
+    camera: str | None = None  # spec of arview.camera.read.load_camera; None: guessed, and said so on the page
     inspection: Path | None = None  # inspection.json, read again whenever it changes
     serial: str | None = None  # of the specimen at the station; None: what the part file says, if anything
     max_age_s: float | None = 86400.0  # an older inspection is called old on the page; None: never. A day: one shift

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from arview.cad.part import Part
 from arview.camera import Camera
-from arview.camera_files import guess_camera, load_camera
+from arview.camera.read import guess_camera, load_camera
 from arview.guideviews import GuideViewSet
 from arview.inspection import Inspection
 from arview.live.inspection_file import InspectionFile
@@ -16,7 +16,7 @@ from arview.live.options import LiveOptions
 from arview.overlay import OverlayOptions, OverlayRenderer
 from arview.overlay.options import EdgeMode
 from arview.tracking import TrackingSession
-from arview.tracking.guide import guide_pose
+from arview.tracking.guide_pose import guide_pose
 
 PHONE_FOV = "fov:66"
 """Along the longer side: main cameras of phones have 24 to 28 mm equivalent, 65 to 72°."""

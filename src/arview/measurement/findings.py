@@ -12,15 +12,15 @@ from arview.cad.model import Model
 from arview.errors import InputError, OutputError
 from arview.geometry import apply, invert
 from arview.inspection import ComponentDeviation, DistanceReport, ForeignReport, Verdict
-from arview.measurement.alignment import Alignment
-from arview.measurement.distance_map import (
+from arview.measurement.cloud.distance_map import (
     DistanceMap,
     distance_map,
     histogram_picture,
     map_picture,
     write_distance_ply,
 )
-from arview.measurement.foreign import ForeignObject, find_foreign
+from arview.measurement.cloud.foreign_objects import ForeignObject, find_foreign
+from arview.measurement.datums.alignment import Alignment
 from arview.measurement.plot import save_picture
 from arview.reconstruction.types import DenseCloud
 

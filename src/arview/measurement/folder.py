@@ -119,7 +119,7 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
     Raises:
         InputError: the part is not found in the cloud; the scale is unknown, and no two datums have a distance.
     """
-    from arview.measurement.global_registration import find_model
+    from arview.measurement.cloud.global_registration import find_model
 
     scale, cloud = reconstruction.scale, reconstruction.cloud
     if scale.model_from_scan is not None or cloud is None:

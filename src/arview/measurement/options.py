@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from arview.errors import InputError
-from arview.measurement.alignment import AlignmentOptions
-from arview.measurement.combine import Combined, combine
-from arview.measurement.datums import DatumOptions
-from arview.measurement.decision import DecisionOptions
+from arview.measurement.datums.alignment import AlignmentOptions
+from arview.measurement.datums.photo_datums import DatumOptions
 from arview.measurement.photo import PhotoOptions
 from arview.measurement.types import Method, Move, NotMeasured
-from arview.measurement.uncertainty import UncertaintyOptions
+from arview.measurement.uncertainty.budget import UncertaintyOptions
+from arview.measurement.uncertainty.combine import Combined, combine
+from arview.measurement.uncertainty.decision import DecisionOptions
 
 METHODS: tuple[Method, ...] = ("sweep", "edges", "cloud")
 

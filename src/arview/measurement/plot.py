@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
 from arview.errors import OutputError
 from arview.geometry import Array
 

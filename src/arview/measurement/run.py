@@ -16,17 +16,28 @@ from arview.cad.part import Part
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import DistanceReport, ForeignReport, Inspection
-from arview.measurement.alignment import Alignment, Equations, align, check_covered, move_equations
-from arview.measurement.cloud_datums import measure_datums_in_cloud
-from arview.measurement.combine import Combined
-from arview.measurement.datums import base_plane, measure_datums
+from arview.measurement.datums.alignment import (
+    Alignment,
+    Equations,
+    align,
+    check_covered,
+    move_equations,
+)
+from arview.measurement.datums.cloud_datums import measure_datums_in_cloud
+from arview.measurement.datums.photo_datums import base_plane, measure_datums
 from arview.measurement.findings import look_at_cloud
 from arview.measurement.folder import MetricReconstruction, in_model_frame
 from arview.measurement.options import Measured, MeasureOptions, combined_of
 from arview.measurement.photo import PhotoViews, load_views, measure_components_in_photos
-from arview.measurement.report import component_record, datum_doubts, datum_record, provenance_of
+from arview.measurement.records import (
+    component_record,
+    datum_doubts,
+    datum_record,
+    provenance_of,
+)
 from arview.measurement.types import Move, NotMeasured
-from arview.measurement.uncertainty import PosePropagation
+from arview.measurement.uncertainty.budget import PosePropagation
+from arview.measurement.uncertainty.combine import Combined
 from arview.reconstruction.scale.cad import base_names
 
 Progress = Callable[[str, int, int], None]
@@ -122,7 +133,7 @@ def measure_all(
         for name, by_method in both.items():
             found[name] += [by_method[method] for method in options.methods if method in by_method]
     if "cloud" in options.methods and reconstruction.cloud is not None:
-        from arview.measurement.cloud_deviation import measure_components_in_cloud
+        from arview.measurement.cloud.deviation import measure_components_in_cloud
 
         tell("cloud", 0, 1)
         try:

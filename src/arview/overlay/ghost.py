@@ -12,7 +12,7 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.geometry import Array, apply
 from arview.overlay.mesh import Topology
-from arview.raster import rasterise
+from arview.rendering.rasterizer import rasterise
 
 NEAR_MM = 1.0
 """Geometry nearer to the camera is clipped."""

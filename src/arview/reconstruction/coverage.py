@@ -12,8 +12,8 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
-from arview.raster import rasterise
-from arview.render import ZBufferRenderer
+from arview.rendering.rasterizer import rasterise
+from arview.rendering.renderers import ZBufferRenderer
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,9 @@ from typing import Any, Literal
 import numpy as np
 
 from arview import __version__
-from arview.atomic import replacing
 from arview.cad import Part
+from arview.core.atomic import replacing
+from arview.core.stage_cache import Stages, content_key, key_of, write_json
 from arview.errors import InputError, OutputError
 from arview.geometry import Array
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of, write_model
@@ -36,7 +37,6 @@ from arview.reconstruction.intake import Intake, VideoIntakeOptions, intake_fram
 from arview.reconstruction.quality import Quality, quality_of
 from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
 from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
-from arview.reconstruction.stages import Stages, content_key, key_of, write_json
 from arview.reconstruction.types import DenseCloud, Photo, SparseModel
 
 Stage = Literal["photos", "sparse", "scale", "dense"]

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.figures import INK, MUTED, figure
+from arview.core.figures import INK, MUTED, figure
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, DatumReport, Verdict
-from arview.measurement.distance_map import DistanceMap
+from arview.measurement.cloud.distance_map import DistanceMap
 
 VERDICT_HEX = {
     Verdict.PASS: "#12805c",

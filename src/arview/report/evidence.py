@@ -12,7 +12,11 @@ from arview.cad.part import Part
 from arview.errors import ArviewError, InputError
 from arview.geometry import apply, invert
 from arview.inspection import Inspection, load_inspection
-from arview.measurement.distance_map import DistanceMap, distance_map, read_distance_ply
+from arview.measurement.cloud.distance_map import (
+    DistanceMap,
+    distance_map,
+    read_distance_ply,
+)
 from arview.reconstruction.types import DenseCloud, SparseModel
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from arview.atomic import replacing
 from arview.cad.part import Part
+from arview.core.atomic import replacing
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.report.evidence import Evidence, gather
 from arview.report.page import Progress, ReportOptions, build_context, render

@@ -17,7 +17,7 @@ from arview import __version__
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Details, Inspection, Verdict
 from arview.inspection.summary import overall_verdict, verdict_sentence
-from arview.measurement.distance_map import COLOR_STOPS, map_picture
+from arview.measurement.cloud.distance_map import COLOR_STOPS, map_picture
 from arview.overlay.labels import by_urgency
 from arview.report import charts, how
 from arview.report.evidence import Evidence

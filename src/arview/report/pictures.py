@@ -19,7 +19,7 @@ from arview.overlay.labels import arrow_in_model
 from arview.pose import Pose, TrackingState
 from arview.reconstruction.intake.reading import read_photo
 from arview.reconstruction.types import PosedPhoto, SparseModel
-from arview.render import ZBufferRenderer
+from arview.rendering.renderers import ZBufferRenderer
 
 Picture = NDArray[np.uint8]
 _ROUND_SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)

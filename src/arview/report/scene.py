@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.geometry import Array
 from arview.inspection import Inspection
-from arview.measurement.distance_map import COLOR_STOPS, DistanceMap
-from arview.measurement.surface import Surface
+from arview.measurement.cloud.distance_map import COLOR_STOPS, DistanceMap
+from arview.measurement.cloud.surface import Surface
 from arview.overlay.labels import arrow_scale
 from arview.overlay.options import OverlayOptions
 from arview.reconstruction.types import DenseCloud

@@ -1,16 +1,7 @@
-"""Detection and 6-DoF tracking of a part in monocular video."""
+"""Tracking: the 6-DoF pose of a part through the frames of a monocular video."""
 
-from arview.tracking.detector import Detection, Detector, DetectorOptions
+from arview.tracking.estimate import Estimate
 from arview.tracking.session import SessionOptions, TrackingSession
-from arview.tracking.tracker import Estimate, Tracker, TrackerOptions
+from arview.tracking.tracker import Tracker, TrackerOptions
 
-__all__ = [
-    "Detection",
-    "Detector",
-    "DetectorOptions",
-    "Estimate",
-    "SessionOptions",
-    "Tracker",
-    "TrackerOptions",
-    "TrackingSession",
-]
+__all__ = ["Estimate", "SessionOptions", "Tracker", "TrackerOptions", "TrackingSession"]

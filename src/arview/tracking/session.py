@@ -12,20 +12,27 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.assembly.monitor import ComponentCheck
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.detection.detector import (
+    Detection,
+    Detector,
+    DetectorOptions,
+    Rejected,
+    local_search_for,
+)
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, check_rigid, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
-from arview.tracking.ambiguity import Rivals
-from arview.tracking.components import ComponentCheck
-from arview.tracking.detector import Detection, Detector, DetectorOptions, local_search_for
-from arview.tracking.learned import LearnedViews, Proposal
-from arview.tracking.second_look import SecondLook
-from arview.tracking.snap import Snap
-from arview.tracking.tracker import Estimate, Tracker, TrackerOptions
-from arview.tracking.why_not import NOTHING, Rejected, poor_picture, why_lost, why_not
+from arview.tracking.appearance_memory import LearnedViews, Proposal
+from arview.tracking.diagnosis import NOTHING, poor_picture, why_lost, why_not
+from arview.tracking.disambiguation import Rivals
+from arview.tracking.estimate import Estimate
+from arview.tracking.guided_init import Snap
+from arview.tracking.pose_recheck import SecondLook
+from arview.tracking.tracker import Tracker, TrackerOptions
 
 ALIGN = "align the part with the outline"
 """The reason while the session waits for the part at its guide pose."""
@@ -122,7 +129,7 @@ class TrackingSession:
             ),
             model,
             SecondLook(self._local) if self.options.use_second_look else None,
-            self._local.tracker.part,
+            self._local.refiner.part,
         )
         self._detector: Detector | None = None
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
@@ -217,7 +224,7 @@ class TrackingSession:
         if not self._rivals:
             return estimate, reason
         twins = [estimate.cam_from_model @ turn for turn in self._rivals.model_from_twins]
-        better = self._rivals.update(estimate.evidence.worth, self.tracker.worths_near(image, twins))
+        better = self._rivals.update(estimate.evidence.worth, self.tracker.scores_near(image, twins))
         if better is not None:
             self._rivals = Rivals([])
             return self._begun(image, estimate.cam_from_model @ better), reason

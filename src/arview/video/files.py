@@ -14,8 +14,8 @@ from av.container import InputContainer
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
+from arview.camera.exif import PHOTO_SUFFIXES, read_exif
 from arview.errors import InputError
-from arview.photo_exif import PHOTO_SUFFIXES, read_exif
 from arview.video.color import rgb_from_video_frame
 from arview.video.frame import Frame, Image
 from arview.video.source import FrameRange, FrameSource, read_ahead

@@ -6,8 +6,8 @@ import glob
 import re
 from pathlib import Path
 
+from arview.camera.exif import PHOTO_SUFFIXES
 from arview.errors import InputError
-from arview.photo_exif import PHOTO_SUFFIXES
 from arview.video.files import PictureSource, VideoFileSource, picture_paths, sorted_naturally
 from arview.video.live import CameraGrabber, LiveSource, UrlGrabber
 from arview.video.source import FrameRange, FrameSource

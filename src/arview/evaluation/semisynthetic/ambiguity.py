@@ -12,7 +12,7 @@ from arview.camera import Camera
 from arview.evaluation.metrics import PoseError, PoseMeter, symmetry_group
 from arview.geometry import Array
 from arview.guideviews.surface import Surface, differing, draw_surface
-from arview.render import ZBufferRenderer
+from arview.rendering.renderers import ZBufferRenderer
 
 LEAST_PIXELS = 24
 """Fewer pixels than these cannot tell two poses apart: a patch of about 5 × 5 px."""

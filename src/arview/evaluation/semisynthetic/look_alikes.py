@@ -12,7 +12,7 @@ from arview.cad.model import Component, Model, make_model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.render import ZBufferRenderer
+from arview.rendering.renderers import ZBufferRenderer
 
 Fault = Literal["missing", "moved", "swapped"]
 

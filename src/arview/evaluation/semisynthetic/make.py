@@ -166,5 +166,5 @@ def _has_record(dataset: Path, record: dict[str, Any]) -> bool:
 def _code_hash() -> str:
     """Hash of the code that makes sequences, so that a changed arview does not take old ones."""
     package = Path(__file__).parent
-    files = [*sorted(package.glob("*.py")), package.parent.parent / "raster.py"]
+    files = [*sorted(package.glob("*.py")), package.parent.parent / "rendering" / "rasterizer.py"]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

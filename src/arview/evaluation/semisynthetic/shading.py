@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.geometry import Array, apply
-from arview.raster import rasterise
+from arview.rendering.rasterizer import rasterise
 
 SUPERSAMPLING = 3
 SMOOTH_BELOW_DEG = 40.0

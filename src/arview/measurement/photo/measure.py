@@ -9,6 +9,7 @@ import numpy as np
 from arview.cad.model import Model
 from arview.cad.part import Part
 from arview.cad.samples import Samples, sample_surface
+from arview.core.parallel import pool
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.edges import ComponentEdges
 from arview.measurement.photo.options import PhotoOptions
@@ -17,7 +18,6 @@ from arview.measurement.photo.sweep import ComponentSweep, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
 from arview.measurement.types import Method, Move, NotMeasured
 from arview.reconstruction.types import SparseModel
-from arview.tracking.threads import pool
 
 Result = dict[Method, Move | NotMeasured]
 

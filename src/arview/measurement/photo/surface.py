@@ -15,7 +15,7 @@ from arview.cad.samples import Samples
 from arview.cad.symmetry import Symmetry, find_symmetries
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import mesh_edges
-from arview.tracking.raycast import RayCaster
+from arview.rendering.raycast import RayCaster
 
 
 def tangents_of(normals: Array) -> tuple[Array, Array]:

@@ -29,7 +29,7 @@ from arview.measurement.photo.surface import (
 )
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
-from arview.tracking.raycast import RayCaster
+from arview.rendering.raycast import RayCaster
 
 Indices = NDArray[np.int64]
 

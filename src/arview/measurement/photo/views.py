@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply
-from arview.raster import rasterise
 from arview.reconstruction.types import SparseModel
-from arview.tracking.threads import pool
+from arview.rendering.rasterizer import rasterise
 
 
 class Stack(NamedTuple):

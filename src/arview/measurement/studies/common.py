@@ -13,12 +13,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
 from arview.errors import OutputError
 from arview.geometry import Array
+from arview.measurement.cloud.registration import RegistrationOptions
+from arview.measurement.cloud.surface import Surface
 from arview.measurement.plot import Picture, save_picture
-from arview.measurement.registration import RegistrationOptions
-from arview.measurement.surface import Surface
 
 T = TypeVar("T")
 R = TypeVar("R")

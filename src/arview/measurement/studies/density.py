@@ -7,9 +7,14 @@ import time
 import numpy as np
 
 from arview.geometry import Array, apply
-from arview.measurement.cloud_registration import CloudRegistrationOptions, Method, TargetCloud, register_clouds
+from arview.measurement.cloud.point_registration import (
+    CloudRegistrationOptions,
+    Method,
+    TargetCloud,
+    register_clouds,
+)
+from arview.measurement.cloud.registration import register_to_surface
 from arview.measurement.plot import Chart
-from arview.measurement.registration import register_to_surface
 from arview.measurement.studies.common import EXACT, Study, over_cores, post, sideways
 
 ROWS = (

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from arview.geometry import Array
+from arview.measurement.cloud.registration import register_to_surface
+from arview.measurement.cloud.surface import Surface
 from arview.measurement.plot import Chart, stack
-from arview.measurement.registration import register_to_surface
 from arview.measurement.studies.common import EXACT, POST_MM, SECOND_POST_MM, Study, over_cores, post, sideways
-from arview.measurement.surface import Surface
 
 SIGMA_MM = 0.1
 """Noise of a point along each axis: that of a usual reconstruction."""

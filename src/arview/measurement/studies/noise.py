@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from arview.geometry import Array
+from arview.measurement.cloud.registration import register_to_surface
+from arview.measurement.cloud.shape_fits import fit_cylinder
 from arview.measurement.plot import Chart, stack
-from arview.measurement.registration import register_to_surface
-from arview.measurement.shape_fits import fit_cylinder
 from arview.measurement.studies.common import EXACT, Study, over_cores, post, sideways
 
 COUNT = 10_000

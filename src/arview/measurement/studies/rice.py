@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from arview.measurement.plot import Chart, stack
-from arview.measurement.rice import rice_density, rice_estimate, rice_mean
 from arview.measurement.studies.common import Study
+from arview.measurement.uncertainty.rice import rice_density, rice_estimate, rice_mean
 
 SIGMA_MM = 0.3
 OFFSETS_MM = (0.0, 1.0)

@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from arview.geometry import Array, apply
-from arview.measurement.cloud_registration import CloudRegistrationOptions, TargetCloud, register_clouds
+from arview.measurement.cloud.point_registration import (
+    CloudRegistrationOptions,
+    TargetCloud,
+    register_clouds,
+)
+from arview.measurement.cloud.registration import register_to_surface
 from arview.measurement.plot import Chart
-from arview.measurement.registration import register_to_surface
 from arview.measurement.studies.common import EXACT, Study, over_cores, post, sideways
 
 THRESHOLDS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
+from arview.core.atomic import replacing
 from arview.errors import InputError, OutputError
 from arview.reconstruction.dense.depth import DepthMap
 from arview.reconstruction.dense.views import Floats

@@ -17,9 +17,9 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert
-from arview.raster import rasterise
 from arview.reconstruction.dense.options import DenseOptions
 from arview.reconstruction.types import PosedPhoto, SparseModel
+from arview.rendering.rasterizer import rasterise
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]

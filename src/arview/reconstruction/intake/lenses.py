@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from arview.camera import Camera
-from arview.camera_files import guess_camera, load_camera
-from arview.camera_profiles import profile_of_photo
+from arview.camera.exif import PhotoExif, focal_length_px
+from arview.camera.profiles import profile_of_photo
+from arview.camera.read import guess_camera, load_camera
 from arview.errors import MismatchError
-from arview.photo_exif import PhotoExif, focal_length_px
 
 _FOCAL_ROUNDING_MM = 0.055  # programs write the focal length in tenths of a millimetre, or more finely
 _EQUIVALENT_ROUNDING_MM = 0.5  # the 35 mm equivalent is written in whole millimetres

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from arview.camera.exif import PhotoExif
 from arview.errors import ArviewError, InputError, MismatchError
-from arview.photo_exif import PhotoExif
 from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck, check_photo, same_views, thumbnail
 from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.intake.reading import RAW_SUFFIXES, Pixels, glance, photo_paths

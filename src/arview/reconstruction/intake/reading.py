@@ -12,8 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.camera.exif import (
+    HEIF_SUFFIXES,
+    PHOTO_SUFFIXES,
+    PhotoExif,
+    exif_of,
+    open_picture,
+)
 from arview.errors import InputError
-from arview.photo_exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif, exif_of, open_picture
 from arview.video.files import sorted_naturally
 
 if TYPE_CHECKING:

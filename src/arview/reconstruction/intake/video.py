@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.atomic import replacing
+from arview.camera.exif import PhotoExif
+from arview.core.atomic import replacing
 from arview.errors import InputError, OutputError
-from arview.photo_exif import PhotoExif
 from arview.reconstruction.intake.checks import CheckOptions, check_photo, thumbnail
 from arview.reconstruction.intake.photos import LEAST_PHOTOS, Intake, Seen, assess, look_at
 from arview.reconstruction.intake.reading import GLANCE_PX, Pixels

@@ -13,16 +13,16 @@ from arview.cad.model import Model
 from arview.cad.part import Part
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
+from arview.core.parallel import pool
+from arview.detection import Detector
 from arview.geometry import Array, invert, rigid
-from arview.guideview_cache import cached_guide_views
 from arview.guideviews import GuideViewOptions, GuideViewSet
+from arview.guideviews.cache import cached_guide_views
 from arview.reconstruction.scale.edges import linear_light
 from arview.reconstruction.scale.refine import Fit, JointRefiner, RefineOptions, Support, View
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.vote import Sighting, Vote, vote
 from arview.reconstruction.types import PosedPhoto
-from arview.tracking import Detector
-from arview.tracking.threads import pool
 
 Pixels = NDArray[np.uint8]
 Progress = Callable[[str, int, int], None]
@@ -190,8 +190,8 @@ def _search(
     progress: Progress | None,
 ) -> tuple[list[Vote], Array, NotFound]:
     """Votes of the detections, turns (N,3,3) that make the part look much the same, and why not when no vote."""
-    from arview.tracking.detector import options_for
-    from arview.tracking.why_not import why_not
+    from arview.detection.detector import options_for
+    from arview.tracking.diagnosis import why_not
 
     detectors: dict[tuple[float, ...], Detector] = {}
     sightings: list[Sighting] = []

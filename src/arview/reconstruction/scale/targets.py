@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.parallel import pool
 from arview.geometry import Array
 from arview.reconstruction.scale.edges import choose_steps, find_steps, linear_light
 from arview.reconstruction.scale.similarity import fit_points
 from arview.reconstruction.scale.specs import Board, Rig, ScaleBar, ScaleSources, Tags
 from arview.reconstruction.scale.types import ScaleEvidence
 from arview.reconstruction.types import PosedPhoto
-from arview.tracking.threads import pool
 
 Key = tuple[str, int, int]
 """A corner: what it is on (``board 0``, or a dictionary), its id there, and which corner of a tag."""

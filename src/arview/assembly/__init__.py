@@ -1,0 +1,1 @@
+"""Assembly: is every component where the CAD has it."""

@@ -1,0 +1,132 @@
+"""Writing a camera in every format that ``camera_files`` reads."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arview.camera.model import Camera
+from arview.core.atomic import replacing
+from arview.errors import InputError, OutputError
+
+_COLMAP_HALF_PX = 0.5  # COLMAP puts (0, 0) on the corner of the first pixel, arview on its centre
+
+
+def write_camera(
+    camera: Camera, path: str | Path, kind: str | None = None, extra: dict[str, Any] | None = None
+) -> None:
+    """Write a camera file, which appears complete or not at all.
+
+    Args:
+        camera: to write.
+        path: of the file.
+        kind: one of FORMATS; None goes by the name: ``.json`` arview, ``.txt`` COLMAP, ``.xml`` and ``.yaml`` OpenCV.
+        extra: objects to put beside the numbers; arview's own format alone has room for them.
+
+    Raises:
+        InputError: an unknown format or name.
+        OutputError: the file cannot be written.
+    """
+    path = Path(path)
+    kind = kind or format_of(path)
+    if kind not in FORMATS:
+        raise InputError(f"camera format {kind!r}: expected one of {', '.join(FORMATS)}")
+    text = _arview(camera, extra) if kind == "arview" else FORMATS[kind](camera)
+    try:
+        with replacing(path) as file:
+            file.write(text.encode())
+    except OSError as error:
+        raise OutputError(f"{path}: cannot write the camera file: {error.strerror or error}") from error
+
+
+def format_of(path: Path) -> str:
+    """The format that a file name stands for. Raises InputError when none does."""
+    kinds = {".json": "arview", ".txt": "colmap", ".xml": "opencv-xml", ".yaml": "opencv", ".yml": "opencv"}
+    kind = kinds.get(path.suffix.lower())
+    if kind is None:
+        raise InputError(f"{path}: expected .json, .yaml, .xml or .txt, or FORMAT:FILE with {', '.join(FORMATS)}")
+    return kind
+
+
+def holds_distortion(kind: str) -> bool:
+    """Whether a format says how the lens distorts; BOP's is for undistorted pictures."""
+    return kind != "bop"
+
+
+def _arview(camera: Camera, extra: dict[str, Any] | None = None) -> str:
+    record = {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": float(camera.fx),
+        "fy": float(camera.fy),
+        "cx": float(camera.cx),
+        "cy": float(camera.cy),
+        "dist": [float(value) for value in camera.dist],
+        **(extra or {}),
+    }
+    return json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _bop(camera: Camera) -> str:
+    record = {"cx": float(camera.cx), "cy": float(camera.cy), "depth_scale": 1.0, "fx": float(camera.fx),
+              "fy": float(camera.fy), "height": camera.height, "width": camera.width}  # fmt: skip
+    return json.dumps(record, indent=2) + "\n"
+
+
+def _opencv(suffix: str) -> Callable[[Camera], str]:
+    def text(camera: Camera) -> str:
+        import cv2
+
+        file = cv2.FileStorage(suffix, cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+        file.write("image_width", camera.width)
+        file.write("image_height", camera.height)
+        file.write("camera_matrix", camera.matrix)
+        file.write("distortion_coefficients", np.asarray(camera.dist).reshape(1, 5))
+        return str(file.releaseAndGetString())
+
+    return text
+
+
+def _ros(camera: Camera) -> str:
+    """``camera_info`` as camera_calibration_parsers reads it."""
+    projection = np.hstack([camera.matrix, np.zeros((3, 1))])
+
+    def matrix(name: str, values: Any, rows: int, columns: int) -> str:
+        numbers = ", ".join(repr(float(value)) for value in np.asarray(values).ravel())
+        return f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: [{numbers}]\n"
+
+    return (
+        f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: camera\n"
+        + matrix("camera_matrix", camera.matrix, 3, 3)
+        + "distortion_model: plumb_bob\n"
+        + matrix("distortion_coefficients", camera.dist, 1, 5)
+        + matrix("rectification_matrix", np.eye(3), 3, 3)
+        + matrix("projection_matrix", projection, 3, 4)
+    )
+
+
+def _colmap(camera: Camera) -> str:
+    k1, k2, p1, p2, k3 = (float(value) for value in camera.dist)
+    model = "PINHOLE"
+    terms: list[float] = []
+    if camera.is_distorted:
+        model, terms = ("FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]) if k3 else ("OPENCV", [k1, k2, p1, p2])
+    numbers = [camera.fx, camera.fy, camera.cx + _COLMAP_HALF_PX, camera.cy + _COLMAP_HALF_PX, *terms]
+    line = " ".join(repr(float(value)) for value in numbers)
+    return f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {model} {camera.width} {camera.height} {line}\n"
+
+
+FORMATS: dict[str, Callable[[Camera], str]] = {
+    "arview": _arview,
+    "bop": _bop,
+    "opencv": _opencv(".yaml"),
+    "opencv-xml": _opencv(".xml"),
+    "opencv-json": _opencv(".json"),
+    "ros": _ros,
+    "colmap": _colmap,
+}
+"""Text of a camera by format."""

@@ -1,0 +1,1 @@
+"""Networks and rankers that score poses of a picture."""

@@ -1,0 +1,1 @@
+"""Searches for rough poses: templates everywhere, pattern search, refinement around the best."""

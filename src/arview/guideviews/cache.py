@@ -1,0 +1,65 @@
+"""Guide views made once per model and range, and kept in the user's cache folder."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+
+from arview import __version__
+from arview.cad.model import Model
+from arview.cad.view_range import ViewRange
+from arview.errors import ArviewError
+from arview.guideviews import GuideViewOptions, GuideViewSet, load_guide_views, make_guide_views
+
+
+def cache_folder() -> Path:
+    """``$ARVIEW_CACHE``, or ``arview`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
+    own = os.environ.get("ARVIEW_CACHE")
+    if own:
+        return Path(own)
+    shared = os.environ.get("XDG_CACHE_HOME")
+    return (Path(shared) if shared else Path.home() / ".cache") / "arview"
+
+
+def cached_path(model: Model, view_range: ViewRange, options: GuideViewOptions) -> Path:
+    """Where the set of a model, range and options lies; another arview has another place."""
+    key = repr((model.source_hash, asdict(view_range), asdict(options), __version__, _code_hash()))
+    name = f"{model.source_hash[:12]}-{hashlib.sha256(key.encode()).hexdigest()[:16]}.guideviews"
+    return cache_folder() / "guideviews" / name
+
+
+def cached_guide_views(
+    model: Model,
+    view_range: ViewRange,
+    options: GuideViewOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> GuideViewSet:
+    """The set from the cache, or made now and put there; see `make_guide_views` for arguments and errors.
+
+    A damaged file is made anew, and a cache that cannot be written to is done without.
+    """
+    options = options or GuideViewOptions()
+    path = cached_path(model, view_range, options)
+    if path.is_file():
+        try:
+            return load_guide_views(path, model)
+        except ArviewError:
+            pass
+    views = make_guide_views(model, view_range, options, progress)
+    try:
+        views.save(path)
+    except ArviewError:
+        return views
+    return load_guide_views(path, model)
+
+
+@cache
+def _code_hash() -> str:
+    """Hash of the code that makes guide views, so that a changed arview does not take old ones."""
+    here = Path(__file__).parent
+    files = [*sorted(here.glob("*.py")), *sorted((here.parent / "rendering").glob("*.py"))]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

@@ -1,0 +1,1 @@
+"""Measurement in a dense cloud: registration to the CAD, deviations, foreign objects, distances."""

@@ -1,0 +1,444 @@
+"""Where components stand, from a dense cloud in the frame of the CAD: crop, registration, what is undetermined.
+
+The way of the dissertation (cloud and ICP), with the exact CAD surface instead of sampled points. Each component is
+registered twice: first all at their nominal places, then with the neighbours where they were found.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from arview.cad.model import Component, Model
+from arview.cad.part import Part
+from arview.errors import InputError
+from arview.geometry import Array, apply, invert, rigid
+from arview.measurement.cloud.points import CloudPoints, prepare_cloud
+from arview.measurement.cloud.registration import (
+    Registration,
+    RegistrationOptions,
+    move_about,
+    register_from_starts,
+    register_to_surface,
+    twist_about,
+)
+from arview.measurement.cloud.surface import Surface
+from arview.measurement.cloud.visibility import Views
+from arview.measurement.types import Move, NotMeasured
+from arview.reconstruction.types import DenseCloud, PosedPhoto
+
+
+@dataclass(frozen=True)
+class CloudDeviationOptions:
+    """Options of measuring components in a cloud.
+
+    Attributes:
+        band_mm: how far from its nominal surface a component's points are looked for; larger displacements are not
+            found, much larger bands take in the neighbours.
+        grid_mm: cell of the grid that the cloud is averaged on: neighbouring points hold no more information.
+        joint_mm: points nearer to another component are left out: weld beads, and what belongs to that component.
+            Of a flat component at most a quarter of its height.
+        least_photos: a piece of surface counts as visible when so many photos see it; two make a point.
+        least_support: with less of its visible surface covered by points that fit, a component is not measured.
+        least_fitting: share of the points near it that must fit, or it is something else.
+        largest_noise_mm: with a larger spread of the residuals the points are no surface of this component.
+        doubt_width_mm: width of the kernel in a second fit; what it changes is added to the covariance.
+        largest_std_mm: moves known less well than this are undetermined.
+        missing_share: with less of the visible surface within the band of any point, there is no component.
+        least_points: of a component.
+        rival_cost: a second minimum whose cost is less than so many times the best one's is told in the notes.
+        registration: of the solver.
+    """
+
+    band_mm: float = 5.0
+    grid_mm: float = 0.5
+    joint_mm: float = 2.0
+    least_photos: int = 2
+    least_support: float = 0.45
+    least_fitting: float = 0.7
+    largest_noise_mm: float = 0.7
+    doubt_width_mm: float = 0.4
+    largest_std_mm: float = 0.5
+    missing_share: float = 0.2
+    least_points: int = 60
+    rival_cost: float = 1.5
+    registration: RegistrationOptions = field(
+        default_factory=lambda: RegistrationOptions(least_width_mm=0.1, threshold_mm=1e-3, threshold_deg=1e-3)
+    )
+
+    def __post_init__(self) -> None:
+        if not (self.band_mm > 0 and self.grid_mm >= 0 and self.joint_mm >= 0):
+            raise InputError("cloud measurement: band, grid and joint must be positive")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A component, what of it can be seen, and what is around it.
+
+    Attributes:
+        component, surface: at nominal.
+        others: the components within reach of it, or None.
+        samples: (S,3) evenly on what the photos can see of it; contact: (C,3) on where it touches others.
+        usable_faces: (F,) faces that the photos can see.
+        spins: (K,6) moves about the centre, rotations scaled by ``radius_mm``, that change nothing about its shape.
+        joint_mm: see CloudDeviationOptions.
+    """
+
+    component: Component
+    surface: Surface
+    others: Surface | None
+    samples: Array
+    contact: Array
+    usable_faces: NDArray[np.bool_]
+    spins: Array
+    joint_mm: float
+
+    @property
+    def center(self) -> Array:
+        """(3,) middle of the bounding box, mm."""
+        return self.component.bounds_in_model.mean(axis=0)
+
+    @property
+    def radius_mm(self) -> float:
+        """Half the diagonal of the bounding box."""
+        return 0.5 * float(np.linalg.norm(np.ptp(self.component.bounds_in_model, axis=0)))
+
+
+def measure_components_in_cloud(
+    cloud: DenseCloud,
+    model: Model,
+    part: Part,
+    photos: Sequence[PosedPhoto] = (),
+    options: CloudDeviationOptions | None = None,
+    names: Sequence[str] | None = None,
+) -> list[Move | NotMeasured]:
+    """Moves of the components to be inspected, in the order of the model.
+
+    Args:
+        cloud: in the frame of the CAD, mm, after alignment to the datums.
+        model: nominal.
+        part: says what is inspected, and symmetries.
+        photos: with ``cam_from_scan`` in the same frame, for what could be seen; none: all but what touches others.
+        options: see CloudDeviationOptions.
+        names: of the components to measure; default: those to be inspected.
+
+    Raises:
+        InputError: the cloud is empty, far from the CAD, of another part, or mirrored.
+    """
+    o = options or CloudDeviationOptions()
+    box = model.bounds_in_model + np.array([[-o.band_mm], [o.band_mm]])
+    points = prepare_cloud(cloud, box, o.grid_mm, o.least_points)
+    check_belongs(points, model, o.band_mm)
+    views = Views(model, photos) if photos else None
+    # Threads of BLAS would wait for each other on matrices as small as these.
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
+        candidates = list(threads.map(lambda name: _candidate(name, model, part, views, o), names or part.inspected))
+        first = list(threads.map(lambda c: _measure(c, points, None, o), candidates))
+        places = {m.component: m.measured_from_nominal for m in first if isinstance(m, Move)}
+
+        def again(index: int) -> Move | NotMeasured:
+            c, found = candidates[index], first[index]
+            if not isinstance(found, Move) or not _is_crowded(c, model, first, o):
+                return found
+            moved = replace(c, others=_around(c.component, model, places, o))
+            return _measure(moved, points, found.nominal_from_measured, o)
+
+        second = list(threads.map(again, range(len(candidates))))
+        return list(threads.map(lambda i: _named(second[i], candidates[i], candidates, points, o), range(len(second))))
+
+
+def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:
+    """Raises InputError when few points are near the CAD, or many more when the cloud is mirrored."""
+    vertices, faces, _ = model.mesh
+    surface = Surface(vertices, faces)
+    few = points.points[:: max(1, len(points) // 6000)]
+    near = 0.2 * band_mm
+
+    def share(trial: Array) -> float:
+        distance = surface.closest(trial, near).faces
+        return float(np.mean(distance >= 0))
+
+    as_is = share(few)
+    center, mirrored = model.center_in_model, 0.0
+    for flip in (np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, 1.0])):
+        mirrored = max(mirrored, share((few - center) * flip + center))
+    if mirrored > as_is + 0.03 and 1.0 - mirrored < 0.5 * (1.0 - as_is):
+        raise InputError(
+            f"cloud: {100 * mirrored:.0f} % of it lies on the CAD when mirrored, {100 * as_is:.0f} % as it is: it is "
+            "left-handed, or the CAD is"
+        )
+    if as_is < 0.3:
+        raise InputError(
+            f"cloud: only {100 * as_is:.0f} % of it is within {near:g} mm of the CAD: another part, a wrong scale, or "
+            "not aligned"
+        )
+
+
+def spin_moves(component: Component, surface: Surface, part: Part | None, least_information: float = 1e-4) -> Array:
+    """(K,6) orthonormal moves about the middle of a component's box that leave its shape as it is.
+
+    Moves along which the whole surface slides in itself (Gelfand & Guibas, SGP 2004), and the continuous symmetry of
+    the part file. Rotations are scaled by half the diagonal of the box.
+    """
+    center = component.bounds_in_model.mean(axis=0)
+    radius_mm = 0.5 * float(np.linalg.norm(np.ptp(component.bounds_in_model, axis=0)))
+    samples, _ = surface.spread(3000)
+    normals = surface.closest(samples).normals
+    rows = np.hstack([np.cross(samples - center, normals) / radius_mm, normals])
+    values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
+    moves = vectors[:, values < least_information].T
+    known = part.component_settings(component.name).symmetry if part is not None else None
+    if known is not None and known.order is None:
+        axis = np.array(known.axis_in_model)
+        declared = np.concatenate([radius_mm * axis, np.cross(axis, center - np.array(known.through_in_model))])
+        moves = np.concatenate([moves, declared[None] / np.linalg.norm(declared)])
+    if len(moves) == 0:
+        return np.zeros((0, 6))
+    _, values, vectors = np.linalg.svd(moves, full_matrices=False)
+    return vectors[values > 0.1]
+
+
+def _candidate(
+    name: str, model: Model, part: Part | None, views: Views | None, o: CloudDeviationOptions
+) -> Candidate:  # fmt: skip
+    component = model.component(name)
+    surface = Surface(component.vertices_in_model, component.faces)
+    others = _around(component, model, {}, o)
+    spacing = max(o.grid_mm, 0.3, float(np.sqrt(surface.areas.sum() / 4000.0)))
+    spread, of_face = surface.sample(spacing)
+    tried = np.concatenate([spread, surface.triangles.mean(axis=1)])
+    faces = np.concatenate([of_face, np.arange(len(surface.faces))])
+    to_others = np.full(len(tried), np.inf)
+    if others is not None:
+        closest = others.closest(tried, 10.0 * max(o.joint_mm, 1.0))
+        to_others = np.where(closest.faces >= 0, np.abs(closest.distances), np.inf)
+    touches = to_others < 0.2
+    seen = ~touches
+    if views is not None:
+        seen &= views.count(tried, surface.face_normals[faces]) >= o.least_photos
+    height = float(np.max(to_others[np.isfinite(to_others)], initial=0.0)) if others is not None else np.inf
+    joint = min(o.joint_mm, 0.25 * height)
+    usable = np.zeros(len(surface.faces), dtype=bool)
+    usable[faces[seen]] = True
+    is_spread = np.arange(len(tried)) < len(spread)
+    return Candidate(
+        component, surface, others, tried[is_spread & seen & (to_others > joint)], tried[is_spread & touches], usable,
+        spin_moves(component, surface, part), joint,
+    )  # fmt: skip
+
+
+def _around(component: Component, model: Model, places: dict[str, Array], o: CloudDeviationOptions) -> Surface | None:
+    """The surface of the components near one, each at its place or nominal."""
+    reach = 2.0 * o.band_mm + o.joint_mm
+    low, high = component.bounds_in_model[0] - reach, component.bounds_in_model[1] + reach
+    vertices, faces, groups, offset = [], [], [], 0
+    for index, other in enumerate(model.components):
+        if other.name == component.name:
+            continue
+        bounds = other.bounds_in_model
+        if (bounds[1] < low).any() or (bounds[0] > high).any():
+            continue
+        at = other.vertices_in_model
+        vertices.append(apply(places[other.name], at) if other.name in places else at)
+        faces.append(other.faces + offset)
+        groups.append(np.full(len(other.faces), index))
+        offset += len(at)
+    if not vertices:
+        return None
+    return Surface(np.concatenate(vertices), np.concatenate(faces), np.concatenate(groups))
+
+
+def _is_crowded(c: Candidate, model: Model, found: Sequence[Move | NotMeasured], o: CloudDeviationOptions) -> bool:
+    """Whether a neighbour stands so far from nominal that other points are left out on its account."""
+    low, high = c.component.bounds_in_model
+    for one in found:
+        if not isinstance(one, Move) or one.component == c.component.name:
+            continue
+        corners = model.component(one.component).bounds_in_model
+        reach = 2.0 * o.band_mm + o.joint_mm
+        is_near = bool((corners[1] > low - reach).all() and (corners[0] < high + reach).all())
+        if is_near and np.linalg.norm(one.twist * ([one.radius_mm] * 3 + [1.0] * 3)) > 0.1 * o.joint_mm:
+            return True
+    return False
+
+
+def _measure(c: Candidate, cloud: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Move | NotMeasured:
+    """Move of one component, or why there is none; ``start`` is nominal_from_measured (4,4), None tries several."""
+    name = c.component.name
+    if len(c.samples) == 0:
+        return NotMeasured(name, "cloud", "none of its surface can be seen in the photos")
+    near, own = _crop(c, cloud, o)
+    missing = _missing(c, near, own, o)
+    if missing is not None:
+        return missing
+    if len(own) < o.least_points:
+        return NotMeasured(name, "cloud", f"only {len(own)} points of it in the cloud; {o.least_points} are needed")
+    try:
+        fit = _register(c, own, start, o)
+    except InputError as error:
+        return NotMeasured(name, "cloud", str(error).removeprefix("registration: "))
+    support = _covered(apply(invert(fit.surface_from_points), c.samples), own.points, max(1.0, 2.0 * o.grid_mm), fit)
+    fitting = float(np.mean(fit.weights > 0.1))
+    found = f"{100 * support:.0f} % of its visible surface found, {100 * fitting:.0f} % of the points there fit it"
+    if fit.sigma_mm > o.largest_noise_mm or (support < o.least_support and fitting < o.least_fitting):
+        reason = (
+            "what stands there does not have its shape: fallen over, bent, another component, or badly reconstructed"
+        )
+        return NotMeasured(name, "cloud", f"{reason} ({found}, residuals {fit.sigma_mm:.2f} mm)")
+    if support < o.least_support:
+        return NotMeasured(name, "cloud", f"too little of it is where it should be: fallen over, or hidden ({found})")
+    return _move(c, fit, support, o)
+
+
+def _crop(c: Candidate, cloud: CloudPoints, o: CloudDeviationOptions) -> tuple[CloudPoints, CloudPoints]:
+    """Points in the component's surroundings, and those that may be its own."""
+    low, high = c.component.bounds_in_model[0] - o.band_mm, c.component.bounds_in_model[1] + o.band_mm
+    near = cloud.only(np.all((cloud.points >= low) & (cloud.points <= high), axis=1))
+    is_own = c.surface.closest(near.points, o.band_mm).faces >= 0
+    if c.others is not None:
+        is_own &= c.others.closest(near.points, c.joint_mm).faces < 0
+    return near, near.only(is_own)
+
+
+def _missing(c: Candidate, near: CloudPoints, own: CloudPoints, o: CloudDeviationOptions) -> NotMeasured | None:
+    """The verdict missing, or not covered, when hardly any point is where the component should be."""
+    if _covered(c.samples, own.points, o.band_mm) >= o.missing_share and len(own) >= o.least_points // 3:
+        return None
+    name = c.component.name
+    # Where it stands on others, those can only be seen when it is not there.
+    behind = _covered(c.contact, near.points, max(1.0, 2.0 * o.grid_mm)) if len(c.contact) else 0.0
+    if behind > 0.4:
+        return NotMeasured(
+            name, "cloud", f"missing: no surface where it should be, and {100 * behind:.0f} % of what it would cover "
+            "is seen", is_missing=True,
+        )  # fmt: skip
+    return NotMeasured(name, "cloud", f"not covered by the cloud: {len(own)} points near its place")
+
+
+def _covered(samples: Array, points: Array, reach_mm: float, fit: Registration | None = None) -> float:
+    """Share of samples with a point (of those that the fit used) within reach."""
+    from scipy.spatial import cKDTree
+
+    if fit is not None:
+        points = points[fit.weights > 0.1]
+    if len(points) == 0 or len(samples) == 0:
+        return 0.0
+    distance, _ = cKDTree(points).query(samples, distance_upper_bound=reach_mm)
+    return float(np.mean(np.isfinite(distance)))
+
+
+def _register(c: Candidate, own: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Registration:
+    """The component's points on its surface: undetermined moves are left out one after the other."""
+    radius, scales = c.radius_mm, np.array([c.radius_mm] * 3 + [1.0] * 3)
+    options = replace(o.registration, first_distance_mm=o.band_mm, least_points=min(o.least_points, 50))
+    given: dict[str, Any] = {"center": c.center, "radius_mm": radius, "usable_faces": c.usable_faces}
+    fixed = c.spins
+    starts = _starts(c.center, radius, o.band_mm) if start is None else [start]
+    for _ in range(6):
+        free = _rest(fixed) / scales
+        fit = register_from_starts(
+            own.points, c.surface, starts, normals=own.normals, point_weights=1.0 / own.sigma**2, options=options,
+            free=free, **given,
+        )  # fmt: skip
+        values, vectors = np.linalg.eigh(fit.covariance * np.outer(scales, scales))
+        loose = vectors[:, values > o.largest_std_mm**2].T
+        unknown = np.concatenate([fit.undetermined, loose])
+        if len(unknown) == 0:
+            break
+        fixed = np.concatenate([fixed, unknown])
+        if len(fixed) >= 6:
+            raise InputError("registration: the points determine no move of it")
+    # What the choice of the kernel does to the result is part of what is not known.
+    wide = replace(options, least_width_mm=o.doubt_width_mm, noise_points=0)
+    other = register_to_surface(
+        own.points, c.surface, fit.surface_from_points, normals=own.normals, point_weights=1.0 / own.sigma**2,
+        options=wide, free=free, **given,
+    )  # fmt: skip
+    doubt = other.twist - fit.twist
+    return replace(fit, covariance=fit.covariance + np.outer(doubt, doubt))
+
+
+def _starts(center: Array, radius: float, band_mm: float) -> list[Array]:
+    """No move, and half the band along each axis with a turn about the next one, both ways."""
+    twists = [np.zeros(6)]
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            twist = np.zeros(6)
+            twist[3 + axis], twist[(axis + 1) % 3] = 0.5 * sign * band_mm, 0.5 * sign * min(band_mm / radius, 0.2)
+            twists.append(twist)
+    return [move_about(center, twist) for twist in twists]
+
+
+def _rest(fixed: Array) -> Array:
+    """(6−K,6) orthonormal basis of the moves that are not fixed."""
+    if len(fixed) == 0:
+        return np.eye(6)
+    _, values, vectors = np.linalg.svd(fixed, full_matrices=True)
+    return vectors[int(np.count_nonzero(values > 1e-6)) :]
+
+
+def _move(c: Candidate, fit: Registration, support: float, o: CloudDeviationOptions) -> Move:
+    """The registration as a move, with what speaks against it."""
+    scales = np.array([c.radius_mm] * 3 + [1.0] * 3)
+    undetermined = _rest(fit.free)
+    determined = np.eye(6) - undetermined.T @ undetermined
+    twist = determined @ (twist_about(c.center, invert(fit.surface_from_points)) * scales) / scales
+    covariance = determined @ (fit.covariance * np.outer(scales, scales)) @ determined / np.outer(scales, scales)
+    notes = []
+    if not fit.converged:
+        notes.append(f"did not converge in {fit.iterations} iterations")
+    if fit.runner_up is not None and fit.runner_up_cost is not None and fit.runner_up_cost < o.rival_cost:
+        other = twist_about(c.center, invert(fit.runner_up))[3:]
+        notes.append(
+            f"fits nearly as well {np.linalg.norm(other - twist[3:]):.2f} mm from there (cost × "
+            f"{fit.runner_up_cost:.2f})"
+        )
+    if np.linalg.norm(twist[3:]) > 0.9 * o.band_mm:
+        notes.append(f"at the end of the band of {o.band_mm:g} mm that was searched")
+    if support < 0.6:
+        notes.append(f"only {100 * support:.0f} % of its visible surface is in the cloud")
+    return Move(
+        component=c.component.name, method="cloud", center_in_model=c.center, twist=twist, covariance=covariance,
+        undetermined=undetermined, radius_mm=c.radius_mm, used=int(np.count_nonzero(fit.weights > 0.1)),
+        residual_mm=fit.sigma_mm, support=support, notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _named(
+    found: Move | NotMeasured, c: Candidate, all_of_them: Sequence[Candidate], cloud: CloudPoints,
+    o: CloudDeviationOptions,
+) -> Move | NotMeasured:  # fmt: skip
+    """A component that did not fit, with the name of another whose shape does: the two were swapped."""
+    if isinstance(found, Move) or found.is_missing or "shape" not in found.reason or c.others is None:
+        return found
+    foot = c.others.closest(c.center[None]).points[0]
+    tried = [c]
+    for other in all_of_them:
+        if other.others is None or any(_same_shape(other, done) for done in tried):
+            continue
+        tried.append(other)
+        there = rigid(np.eye(3), foot - other.others.closest(other.center[None]).points[0])
+        vertices = apply(there, other.component.vertices_in_model)
+        trial = replace(
+            other, component=Component(c.component.name, vertices, other.component.faces), others=c.others,
+            surface=Surface(vertices, other.component.faces), samples=apply(there, other.samples),
+            contact=apply(there, other.contact),
+        )  # fmt: skip
+        if isinstance(_measure(trial, cloud, np.eye(4), o), Move):
+            return replace(found, reason=f"{found.reason}; it has the shape of {other.component.name}: swapped?")
+    return found
+
+
+def _same_shape(a: Candidate, b: Candidate) -> bool:
+    sizes = [np.sort(np.ptp(c.component.bounds_in_model, axis=0)) for c in (a, b)]
+    return (
+        bool(np.allclose(sizes[0], sizes[1], atol=0.1))
+        and abs(a.surface.areas.sum() / b.surface.areas.sum() - 1.0) < 0.01
+    )

@@ -1,0 +1,104 @@
+"""Foreign objects: surfaces in the cloud that belong to nothing in the CAD."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from arview.cad.model import Model
+from arview.geometry import Array, apply
+from arview.measurement.cloud.points import prepare_cloud
+from arview.measurement.cloud.surface import Surface
+from arview.reconstruction.types import DenseCloud
+
+
+@dataclass(frozen=True)
+class ForeignOptions:
+    """Options of the search.
+
+    Attributes:
+        far_mm: points nearer to the CAD (measured components at their places) belong to it, or are weld.
+        cell_mm: points in touching cells of this size are one object.
+        least_area_mm2: smaller ones are spatter or wrong points.
+        grid_mm: of the averaging, see `CloudDeviationOptions`.
+    """
+
+    far_mm: float = 4.0
+    cell_mm: float = 2.0
+    least_area_mm2: float = 40.0
+    grid_mm: float = 0.5
+
+
+@dataclass(frozen=True)
+class ForeignObject:
+    """A surface that is in no CAD: middle (3,) and extent (3,) of its box in the model frame, mm, and its area."""
+
+    center_in_model: Array
+    size_mm: Array
+    area_mm2: float
+    nearest_component: str
+    distance_mm: float
+
+    def describe(self) -> str:
+        """One line for the report."""
+        x, y, z = self.center_in_model
+        a, b, c = self.size_mm
+        return (
+            f"foreign object at ({x:.1f}, {y:.1f}, {z:.1f}) mm, {a:.0f} × {b:.0f} × {c:.0f} mm, up to "
+            f"{self.distance_mm:.1f} mm from {self.nearest_component}"
+        )
+
+
+def find_foreign(
+    cloud: DenseCloud, model: Model, places: Mapping[str, Array] | None = None, unknown: Sequence[str] = (),
+    options: ForeignOptions | None = None,
+) -> list[ForeignObject]:  # fmt: skip
+    """Objects inside the model's box that are far from all of its surfaces, the largest first.
+
+    Args:
+        cloud: in the frame of the CAD, mm.
+        model: nominal.
+        places: (4,4) ``measured_from_nominal`` by component, so that displaced ones are no foreign objects.
+        unknown: components that are there but could not be measured; around them nothing is said.
+        options: see ForeignOptions.
+
+    Raises:
+        InputError: the cloud has no points there.
+    """
+    from scipy.ndimage import label
+
+    o = options or ForeignOptions()
+    # What lies below the part and around it shows at the rim of its box.
+    points = prepare_cloud(cloud, model.bounds_in_model + np.array([[o.far_mm], [-o.far_mm]]), o.grid_mm, 1).points
+    places = places or {}
+    _, faces, groups = model.mesh
+    parts = [apply(places.get(c.name, np.eye(4)), c.vertices_in_model) for c in model.components]
+    surface = Surface(np.concatenate(parts), faces, groups)
+    far = points[surface.closest(points, o.far_mm).faces < 0]
+    for name in unknown:
+        low, high = model.component(name).bounds_in_model
+        reach = float(np.linalg.norm(high - low))
+        far = far[~np.all((far > low - reach) & (far < high + reach), axis=1)]
+    if len(far) == 0:
+        return []
+    cell_mm = max(o.cell_mm, model.diameter_mm / 400.0)
+    cell = np.floor((far - far.min(axis=0)) / cell_mm).astype(np.int64)
+    filled = np.zeros(cell.max(axis=0) + 1, dtype=bool)
+    filled[tuple(cell.T)] = True
+    of_cell, count = label(filled, np.ones((3, 3, 3)))
+    owner = of_cell[tuple(cell.T)]
+    found = []
+    for index in range(1, count + 1):
+        mine = far[owner == index]
+        area = len(mine) * o.grid_mm**2
+        if area < o.least_area_mm2:
+            continue
+        closest = surface.closest(mine)
+        farthest = int(np.argmax(np.abs(closest.distances)))
+        name = model.components[int(groups[closest.faces[farthest]])].name
+        low, high = mine.min(axis=0), mine.max(axis=0)
+        distance = float(np.abs(closest.distances[farthest]))
+        found.append(ForeignObject(0.5 * (low + high), high - low, area, name, distance))
+    return sorted(found, key=lambda item: -item.area_mm2)

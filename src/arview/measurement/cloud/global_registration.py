@@ -1,0 +1,255 @@
+"""Where the CAD is in a cloud of which nothing is known: its frame, and its scale if that is unknown too.
+
+Rotations are tried that turn a main direction of the cloud's normals onto one of the CAD's, all around it; for each
+the shift follows from a correlation of both as voxels (by FFT, as in Padfield, CVPR 2010). The best are refined on
+the exact surface, and how well all of the part then fits decides: symmetric wrong answers fit the base, but not the
+components.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from arview.cad.model import Model
+from arview.core.parallel import pool
+from arview.errors import InputError
+from arview.geometry import Array, apply, exp_so3, invert, rigid
+from arview.measurement.cloud.registration import TUKEY_SIGMAS
+from arview.measurement.cloud.surface import Surface
+from arview.reconstruction.scale.similarity import Similarity
+from arview.reconstruction.types import DenseCloud
+
+
+@dataclass(frozen=True)
+class GlobalOptions:
+    """Options of the search. ``diameter`` is the model's."""
+
+    points: int = 4000  # of cloud and CAD each; a few to each voxel
+    voxels: int = 40  # across the diameter: components are some voxels wide
+    step_deg: float = 6.0  # of the turns about a main direction; refining takes half of it
+    kept: int = 12  # poses that are refined and compared
+    scale_step: float = 1.08  # between scales that are tried when it is unknown
+    scale_range: tuple[float, float] = (0.7, 2.5)  # the part's size over the cloud's; more than 1: part of it is seen
+    limit_share: float = 0.015  # distances count up to this share of the diameter: displaced, or not the part
+    least_lead: float = 1.08  # cost of the next best place over the best one's, or it is ambiguous
+    seed: int = 0
+
+
+def find_model(
+    cloud: DenseCloud, model: Model, scale: float | None = 1.0, options: GlobalOptions | None = None
+) -> Similarity:
+    """The scale and rigid place ``model_from_scan`` of a cloud anywhere.
+
+    Args:
+        cloud: of the part and little else.
+        model: nominal.
+        scale: mm per unit of the cloud, None when it is unknown.
+        options: see GlobalOptions.
+
+    Raises:
+        InputError: too few points; two places that are no symmetry of the part fit alike; none fits.
+    """
+    o = options or GlobalOptions()
+    points, normals, is_oriented = _some_points(cloud, o)
+    vertices, faces, groups = model.mesh
+    surface = Surface(vertices, faces, groups)
+    samples, of_face = surface.spread(o.points, o.seed)
+    extent = float(np.linalg.norm(np.diff(np.quantile(points, [0.01, 0.99], axis=0), axis=0)))
+    scales = [scale] if scale else list(_ladder(model.diameter_mm / extent, o))
+    turns = _turns(normals, surface.face_normals[of_face], o)
+    places = [
+        job
+        for one in scales
+        for job in pool().map(lambda r, s=one: _shifted(points * s, samples, r, model, s, o), turns)
+    ]
+    places.sort(key=lambda place: -place[0])
+    limit_mm = o.limit_share * model.diameter_mm
+    # A thin plate fits with its top at its bottom too: starts to both sides.
+    step = 0.8 * model.diameter_mm / o.voxels * _main_axes(surface.face_normals[of_face], 1)[0]
+    tried = [(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _distinct(places, o) for k in (-1.0, 0.0, 1.0)]
+    sides = normals if is_oriented else None
+    fits = list(pool().map(lambda job: _refined(points, sides, surface, samples, job, scale is None, limit_mm), tried))
+    fits.sort(key=lambda fit: fit[0])
+    cost, found_scale, pose = fits[0]
+    around = _around(apply(pose, points * found_scale), samples, limit_mm)
+    cost -= around * limit_mm
+    if around > 0.7 or cost > 0.6 * limit_mm * (1.0 - around):
+        raise InputError("cloud: the part is not found in it: another part, or too little of it")
+    for rival_cost, _, rival in fits[1:]:
+        if rival_cost - around * limit_mm > o.least_lead * cost + 1e-3 * limit_mm:
+            break
+        moved = apply(rival @ invert(pose), samples)
+        other_mm = np.abs(surface.closest(moved).distances)
+        if np.mean(np.linalg.norm(moved - samples, axis=1)) > limit_mm and np.mean(other_mm) > 0.1 * limit_mm:
+            raise InputError(
+                "cloud: the part fits in two ways alike, and in none well: it is mirrored, another part, or shows too "
+                "little of what tells its sides apart"
+            )
+    return Similarity(found_scale, pose)
+
+
+def _some_points(cloud: DenseCloud, o: GlobalOptions) -> tuple[Array, Array, bool]:
+    """Points (N,3) spread evenly over a cloud, normals, and whether their side is known: else they are estimated."""
+    points, own = np.asarray(cloud.points, dtype=np.float64), np.asarray(cloud.normals, dtype=np.float64)
+    sound = np.isfinite(points).all(axis=1)
+    points, own = points[sound], np.nan_to_num(own[sound])
+    if len(points) < 200:
+        raise InputError(f"cloud: {len(points)} points are too few to find the part in it; at least 200 are needed")
+    rng = np.random.default_rng(o.seed)
+    if len(points) > 40 * o.points:
+        few = rng.permutation(len(points))[: 40 * o.points]
+        points, own = points[few], own[few]
+    low, high = np.quantile(points, [0.002, 0.998], axis=0)
+    core = np.all((points >= low - 0.05 * (high - low)) & (points <= high + 0.05 * (high - low)), axis=1)
+    points, own = points[core], own[core]
+    # As many cells as are wanted points: halve the cell until there are.
+    cell = float(np.linalg.norm(high - low)) / 20.0
+    for _ in range(12):
+        _, first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)
+        if len(first) >= 0.7 * o.points or len(first) > 0.5 * len(points):
+            break
+        cell *= 0.8
+    chosen = points[first]
+    if np.mean(np.linalg.norm(own, axis=1) > 0.5) > 0.9:
+        return chosen, own[first], True
+    _, near = cKDTree(points).query(chosen, k=min(16, len(points)))
+    around = points[near] - points[near].mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    return chosen, vectors[:, :, 0], False
+
+
+def _ladder(middle: float, o: GlobalOptions) -> Array:
+    low, high = o.scale_range
+    return np.asarray(middle * np.geomspace(low, high, int(np.log(high / low) / np.log(o.scale_step)) + 2))
+
+
+def _main_axes(normals: Array, most: int) -> list[Array]:
+    """Directions that most normals (N,3) have, with the sign that most of them have."""
+    left, found = normals[np.linalg.norm(normals, axis=1) > 0.5], []
+    for _ in range(most):
+        if len(left) < 0.03 * len(normals):
+            break
+        tried = left[:: max(1, len(left) // 400)]
+        close = np.abs(tried @ left.T) > np.cos(np.deg2rad(5.0))
+        best = close[np.argmax(close.sum(axis=1))]
+        if best.sum() < 0.04 * len(normals):
+            break
+        _, _, axes = np.linalg.svd(left[best], full_matrices=False)
+        found.append(axes[0] * (1.0 if np.mean(left[best] @ axes[0] > 0) >= 0.5 else -1.0))
+        left = left[np.abs(left @ axes[0]) < np.cos(np.deg2rad(15.0))]
+    return found or [np.array([0.0, 0.0, 1.0])]
+
+
+def _turns(of_cloud: Array, of_model: Array, o: GlobalOptions) -> list[Array]:
+    """Rotations (3,3) that turn the cloud's main direction onto one of the model's, either side, all around it."""
+    turns = []
+    angles = np.arange(0.0, 360.0, o.step_deg)
+    for target in _main_axes(of_model, 2):
+        for sign in (1.0, -1.0):
+            first = _between(sign * _main_axes(of_cloud, 1)[0], target)
+            turns += [exp_so3(np.deg2rad(angle) * target) @ first for angle in angles]
+    return turns
+
+
+def _between(a: Array, b: Array) -> Array:
+    """(3,3) the smallest rotation of one unit vector onto another."""
+    axis, cosine = np.cross(a, b), float(a @ b)
+    if np.linalg.norm(axis) < 1e-9:
+        across = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        return np.eye(3) if cosine > 0 else exp_so3(np.pi * across / np.linalg.norm(across))
+    return exp_so3(axis / np.linalg.norm(axis) * np.arctan2(np.linalg.norm(axis), cosine))
+
+
+def _shifted(
+    points: Array, samples: Array, turn: Array, model: Model, scale: float, o: GlobalOptions
+) -> tuple[float, float, Array]:
+    """How well turned points fit at their best shift: score, scale, pose (4,4) of the scaled points."""
+    from scipy import fft
+
+    turned = points @ turn.T
+    cell = max(model.diameter_mm / o.voxels, float(np.ptp(turned, axis=0).max()) / 90.0)
+    of_points, low = _voxels(turned, cell)
+    of_model, low_model = _voxels(samples, cell)
+    shape = [fft.next_fast_len(a + b, real=True) for a, b in zip(of_points.shape, of_model.shape, strict=True)]
+    spectrum = fft.rfftn(of_model, shape) * np.conj(fft.rfftn(of_points, shape))
+    score = fft.irfftn(spectrum, shape)
+    best = np.array(np.unravel_index(int(np.argmax(score)), score.shape))
+    best = np.where(best > np.array(of_model.shape), best - np.array(shape), best)
+    shift = low_model - low + best * cell
+    size = np.sqrt(float((of_points**2).sum()) * float((of_model**2).sum()))
+    return float(score.max()) / size, scale, rigid(turn, shift)
+
+
+def _voxels(points: Array, cell: float) -> tuple[Array, Array]:
+    """Occupied cells, blurred by one, and the corner of the first."""
+    from scipy.ndimage import gaussian_filter
+
+    low = points.min(axis=0) - 2.0 * cell
+    index = np.floor((points - low) / cell).astype(np.int64)
+    grid = np.zeros(index.max(axis=0) + 3)
+    grid[tuple(index.T)] = 1.0
+    return gaussian_filter(grid, 0.8), low
+
+
+def _distinct(places: list[tuple[float, float, Array]], o: GlobalOptions) -> list[tuple[float, float, Array]]:
+    """The best places that are not nearly one that is better."""
+    kept: list[tuple[float, float, Array]] = []
+    for score, scale, pose in places:
+        turns = [np.trace(other[:3, :3].T @ pose[:3, :3]) for _, s, other in kept if abs(s / scale - 1.0) < 0.04]
+        if all(turn < 1.0 + 2.0 * np.cos(np.deg2rad(2.5 * o.step_deg)) for turn in turns):
+            kept.append((score, scale, pose))
+        if len(kept) == o.kept:
+            break
+    return kept
+
+
+def _refined(
+    points: Array, normals: Array | None, surface: Surface, samples: Array, start: tuple[float, Array],
+    with_scale: bool, limit_mm: float,
+) -> tuple[float, float, Array]:  # fmt: skip
+    """Cost, scale and pose (4,4) on the exact surface: Gauss–Newton on seven numbers with Tukey's weights."""
+    scale, pose = start
+    width, size = 4.0 * limit_mm, 0.25 * float(np.linalg.norm(np.ptp(samples, axis=0)))
+    for _ in range(40):
+        moved = apply(pose, points * scale)
+        closest = surface.closest(moved, TUKEY_SIGMAS * width)
+        near = closest.faces >= 0
+        if normals is not None:
+            near &= np.sum(np.nan_to_num(closest.normals) * (normals @ pose[:3, :3].T), axis=1) > 0.3
+        if np.count_nonzero(near) < 50:
+            return np.inf, scale, pose
+        x, n, r = moved[near], closest.normals[near], closest.distances[near]
+        center = x.mean(axis=0)
+        rows = np.hstack([np.cross(x - center, n) / size, n, np.sum(n * (x - center), axis=1)[:, None] / size])
+        rows = rows if with_scale else rows[:, :6]
+        weights = (1.0 - np.minimum(np.abs(r) / (TUKEY_SIGMAS * width), 1.0) ** 2) ** 2
+        normal = (rows * weights[:, None]).T @ rows
+        step = -np.linalg.solve(normal + 1e-6 * np.trace(normal) * np.eye(len(normal)), (rows * weights[:, None]).T @ r)
+        grown = 1.0 + step[6] / size if with_scale else 1.0
+        turn = exp_so3(step[:3] / size)
+        pose = rigid(turn, center + step[3:6] - turn @ center) @ pose
+        if with_scale:
+            scale, about = scale * grown, pose[:3, :3].T @ (center - pose[:3, 3])
+            pose = rigid(pose[:3, :3], pose[:3, 3] + pose[:3, :3] @ about * (1.0 - grown))
+        if np.abs(step).max() < 1e-4 * size and width <= 0.05 * limit_mm:
+            break
+        width = max(0.6 * width, 0.05 * limit_mm)
+    # Both ways: points that have no surface, and surface that has no points. What lies around the part costs the same
+    # wherever it is.
+    moved = apply(pose, points * scale)
+    closest = surface.closest(moved)
+    of_points = np.minimum(np.abs(closest.distances), limit_mm)
+    if normals is not None:
+        of_points[np.sum(closest.normals * (normals @ pose[:3, :3].T), axis=1) < 0.0] = limit_mm
+    apart = cKDTree(moved).query(samples)[0]
+    to_points = np.clip(apart - 2.0 * np.median(apart), 0.0, limit_mm)  # less what lies between the points
+    return float(of_points.mean() + 0.3 * to_points.mean()), scale, pose
+
+
+def _around(points: Array, samples: Array, limit_mm: float) -> float:
+    """Share of points (N,3) outside the model's box: no part of it."""
+    low, high = samples.min(axis=0) - limit_mm, samples.max(axis=0) + limit_mm
+    return 1.0 - float(np.mean(np.all((points > low) & (points < high), axis=1)))

@@ -1,0 +1,414 @@
+"""Registration of points to the exact surface of a mesh: one solver, any set of free degrees of freedom.
+
+Gauss–Newton on the signed distances of the points to the surface, reweighted for robustness (Holland & Welsch 1977;
+Huber 1981). What moves are free is a subspace of the six; those that the points do not determine are found in the
+information matrix and left alone. The covariance of the result takes into account that neighbouring points err
+together (`arview.measurement.cloud.noise`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.errors import InputError
+from arview.geometry import Array, apply, exp_so3, log_so3, rigid
+from arview.measurement.cloud.noise import Noise, estimate_noise, spread_of_sum
+from arview.measurement.cloud.surface import Surface
+
+NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
+TUKEY_SIGMAS, HUBER_SIGMAS = 4.685, 1.345
+"""Where the kernels begin to doubt a residual: 95 % efficiency on Gaussian noise."""
+
+
+@dataclass(frozen=True)
+class RegistrationOptions:
+    """Options of the solver.
+
+    Attributes:
+        kernel: how residuals are weighed: ``tukey`` ignores outliers, ``huber`` only limits them, ``none`` is least
+            squares. Its width starts at the first distance and shrinks to the noise, or a face that is off by more
+            than the noise of the others would be taken for an outlier at once.
+        trim: share of the points, those with the largest residuals, that is left out in every iteration.
+        first_distance_mm: points farther from the surface than this are left out at first …
+        last_distance_mm: … and farther than this at last, unless the noise is larger.
+        distance_sigmas: the limit in widths of the kernel.
+        shrink: of that width from one iteration to the next, until it is that of the noise.
+        threshold_mm, threshold_deg: converged when the centre moves and the points turn less than this in a step.
+        most_iterations: the solver needs 4 to 15.
+        skips_edges: leaves out points whose closest point lies on an edge: with noise they pull to its outside.
+        least_normal_cosine: points with a normal that leans more against the surface's belong to another face.
+        least_information: moves with less information per point, in the unit of the best one's possible, are not
+            determined; turns are weighed with the size of the points' cloud.
+        least_points: fewer cannot tell a place from noise.
+        least_width_mm: of the kernel: a surface that is off by less is never left out as an outlier, however well the
+            rest fits.
+        noise_points: points that the noise is estimated from; 0 takes the points to err independently, which makes
+            the covariance far too small on real clouds.
+        seed: of the choice of those.
+    """
+
+    kernel: Literal["tukey", "huber", "none"] = "tukey"
+    trim: float = 0.0
+    first_distance_mm: float = 5.0
+    last_distance_mm: float = 0.2
+    distance_sigmas: float = 6.0
+    shrink: float = 1.0 / 3.0
+    threshold_mm: float = 1e-4
+    threshold_deg: float = 1e-4
+    most_iterations: int = 60
+    skips_edges: bool = True
+    least_normal_cosine: float = 0.5
+    least_information: float = 1e-4
+    least_points: int = 50
+    least_width_mm: float = 0.0
+    noise_points: int = 240
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kernel not in ("tukey", "huber", "none"):
+            raise InputError(f"registration: kernel {self.kernel!r}, expected tukey, huber or none")
+        if not 0.0 <= self.trim < 0.9:
+            raise InputError(f"registration: trim {self.trim} must be at least 0 and below 0.9")
+        if not 0.0 < self.last_distance_mm <= self.first_distance_mm:
+            raise InputError(
+                f"registration: distances {self.first_distance_mm} … {self.last_distance_mm} mm must be positive and "
+                "shrink"
+            )
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Where points lie relative to a surface.
+
+    Attributes:
+        surface_from_points: (4,4), mm.
+        twist: (6,) the same as rotation vector (rad) and shift (mm) of the centre: x → R (x − c) + c + t.
+        center: (3,) mm, c.
+        radius_mm: length that rotations are weighed with where directions of moves are compared.
+        free: (K,6) orthonormal directions, rotations scaled by ``radius_mm``, that were solved for.
+        undetermined: (M,6) the same, of those free ones that the points do not determine: nothing moved along them.
+        information: (6,6) of ``twist``: JᵀWJ in points per rad² and mm²; divided by ``sigma_mm``² it is the inverse
+            of the naive covariance.
+        covariance: (6,6) of ``twist`` with the correlation of the noise; zero along what was not solved.
+        noise: of the residuals.
+        residuals: (N,) mm, signed; NaN for points without a surface in reach.
+        weights: (N,) 0–1 of the last iteration.
+        rms_mm: weighted root mean square of the residuals.
+        sigma_mm: robust standard deviation of those within reach.
+        overlap: share of the points with a weight above one half.
+        iterations, converged: of the solver.
+        runner_up: next best minimum that was found from other starts, or None.
+        runner_up_cost: its cost in units of the best one's: near 1 makes the result ambiguous.
+    """
+
+    surface_from_points: Array
+    twist: Array
+    center: Array
+    radius_mm: float
+    free: Array
+    undetermined: Array
+    information: Array
+    covariance: Array
+    noise: Noise
+    residuals: Array
+    weights: Array
+    rms_mm: float
+    sigma_mm: float
+    overlap: float
+    iterations: int
+    converged: bool
+    runner_up: Array | None = None
+    runner_up_cost: float | None = None
+
+    @property
+    def naive_covariance(self) -> Array:
+        """(6,6) as if all points erred independently: far too small on real clouds; for comparison."""
+        basis = _determined(self.free, self.undetermined) * _scales(self.radius_mm)
+        return basis.T @ np.linalg.inv(basis @ self.information @ basis.T) @ basis * self.sigma_mm**2
+
+
+def degrees_of_freedom(names: str, axes: Array | None = None) -> Array:
+    """(K,6) directions of moves for names like ``"rz tx ty"``, about and along ``axes`` (3,3), rows; default XYZ.
+
+    Raises:
+        InputError: an unknown name, or none.
+    """
+    axes = np.eye(3) if axes is None else axes
+    rows = []
+    for name in names.split():
+        if name not in NAMES:
+            raise InputError(f"degrees of freedom: {name!r} is none of {' '.join(NAMES)}")
+        row = np.zeros((2, 3))
+        row[NAMES.index(name) // 3] = axes[NAMES.index(name) % 3]
+        rows.append(row.ravel())
+    if not rows:
+        raise InputError("degrees of freedom: none is free; there is nothing to register")
+    return np.array(rows)
+
+
+def move_about(center: Array, twist: Array) -> Array:
+    """(4,4) of a twist (rotation vector in rad, shift in mm) about a centre: x → R (x − c) + c + t."""
+    rotation = exp_so3(twist[:3])
+    return rigid(rotation, center - rotation @ center + twist[3:])
+
+
+def twist_about(center: Array, b_from_a: Array) -> Array:
+    """(6,) inverse of `move_about`."""
+    return np.concatenate([log_so3(b_from_a[:3, :3]), apply(b_from_a, center) - center])
+
+
+def register_to_surface(
+    points: Array,
+    surface: Surface,
+    start: Array | None = None,
+    center: Array | None = None,
+    free: Array | None = None,
+    radius_mm: float | None = None,
+    point_weights: Array | None = None,
+    normals: Array | None = None,
+    usable_faces: NDArray[np.bool_] | None = None,
+    options: RegistrationOptions | None = None,
+) -> Registration:
+    """Move points onto a surface.
+
+    Args:
+        points: (N,3), mm.
+        surface: the reference.
+        start: (4,4) first guess of ``surface_from_points``; default: none.
+        center: (3,) in the frame of the surface, about which the free moves turn; default: middle of the points.
+        free: (K,6) moves (rotation vector, shift) that are allowed, see `degrees_of_freedom`; default: all.
+            Finite turns about two axes leave their subspace in second order.
+        radius_mm: that rotations are weighed with; default: root mean square distance of the points to the centre.
+        point_weights: (N,) inverse variances; only their ratios count. Residuals are judged in units of these.
+        normals: (N,3) of the points, to keep them to faces that look the same way; zeros where unknown.
+        usable_faces: (F,) False for faces that cannot have been seen: points nearest to those do not count.
+        options: see RegistrationOptions.
+
+    Raises:
+        InputError: too few points, a NaN, or no point within reach of the surface.
+    """
+    o = options or RegistrationOptions()
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < o.least_points:
+        raise InputError(f"registration: {len(points)} points are too few to place a surface; {o.least_points} needed")
+    if not np.isfinite(points).all():
+        bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
+        raise InputError(f"registration: {bad} of {len(points)} points are NaN or infinite; leave them out first")
+    pose = np.eye(4) if start is None else np.asarray(start, dtype=np.float64)
+    base = (
+        np.ones(len(points)) if point_weights is None else np.clip(point_weights / np.median(point_weights), 0.04, 25.0)
+    )
+    center = apply(pose, points).mean(axis=0) if center is None else np.asarray(center, dtype=np.float64)
+    radius = radius_mm or float(np.sqrt(np.mean(np.sum((apply(pose, points) - center) ** 2, axis=1)))) or 1.0
+    scales = _scales(radius)
+    basis = np.eye(6) if free is None else _orthonormal(free / scales)
+    width, hint, converged = o.first_distance_mm / o.distance_sigmas, None, False
+    iterations = 0
+    while iterations < o.most_iterations:
+        iterations += 1
+        system = _measure(points, normals, base, surface, usable_faces, pose, center, radius, basis, width, hint, o)
+        step = -(system.vectors / system.values) @ (system.vectors.T @ (basis @ system.gradient))
+        twist = (basis.T @ step) * scales
+        pose = move_about(center, twist) @ pose
+        hint = system.faces
+        turned_deg = float(np.rad2deg(np.linalg.norm(twist[:3])))
+        is_narrow = width <= max(system.sigma, o.least_width_mm, o.last_distance_mm / o.distance_sigmas)
+        if is_narrow and np.linalg.norm(twist[3:]) < o.threshold_mm and turned_deg < o.threshold_deg:
+            converged = True
+            break
+        width = max(system.sigma, o.least_width_mm, o.shrink * width)
+    system = _measure(points, normals, base, surface, usable_faces, pose, center, radius, basis, width, hint, o)
+    return _result(system, pose, center, radius, basis, base, iterations, converged, o)
+
+
+def register_from_starts(
+    points: Array,
+    surface: Surface,
+    starts: Sequence[Array],
+    coarse_points: int = 800,
+    apart_mm: float = 0.2,
+    normals: Array | None = None,
+    point_weights: Array | None = None,
+    options: RegistrationOptions | None = None,
+    **given: object,
+) -> Registration:
+    """The best of the minima found from several starts, with the next best one as ``runner_up``.
+
+    All starts are tried on few points, the best minimum is refined on all. The cost of a minimum is the mean of its
+    squared residuals, each limited to three times the best minimum's noise.
+
+    Args:
+        points, surface, normals, point_weights, options, given: see `register_to_surface`.
+        starts: (4,4) each.
+        coarse_points: number of points that starts are tried on.
+        apart_mm: minima whose points differ less on average are one.
+    """
+    o = options or RegistrationOptions()
+    few = slice(None, None, -(-len(points) // coarse_points))
+    some = {"normals": normals[few] if normals is not None else None,
+            "point_weights": point_weights[few] if point_weights is not None else None}  # fmt: skip
+    quick = replace(o, noise_points=0, threshold_mm=0.01, threshold_deg=0.01, most_iterations=15)
+    found: list[Registration] = []
+    failure: InputError | None = None
+    for start in starts:
+        try:
+            found.append(register_to_surface(points[few], surface, start, options=quick, **some, **given))  # type: ignore[arg-type]
+        except InputError as error:
+            failure = error
+    if not found:
+        raise failure or InputError("registration: no start was given")
+    limit = 3.0 * max(min(item.sigma_mm for item in found), 0.02)
+    costs = np.array([_cost(item, limit) for item in found])
+    best = found[int(np.argmin(costs))]
+    placed = apply(best.surface_from_points, points[few])
+    rivals = [
+        (cost, item.surface_from_points)
+        for cost, item in zip(costs, found, strict=True)
+        if np.sqrt(np.mean(np.sum((apply(item.surface_from_points, points[few]) - placed) ** 2, axis=1))) > apart_mm
+    ]
+    result = register_to_surface(
+        points, surface, best.surface_from_points, normals=normals, point_weights=point_weights,
+        options=replace(o, first_distance_mm=max(o.last_distance_mm, min(o.first_distance_mm, limit))), **given,  # type: ignore[arg-type]
+    )  # fmt: skip
+    if not rivals:
+        return result
+    cost, rival = min(rivals, key=lambda item: item[0])
+    return replace(result, runner_up=rival, runner_up_cost=float(cost / max(costs.min(), 1e-12)))
+
+
+@dataclass(frozen=True)
+class _System:
+    """The linear system of one iteration; ``values`` and ``vectors`` are of the determined part of ``basis``."""
+
+    residuals: Array
+    weights: Array
+    rows: Array
+    normals: Array
+    moved: Array
+    hessian: Array
+    gradient: Array
+    values: Array
+    vectors: Array
+    sigma: float
+    faces: NDArray[np.int64]
+
+
+def _measure(
+    points: Array, point_normals: Array | None, base: Array, surface: Surface,
+    usable_faces: NDArray[np.bool_] | None, pose: Array, center: Array, radius: float, basis: Array, width: float,
+    hint: NDArray[np.int64] | None, o: RegistrationOptions,
+) -> _System:  # fmt: skip
+    """Residuals, weights and normal equations at a pose; turns are scaled to mm at ``radius``."""
+    moved = apply(pose, points)
+    reach = min(max(o.distance_sigmas * width, o.last_distance_mm), o.first_distance_mm)
+    closest = surface.closest(moved, reach, hint)
+    residuals = closest.distances
+    counts = closest.faces >= 0
+    if usable_faces is not None:
+        counts &= usable_faces[closest.faces]
+    if o.skips_edges:
+        counts &= ~closest.is_edge
+    if point_normals is not None:
+        cosine = np.sum((point_normals @ pose[:3, :3].T) * np.nan_to_num(closest.normals), axis=1)
+        counts &= (cosine >= o.least_normal_cosine) | ~point_normals.any(axis=1)
+    if np.count_nonzero(counts) < max(6, o.least_points // 4):
+        raise InputError(
+            f"registration: {np.count_nonzero(counts)} of {len(points)} points are within {reach:.2f} mm of the surface"
+        )
+    size = np.abs(np.where(counts, residuals, 0.0)) * np.sqrt(base)
+    if o.trim > 0.0:
+        counts &= size <= np.quantile(size[counts], 1.0 - o.trim)
+    sigma = max(1.4826 * float(np.median(size[counts])), 1e-9)
+    weights = np.where(counts, _kernel(size / max(sigma, width, o.least_width_mm), o.kernel), 0.0) * base
+    normals = np.where(counts[:, None], closest.normals, 0.0)
+    rows = np.hstack([np.cross(moved - center, normals) / radius, normals])
+    weighted = rows * weights[:, None]
+    hessian = weighted.T @ rows
+    values, vectors = np.linalg.eigh(basis @ hessian @ basis.T)
+    kept = values > o.least_information * weights.sum()
+    gradient = weighted.T @ np.where(counts, residuals, 0.0)
+    return _System(
+        residuals, weights, rows, normals, moved, hessian, gradient, values[kept], vectors[:, kept], sigma,
+        closest.faces,
+    )  # fmt: skip
+
+
+def _kernel(size: Array, kernel: str) -> Array:
+    """Weights 0–1 of residuals in standard deviations."""
+    if kernel == "none":
+        return np.ones_like(size)
+    if kernel == "huber":
+        return np.minimum(1.0, HUBER_SIGMAS / np.maximum(size, 1e-12))
+    return np.where(size < TUKEY_SIGMAS, (1.0 - np.minimum(size / TUKEY_SIGMAS, 1.0) ** 2) ** 2, 0.0)
+
+
+def _result(
+    system: _System, pose: Array, center: Array, radius: float, basis: Array, base: Array, iterations: int,
+    converged: bool, o: RegistrationOptions,
+) -> Registration:  # fmt: skip
+    determined = system.vectors.T @ basis
+    scales = _scales(radius)
+    used = np.flatnonzero(system.weights > 0.1 * base)
+    residuals, weights = system.residuals[used], system.weights[used]
+    own = np.sqrt(base[used])  # residuals × own all have one variance
+    noise = estimate_noise(
+        system.moved[used],
+        system.normals[used],
+        residuals * own,
+        (system.rows[used] * own[:, None]) @ determined.T,
+        o.noise_points,
+        o.seed,
+    )
+    # Each residual moves the result by H⁻¹ Jᵀ w: what such a sum of correlated errors scatters by.
+    pull = (determined.T / system.values) @ (determined @ (system.rows[used] * (weights / own)[:, None]).T)
+    scatter = spread_of_sum(system.moved[used], system.normals[used], pull, noise, o.seed)
+    undetermined = _complement(basis, determined)
+    return Registration(
+        surface_from_points=pose,
+        twist=twist_about(center, pose),
+        center=center,
+        radius_mm=radius,
+        free=basis,
+        undetermined=undetermined,
+        information=system.hessian / np.outer(scales, scales),
+        covariance=scatter * np.outer(scales, scales),
+        noise=noise,
+        residuals=system.residuals,
+        weights=system.weights / np.maximum(base, 1e-300),
+        rms_mm=float(np.sqrt(np.average(residuals**2, weights=weights))),
+        sigma_mm=system.sigma,
+        overlap=float(np.mean(system.weights > 0.5 * base)),
+        iterations=iterations,
+        converged=converged,
+    )
+
+
+def _cost(found: Registration, limit: float) -> float:
+    size = np.abs(np.nan_to_num(found.residuals, nan=np.inf))
+    return float(np.mean(np.minimum(size, limit) ** 2))
+
+
+def _scales(radius: float) -> Array:
+    """(6,) factors from scaled moves, mm at the radius, to rad and mm."""
+    return np.array([1.0 / radius] * 3 + [1.0] * 3)
+
+
+def _orthonormal(rows: Array) -> Array:
+    """(K,6) orthonormal basis of the space that rows span."""
+    _, values, vectors = np.linalg.svd(np.atleast_2d(rows), full_matrices=False)
+    return vectors[values > 1e-9 * max(values[0], 1e-300)]
+
+
+def _complement(basis: Array, part: Array) -> Array:
+    """(M,6) what of the space of ``basis`` is not in the space of ``part``; both orthonormal."""
+    values, vectors = np.linalg.eigh(basis @ (np.eye(6) - part.T @ part) @ basis.T)
+    return vectors[:, values > 0.5].T @ basis
+
+
+def _determined(free: Array, undetermined: Array) -> Array:
+    return _complement(free, undetermined) if len(undetermined) else free

@@ -1,0 +1,194 @@
+"""Least-squares planes, cylinders and circles through points: the cross-check that feature-based metrology makes.
+
+Gauss–Newton on orthogonal distances (Forbes, NPL DITC 140/89), with Tukey's weights against outliers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from arview.errors import InputError
+from arview.geometry import Array
+from arview.measurement.cloud.registration import TUKEY_SIGMAS
+
+_ITERATIONS = 60
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Point (3,) on it nearest to the points' middle, unit normal (3,), RMS of the residuals of the points used."""
+
+    point: Array
+    normal: Array
+    rms_mm: float
+    used: int
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """Point (3,) of the axis nearest to the points' middle, unit direction (3,), radius; RMS of the residuals."""
+
+    point: Array
+    direction: Array
+    radius_mm: float
+    rms_mm: float
+    used: int
+
+    def axis_at(self, plane_point: Array, plane_normal: Array) -> Array:
+        """(3,) where the axis meets a plane."""
+        return self.point + self.direction * (
+            float((plane_point - self.point) @ plane_normal) / float(self.direction @ plane_normal)
+        )
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Centre (3,), unit normal (3,) of its plane, radius; RMS of the residuals."""
+
+    center: Array
+    normal: Array
+    radius_mm: float
+    rms_mm: float
+    used: int
+
+
+def fit_plane(points: Array, is_robust: bool = True) -> Plane:
+    """Plane through points (N,3), mm. Raises InputError for fewer than 3 or a NaN."""
+    points = _checked(points, 3, "plane")
+    weights = np.ones(len(points))
+    for _ in range(_ITERATIONS if is_robust else 1):
+        middle = np.average(points, axis=0, weights=weights)
+        centred = points - middle
+        normal = np.linalg.eigh((centred * weights[:, None]).T @ centred)[1][:, 0]
+        residuals = centred @ normal
+        before, weights = weights, _weights(residuals) if is_robust else weights
+        if np.abs(weights - before).max() < 1e-6:
+            break
+    return Plane(middle, normal, *_quality(residuals, weights))
+
+
+def fit_cylinder(
+    points: Array, direction: Array | None = None, radius_mm: float | None = None, is_robust: bool = True
+) -> Cylinder:
+    """Cylinder through points (N,3), mm.
+
+    Args:
+        points: on its wall.
+        direction: (3,) of the axis, roughly; None tries the three main directions of the points.
+        radius_mm: known radius; None fits it.
+        is_robust: False is plain least squares.
+
+    Raises:
+        InputError: fewer than 5 points, a NaN, or no cylinder there.
+    """
+    points = _checked(points, 5, "cylinder")
+    if direction is None:
+        main = np.linalg.eigh(np.cov(points.T))[1].T
+        fits = []
+        for axis in main:
+            try:
+                fits.append(fit_cylinder(points, axis, radius_mm, is_robust))
+            except InputError:
+                continue
+        if not fits:
+            raise InputError("cylinder: the points lie on none")
+        return min(fits, key=lambda fit: fit.rms_mm / fit.used)
+    middle = points.mean(axis=0)
+    frame = _frame(np.asarray(direction, dtype=np.float64))
+    local = (points - middle) @ frame.T
+
+    def residuals(x: Array) -> tuple[Array, Array]:
+        """Distances to the wall, and their derivatives by centre (2), slopes of the axis (2) and radius."""
+        axis = np.array([x[2], x[3], 1.0])
+        scale = np.linalg.norm(axis)
+        axis = axis / scale
+        away = local - np.array([x[0], x[1], 0.0])
+        along = away @ axis
+        across = away - along[:, None] * axis
+        distance = np.maximum(np.linalg.norm(across, axis=1), 1e-9)
+        out = across / distance[:, None]
+        rows = np.column_stack([-out[:, :2], -out[:, :2] * (along / scale)[:, None], -np.ones(len(local))])
+        return distance - x[4], rows
+
+    known = radius_mm if radius_mm is not None else np.nan
+    center, radius = _circle_start(local[:, :2])
+    start = np.array([*center, 0.0, 0.0, radius if radius_mm is None else known])
+    x, weights, rest = _solve(residuals, start, 5 if radius_mm is None else 4, is_robust)
+    axis = np.array([x[2], x[3], 1.0]) @ frame
+    axis = axis / np.linalg.norm(axis)
+    point = middle + np.array([x[0], x[1], 0.0]) @ frame
+    return Cylinder(point + axis * ((middle - point) @ axis), axis, float(x[4]), *_quality(rest, weights))
+
+
+def fit_circle(points: Array, normal: Array | None = None, is_robust: bool = True) -> Circle:
+    """Circle through points (N,3), mm, in the plane through their middle with ``normal`` (None: their own plane).
+
+    Raises:
+        InputError: fewer than 3 points or a NaN.
+    """
+    points = _checked(points, 3, "circle")
+    plane = fit_plane(points, is_robust) if normal is None else Plane(points.mean(axis=0), normal, 0.0, 0)
+    frame = _frame(plane.normal)
+    local = ((points - plane.point) @ frame.T)[:, :2]
+
+    def residuals(x: Array) -> tuple[Array, Array]:
+        away = local - x[:2]
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        return distance - x[2], np.column_stack([-away / distance[:, None], -np.ones(len(local))])
+
+    center, radius = _circle_start(local)
+    x, weights, rest = _solve(residuals, np.array([*center, radius]), 3, is_robust)
+    return Circle(plane.point + np.array([x[0], x[1], 0.0]) @ frame, frame[2], float(x[2]), *_quality(rest, weights))
+
+
+def _solve(
+    residuals: Callable[[Array], tuple[Array, Array]], x: Array, free: int, is_robust: bool
+) -> tuple[Array, Array, Array]:
+    """Gauss–Newton with weights over the first ``free`` unknowns; the unknowns, weights and residuals."""
+    for _ in range(_ITERATIONS):
+        rest, rows = residuals(x)
+        weights = _weights(rest) if is_robust else np.ones(len(rest))
+        part = rows[:, :free] * weights[:, None]
+        step = np.linalg.lstsq(part.T @ rows[:, :free], -part.T @ rest, rcond=1e-12)[0]
+        x = x + np.pad(step, (0, len(x) - free))
+        if np.abs(step).max() < 1e-9:
+            break
+    rest, _ = residuals(x)
+    if not np.isfinite(x).all():
+        raise InputError("cylinder: the points lie on none")
+    return x, weights, rest
+
+
+def _weights(residuals: Array) -> Array:
+    limit = TUKEY_SIGMAS * max(1.4826 * float(np.median(np.abs(residuals))), 1e-9)
+    return np.where(np.abs(residuals) < limit, (1.0 - np.minimum(np.abs(residuals) / limit, 1.0) ** 2) ** 2, 0.0)
+
+
+def _quality(residuals: Array, weights: Array) -> tuple[float, int]:
+    used = weights > 0.1
+    return float(np.sqrt(np.mean(residuals[used] ** 2))), int(np.count_nonzero(used))
+
+
+def _circle_start(local: Array) -> tuple[Array, float]:
+    """Centre and radius by algebraic least squares (Kåsa 1976)."""
+    rows = np.column_stack([2.0 * local, np.ones(len(local))])
+    a, b, c = np.linalg.lstsq(rows, np.sum(local**2, axis=1), rcond=None)[0]
+    return np.array([a, b]), float(np.sqrt(max(c + a * a + b * b, 1e-12)))
+
+
+def _frame(direction: Array) -> Array:
+    """(3,3) rows: two directions across, and the direction itself."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _checked(points: Array, least: int, name: str) -> Array:
+    points = np.asarray(points, dtype=np.float64)
+    if len(points) < least or not np.isfinite(points).all():
+        raise InputError(f"{name}: needs at least {least} points, none NaN; got {len(points)}")
+    return points

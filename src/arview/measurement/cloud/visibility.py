@@ -1,0 +1,56 @@
+"""Which points of the CAD the photos can see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.model import Model
+from arview.camera import Camera
+from arview.geometry import Array, apply
+from arview.reconstruction.types import PosedPhoto
+from arview.rendering.rasterizer import rasterise
+
+_SIDE_PX = 800
+"""Longer side of the depth pictures: a pixel is under a millimetre where a photo resolves a tenth of one."""
+_LEAST_COSINE = 0.15
+"""Surfaces that lean away more are seen too flat to be reconstructed."""
+
+
+class Views:
+    """What photos see of a model at nominal, by z-buffers that are drawn once.
+
+    ``cam_from_scan`` of the photos is taken for ``cam_from_model``.
+    """
+
+    def __init__(self, model: Model, photos: Sequence[PosedPhoto]) -> None:
+        self._photos = photos
+        self._drawn: list[tuple[Camera, Array]] = []
+        vertices, faces, _ = model.mesh
+        for photo in photos:
+            scale = min(1.0, _SIDE_PX / max(photo.camera.width, photo.camera.height))
+            camera = photo.camera.without_distortion().scaled(
+                round(scale * photo.camera.width), round(scale * photo.camera.height)
+            )
+            inverse_depth, _ = rasterise(
+                apply(photo.cam_from_scan, vertices), faces, camera.fx, camera.fy, camera.cx, camera.cy,
+                camera.width, camera.height,
+            )  # fmt: skip
+            # Within a pixel the surface may be as much farther as it leans: the farthest of 3 × 3 pixels counts.
+            self._drawn.append((camera, cv2.erode(np.where(inverse_depth > 0, inverse_depth, np.inf), np.ones((3, 3)))))
+
+    def count(self, points: Array, normals: Array, slack_mm: float = 0.5) -> NDArray[np.int64]:
+        """(N,) number of photos that see points (N,3) of the model with their normals (N,3)."""
+        seen = np.zeros(len(points), dtype=np.int64)
+        for photo, (camera, nearness) in zip(self._photos, self._drawn, strict=True):
+            in_cam = apply(photo.cam_from_scan, points)
+            towards = photo.centre_in_scan - points
+            facing = np.sum(normals * towards, axis=1) > _LEAST_COSINE * np.linalg.norm(towards, axis=1)
+            pixels = np.nan_to_num(camera.project(in_cam), nan=-1.0)
+            inside = facing & np.all((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1]), axis=1)
+            u, v = np.round(pixels[inside]).astype(int).T
+            seen[inside] += in_cam[inside, 2] <= 1.0 / nearness[v, u] + slack_mm
+        return seen

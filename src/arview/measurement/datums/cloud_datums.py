@@ -1,0 +1,151 @@
+"""The datum features of a part file, measured in a cloud that has no photos: distances of its points to the CAD."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.model import Model
+from arview.cad.part import Datum
+from arview.errors import InputError
+from arview.geometry import Array
+from arview.measurement.cloud.points import CloudPoints, prepare_cloud
+from arview.measurement.cloud.surface import Surface
+from arview.measurement.datums.alignment import (
+    Equations,
+    move_equations,
+    robust_weights,
+    surface_equations,
+)
+from arview.measurement.datums.features import edge_line, flat_faces, round_faces
+from arview.measurement.datums.photo_datums import DatumOptions
+from arview.measurement.photo.surface import near_others
+from arview.measurement.types import Move
+from arview.reconstruction.types import DenseCloud
+
+_GRID_MM = 0.5
+_MOST = 1500
+"""Points of a feature: more err together."""
+_EDGE_BAND_MM = (2.0, 15.0)
+"""What of the faces beside an edge says where they meet: not its rounding, not their far end."""
+
+
+def measure_datums_in_cloud(
+    datums: tuple[Datum, ...], model: Model, cloud: DenseCloud, moves: Mapping[str, Move],
+    options: DatumOptions | None = None,
+) -> list[Equations]:  # fmt: skip
+    """Offsets of each datum feature in a cloud (mm, within about a millimetre of the CAD's frame).
+
+    Args:
+        datums: of the part file, in order of precedence.
+        model: nominal.
+        cloud: of the part.
+        moves: best fits of components, for datums of the feature ``fit``.
+        options: of the reach, and how far from other components.
+
+    Raises:
+        InputError: the CAD has no such feature, or the cloud does not cover it; the datum is named.
+    """
+    o = options or DatumOptions()
+    if not datums:
+        return []
+    points = prepare_cloud(cloud, model.bounds_in_model + np.array([[-5.0], [5.0]]), _GRID_MM, 20)
+    return [_measure(datum, model, points, moves, o) for datum in datums]
+
+
+def _measure(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str, Move], o: DatumOptions) -> Equations:
+    if datum.feature == "fit":
+        if datum.component not in moves:
+            raise InputError(f"datum {datum.label}: {datum.component!r} could not be measured as a whole")
+        return move_equations(datum.label, moves[datum.component], datum.locks)[0]
+    component = model.component(datum.component)
+    if datum.feature == "edge":
+        return _measure_edge(datum, model, cloud, o)
+    is_round = datum.feature in ("hole", "pin", "cylinder")
+    faces, side = round_faces(component, datum) if is_round else (flat_faces(component, datum), 0.0)
+    near, offsets, normals = _offsets(datum, model, cloud, faces, o)
+    if datum.feature == "point":
+        around = np.linalg.norm(near.points - np.array(datum.point_in_model), axis=1) < o.point_radius_mm
+        near, offsets, normals = near.only(around), offsets[around], normals[around]
+    _check(datum, len(offsets))
+    if datum.feature in ("hole", "pin"):  # of a short bore the axis' tilt is the plane's to say
+        axis = np.array(datum.direction_in_model)
+        normals = normals - (normals @ axis)[:, None] * axis
+    radius = np.full(len(offsets), side) if is_round else None
+    variances = near.sigma**2
+    equations = surface_equations(
+        datum.label, datum.feature, near.points, normals, offsets, variances, None, radius, datum.locks
+    )
+    if radius is None:
+        return equations
+    # Bores in clouds from photos are rounded off, half filled: what the points are off any circle, its middle may be.
+    _, residuals = robust_weights(np.concatenate([normals, radius[:, None]], axis=1), offsets, variances)
+    excess = float(np.mean(residuals**2) - np.median(variances))
+    return replace(equations, form_mm=float(np.sqrt(max(0.0, excess))))
+
+
+def _offsets(
+    datum: Datum, model: Model, cloud: CloudPoints, faces: NDArray[np.bool_], o: DatumOptions
+) -> tuple[CloudPoints, Array, Array]:
+    """Points near some faces of the datum's component, their signed distances and the faces' normals there."""
+    component = model.component(datum.component)
+    surface = Surface(component.vertices_in_model, component.faces)
+    low, high = component.bounds_in_model[0] - o.reach_mm, component.bounds_in_model[1] + o.reach_mm
+    near = cloud.only(np.all((cloud.points > low) & (cloud.points < high), axis=1))
+    closest = surface.closest(near.points, o.reach_mm)
+    mine = (closest.faces >= 0) & ~closest.is_edge
+    mine[mine] &= faces[closest.faces[mine]]
+    facing = np.sum(near.normals * np.nan_to_num(closest.normals), axis=1)
+    mine &= (facing > 0.5) | ~near.normals.any(axis=1)
+    chosen = np.flatnonzero(mine)
+    index = model.index(datum.component)
+    for clear_mm in (o.clear_mm, o.least_clear_mm):
+        clear = chosen[~near_others(near.points[chosen], model, index, clear_mm)] if len(chosen) else chosen
+        if len(clear) >= min(300, 0.3 * len(chosen)):
+            break
+    if len(clear) > _MOST:
+        clear = np.sort(np.random.default_rng(0).permutation(clear)[:_MOST])
+    return near.only(clear), closest.distances[clear], closest.normals[clear]
+
+
+def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints, o: DatumOptions) -> Equations:
+    """Where the planes through both faces of an edge meet: each one's offset at two places along it."""
+    line = edge_line(model.component(datum.component), datum)
+    ends = line.points(2, 0.25 * float(np.linalg.norm(line.end - line.start)))
+    parts: list[tuple[Array, Array, Array]] = []
+    for normal in line.normals:
+        x, y, z = (float(v) for v in normal)
+        face = Datum(datum.label, "plane", datum.component, datum.point_in_model, (x, y, z))
+        near, offsets, _ = _offsets(datum, model, cloud, flat_faces(model.component(datum.component), face), o)
+        from_line = near.points - line.start
+        across = from_line @ np.cross(normal, line.direction)
+        band = (np.abs(across) > _EDGE_BAND_MM[0]) & (np.abs(across) < _EDGE_BAND_MM[1])
+        _check(datum, int(np.count_nonzero(band)))
+        along, across = (from_line @ line.direction)[band], across[band]
+        design = np.stack([np.ones_like(along), along, across], axis=1)
+        variances = near.sigma[band] ** 2
+        share, residuals = robust_weights(design, offsets[band], variances)
+        solver = (
+            np.linalg.pinv((design * (share / variances)[:, None]).T @ design)
+            @ (design * (share / variances)[:, None]).T
+        )
+        at = np.stack([np.ones(2), (ends - line.start) @ line.direction, np.zeros(2)], axis=1)
+        factor = max(1.0, float((share * residuals**2 / variances).sum() / max(1.0, share.sum() - 3.0)))
+        # Neighbours err together, over some millimetres: as one in ten points of the grid.
+        spread = 10.0 * factor * np.sum((at @ solver) ** 2 * variances, axis=1)
+        parts.append((at @ (solver @ offsets[band]), spread, np.tile(normal, (2, 1))))
+    offsets, variances, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return surface_equations(
+        datum.label, "edge", np.tile(ends, (2, 1)), normals, offsets, variances, None, None, datum.locks
+    )
+
+
+def _check(datum: Datum, count: int) -> None:
+    if count < 12:
+        raise InputError(
+            f"datum {datum.label} ({datum.feature}): {count} points of the cloud are on it, 12 are needed; is it "
+            "covered, or name another feature in the part file"
+        )

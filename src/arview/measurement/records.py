@@ -1,0 +1,266 @@
+"""What was measured as the records of an inspection: components, datums, provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, version
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview import __version__
+from arview.cad.part import ComponentSettings, Part
+from arview.core.stage_cache import content_key
+from arview.geometry import Array, exp_so3, rigid
+from arview.inspection import (
+    BudgetLine,
+    ComponentDeviation,
+    DatumReport,
+    DatumSystem,
+    Details,
+    Finding,
+    MethodAgreement,
+    MethodResult,
+    Provenance,
+    Verdict,
+)
+from arview.measurement.datums.alignment import Alignment
+from arview.measurement.folder import MetricReconstruction
+from arview.measurement.options import Measured, MeasureOptions, combined_of
+from arview.measurement.types import Move
+from arview.measurement.uncertainty.budget import (
+    Placement,
+    PosePropagation,
+    place,
+    relative_twists,
+)
+from arview.measurement.uncertainty.combine import Agreement, Combined, agreements
+from arview.measurement.uncertainty.decision import decide, worst, zone_diameter_mm
+
+_SOFTWARE = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "numba")
+
+
+def component_record(
+    name: str, measured: Measured, alignment: Alignment, poses: PosePropagation | None, part: Part,
+    options: MeasureOptions,
+) -> ComponentDeviation:  # fmt: skip
+    """Where a component stands in the datum frame, and the verdict."""
+    settings = part.component_settings(name)
+    tolerance_mm = settings.position_tolerance_mm or options.tolerance_mm
+    component = part.model.component(name)
+    center = component.bounds_in_model.mean(axis=0)
+    together = combined_of(measured)
+    nothing = (False,) * 6
+    failures = tuple(MethodResult(f.method, reason=f.reason) for f in measured.failures)
+    if together is None or any(f.is_missing for f in measured.failures if f.method != "cloud"):
+        is_missing = any(f.is_missing for f in measured.failures)
+        reasons = tuple(dict.fromkeys(f.reason for f in measured.failures))
+        details = Details(_three(center), methods=failures, notes=reasons)
+        verdict, finding = (Verdict.FAIL, Finding.MISSING) if is_missing else (Verdict.NOT_MEASURED, None)
+        return ComponentDeviation(
+            name, (None, None, None), None, nothing, None, tolerance_mm, verdict, finding=finding, details=details
+        )
+    by_poses = None if poses is None else poses.covariance_of(component, center)
+    placed = place(together, alignment, by_poses, options.uncertainty)
+    pairs = agreements(measured.moves)
+    notes: list[str] = [note for move in measured.moves for note in move.notes]
+    notes += [_contradiction(pair) for pair in pairs if pair.ratio > 1.0]
+    verdict = _verdict(placed, tolerance_mm, settings, options, notes)
+    axis = _axis(settings, placed, part)
+    tilt_deg, twist_deg = tilt_and_twist(placed, axis)
+    displacement = [float(v) if seen else None for v, seen in zip(placed.twist[3:], placed.observable[3:], strict=True)]
+    methods = tuple(_method_result(move, alignment) for move in measured.moves) + failures
+    distance = placed.distance
+    return ComponentDeviation(
+        name=name,
+        displacement_mm=(displacement[0], displacement[1], displacement[2]),
+        distance_mm=None if distance is None else distance.value,
+        observable=cast("tuple[bool, bool, bool, bool, bool, bool]", tuple(bool(v) for v in placed.observable)),
+        uncertainty_mm=None if distance is None else distance.uncertainty,
+        tolerance_mm=tolerance_mm,
+        verdict=verdict,
+        tilt_deg=tilt_deg,
+        twist_deg=twist_deg,
+        details=replace(
+            _details(placed, together, settings), methods=methods, notes=tuple(notes),
+            agreement=tuple(
+                MethodAgreement((p.first, p.second), p.difference_mm, p.joint_mm, p.ratio <= 1.0) for p in pairs
+            ),
+        ),
+    )  # fmt: skip
+
+
+def _verdict(
+    placed: Placement, tolerance_mm: float | None, settings: ComponentSettings, options: MeasureOptions,
+    notes: list[str],
+) -> Verdict:  # fmt: skip
+    """Position and, where it has a tolerance, angle; what could not be determined cannot pass."""
+    guard, distance, angle = options.decision.guard, placed.distance, placed.angle
+    verdicts = []
+    if distance is not None:
+        value = distance.corrected if options.corrects_bias else distance.value
+        verdicts.append(decide(value, distance.uncertainty, tolerance_mm, guard))
+        if verdicts[0] is Verdict.PASS and distance.value > cast(float, tolerance_mm):
+            verdicts = [Verdict.UNDECIDED]
+    if settings.angle_tolerance_deg is not None and angle is not None:
+        limit = np.deg2rad(settings.angle_tolerance_deg)
+        verdicts.append(
+            decide(angle.corrected if options.corrects_bias else angle.value, angle.uncertainty, limit, guard)
+        )
+        if verdicts[-1] is Verdict.FAIL:
+            notes.append(f"turned by {np.rad2deg(angle.value):.2f}°, {settings.angle_tolerance_deg:g}° allowed")
+    verdict = worst(verdicts)
+    hidden = [axis for axis, seen in zip("xyz", placed.observable[3:], strict=True) if not seen]
+    if hidden:
+        notes.append(f"the displacement along {' '.join(hidden)} is undetermined")
+        verdict = Verdict.UNDECIDED if verdict is Verdict.PASS else verdict
+    return verdict if verdicts else Verdict.UNDECIDED
+
+
+def _details(placed: Placement, together: Combined, settings: ComponentSettings) -> Details:
+    rotation = exp_so3(placed.twist[:3])
+    center, distance, angle = together.center_in_model, placed.distance, placed.angle
+    return Details(
+        center_mm=_three(center),
+        measured_from_nominal=_matrix(rigid(rotation, center - rotation @ center + placed.twist[3:])),
+        covariance=_matrix(placed.covariance),
+        undetermined=_matrix(placed.undetermined),
+        radius_mm=together.radius_mm,
+        k=None if distance is None else distance.k,
+        interval_mm=None if distance is None else (distance.low, distance.high),
+        corrected_distance_mm=None if distance is None else distance.corrected,
+        zone_diameter_mm=None if distance is None else zone_diameter_mm(distance.value),
+        angle_deg=None if angle is None else float(np.rad2deg(angle.value)),
+        angle_uncertainty_deg=None if angle is None else float(np.rad2deg(angle.uncertainty)),
+        angle_tolerance_deg=settings.angle_tolerance_deg,
+        budget=() if distance is None else tuple(BudgetLine(*line) for line in placed.budget()),
+    )
+
+
+def _method_result(move: Move, alignment: Alignment) -> MethodResult:
+    """A method's own result in the datum frame."""
+    alone = Combined(move.twist, {}, np.zeros((6, 6)), move.undetermined, move.radius_mm, move.center_in_model)
+    twist = relative_twists(move.twist[None], alignment.move[None], alone, alignment)[0]
+    std = np.sqrt(np.maximum(np.diag(move.covariance), 0.0))
+
+    def shown(values: Array, seen: NDArray[np.bool_]) -> tuple[float | None, ...]:
+        return tuple(float(v) if ok else None for v, ok in zip(values, seen, strict=True))
+
+    seen = move.observable
+    return MethodResult(
+        move.method, shown(twist[3:], seen[3:]), shown(np.rad2deg(twist[:3]), seen[:3]), shown(std[3:], seen[3:]),
+        move.used, move.residual_mm, move.support, notes=move.notes,
+    )  # fmt: skip
+
+
+def _axis(settings: ComponentSettings, placed: Placement, part: Part) -> Array:
+    """Axis that tilt is of and twist about: of symmetry, else the normal of the first datum plane, else +Z."""
+    if settings.symmetry is not None:
+        return np.array(settings.symmetry.axis_in_model)
+    turns = [row[:3] / np.linalg.norm(row[:3]) for row in placed.undetermined if np.linalg.norm(row[:3]) > 0.95]
+    if len(turns) == 1:
+        axis = turns[0]
+        return np.asarray(axis if axis[np.argmax(np.abs(axis))] > 0 else -axis)
+    planes = [np.array(datum.direction_in_model) for datum in part.datums if datum.feature == "plane"]
+    return planes[0] if planes else np.array([0.0, 0.0, 1.0])
+
+
+def tilt_and_twist(placed: Placement, axis: Array) -> tuple[float | None, float | None]:
+    """Angle in degrees between a component's axis (3,) and where it should point, and turn about it; None if open."""
+    if not placed.observable[:3].any():
+        return None, None
+    turns = placed.undetermined[:, :3]
+    across = turns - (turns @ axis)[:, None] * axis
+    rotation = exp_so3(placed.twist[:3])
+    tilt = float(np.arctan2(np.linalg.norm(np.cross(axis, rotation @ axis)), axis @ rotation @ axis))
+    twist = float(placed.twist[:3] @ axis)
+    is_tilt = bool((np.linalg.norm(across, axis=1) < 0.05).all())
+    is_twist = bool((np.abs(turns @ axis) < 0.05).all())
+    return (float(np.rad2deg(tilt)) if is_tilt else None), (float(np.rad2deg(twist)) if is_twist else None)
+
+
+def _contradiction(pair: Agreement) -> str:
+    return (
+        f"{pair.first} and {pair.second} differ by {pair.difference_mm:.3f} mm, more than the {pair.joint_mm:.3f} mm"
+        " that both allow"
+    )
+
+
+def datum_doubts(alignment: Alignment) -> list[str]:
+    """Datums that contradict those before them."""
+    doubts = []
+    for result in alignment.datums:
+        excess = np.sqrt(max(0.0, result.rest_mm**2 - result.residual_mm**2))
+        if result.feature != "fit" and excess > max(0.1, result.residual_mm):
+            doubts.append(
+                f"datum {result.label}: {excess:.2f} mm rms off the datums before it; is it where the CAD says?"
+            )
+    return doubts
+
+
+def datum_record(
+    alignment: Alignment, part: Part, base: Sequence[str], reconstruction: MetricReconstruction
+) -> DatumSystem:
+    """The frame of the deviations."""
+    components = {datum.label: datum.component for datum in part.datums}
+    methods = dict.fromkeys(("plane", "point", "cylinder"), "sweep") | dict.fromkeys(("hole", "pin", "edge"), "edges")
+    reports = tuple(
+        DatumReport(
+            one.label, one.feature, components.get(one.label, base[0]), one.locked, one.used, one.of,
+            one.residual_mm, one.rest_mm, one.radius_mm,
+            methods.get(one.feature, "sweep and edges") if reconstruction.sparse.photos else "cloud",
+        )
+        for one in alignment.datums
+    )  # fmt: skip
+    notes = alignment.notes
+    if not part.datums:
+        notes = (f"no datums in the part file: best fit of {', '.join(base)}", *notes)
+    scale = reconstruction.scale
+    used = [evidence.detail for evidence in scale.evidence if evidence.is_used]
+    return DatumSystem(
+        reports, _matrix(alignment.rough_from_datum), _matrix(alignment.covariance), _three(alignment.origin_in_model),
+        scale.scale, scale.scale_std, "; ".join(used), notes,
+    )  # fmt: skip
+
+
+def provenance_of(reconstruction: MetricReconstruction, options: MeasureOptions, cpu_s: float) -> Provenance:
+    """What the numbers were made with."""
+    photos = reconstruction.sparse.photos
+    used = [m for m in options.methods if m != "cloud" or reconstruction.cloud is not None]
+    asked = {
+        "methods": ",".join(options.methods),
+        "guard": f"{options.decision.guard:g}",
+        "k": f"{options.uncertainty.k:g}",
+        "probability": f"{options.uncertainty.probability:g}",
+        "monte_carlo": str(options.uncertainty.draws if options.uncertainty.monte_carlo else 0),
+        "seed": str(options.uncertainty.seed),
+        "form_mm": f"{options.uncertainty.form_mm:g}",
+        "corrects_bias": str(options.corrects_bias).lower(),
+    }
+    return Provenance(
+        tool="arview measure",
+        version=__version__,
+        method=f"{', '.join(used)} in {len(photos)} photos" if photos else "cloud alone",
+        photos_hash=content_key(photo.path for photo in photos) if photos else "",
+        photos=len(photos),
+        software=tuple((name, _version(name)) for name in _SOFTWARE),
+        options=tuple(asked.items()),
+        cpu_s=round(cpu_s, 2),
+    )
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _three(point: Array) -> tuple[float, float, float]:
+    return float(point[0]), float(point[1]), float(point[2])
+
+
+def _matrix(values: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(float(value) for value in row) for row in values)

@@ -1,0 +1,1 @@
+"""Uncertainty: methods combined, budgets, Monte Carlo, and the decision rule."""

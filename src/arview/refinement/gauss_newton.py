@@ -1,0 +1,119 @@
+"""Gauss-Newton kernels that all modalities share: the point-to-line Jacobian, the 6×6 solve, the update of a pose.
+
+The pose is perturbed on the right about the model's centre: ``cam_from_body @ exp_se3(twist)`` with the body frame
+at the centre. For a residual along a unit image direction n, J = [p × a, a] with a = Rᵀ (∂π/∂X)ᵀ n.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, inline="always")
+def add_line(hessian, gradient, point, cam_from_body, x, y, z, nu, nv, intrinsics, residual, weight):  # type: ignore[no-untyped-def]
+    """Add weight · (Jᵀ J, Jᵀ r) of one residual along (nu, nv) to the system; lower triangle only."""
+    ax = nu * intrinsics[0] / z
+    ay = nv * intrinsics[1] / z
+    az = -(ax * x + ay * y) / z
+    r = cam_from_body
+    bx = r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az
+    by = r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az
+    bz = r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az
+    j0 = point[1] * bz - point[2] * by
+    j1 = point[2] * bx - point[0] * bz
+    j2 = point[0] * by - point[1] * bx
+    jac = (j0, j1, j2, bx, by, bz)
+    for a in range(6):
+        wa = weight * jac[a]
+        gradient[a] += wa * residual
+        for b in range(a + 1):
+            hessian[a, b] += wa * jac[b]
+
+
+@njit(cache=True, nogil=True)
+def solve_step(hessian, gradient, damping):  # type: ignore[no-untyped-def]
+    """Twist (6,) that solves (H + diag(damping)) x = -g, H given by its lower triangle; zeros when singular."""
+    lower = np.zeros((6, 6))
+    twist = np.zeros(6)
+    for i in range(6):
+        for j in range(i + 1):
+            total = hessian[i, j]
+            if i == j:
+                total += damping[i]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not total > 1e-12:
+                    return twist
+                lower[i, i] = np.sqrt(total)
+            else:
+                lower[i, j] = total / lower[j, j]
+    for i in range(6):
+        total = -gradient[i]
+        for k in range(i):
+            total -= lower[i, k] * twist[k]
+        twist[i] = total / lower[i, i]
+    for i in range(5, -1, -1):
+        total = twist[i]
+        for k in range(i + 1, 6):
+            total -= lower[k, i] * twist[k]
+        twist[i] = total / lower[i, i]
+    return twist
+
+
+@njit(cache=True, nogil=True)
+def apply_twist(cam_from_body, twist):  # type: ignore[no-untyped-def]
+    """``cam_from_body`` after a small twist on the right: rotation by Rodrigues, then translation in the body."""
+    wx, wy, wz = twist[0], twist[1], twist[2]
+    theta = np.sqrt(wx * wx + wy * wy + wz * wz)
+    if theta < 1e-9:
+        s, c = 1.0, 0.5
+    else:
+        s = np.sin(theta) / theta
+        c = (1.0 - np.cos(theta)) / (theta * theta)
+    rotation = np.empty((3, 3))
+    rotation[0, 0] = 1.0 - c * (wy * wy + wz * wz)
+    rotation[0, 1] = -s * wz + c * wx * wy
+    rotation[0, 2] = s * wy + c * wx * wz
+    rotation[1, 0] = s * wz + c * wx * wy
+    rotation[1, 1] = 1.0 - c * (wx * wx + wz * wz)
+    rotation[1, 2] = -s * wx + c * wy * wz
+    rotation[2, 0] = -s * wy + c * wx * wz
+    rotation[2, 1] = s * wx + c * wy * wz
+    rotation[2, 2] = 1.0 - c * (wx * wx + wy * wy)
+    result = np.empty((4, 4))
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += cam_from_body[i, k] * rotation[k, j]
+            result[i, j] = total
+        total = cam_from_body[i, 3]
+        for k in range(3):
+            total += cam_from_body[i, k] * twist[3 + k]
+        result[i, 3] = total
+        result[3, i] = 0.0
+    result[3, 3] = 1.0
+    return result
+
+
+@njit(cache=True, nogil=True)
+def relative_twist(cam_from_before, cam_from_after):  # type: ignore[no-untyped-def]
+    """Twist (6,) with ``apply_twist(cam_from_before, twist) = cam_from_after``, for turns below 180°."""
+    a, b = cam_from_before, cam_from_after
+    turn = np.zeros((3, 3))
+    twist = np.zeros(6)
+    for i in range(3):
+        for k in range(3):
+            twist[3 + i] += a[k, i] * (b[k, 3] - a[k, 3])
+            for j in range(3):
+                turn[i, j] += a[k, i] * b[k, j]
+    x = 0.5 * (turn[2, 1] - turn[1, 2])
+    y = 0.5 * (turn[0, 2] - turn[2, 0])
+    z = 0.5 * (turn[1, 0] - turn[0, 1])
+    sine = np.sqrt(x * x + y * y + z * z)
+    angle = np.arctan2(sine, 0.5 * (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0))
+    factor = angle / sine if sine > 1e-9 else 1.0
+    twist[0], twist[1], twist[2] = factor * x, factor * y, factor * z
+    return twist

@@ -1,0 +1,1 @@
+"""Modalities: what each kind of measurement adds to the pose."""

@@ -1,0 +1,320 @@
+"""Keyframes of the feature modality: pictures of known pose with corners on the part and their surface in 3D.
+
+Corners by the minimum eigenvalue of the gradient's covariance (Shi & Tomasi, CVPR 1994); their 3D points and
+normals come from rays cast onto the CAD, so a keyframe needs one picture only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+
+from arview.errors import InputError
+from arview.geometry import Array, invert
+from arview.refinement.modalities.patch_alignment import Pyramid
+from arview.refinement.projection import project
+from arview.rendering.raycast import RayCaster, cast_ray
+
+_RESPONSE = (8.0 / (4 * 255)) ** 2
+"""What cornerMinEigenVal (3×3 Sobel, uint8) gives for a mean squared gradient of one (grey level/px)²."""
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """Options of the feature modality.
+
+    Attributes:
+        levels: of the pyramid; the common shift is searched at the last: 4 px there are 32 px in the picture.
+        search_px: reach of the common shift at the last level, px of that level; 0 leaves the search out.
+        max_corners, min_corners: per keyframe; with fewer than the least, no keyframe is made.
+        corner_distance_px: least distance of two corners.
+        corner_contrast: weakest corner, rms gradient along the weaker direction, grey levels per px
+            of the half-size picture.
+        margin_px: the surface must go on for so far around a corner, or the patch would hold background.
+        flatness_px: largest height of that surroundings over the tangent plane, px of the keyframe.
+        min_facing: least cosine between surface normal and line of sight; foreshortened patches match badly.
+        check_occlusion: cast a shadow ray from each point to the camera.
+        min_ncc: least normalised correlation of an aligned patch with its keyframe.
+        neighbour_px: largest deviation from the median displacement of the nearest neighbours.
+        view_step_rad, roll_step_rad, scale_step: a view differing by more asks for a new keyframe.
+        max_keyframes: the least recently used is dropped beyond.
+    """
+
+    levels: int = 4
+    search_px: int = 4
+    max_corners: int = 120
+    min_corners: int = 12
+    corner_distance_px: float = 7.0
+    corner_contrast: float = 3.0
+    margin_px: float = 6.0
+    flatness_px: float = 1.5
+    min_facing: float = 0.2
+    check_occlusion: bool = True
+    min_ncc: float = 0.8
+    neighbour_px: float = 3.0
+    view_step_rad: float = 0.17
+    roll_step_rad: float = 0.26
+    scale_step: float = 0.15
+    max_keyframes: int = 12
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.levels <= 6:
+            raise InputError(f"feature options: levels is {self.levels}, expected 2 to 6")
+        if not 0 < self.min_corners <= self.max_corners:
+            raise InputError(
+                f"feature options: min_corners {self.min_corners} is not in 1..max_corners {self.max_corners}"
+            )
+        if not 0.0 < self.min_ncc < 1.0:
+            raise InputError(f"feature options: min_ncc is {self.min_ncc}, expected within 0 to 1")
+
+
+class Anchors(NamedTuple):
+    """The features of a keyframe, as the kernels take them.
+
+    Attributes:
+        pixels: (N,2) corners, px from the first pixel of the keyframe's cropped pyramid.
+        points: (N,3) in the body, mm.
+        tangents: (N,2,3) unit vectors spanning the surface; their cross product looks away from the camera.
+        jacobians: (N,2,2) px per mm along the tangents.
+        trust: (N,) 0–1, falls when a feature is found elsewhere than the pose says.
+    """
+
+    pixels: Array
+    points: Array
+    tangents: Array
+    jacobians: Array
+    trust: Array
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """A view of the part with a known pose; ``pyramid`` is the part's rectangle of each level."""
+
+    cam_from_body: Array
+    pyramid: Pyramid
+    anchors: Anchors
+    last_used: int
+
+
+@njit(cache=True, nogil=True, inline="always")
+def to_camera(m, x, y, z):  # type: ignore[no-untyped-def]
+    """A point mapped by a (4,4) rigid transform."""
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
+    )
+
+
+@njit(cache=True, nogil=True)
+def tangent_jacobian(point, tangents, cam_from_body, intrinsics, out):  # type: ignore[no-untyped-def]
+    """Pixel, depth, and (2,2) px per mm along the two tangents (central differences over about 4 px)."""
+    x, y, z = to_camera(cam_from_body, point[0], point[1], point[2])
+    if z < 1.0:
+        return 0.0, 0.0, -1.0
+    step = 2.0 * z / intrinsics[0]
+    for k in range(2):
+        tx, ty, tz = step * tangents[k, 0], step * tangents[k, 1], step * tangents[k, 2]
+        x1, y1, z1 = to_camera(cam_from_body, point[0] + tx, point[1] + ty, point[2] + tz)
+        x2, y2, z2 = to_camera(cam_from_body, point[0] - tx, point[1] - ty, point[2] - tz)
+        if z1 < 1.0 or z2 < 1.0:
+            return 0.0, 0.0, -1.0
+        u1, v1 = project(x1, y1, z1, intrinsics)
+        u2, v2 = project(x2, y2, z2, intrinsics)
+        out[0, k] = (u1 - u2) / (2.0 * step)
+        out[1, k] = (v1 - v2) / (2.0 * step)
+    u, v = project(x, y, z, intrinsics)
+    return u, v, z
+
+
+@njit(cache=True, nogil=True)
+def _best_corners(response, threshold, cell):  # type: ignore[no-untyped-def]
+    """The strongest pixel of each ``cell`` × ``cell`` square if a local maximum: (N,3) u, v, response."""
+    height, width = response.shape
+    rows, columns = (height + cell - 1) // cell, (width + cell - 1) // cell
+    found = np.empty((rows * columns, 3))
+    count = 0
+    for row in range(rows):
+        for column in range(columns):
+            best, u, v = threshold, -1, -1
+            for y in range(row * cell, min((row + 1) * cell, height)):
+                for x in range(column * cell, min((column + 1) * cell, width)):
+                    if response[y, x] > best:
+                        best, u, v = response[y, x], x, y
+            peak = u >= 0
+            for y in range(max(v - 1, 0), min(v + 2, height)):
+                for x in range(max(u - 1, 0), min(u + 2, width)):
+                    peak = peak and response[y, x] <= best
+            if peak:
+                found[count, 0], found[count, 1], found[count, 2] = u, v, best
+                count += 1
+    return found[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _unproject(u, v, intrinsics):  # type: ignore[no-untyped-def]
+    """Ideal x, y at z = 1 of a pixel; distortion is removed by iteration."""
+    x = xd = (u - intrinsics[2]) / intrinsics[0]
+    y = yd = (v - intrinsics[3]) / intrinsics[1]
+    if intrinsics[9] != 0.0:
+        for _ in range(20):
+            ue, ve = project(x, y, 1.0, intrinsics)
+            x += xd - (ue - intrinsics[2]) / intrinsics[0]
+            y += yd - (ve - intrinsics[3]) / intrinsics[1]
+    return x, y
+
+
+@njit(cache=True, nogil=True)
+def _place_corners(hierarchy, body_from_cam, corners, intrinsics, margin_px,  # type: ignore[no-untyped-def]
+                   distance_px, flatness_px, min_facing, most):  # fmt: skip
+    """Corners that lie on a smooth piece of the part's surface, strongest first.
+
+    Rays go through the corner and ``margin_px`` left, right, above and below it. The surface normal is taken
+    across these four hits, which smooths the tessellation; steps and creases stand off that plane and are
+    refused. Returns the number kept, their indices (most,), points (most,3) and tangents (most,2,3) in the
+    body.
+    """
+    kept = np.empty(most, dtype=np.int64)
+    points = np.empty((most, 3))
+    tangents = np.empty((most, 2, 3))
+    around = np.empty((5, 3))
+    n = np.empty(3)
+    sight = np.empty(3)
+    r = body_from_cam
+    used = 0
+    for i in range(corners.shape[0]):
+        if used == most:
+            break
+        crowded = False
+        for k in range(used):
+            du, dv = corners[i, 0] - corners[kept[k], 0], corners[i, 1] - corners[kept[k], 1]
+            if du * du + dv * dv < distance_px * distance_px:
+                crowded = True
+                break
+        if crowded:
+            continue
+        whole = True
+        middle = 0.0
+        for k in range(5):
+            side = margin_px if k % 2 == 0 else -margin_px
+            du, dv = (0.0 if k == 0 or k > 2 else side), (side if k > 2 else 0.0)
+            rx, ry = _unproject(corners[i, 0] + du, corners[i, 1] + dv, intrinsics)
+            dx = r[0, 0] * rx + r[0, 1] * ry + r[0, 2]
+            dy = r[1, 0] * rx + r[1, 1] * ry + r[1, 2]
+            dz = r[2, 0] * rx + r[2, 1] * ry + r[2, 2]
+            depth, face = cast_ray(hierarchy, r[0, 3], r[1, 3], r[2, 3], dx, dy, dz, 1e30, False)
+            if face < 0:
+                whole = False
+                break
+            if k == 0:
+                middle = depth
+                sight[0], sight[1], sight[2] = dx, dy, dz
+            around[k, 0] = r[0, 3] + depth * dx
+            around[k, 1] = r[1, 3] + depth * dy
+            around[k, 2] = r[2, 3] + depth * dz
+        if not whole:
+            continue
+        a, b = around[2] - around[1], around[4] - around[3]
+        n[0], n[1], n[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        size = np.sqrt(np.sum(n * n))
+        if size < 1e-12:
+            continue
+        n /= size
+        limit = flatness_px * middle / intrinsics[0]
+        for k in range(1, 5):
+            if abs(np.sum((around[k] - around[0]) * n)) > limit:
+                whole = False
+        if not whole or abs(np.sum(n * sight)) < min_facing * np.sqrt(np.sum(sight * sight)):
+            continue
+        a /= np.sqrt(np.sum(a * a))
+        kept[used] = i
+        points[used] = around[0]
+        # The second tangent is n × t0, so that t0 × t1 = n, which looks away from the camera as a × b does.
+        tangents[used, 0] = a
+        tangents[used, 1, 0] = n[1] * a[2] - n[2] * a[1]
+        tangents[used, 1, 1] = n[2] * a[0] - n[0] * a[2]
+        tangents[used, 1, 2] = n[0] * a[1] - n[1] * a[0]
+        used += 1
+    return used, kept, points, tangents
+
+
+@njit(cache=True, nogil=True)
+def _all_jacobians(points, tangents, cam_from_body, intrinsics):  # type: ignore[no-untyped-def]
+    """(N,2,2) of `tangent_jacobian`."""
+    jacobians = np.empty((points.shape[0], 2, 2))
+    for i in range(points.shape[0]):
+        tangent_jacobian(points[i], tangents[i], cam_from_body, intrinsics, jacobians[i])
+    return jacobians
+
+
+def make_keyframe(
+    pyramid: Pyramid,
+    cam_from_body: Array,
+    outline: Array,
+    caster: RayCaster,
+    intrinsics: Array,
+    options: FeatureOptions,
+) -> Keyframe | None:
+    """Keyframe of a picture, or None when too few corners lie on the part.
+
+    Args:
+        pyramid: of the picture.
+        cam_from_body: (4,4) its pose.
+        outline: (K,2) convex polygon around the part, px.
+        caster: of the part in the body.
+        intrinsics: (10,) as in `solver.project`.
+        options: of the modality.
+    """
+    o = options
+    rectangle = _rectangle(outline, pyramid)
+    if rectangle is None:
+        return None
+    left, top, right, bottom = rectangle
+    # Corners of the half-size picture: four times as quick, quieter, and as wide as the patches.
+    half = pyramid[1][top >> 1 : bottom >> 1, left >> 1 : right >> 1]
+    response = cv2.cornerMinEigenVal(half, 3, ksize=3)
+    mask = np.zeros(response.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(mask, np.round((outline - (left, top)) / 2.0).astype(np.int32), 1)
+    response *= mask
+    cell = max(2, round(0.5 * o.corner_distance_px))
+    corners = _best_corners(response, _RESPONSE * o.corner_contrast**2, cell)
+    corners = 2.0 * corners[np.argsort(-corners[:, 2]), :2] + (left, top)
+    used, kept, points, tangents = _place_corners(
+        caster.hierarchy, invert(cam_from_body), corners, intrinsics, o.margin_px, o.corner_distance_px,
+        o.flatness_px, o.min_facing, o.max_corners,
+    )  # fmt: skip
+    if used < o.min_corners:
+        return None
+    points, tangents = points[:used].copy(), tangents[:used].copy()
+    return Keyframe(
+        cam_from_body=cam_from_body.copy(),
+        pyramid=tuple(
+            image[top >> level : (bottom >> level) + 1, left >> level : (right >> level) + 1].copy()
+            for level, image in enumerate(pyramid)
+        ),
+        anchors=Anchors(
+            pixels=corners[kept[:used]] - (left, top),
+            points=points,
+            tangents=tangents,
+            jacobians=_all_jacobians(points, tangents, cam_from_body, intrinsics),
+            trust=np.ones(used),
+        ),
+        last_used=0,
+    )
+
+
+def _rectangle(outline: Array, pyramid: Pyramid) -> tuple[int, int, int, int] | None:
+    """Left, top, right, bottom px around an outline (K,2) in the picture, on the coarsest level's grid."""
+    height, width = pyramid[0].shape
+    grid = 1 << (len(pyramid) - 1)
+    # Room for the warped patches of the coarser levels.
+    low = np.maximum(outline.min(axis=0) - 5 * grid, 0.0)
+    high = np.minimum(outline.max(axis=0) + 5 * grid, (width, height))
+    if np.any(high - low < 16):
+        return None
+    left, top = int(low[0]) // grid * grid, int(low[1]) // grid * grid
+    return left, top, int(high[0]), int(high[1])

@@ -1,0 +1,438 @@
+"""Feature modality: the part's own texture, tracked from keyframes of known pose so that it does not drift.
+
+A keyframe holds corners (Shi & Tomasi, CVPR 1994) with their 3D points and surface normals from the CAD. In a
+new frame every patch is warped into the predicted view by its tangent plane (PTAM: Klein & Murray, ISMAR
+2007) and aligned coarse to fine by inverse-compositional Lucas-Kanade (Baker & Matthews, IJCV 2004).
+Brightness gain and offset are projected out of the steepest-descent images (Hager & Belhumeur, PAMI 1998), so
+exposure may jump. Before that, all patches together search one common shift at the coarsest level, as PTAM's
+small image does, for large motion.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from arview.camera import Camera
+from arview.errors import InputError
+from arview.geometry import Array
+from arview.refinement.gauss_newton import add_line, apply_twist, solve_step
+from arview.refinement.modalities.keyframes import (
+    FeatureOptions,
+    Keyframe,
+    make_keyframe,
+    tangent_jacobian,
+    to_camera,
+)
+from arview.refinement.modalities.patch_alignment import (
+    Pyramid,
+    align_template,
+    build_pyramid,
+    common_shift,
+    prepare_template,
+    sample_patch,
+)
+from arview.refinement.projection import project
+from arview.rendering.raycast import RayCaster, cast_ray
+
+
+class Matches(NamedTuple):
+    """Features found in one frame.
+
+    Attributes:
+        points_in_body: (N,3) mm.
+        pixels: (N,2) where each was found, distorted px.
+        weights: (N,) 0–1, by how well the patch fits; times 1/σ² in `add_features`.
+        tried: how many were expected in view, to judge the share found.
+    """
+
+    points_in_body: Array
+    pixels: Array
+    weights: Array
+    tried: int
+
+
+@njit(cache=True, nogil=True)
+def _agree_with_neighbours(predicted, pixels, weights, limit_px):  # type: ignore[no-untyped-def]
+    """Clear the weights of points displaced unlike the median of their seven nearest neighbours."""
+    count = predicted.shape[0]
+    near = 7
+    index = np.empty(near, dtype=np.int64)
+    distance = np.empty(near)
+    du, dv = np.empty(near), np.empty(near)
+    wrong = np.zeros(count, dtype=np.bool_)
+    for i in range(count):
+        if weights[i] == 0.0:
+            continue
+        found = 0
+        for j in range(count):
+            if j == i or weights[j] == 0.0:
+                continue
+            d = (predicted[i, 0] - predicted[j, 0]) ** 2 + (predicted[i, 1] - predicted[j, 1]) ** 2
+            if found < near:
+                k = found
+                found += 1
+            elif d < distance[near - 1]:
+                k = near - 1
+            else:
+                continue
+            while k > 0 and distance[k - 1] > d:
+                distance[k], index[k] = distance[k - 1], index[k - 1]
+                k -= 1
+            distance[k], index[k] = d, j
+        if found < 3:
+            continue
+        for k in range(found):
+            du[k] = pixels[index[k], 0] - predicted[index[k], 0]
+            dv[k] = pixels[index[k], 1] - predicted[index[k], 1]
+        eu = pixels[i, 0] - predicted[i, 0] - np.median(du[:found])
+        ev = pixels[i, 1] - predicted[i, 1] - np.median(dv[:found])
+        wrong[i] = eu * eu + ev * ev > limit_px * limit_px
+    for i in range(count):
+        if wrong[i]:
+            weights[i] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def add_features(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px):  # type: ignore[no-untyped-def]
+    """Add the reprojection residuals of matched points to the 6×6 system.
+
+    Residuals fade out towards ``robust_px`` (Tukey). Returns the summed weighted squared residual, the summed
+    weight, and the number of points within ``robust_px``.
+    """
+    r = cam_from_body
+    sum_square = 0.0
+    sum_weight = 0.0
+    inliers = 0
+    for i in range(points.shape[0]):
+        if weights[i] <= 0.0:
+            continue
+        p = points[i]
+        x, y, z = to_camera(r, p[0], p[1], p[2])
+        if z < 1.0:
+            continue
+        u, v = project(x, y, z, intrinsics)
+        eu, ev = u - pixels[i, 0], v - pixels[i, 1]
+        square = (eu * eu + ev * ev) / (robust_px * robust_px)
+        if square >= 1.0:
+            continue
+        w = weights[i] * (1.0 - square) ** 2 / (sigma_px * sigma_px)
+        add_line(hessian, gradient, p, r, x, y, z, 1.0, 0.0, intrinsics, eu, w)
+        add_line(hessian, gradient, p, r, x, y, z, 0.0, 1.0, intrinsics, ev, w)
+        sum_square += w * (eu * eu + ev * ev)
+        sum_weight += w
+        inliers += 1
+    return sum_square, sum_weight, inliers
+
+
+@njit(cache=True, nogil=True)
+def _align_pose(points, cam_from_body, intrinsics, pixels, weights, damping, sigma_px):  # type: ignore[no-untyped-def]
+    """Pose that lays points on their pixels: Gauss-Newton, robust limit shrinking from 40 to 3 px."""
+    hessian = np.zeros((6, 6))
+    gradient = np.zeros(6)
+    robust_px = 40.0
+    for _ in range(8):
+        hessian[:] = 0.0
+        gradient[:] = 0.0
+        add_features(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px)
+        cam_from_body = apply_twist(cam_from_body, solve_step(hessian, gradient, damping))
+        robust_px = max(3.0, 0.6 * robust_px)
+    return cam_from_body
+
+
+@njit(cache=True, nogil=True)
+def _count_near(points, cam_from_body, intrinsics, pixels, weights, limit_px):  # type: ignore[no-untyped-def]
+    """How many points of positive weight project to within ``limit_px`` of their pixels."""
+    count = 0
+    for i in range(points.shape[0]):
+        x, y, z = to_camera(cam_from_body, points[i, 0], points[i, 1], points[i, 2])
+        if weights[i] > 0.0 and z >= 1.0:
+            u, v = project(x, y, z, intrinsics)
+            if (u - pixels[i, 0]) ** 2 + (v - pixels[i, 1]) ** 2 < limit_px * limit_px:
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _facing_camera(anchors, hierarchy, cam_from_body, min_facing, check_occlusion):  # type: ignore[no-untyped-def]
+    """(N,) whether each trusted anchor faces the camera and is not hidden behind the part itself."""
+    r = cam_from_body
+    eye = np.empty(3)
+    for a in range(3):
+        eye[a] = -(r[0, a] * r[0, 3] + r[1, a] * r[1, 3] + r[2, a] * r[2, 3])
+    wanted = np.zeros(anchors.points.shape[0], dtype=np.bool_)
+    for i in range(wanted.shape[0]):
+        if anchors.trust[i] < 0.2:
+            continue
+        p, t = anchors.points[i], anchors.tangents[i]
+        dx, dy, dz = eye[0] - p[0], eye[1] - p[1], eye[2] - p[2]
+        facing = (
+            (t[0, 2] * t[1, 1] - t[0, 1] * t[1, 2]) * dx
+            + (t[0, 0] * t[1, 2] - t[0, 2] * t[1, 0]) * dy
+            + (t[0, 1] * t[1, 0] - t[0, 0] * t[1, 1]) * dz
+        )
+        if facing < min_facing * np.sqrt(dx * dx + dy * dy + dz * dz):
+            continue
+        face = -1
+        if check_occlusion:
+            # From 1 % along the way on, so that the surface itself is not hit.
+            x, y, z = p[0] + 0.01 * dx, p[1] + 0.01 * dy, p[2] + 0.01 * dz
+            _, face = cast_ray(hierarchy, x, y, z, dx, dy, dz, 0.99, True)
+        wanted[i] = face < 0
+    return wanted
+
+
+@njit(cache=True, nogil=True)
+def _predict(anchors, cam_from_body, intrinsics, width, height, wanted, predicted, warps):  # type: ignore[no-untyped-def]
+    """Fill predicted pixels (N,2) and the warps (N,2,2) from frame to keyframe px of the tangent planes.
+
+    Clears ``wanted`` where the patch is out of the picture or much larger or smaller than in the keyframe.
+    """
+    jacobian = np.empty((2, 2))
+    for i in range(wanted.shape[0]):
+        if not wanted[i]:
+            continue
+        wanted[i] = False
+        u, v, z = tangent_jacobian(anchors.points[i], anchors.tangents[i], cam_from_body, intrinsics, jacobian)
+        if z <= 0.0 or u < 6 or v < 6 or u > width - 7 or v > height - 7:
+            continue
+        det = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
+        if abs(det) < 1e-12:
+            continue
+        p, w = anchors.jacobians[i], warps[i]
+        w[0, 0] = (p[0, 0] * jacobian[1, 1] - p[0, 1] * jacobian[1, 0]) / det
+        w[0, 1] = (p[0, 1] * jacobian[0, 0] - p[0, 0] * jacobian[0, 1]) / det
+        w[1, 0] = (p[1, 0] * jacobian[1, 1] - p[1, 1] * jacobian[1, 0]) / det
+        w[1, 1] = (p[1, 1] * jacobian[0, 0] - p[1, 0] * jacobian[0, 1]) / det
+        area = w[0, 0] * w[1, 1] - w[0, 1] * w[1, 0]
+        if area < 0.1 or area > 10.0:
+            continue
+        predicted[i, 0], predicted[i, 1] = u, v
+        wanted[i] = True
+
+
+@njit(cache=True, nogil=True)
+def _align_level(level, key_pyramid, pyramid, key_pixels, warps, wanted, min_ncc, pixels, scores):  # type: ignore[no-untyped-def]
+    """Align wanted patches on one level from ``pixels`` on, in place; scores (N,) = correlation or 0."""
+    side = 9
+    patch = np.empty((side + 2, side + 2), dtype=np.float32)
+    template = np.empty(side * side, dtype=np.float32)
+    across = np.empty(side * side, dtype=np.float32)
+    down = np.empty(side * side, dtype=np.float32)
+    key_image, image = key_pyramid[level], pyramid[level]
+    scale = 1 << level
+    for i in range(pixels.shape[0]):
+        scores[i] = 0.0
+        if not wanted[i]:
+            continue
+        u, v = key_pixels[i, 0] / scale, key_pixels[i, 1] / scale
+        if not sample_patch(key_image, u, v, warps[i], side // 2 + 1, patch):
+            continue
+        normal, norm = prepare_template(patch, side, template, across, down)
+        if norm == 0.0:
+            continue
+        u, v = pixels[i, 0] / scale, pixels[i, 1] / scale
+        u, v, ncc = align_template(image, u, v, side, template, across, down, normal, norm, 12, 0.03)
+        if ncc >= min_ncc:
+            pixels[i, 0], pixels[i, 1] = u * scale, v * scale
+            scores[i] = ncc
+
+
+@njit(cache=True, nogil=True)
+def match_features(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intrinsics,  # type: ignore[no-untyped-def]
+                   damping, search_px, check_occlusion, min_facing, min_ncc, neighbour_px):  # fmt: skip
+    """Find a keyframe's features in a new frame.
+
+    Common shift on the coarsest level; patches alone on level 2; a pose from these, where they agree on one,
+    predicts anew; patches alone on levels 1 and 0. ``pyramid`` and ``key_pyramid`` are of frame and keyframe,
+    ``hierarchy`` of the part's triangles in the body, ``cam_from_body`` (4,4) the predicted pose, ``damping``
+    (6,) of the coarse pose as in `solve_step`; the rest as in `FeatureOptions`.
+
+    Returns:
+        pixels (N,2); weights (N,), 0 = not found; expected (N,) whether the feature should be in view.
+    """
+    points = anchors.points
+    count = points.shape[0]
+    height, width = pyramid[0].shape
+    top = len(pyramid) - 1
+    predicted = np.zeros((count, 2))
+    warps = np.empty((count, 2, 2))
+    scores = np.zeros(count)
+    expected = _facing_camera(anchors, hierarchy, cam_from_body, min_facing, check_occlusion)
+    _predict(anchors, cam_from_body, intrinsics, width, height, expected, predicted, warps)
+    seen = np.flatnonzero(expected)
+    pixels = predicted.copy()
+    if search_px > 0 and len(seen) > 0:
+        chosen = seen[:: max(1, len(seen) // 24)]
+        shift = common_shift(
+            key_pyramid[top], pyramid[top], 1 << top, anchors.pixels, predicted, warps, chosen, search_px
+        )
+        for a in range(2):
+            pixels[:, a] += shift[a]
+    if top > 1:
+        _align_level(2, key_pyramid, pyramid, anchors.pixels, warps, expected, 0.6, pixels, scores)
+        found = np.count_nonzero(scores)
+        coarse = _align_pose(points, cam_from_body, intrinsics, pixels, scores, damping, 1.0)
+        near = _count_near(points, coarse, intrinsics, pixels, scores, 5.0)
+        if near >= 8 and near > 0.6 * found:
+            _predict(anchors, coarse, intrinsics, width, height, expected, predicted, warps)
+            pixels[:] = predicted
+    _align_level(1, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels, scores)
+    # A patch found at half resolution only (motion blur, noise) is worth half the accuracy.
+    weights = np.maximum(scores - min_ncc, 0.0) / (4.0 * (1.0 - min_ncc))
+    _align_level(0, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels, scores)
+    for i in range(count):
+        if scores[i] > 0.0:
+            weights[i] = (scores[i] - min_ncc) / (1.0 - min_ncc)
+    _agree_with_neighbours(predicted, pixels, weights, neighbour_px)
+    return pixels, weights, expected
+
+
+class FeatureModality:
+    """Texture of one part, matched from a bank of keyframes."""
+
+    def __init__(
+        self,
+        vertices_in_body: Array,
+        faces: NDArray[np.int32],
+        camera: Camera,
+        options: FeatureOptions | None = None,
+    ) -> None:
+        """Prepare for a part of vertices (V,3) mm about its centre and faces (F,3), and a camera."""
+        self.options = options or FeatureOptions()
+        self.camera = camera
+        self.keyframes: list[Keyframe] = []
+        self._caster = RayCaster(vertices_in_body, faces)
+        used = np.asarray(vertices_in_body)[np.unique(faces)]
+        low, high = used.min(axis=0), used.max(axis=0)
+        self._damping = np.full(6, 1.0 / 0.3**2)
+        self._damping[3:] /= float((high - low) @ (high - low))
+        pick = np.array(list(np.ndindex(2, 2, 2)), dtype=np.float64)
+        self._box_corners = low + pick * (high - low)
+        self._intrinsics = np.array(
+            [camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0]
+        )
+        self._clock = 0
+        self._last: tuple[Keyframe, NDArray[np.intp], Array] | None = None
+
+    def pyramid(self, gray: NDArray[np.uint8]) -> Pyramid:
+        """Pyramid of a gray image (H,W) as `measure` and `add_keyframe` take it."""
+        if gray.shape != (self.camera.height, self.camera.width):
+            raise InputError(
+                f"feature modality: image is {gray.shape[1]}×{gray.shape[0]}, "
+                f"the camera {self.camera.width}×{self.camera.height}"
+            )
+        return build_pyramid(gray, self.options.levels)
+
+    def clear(self) -> None:
+        """Forget all keyframes."""
+        self.keyframes.clear()
+        self._last = None
+
+    def _nearest(self, cam_from_body: Array) -> tuple[Keyframe | None, float]:
+        """The keyframe nearest in view direction, roll and scale, and how far: 1 = a step of one of them."""
+        if not self.keyframes:
+            return None, np.inf
+        o = self.options
+        poses = np.stack([keyframe.cam_from_body for keyframe in self.keyframes])
+        eyes = np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+        eye = cam_from_body[:3, 3] @ cam_from_body[:3, :3]
+        ranges, distance = np.linalg.norm(eyes, axis=1), np.linalg.norm(eye)
+        view = np.arccos(np.clip(eyes @ eye / (ranges * distance), -1.0, 1.0))
+        turn = np.einsum("ik,njk->nij", cam_from_body[:3, :3], poses[:, :3, :3])
+        roll = np.abs(np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1]))
+        scale = np.abs(np.log(distance / ranges)) / np.log1p(o.scale_step)
+        steps = np.maximum(np.maximum(view / o.view_step_rad, roll / o.roll_step_rad), scale)
+        best = int(np.argmin(steps))
+        return self.keyframes[best], float(steps[best])
+
+    def wants_keyframe(self, cam_from_body: Array, tracked_count: int) -> bool:
+        """Whether a keyframe here would help: the view is new, or a bit new and few features were found."""
+        keyframe, distance = self._nearest(cam_from_body)
+        if keyframe is None or distance > 1.0:
+            return True
+        return tracked_count < self.options.min_corners and distance > 0.3
+
+    def add_keyframe(self, gray: NDArray[np.uint8] | Pyramid, cam_from_body: Array) -> int:
+        """Keep this frame, whose pose must be good; returns the number of features, 0 = too few.
+
+        ``gray`` is an image (H,W) uint8 or its pyramid. A keyframe nearer than 0.3 of a step is replaced.
+        """
+        pyramid = gray if isinstance(gray, tuple) else self.pyramid(gray)
+        keyframe = make_keyframe(
+            pyramid, cam_from_body, self._outline(cam_from_body), self._caster, self._intrinsics, self.options
+        )
+        if keyframe is None:
+            return 0
+        self._clock += 1
+        keyframe.last_used = self._clock
+        nearest, distance = self._nearest(cam_from_body)
+        if nearest is not None and distance < 0.3:
+            self.keyframes.remove(nearest)
+        elif len(self.keyframes) >= self.options.max_keyframes:
+            self.keyframes.remove(min(self.keyframes, key=lambda old: old.last_used))
+        self.keyframes.append(keyframe)
+        return len(keyframe.anchors.points)
+
+    def _outline(self, cam_from_body: Array) -> Array:
+        """Convex polygon (K,2) px around the part's box; the whole picture when that reaches behind."""
+        pixels = self.camera.project(self._box_corners @ cam_from_body[:3, :3].T + cam_from_body[:3, 3])
+        if not np.all(np.isfinite(pixels)):
+            w, h = float(self.camera.width), float(self.camera.height)
+            return np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
+        return np.asarray(cv2.convexHull(pixels.astype(np.float32))[:, 0], dtype=np.float64)
+
+    def measure(self, pyramid: Pyramid, cam_from_body: Array) -> Matches:
+        """Find the features of the nearest keyframe in a frame.
+
+        Args:
+            pyramid: of the frame, see `pyramid`.
+            cam_from_body: (4,4) predicted pose, to within about 30 px in the picture at 640×480.
+        """
+        o = self.options
+        keyframe, _ = self._nearest(cam_from_body)
+        if keyframe is None:
+            self._last = None
+            return Matches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
+        self._clock += 1
+        keyframe.last_used = self._clock
+        pixels, weights, expected = match_features(
+            keyframe.pyramid, pyramid, keyframe.anchors, self._caster.hierarchy, cam_from_body,
+            self._intrinsics, self._damping, o.search_px, o.check_occlusion, o.min_facing, o.min_ncc,
+            o.neighbour_px,
+        )  # fmt: skip
+        found = np.flatnonzero(weights > 0.0)
+        self._last = (keyframe, found, pixels[found])
+        tried = int(np.count_nonzero(expected))
+        return Matches(keyframe.anchors.points[found], pixels[found], weights[found], tried)
+
+    def align(self, matches: Matches, cam_from_body: Array) -> Array:
+        """Pose (4,4) from the matches alone, started at and held towards a pose: a pre-alignment."""
+        points, pixels, weights, _ = matches
+        return np.asarray(_align_pose(points, cam_from_body, self._intrinsics, pixels, weights, self._damping, 1.0))
+
+    def settle(self, cam_from_body: Array, limit_px: float = 2.0) -> None:
+        """Learn from the frame's accepted pose which features of the last `measure` can be trusted.
+
+        A feature found more than ``limit_px`` from where the pose says (a reflection, a shadow, a hand that
+        was in the keyframe) loses trust, and below 0.2 it is left out for good; one that is not found may
+        be hidden and keeps it. A keyframe with too few features left is dropped.
+        """
+        if self._last is None:
+            return
+        keyframe, found, pixels = self._last
+        trust = keyframe.anchors.trust
+        points = keyframe.anchors.points[found] @ cam_from_body[:3, :3].T + cam_from_body[:3, 3]
+        with np.errstate(invalid="ignore"):
+            good = np.linalg.norm(self.camera.project(points) - pixels, axis=1) <= limit_px
+        # When most disagree, the pose may be at fault.
+        if 2 * np.count_nonzero(good) < len(found):
+            return
+        trust[found] += 0.1 * (good - trust[found])
+        if np.count_nonzero(trust >= 0.2) < self.options.min_corners and keyframe in self.keyframes:
+            self.keyframes.remove(keyframe)
+        self._last = None

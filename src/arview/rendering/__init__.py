@@ -1,0 +1,1 @@
+"""Rendering: depth, normals, components and shaded views of a model; rays against its mesh."""

@@ -1,0 +1,25 @@
+"""The tracker's result for one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from arview.geometry import Array
+from arview.refinement.evidence import Evidence
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Pose of the part in one frame, before the session decides on its state.
+
+    Attributes:
+        cam_from_model: (4,4) mm.
+        information: (6,6) of the twist (rad, mm) about the model's centre.
+        quality: 0–1, see `Evidence.quality`.
+        evidence: of the picture for the pose.
+    """
+
+    cam_from_model: Array
+    information: Array
+    quality: float
+    evidence: Evidence

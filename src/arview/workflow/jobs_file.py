@@ -1,0 +1,112 @@
+"""JOBS.toml: which parts are to be inspected, and where the results go."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from arview.errors import InputError
+from arview.workflow.job import InspectJob
+from arview.workflow.storage import is_url, joined
+
+JOBS_FILE_EXAMPLE = """\
+# Inspections of many parts. Paths are relative to this file, or URLs that fsspec knows (s3://bucket/…, gs://…, sftp://…).
+out = "results"                # a folder for each job below it
+
+[defaults]                     # for jobs that do not say otherwise: any field of a job
+part = "part.toml"
+# tolerance_mm, guard, camera, video_camera, scale_file, unit, max_frames, seed, device, makes_pdf
+
+[[job]]
+serial = "PL-0417"             # the name of its folder too, unless there is a name
+photos = "photos/PL-0417"
+
+[[job]]
+name = "PL-0418_second_look"
+serial = "PL-0418"
+photos = "photos/PL-0418b"
+video = "films/PL-0418.mp4"
+"""
+"""A complete file; what `arview batch --help` shows."""
+
+PLACES = ("part", "photos", "video", "camera", "video_camera", "scale_file")
+_KINDS = {"tolerance_mm": float, "guard": float, "max_frames": int, "seed": int, "threads": int, "makes_pdf": bool}
+_NAME = re.compile(r"[\w][\w.+-]*")
+
+
+@dataclass(frozen=True)
+class BatchJob:
+    """One inspection of a batch: its name, what is inspected, and the folder or URL of its results."""
+
+    name: str
+    job: InspectJob
+    out: str
+
+
+def load_jobs(path: str | Path) -> tuple[BatchJob, ...]:
+    """The jobs of a file, with names that differ.
+
+    Raises:
+        InputError: no such file, no TOML, or an entry that cannot be; the message names it.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    _refuse_unknown(content, ("out", "defaults", "job"), f"{path}")
+    out = content.get("out")
+    if not isinstance(out, str) or not out:
+        raise InputError(f"{path}: out: expected the folder or URL of the results")
+    defaults, entries = content.get("defaults", {}), content.get("job", [])
+    if not isinstance(defaults, dict) or not isinstance(entries, list) or not entries:
+        raise InputError(f"{path}: expected one [defaults] and at least one [[job]]")
+    known = ("name", *(field.name for field in fields(InspectJob)))
+    _refuse_unknown(defaults, known[1:], f"{path}: [defaults]")
+    jobs: dict[str, BatchJob] = {}
+    for number, entry in enumerate(entries, 1):
+        place = f"{path}: job {number}"
+        if not isinstance(entry, dict):
+            raise InputError(f"{place}: expected a [[job]] table")
+        _refuse_unknown(entry, known, place)
+        values = {**defaults, **entry}
+        name = values.pop("name", None) or values.get("serial")
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise InputError(f"{place}: name {name!r}: expected a serial or name of letters, digits and . _ + -")
+        if name in jobs:
+            raise InputError(f"{place}: {name!r} is there already; give each its own name")
+        jobs[name] = BatchJob(name, _job(values, path.parent, place), joined(_placed(out, path.parent), name))
+    return tuple(jobs.values())
+
+
+def _job(values: dict[str, Any], base: Path, place: str) -> InspectJob:
+    if "part" not in values:
+        raise InputError(f"{place}: part: is missing; give a part file or CAD file")
+    if not values.get("photos") and not values.get("video"):
+        raise InputError(f"{place}: give photos, a video, or both")
+    for key, value in values.items():
+        kind = _KINDS.get(key, str)
+        is_right = isinstance(value, kind) or (kind is float and type(value) is int)
+        if not is_right or (isinstance(value, bool) and kind is not bool):
+            raise InputError(
+                f"{place}: {key}: {value!r}, expected {'a number' if kind in (int, float) else kind.__name__}"
+            )
+        if key in PLACES and not (key.endswith("camera") and value.startswith("fov:")):
+            values[key] = _placed(value, base)
+    return InspectJob(**values)
+
+
+def _placed(text: str, base: Path) -> str:
+    """A path relative to the file as an absolute one; a URL as it is."""
+    return text if is_url(text) else str((base / text).resolve())
+
+
+def _refuse_unknown(table: dict[str, Any], known: tuple[str, ...], place: str) -> None:
+    unknown = sorted(set(table) - set(known))
+    if unknown:
+        raise InputError(f"{place}: unknown {', '.join(unknown)}; expected {', '.join(known)}")

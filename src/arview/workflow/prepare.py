@@ -1,0 +1,109 @@
+"""The inputs of a job, read and checked before the work begins; what its results depend on, as a hash."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from arview import __version__
+from arview.cad import Part, load_part
+from arview.camera.read import load_camera
+from arview.core.stage_cache import content_key, key_of
+from arview.errors import InputError
+from arview.measurement.options import MeasureOptions
+from arview.measurement.uncertainty.decision import DecisionOptions
+from arview.reconstruction.dense import DenseOptions
+from arview.reconstruction.intake import VideoIntakeOptions
+from arview.reconstruction.intake.reading import photo_paths
+from arview.reconstruction.run import ReconstructOptions
+from arview.reconstruction.scale import ScaleSources, load_scale_file
+from arview.reconstruction.sparse import SparseOptions
+from arview.video import open_source
+from arview.workflow.job import InspectJob
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A job whose inputs were read and found usable."""
+
+    job: InspectJob
+    part: Part
+    reconstruct: ReconstructOptions
+    measure: MeasureOptions
+
+
+def prepare(job: InspectJob, folder: Path) -> Prepared:
+    """Read and check everything that can be checked before the work begins.
+
+    Args:
+        job: what is wanted.
+        folder: for the results.
+
+    Raises:
+        InputError, MismatchError: an input is missing or unusable, or does not belong to the others.
+    """
+    if not job.photos and not job.video:
+        raise InputError("give photos, a video, or both")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; give a folder for the results")
+    if job.photos:
+        if Path(job.photos).is_dir() and folder.resolve() == Path(job.photos).resolve():
+            raise InputError(f"{folder}: is the folder of the photos; give another one for the results")
+        photo_paths(job.photos)
+    part = load_part(job.part, job.unit)
+    if job.serial is not None:
+        part = replace(part, serial=job.serial)
+    if not part.inspected:
+        raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
+    _check_cameras(job)
+    threads, seed = job.threads, job.seed
+    reconstruct = ReconstructOptions(
+        video=VideoIntakeOptions(max_frames=job.max_frames),
+        sparse=SparseOptions(seed=seed, threads=threads),
+        sources=load_scale_file(job.scale_file) if job.scale_file else ScaleSources(),
+        dense=DenseOptions(seed=seed, threads=threads, device=job.device),
+    )
+    measure = MeasureOptions(
+        tolerance_mm=job.tolerance_mm, maps_folder=folder / "inspection_distances", decision=DecisionOptions(job.guard)
+    )
+    return Prepared(job, part, reconstruct, measure)
+
+
+def _check_cameras(job: InspectJob) -> None:
+    """Open the video once, and read the cameras as far as they can be without a photo."""
+    if job.video:
+        with open_source(job.video) as frames:
+            if frames.is_live:
+                raise InputError(f"{job.video}: is a live source; record a video first and give its file")
+            if job.video_camera is not None:
+                load_camera(job.video_camera, frames.width, frames.height, job.video, frames.quarter_turns_clockwise)
+    elif job.video_camera:
+        raise InputError("a camera of the video is given, but no video")
+    if job.camera:
+        is_angle = job.camera.startswith("fov:")
+        load_camera(job.camera, *((1000, 1000) if is_angle else (None, None)))
+
+
+def measurement_key(prepared: Prepared) -> str:
+    """A hash of all that the measurement depends on, by content: the same wherever the files lie."""
+    job, part, options = prepared.job, prepared.part, prepared.measure
+    source = Path(job.photo_source)
+    photos = [source] if source.is_file() else photo_paths(job.photo_source)[0]
+    return key_of(
+        content_key(photos), _content(job.camera), part.model.source_hash, part.name, part.settings, part.datums,
+        part.serial, part.effective_view_range, replace(options, maps_folder=None),
+        replace(prepared.reconstruct, sparse=replace(prepared.reconstruct.sparse, threads=0),
+                dense=replace(prepared.reconstruct.dense, threads=0)), __version__,
+    )  # fmt: skip
+
+
+def job_key(prepared: Prepared) -> str:
+    """A hash of all that the results depend on: the measurement, the film and the kinds of files."""
+    job = prepared.job
+    video = content_key([Path(job.video)]) if job.video else None
+    return key_of(measurement_key(prepared), video, _content(job.video_camera), job.makes_pdf)
+
+
+def _content(spec: str | None) -> str | None:
+    """The content of a file, or the text itself where it is none."""
+    return content_key([Path(spec)]) if spec and Path(spec).is_file() else spec

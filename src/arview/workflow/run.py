@@ -1,0 +1,251 @@
+"""One line from photos and a video to the verdict: reconstruct → measure → report → film, each done once.
+
+| file | of |
+|---|---|
+| those of ``arview.reconstruction.run`` | photos → poses → mm → cloud |
+| ``inspection.json``, ``inspection_distances/`` | the measurement; the cloud coloured by its distance to the CAD |
+| ``report.html``, ``report.pdf`` | the report |
+| ``annotated.mp4``, ``poses.jsonl`` | the video with what was measured, and its poses |
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from arview import __version__
+from arview.core.stage_cache import Stages, content_key, key_of
+from arview.errors import CannotMeasureError, InputError, MismatchError, MissingDependencyError
+from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
+from arview.inspection.summary import overall_verdict, verdict_sentence
+from arview.reconstruction.run import Reconstruction, reconstruct
+from arview.workflow.film import camera_of_video, make_film
+from arview.workflow.job import InspectJob
+from arview.workflow.lock import alone
+from arview.workflow.prepare import Prepared, measurement_key, prepare
+
+Progress = Callable[[str, int, int], None]
+RESULTS = (
+    "report.html", "report.pdf", "annotated.mp4", "poses.jsonl", "inspection.json",
+    "inspection_distances/distances.ply",
+)  # fmt: skip
+_RECONSTRUCTION = {"photos": "photos", "sparse": "camera poses", "scale": "scale and CAD frame", "dense": "dense cloud"}
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """A stage of a run: ``state`` is ``done``, ``kept`` (of an earlier run) or ``left out``; ``note`` says more."""
+
+    name: str
+    state: str
+    seconds: float = 0.0
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an inspection found.
+
+    Attributes:
+        folder: where its files are.
+        inspection: what was measured.
+        stages: in their order.
+        files: the results, those for people first.
+        warnings: in words, what speaks against the result or is missing of it.
+        peak_memory_mb: of this process, up to the end.
+    """
+
+    folder: Path
+    inspection: Inspection
+    stages: tuple[StageRecord, ...]
+    files: tuple[Path, ...]
+    warnings: tuple[str, ...]
+    peak_memory_mb: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the whole part."""
+        return overall_verdict(self.inspection)
+
+    @property
+    def sentence(self) -> str:
+        """The counts in words."""
+        return verdict_sentence(self.inspection)
+
+
+def inspect_part(
+    job: InspectJob, folder: str | Path, progress: Progress | None = None, starts_over: bool = False
+) -> Outcome:
+    """Inspect one part; stages that an earlier run finished in ``folder`` with the same inputs are not done again.
+
+    Args:
+        job: what is to be inspected.
+        folder: where everything is written; made when missing.
+        progress: called with (what, done, total), see `arview.workflow.clock`.
+        starts_over: forget what an earlier run left in the folder.
+
+    Raises:
+        CannotMeasureError: photos that do not fit together, do not show the part, or contradict its CAD.
+        InputError, MismatchError: an input is missing, unusable, or does not belong to the others; another process
+            works in the folder.
+        OutputError: the folder cannot be written to.
+        MissingDependencyError: a library is missing; the PDF alone is left out with a warning.
+    """
+    folder = Path(folder)
+    prepared = prepare(job, folder)
+    with alone(folder, ".lock", waits=False):
+        return _Line(prepared, folder, progress or (lambda what, done, total: None)).all(starts_over)
+
+
+class _Line:
+    """One run: what it works on, and what it has come to."""
+
+    def __init__(self, prepared: Prepared, folder: Path, tell: Progress) -> None:
+        self.prepared, self.folder, self.tell = prepared, folder, tell
+        self.stages = Stages(folder)
+        self.records: list[StageRecord] = []
+        self.warnings: list[str] = []
+
+    def all(self, starts_over: bool) -> Outcome:
+        """The stages in their order."""
+        key = measurement_key(self.prepared)
+        if starts_over or not self.stages.is_finished("inputs", key):
+            # Results of other inputs go before anything can fail: what lies in the folder is always of these.
+            for name in RESULTS:
+                (self.folder / name).unlink(missing_ok=True)
+            self.stages.restart("inputs")
+        self.stages.finish("inputs", key)
+        found = self._reconstructed(starts_over)
+        self.stages = Stages(self.folder)  # as the reconstruction left them
+        inspection = self._measured(key)
+        self._report()
+        self._film(found, inspection)
+        return Outcome(
+            self.folder, inspection, tuple(self.records),
+            tuple(path for path in (self.folder / name for name in (*RESULTS, "cloud.ply")) if path.is_file()),
+            tuple(dict.fromkeys([*self.warnings, *inspection.warnings])), _peak_memory_mb(),
+        )  # fmt: skip
+
+    def _reconstructed(self, starts_over: bool) -> Reconstruction:
+        prepared, job = self.prepared, self.prepared.job
+        options = replace(prepared.reconstruct, starts_over=starts_over)
+        with _measuring():
+            found = reconstruct(job.photo_source, self.folder, prepared.part, job.camera, options, self.tell)
+        for name, title in _RECONSTRUCTION.items():
+            state = "done" if name in found.seconds else "kept"
+            self.records.append(StageRecord(title, state, found.seconds.get(name, 0.0), _about(found, name)))
+        self.warnings += found.intake.warnings
+        self.warnings += found.coverage.advice if found.coverage is not None else ()
+        return found
+
+    def _measured(self, inputs: str) -> Inspection:
+        part, path = self.prepared.part, self.folder / "inspection.json"
+
+        def work() -> str:
+            from arview.measurement.folder import read_folder
+            from arview.measurement.run import measure
+
+            with _measuring():
+                inspection = measure(read_folder(self.folder), part, self.prepared.measure, self.tell)
+            save_inspection(inspection, path)
+            return ""
+
+        self._once("measure", "measurement", key_of(inputs, self.stages.key("dense")), [path], work)
+        inspection = load_inspection(path, part.model)
+        self.records[-1] = replace(self.records[-1], note=verdict_sentence(inspection))
+        return inspection
+
+    def _report(self) -> None:
+        part, wants_pdf = self.prepared.part, self.prepared.job.makes_pdf
+        source, html, pdf = (self.folder / name for name in ("inspection.json", "report.html", "report.pdf"))
+
+        def work() -> str:
+            from arview.report import make_report
+
+            try:
+                evidence = make_report(source, html, pdf if wants_pdf else None, part, progress=self.tell)
+            except MissingDependencyError as error:
+                self.warnings.append(f"no PDF: {error}")
+                evidence = make_report(source, html, None, part, progress=self.tell)
+            self.warnings += evidence.absent.values()
+            return "HTML and PDF" if pdf.is_file() else "HTML"
+
+        key = key_of(content_key([source]), self.stages.key("dense"), part.model.source_hash, __version__)
+        if not wants_pdf:
+            pdf.unlink(missing_ok=True)
+        self._once("report", "report", key, [html, pdf] if wants_pdf else [html], work)
+
+    def _film(self, found: Reconstruction, inspection: Inspection) -> None:
+        part, job = self.prepared.part, self.prepared.job
+        film, poses = self.folder / "annotated.mp4", self.folder / "poses.jsonl"
+        video = job.video
+        try:
+            if video is None:
+                raise InputError("no --video")
+            of_photos = None if found.sparse is None else found.sparse.photos[0].camera
+            camera, warning = camera_of_video(video, job.video_camera, of_photos, job.is_from_video)
+            self.warnings += [warning] if warning else []
+            key = key_of(
+                content_key([Path(video), self.folder / "inspection.json"]), camera.width, camera.height,
+                camera.matrix.tolist(), camera.dist.tolist(), part.effective_view_range, __version__,
+            )  # fmt: skip
+            self._once(
+                "film", "film", key, [film, poses],
+                lambda: make_film(video, part, camera, inspection, film, poses,
+                                  lambda done, total: self.tell("film", done, total)),
+            )  # fmt: skip
+        except (InputError, MismatchError) as error:  # the measurement stands by itself
+            for old in (film, poses):
+                old.unlink(missing_ok=True)
+            self.records.append(StageRecord("film", "left out", note=str(error)))
+            if video is not None:
+                self.warnings.append(f"no film: {error}")
+
+    def _once(self, name: str, title: str, key: str, files: Sequence[Path], work: Callable[[], str]) -> None:
+        """Do the work, unless it was done with this key and its files are as it left them."""
+        if self.stages.is_finished(name, f"{key} {content_key(files)}") and all(path.is_file() for path in files):
+            self.records.append(StageRecord(title, "kept"))
+            return
+        self.stages.restart(name)
+        began = time.perf_counter()
+        note = work()
+        if all(path.is_file() for path in files):
+            self.stages.finish(name, f"{key} {content_key(files)}")
+        self.records.append(StageRecord(title, "done", time.perf_counter() - began, note))
+
+
+@contextmanager
+def _measuring() -> Iterator[None]:
+    """Inputs were looked at before: what is wrong with them now is that they cannot be measured."""
+    try:
+        yield
+    except (InputError, MismatchError) as error:
+        raise CannotMeasureError(str(error)) from error
+
+
+def _about(found: Reconstruction, stage: str) -> str:
+    """What a stage of the reconstruction found, in a few words."""
+    sparse, scale, quality = found.sparse, found.scale, found.quality
+    if stage == "photos":
+        left_out = f", {len(found.intake.rejected)} left out" if found.intake.rejected else ""
+        return f"{len(found.intake.photos)} usable{left_out}"
+    if stage == "sparse" and sparse is not None and quality is not None:
+        total = len(sparse.photos) + len(sparse.unplaced)
+        return f"{len(sparse.photos)} of {total} photos placed, {quality.reprojection_rms_px:.2f} px rms"
+    if stage == "scale" and scale is not None and scale.scale_std is not None:
+        kinds = ", ".join(dict.fromkeys(one.kind for one in scale.evidence if one.is_used))
+        return f"scale from {kinds}, ±{100 * scale.scale_std:.3f} %"
+    if stage == "dense" and found.cloud is not None:
+        return f"{len(found.cloud.points)} points"
+    return ""
+
+
+def _peak_memory_mb() -> float:
+    """The most this process has held in memory so far."""
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most / (1024.0**2 if sys.platform == "darwin" else 1024.0)
