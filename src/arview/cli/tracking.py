@@ -241,7 +241,7 @@ def annotate(
 
     SOURCE is a video file, a picture, a folder or glob of pictures, a camera number or an RTSP/HTTP address.
     """
-    from arview import annotation as pipeline
+    from arview import annotation
     from arview.cad import load_part
     from arview.guideviews import GuideViewOptions, load_guide_views
     from arview.guideviews.cache import cached_guide_views

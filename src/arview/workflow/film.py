@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from arview import annotation as pipeline
+from arview import annotation
 from arview.cad import Part
 from arview.camera import Camera
 from arview.camera.read import guess_camera, load_camera
