@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +18,7 @@ from arview.calibration.verdict import Judgement, VerdictOptions, judge
 from arview.calibration.views import Sightings, find_views
 from arview.camera import Camera
 from arview.camera.profiles import lens_record
+from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.reconstruction.scale import Board
 
@@ -49,7 +50,7 @@ def calibrate(
     choice: ChoiceOptions | None = None,
     solving: SolveOptions | None = None,
     limits: VerdictOptions | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> Calibration:
     """Calibrate a camera from photos, or one video, of a ChArUco board.
 

@@ -8,7 +8,7 @@ calibrate one camera, and that is how ``load_camera`` expects it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
+from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.reconstruction.scale import Board
@@ -136,9 +137,7 @@ class BoardFinder:
         return cv2.aruco.CharucoDetector(drawn, details, self._parameters)
 
 
-def find_views(
-    sources: Sequence[str | Path], board: Board, progress: Callable[[int, int], None] | None = None
-) -> Sightings:
+def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgress | None = None) -> Sightings:
     """Look for the board in photos, or in one video.
 
     Args:
@@ -167,9 +166,7 @@ def find_views(
 # --- photos ------------------------------------------------------------------------------------------------
 
 
-def _look_at_photos(
-    sources: Sequence[str | Path], finder: BoardFinder, progress: Callable[[int, int], None] | None
-) -> Sightings:
+def _look_at_photos(sources: Sequence[str | Path], finder: BoardFinder, progress: StepProgress | None) -> Sightings:
     from arview.reconstruction.intake.reading import photo_paths
 
     paths: list[Path] = []
@@ -265,7 +262,7 @@ def _is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES
 
 
-def _look_at_video(path: Path, finder: BoardFinder, progress: Callable[[int, int], None] | None) -> Sightings:
+def _look_at_video(path: Path, finder: BoardFinder, progress: StepProgress | None) -> Sightings:
     import cv2
 
     from arview.camera.profiles import exif_of_video

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,10 @@ import click
 
 from arview import __version__
 from arview.core.atomic import replacing
+from arview.core.progress import Progress, StepProgress
 from arview.errors import ArviewError, OutputError
 
 EXIT_ERROR, EXIT_BUG, EXIT_INTERRUPTED = 2, 1, 130
-Progress = Callable[[int, int], None]
 
 
 class _Group(click.Group):
@@ -85,7 +85,7 @@ RENDERER = click.option(
 
 
 @contextmanager
-def progress_bar(label: str, total: int | None = None) -> Iterator[Progress]:
+def progress_bar(label: str, total: int | None = None) -> Iterator[StepProgress]:
     """A bar on stderr, shown only on a terminal; yields a function of (done, in all)."""
     from tqdm import tqdm
 
@@ -99,7 +99,7 @@ def progress_bar(label: str, total: int | None = None) -> Iterator[Progress]:
 
 
 @contextmanager
-def stage_bar() -> Iterator[Callable[[str, int, int], None]]:
+def stage_bar() -> Iterator[Progress]:
     """Like ``progress_bar`` for work in stages: yields a function of (stage, done, in all)."""
     from tqdm import tqdm
 

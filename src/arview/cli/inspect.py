@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from arview.cli.common import UNIT, main, say, say_bug
+from arview.core.progress import Progress
 from arview.errors import ArviewError, CannotMeasureError
 
 if TYPE_CHECKING:
@@ -181,7 +182,7 @@ def print_outcome(outcome: Outcome) -> None:
 
 
 @contextmanager
-def line_bar(has_film: bool, is_from_video: bool, has_pdf: bool) -> Iterator[Callable[[str, int, int], None]]:
+def line_bar(has_film: bool, is_from_video: bool, has_pdf: bool) -> Iterator[Progress]:
     """One bar for all stages, with the time left; shown only on a terminal."""
     from tqdm import tqdm
 

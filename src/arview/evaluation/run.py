@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from arview.camera import Camera
+from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.evaluation.bop import Scene, SceneFrame
 from arview.evaluation.metrics import PoseError, PoseMeter
@@ -154,7 +155,7 @@ class SceneResult:
 def scene_guide_views(
     scene: Scene,
     options: GuideViewOptions | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> GuideViewSet:
     """Guide views for a scene, cached: over the part's declared range, else over what covers its poses."""
     part = scene.part
@@ -167,7 +168,7 @@ def evaluate_scene(
     init: str = "truth",
     options: SessionOptions | None = None,
     views: GuideViewSet | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: StepProgress | None = None,
     make_session: Callable[[GuideViewSet, Camera, Array | None], Session] | None = None,
 ) -> SceneResult:
     """Track the part through the scene.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 from arview import __version__
 from arview.cad.model import Model
 from arview.cad.view_range import ViewRange
+from arview.core.progress import StepProgress
 from arview.errors import ArviewError
 from arview.guideviews import GuideViewOptions, GuideViewSet, load_guide_views, make_guide_views
 
@@ -36,7 +36,7 @@ def cached_guide_views(
     model: Model,
     view_range: ViewRange,
     options: GuideViewOptions | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> GuideViewSet:
     """The set from the cache, or made now and put there; see `make_guide_views` for arguments and errors.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
+from arview.core.progress import StepProgress
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array
 from arview.guideviews.extract import ViewFeatures, extract_features
@@ -222,7 +223,7 @@ def make_guide_views(
     model: Model,
     view_range: ViewRange,
     options: GuideViewOptions | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> GuideViewSet:
     """Render and extract the guide views of a model over a range.
 

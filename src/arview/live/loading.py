@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from arview.cad import load_part
 from arview.camera.read import guess_camera
+from arview.core.progress import StepProgress
 from arview.errors import ArviewError, MismatchError
 from arview.guideviews import GuideViewOptions, load_guide_views
 from arview.guideviews.cache import cached_guide_views
@@ -28,7 +28,7 @@ def load_subject(
     views_path: str | None,
     options: LiveOptions,
     view_options: GuideViewOptions | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> Subject:
     """Part, guide views (of a file, of the cache, or made now), inspection and camera.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from arview.cad.model import Model
 from arview.cad.part import Part
+from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import DistanceReport, ForeignReport, Inspection
@@ -39,8 +40,6 @@ from arview.measurement.types import Move, NotMeasured
 from arview.measurement.uncertainty.budget import PosePropagation
 from arview.measurement.uncertainty.combine import Combined
 from arview.reconstruction.scale.cad import base_names
-
-Progress = Callable[[str, int, int], None]
 
 
 def measure(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.progress import StepProgress
 from arview.reconstruction.intake import read_photo
 from arview.reconstruction.types import Photo
 
 Descriptors = NDArray[np.float32]
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def _spread(points: NDArray[np.float32], strength: NDArray[np.float64], shape: t
 
 
 def find_all_features(
-    photos: Sequence[Photo], options: FeatureOptions, threads: int, progress: Progress | None = None
+    photos: Sequence[Photo], options: FeatureOptions, threads: int, progress: StepProgress | None = None
 ) -> list[Features]:
     """Features of every photo, in their order; photos are read and searched by ``threads`` at a time.
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -27,6 +26,7 @@ import numpy as np
 from arview import __version__
 from arview.cad import Part
 from arview.core.atomic import replacing
+from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of, write_json
 from arview.errors import InputError, OutputError
 from arview.geometry import Array
@@ -41,7 +41,6 @@ from arview.reconstruction.types import DenseCloud, Photo, SparseModel
 
 Stage = Literal["photos", "sparse", "scale", "dense"]
 STAGES: tuple[Stage, ...] = ("photos", "sparse", "scale", "dense")
-Progress = Callable[[str, int, int], None]
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mts", ".3gp"})
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from arview.camera import Camera
+from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array, invert, skew
 from arview.reconstruction.colmap import CALIBRATED_MODEL, HALF_PX, colmap_camera, import_pycolmap, sparse_model_of
@@ -28,7 +29,6 @@ from arview.reconstruction.features import FeatureOptions, Features, find_all_fe
 from arview.reconstruction.matching import Matches, epipolar_inliers, match_along_lines, match_descriptors
 from arview.reconstruction.types import Photo, SparseModel
 
-Progress = Callable[[str, int, int], None]
 Pair = tuple[int, int]
 
 

@@ -7,9 +7,10 @@ from typing import Any
 
 from arview.cad.part import Part
 from arview.core.atomic import replacing
+from arview.core.progress import Progress
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.report.evidence import Evidence, gather
-from arview.report.page import Progress, ReportOptions, build_context, render
+from arview.report.page import ReportOptions, build_context, render
 
 PANGO_INSTALL_COMMAND = (
     "apt-get install -y --no-install-recommends libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import resources
@@ -14,6 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from arview import __version__
+from arview.core.progress import Progress
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Details, Inspection, Verdict
 from arview.inspection.summary import overall_verdict, verdict_sentence
@@ -35,7 +35,6 @@ from arview.report.words import (
     zone_text,
 )
 
-Progress = Callable[[str, int, int], None]
 _FONTS = (("Inter", "400", "inter-400"), ("Inter", "600", "inter-600"), ('"Inter Greek"', "400", "inter-greek-400"))
 _EXAGGERATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 

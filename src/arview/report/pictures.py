@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
 from arview.inspection import ComponentDeviation, ForeignReport, Inspection, Verdict
@@ -66,7 +67,7 @@ class Gallery:
 
 def make_gallery(
     inspection: Inspection, model: Model, sparse: SparseModel, options: CropOptions | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> Gallery:  # fmt: skip
     """Two crops of what did not pass and of foreign objects, one of the rest, from the photos that show it best.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from arview import annotation
 from arview.cad import Part
 from arview.camera import Camera
 from arview.camera.read import guess_camera, load_camera
+from arview.core.progress import StepProgress
 from arview.guideviews.cache import cached_guide_views
 from arview.inspection import Inspection
 from arview.overlay import OverlayRenderer
@@ -44,7 +44,7 @@ def camera_of_video(video: str, spec: str | None, of_photos: Camera | None, is_f
 
 def make_film(
     video: str, part: Part, camera: Camera, inspection: Inspection, film: Path, poses: Path,
-    progress: Callable[[int, int], None],
+    progress: StepProgress,
 ) -> str:  # fmt: skip
     """Follow the part through a video, draw what was measured, and say in how many frames it was followed.
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from arview import __version__
+from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of
 from arview.errors import CannotMeasureError, InputError, MismatchError, MissingDependencyError
 from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
@@ -29,7 +30,6 @@ from arview.workflow.job import InspectJob
 from arview.workflow.lock import alone
 from arview.workflow.prepare import Prepared, measurement_key, prepare
 
-Progress = Callable[[str, int, int], None]
 RESULTS = (
     "report.html", "report.pdf", "annotated.mp4", "poses.jsonl", "inspection.json",
     "inspection_distances/distances.ply",

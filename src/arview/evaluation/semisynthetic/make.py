@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 from arview.cad.model import Model
 from arview.cad.symmetry import Symmetry
 from arview.camera import Camera
+from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.evaluation.bop import Scene
 from arview.evaluation.metrics import symmetry_group
@@ -31,7 +31,6 @@ from arview.evaluation.semisynthetic.shapes import SHAPES, shape
 from arview.evaluation.semisynthetic.trajectory import TrajectoryOptions, followed_trajectory
 from arview.geometry import Array
 
-Progress = Callable[[int, int], None]
 WALK_ROUND = TrajectoryOptions(turn_deg=4.0, step_mm=8.0, distance_mm=(450.0, 800.0))
 """Motion of a camera that is led round an assembly, for look-alikes."""
 
@@ -100,7 +99,7 @@ def look_alike_job(
     return Job(name, model, options, photos, look_alike, follow)
 
 
-def make_sequence(job: Job, folder: Path, progress: Progress | None = None) -> Path:
+def make_sequence(job: Job, folder: Path, progress: StepProgress | None = None) -> Path:
     """Make a sequence and write it below a folder, unless it is there already; returns its own folder.
 
     Raises:

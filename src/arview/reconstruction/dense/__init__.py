@@ -6,11 +6,11 @@ views → depth maps (kernels, patchmatch, polish) → fusion
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.reconstruction.dense.depth import depth_maps
 from arview.reconstruction.dense.files import read_map, read_ply, write_map, write_maps, write_ply
@@ -36,7 +36,7 @@ def reconstruct_dense(
     options: DenseOptions | None = None,
     cad: Cad | None = None,
     folder: Path | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> DenseCloud:
     """The dense cloud of posed photos, in the frame and unit of ``sparse``.
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.progress import Progress
 from arview.reconstruction.dense.kernels import PARALLAX, Problem, make_scratch
 from arview.reconstruction.dense.options import DenseOptions
 from arview.reconstruction.dense.patchmatch import NEIGHBOURS, sweep, try_hypotheses
@@ -30,8 +31,6 @@ SWEEPS = (2, 1)
 RANDOMS = 6
 POLISH_ITERATIONS = 5
 T = TypeVar("T")
-Progress = Callable[[str, int, int], None]
-"""Called with the stage's name, views done and views in all."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ independent in this, so threads take one each; of all points in a small cell the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.progress import Progress
 from arview.geometry import Array, invert
 from arview.reconstruction.dense.depth import DepthMap
 from arview.reconstruction.dense.options import DenseOptions
@@ -58,7 +59,7 @@ class _Stack:
 
 def fuse(
     maps: Sequence[DepthMap], images: Sequence[Image], options: DenseOptions, threads: int,
-    progress: Callable[[str, int, int], None],
+    progress: Progress,
 ) -> DenseCloud:  # fmt: skip
     """The cloud of all points that ``options.least_views`` maps agree on; empty when there are none.
 

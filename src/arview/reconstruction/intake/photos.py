@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from arview.camera.exif import PhotoExif
+from arview.core.progress import StepProgress
 from arview.errors import ArviewError, InputError, MismatchError
 from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck, check_photo, same_views, thumbnail
 from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.intake.reading import RAW_SUFFIXES, Pixels, glance, photo_paths
 from arview.reconstruction.types import Photo
-
-Progress = Callable[[int, int], None]
 
 LEAST_PHOTOS = 3  # a third photo is the first that can contradict the other two
 GOOD_NUMBER = "20 to 40 photos from all around the part, each sharing more than half of what it shows with the next"
@@ -59,7 +58,7 @@ def intake_photos(
     source: str | Path | Sequence[str | Path],
     camera: str | Path | None = None,
     options: CheckOptions | None = None,
-    progress: Progress | None = None,
+    progress: StepProgress | None = None,
 ) -> Intake:
     """Read, judge and sort the photos of a folder.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from arview.camera.exif import PhotoExif
 from arview.core.atomic import replacing
+from arview.core.progress import StepProgress
 from arview.errors import InputError, OutputError
 from arview.reconstruction.intake.checks import CheckOptions, check_photo, thumbnail
 from arview.reconstruction.intake.photos import LEAST_PHOTOS, Intake, Seen, assess, look_at
@@ -47,7 +47,7 @@ def intake_video(
     folder: str | Path,
     options: VideoIntakeOptions | None = None,
     camera: str | Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> Intake:
     """Pick frames of a video and write them into ``folder`` as ``frame_000123.png``, numbered as in the video.
 
@@ -98,7 +98,7 @@ def intake_frames(
     folder: str | Path,
     options: VideoIntakeOptions | None = None,
     camera: str | Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> Intake:
     """The intake of frames that ``intake_video`` has written into ``folder`` before.
 
@@ -139,7 +139,7 @@ def choose_frames(
 
 
 def _look_through(
-    source: FrameSource, options: VideoIntakeOptions, progress: Callable[[int, int], None] | None, total: int
+    source: FrameSource, options: VideoIntakeOptions, progress: StepProgress | None, total: int
 ) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
     """Index of each frame, how far the picture has travelled (in diagonals, never falling), and its sharpness."""
     indices: list[int] = []

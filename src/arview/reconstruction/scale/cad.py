@@ -14,6 +14,7 @@ from arview.cad.part import Part
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
 from arview.core.parallel import pool
+from arview.core.progress import Progress
 from arview.detection import Detector
 from arview.geometry import Array, invert, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet
@@ -25,8 +26,6 @@ from arview.reconstruction.scale.vote import Sighting, Vote, vote
 from arview.reconstruction.types import PosedPhoto
 
 Pixels = NDArray[np.uint8]
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many are done and how many there are."""
 
 
 FOUND_QUALITY = 0.5

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad.part import Part
+from arview.core.progress import Progress
 from arview.geometry import Array
-from arview.reconstruction.scale.cad import CadFind, CadOptions, NotFound, Pixels, Progress, find_cad
+from arview.reconstruction.scale.cad import CadFind, CadOptions, NotFound, Pixels, find_cad
 from arview.reconstruction.scale.consistency import check_consistency
 from arview.reconstruction.scale.specs import ScaleSources
 from arview.reconstruction.scale.targets import scale_from_rig, scale_from_targets
