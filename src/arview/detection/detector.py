@@ -128,9 +128,9 @@ def local_search_for(views: GuideViewSet, camera: Camera, options: DetectorOptio
 class Detector:
     """Detection of one part with one camera over the declared range of its guide views.
 
-    ``best_rejected`` is the best hypothesis of the last frame when nothing was found, for `why_not`. ``same_turns`` (N,3,3) are those that take the
-    part onto itself, with none at all; ``turns`` those that nearly do, too. ``local`` is the search around rough
-    poses, see `local_search_for`.
+    ``best_rejected`` is the best hypothesis of the last frame when nothing was found, for the diagnosis.
+    ``same_turns`` (N,3,3) are the rotations that map the part onto itself, the identity among them; ``turns`` also
+    hold those that nearly do. ``local`` is the search around rough poses, see `local_search_for`.
     """
 
     def __init__(

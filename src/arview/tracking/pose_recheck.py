@@ -32,7 +32,7 @@ KEPT = (6, 4)
 REACH, MARGIN_PX, WINDOW_PX = 1.25, 20.0, 64
 """The window reaches so many half diameters, and so many pixels, around the part; its sides are multiples of this."""
 PRIOR = 16.0
-"""Of the log odds a squared_motion_distance of 1 takes so much: a prior with a deviation of 8°, or 6 % of the diameter aside."""
+"""Log odds that a squared motion distance of 1 costs: a prior with a deviation of 8°, or 6 % of the diameter aside."""
 LEAST_LEAD = 1.0
 """By so much another pose must be likelier than the tracked one."""
 
