@@ -31,13 +31,13 @@ check: $(READY)
 	tools/check
 
 bench: $(READY)
-	.venv/bin/python tools/bench --json out/bench.json
+	.venv/bin/python tools/benchmarks/bench.py --json out/bench.json
 
 evaluate: $(READY)
-	.venv/bin/python tools/evaluate --folder out
+	.venv/bin/python tools/benchmarks/evaluate.py --folder out
 
 soak: $(READY)
-	.venv/bin/python tools/soak
+	.venv/bin/python tools/benchmarks/soak.py
 
 clean:
 	rm -rf out dist .pytest_cache .mypy_cache .ruff_cache

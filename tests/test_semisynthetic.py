@@ -55,7 +55,7 @@ from arview.video import Image
 from cad_files import box
 from synthetic import background, component
 
-TOOL = Path(__file__).resolve().parent.parent / "tools" / "make_sequences"
+TOOL = Path(__file__).resolve().parent.parent / "tools" / "benchmarks" / "make_sequences.py"
 
 
 def brick() -> Model:

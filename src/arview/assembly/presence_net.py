@@ -3,7 +3,7 @@
 Edges say little of components that look much alike, as two nuts do. The network, shown the picture around a component
 beside the normals and the depth that the CAD has there and what the line network sees, sees the whole of it: what it
 is shown is made as for the `verifier`, about one component instead of the part. It was fitted on random assemblies in
-which components were right, missing, moved or swapped, see ``tools/fit_judge``.
+which components were right, missing, moved or swapped, see ``tools/training/fit.py``.
 """
 
 from __future__ import annotations

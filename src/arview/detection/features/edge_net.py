@@ -4,7 +4,7 @@ Gradients answer to noise, to the texture of what lies around and to shadows as 
 a whole neighbourhood, answers to what looks like the outline or an edge of a solid, as learned edge detectors do (Xie &
 Tu, "Holistically-Nested Edge Detection", ICCV 2015); the layout is that of Ronneberger et al., "U-Net" (MICCAI 2015),
 but that levels are added. It knows nothing of a part: it was fitted to random solids before photos, see
-``tools/fit_judge``.
+``tools/training/fit.py``.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ thing is off, are less than one of its own. Strips are of the picture's full res
 outline, one after the other along it, below them such lines across the design edges inside; the middle column is where
 the pose has the edge. Where all is right there is one sharp step there, row after row, or what hides it, and the same
 material on one side of it. The outline of something else strays from the middle, at a slant. The network knows nothing
-of a part: it was fitted on random solids before photos, see ``tools/fit_judge``, to what it says beyond evidence,
+of a part: it was fitted on random solids before photos, see ``tools/training/fit.py``, to what it says beyond evidence,
 judge, verifier and lines.
 """
 

@@ -5,7 +5,7 @@ and what it says of the many others is chance. Here poses are told apart in pair
 and the CAD show beside each other is seen for each pose as the verifier sees it; the layers after that see two poses
 at once, and count only where these are drawn differently. One over the other is worth as much as the other over the one
 is not, by how the network is made (as the pairwise comparisons of Burges et al., "Learning to rank using gradient
-descent", ICML 2005). It knows nothing of a part: it was fitted on random solids before photos, see ``tools/fit_judge``.
+descent", ICML 2005). It knows nothing of a part: it was fitted on random solids before photos, see ``tools/training``.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ hides a stretch of the outline is something in front of it. A small convolutiona
 picture around the pose beside what the CAD says is there: the distance to the outline, the design edges, the normals
 and depth of the surface, and what of the brightness the normals explain (as Labbé et al., "MegaPose", CoRL 2022, score
 poses by rendered normals); and what the line network sees there, for which noise is no matter. It knows nothing of a
-part: it was fitted on random solids before photos, see ``tools/fit_judge``.
+part: it was fitted on random solids before photos, see ``tools/training/fit.py``.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ whether a whole stretch of the outline has nothing. All that is in the profiles 
 colours, and of what the line network sees. The same few weights look at each line's profile; the means over the outline
 and over the design edges, and the least of any stretch of the outline, make the score (after Qi et al., "PointNet",
 CVPR 2017). The weights know nothing of a part: they were fitted on random solids before photos, see
-``tools/fit_judge``, by which of a picture's poses is the right one (Cao et al., "Learning to rank: from pairwise
+``tools/training/fit.py``, by which of a picture's poses is the right one (Cao et al., "Learning to rank: from pairwise
 approach to listwise approach", ICML 2007). There are three: for rough poses, and two for refined ones, which look at
 the part at two sizes.
 """

@@ -2,7 +2,7 @@
 
 The verifier, the network of strips and the component network are of this kind. A look may be scored in mirrors, too:
 neither form is truer, and where they differ it is chance, of which the mean has less (Krizhevsky et al., NIPS 2012,
-average over forms of a picture). ``tools/score_networks.py`` makes and writes such networks.
+average over forms of a picture). ``tools/training/networks/score_nets.py`` makes and writes such networks.
 """
 
 from __future__ import annotations

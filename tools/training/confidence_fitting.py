@@ -17,10 +17,10 @@ from arview.errors import InputError
 from arview.evaluation.protocols import spread_frames
 from arview.evaluation.semisynthetic import frames_without_part
 from arview.geometry import Array
-from judge_examples import ALIKE, REFINED_NEAR, is_alike, is_near, pictures_of
 from photos import all_photos
+from profile_ranker_examples import ALIKE, REFINED_NEAR, is_alike, is_near, pictures_of
 from recordings import scenes
-from sections import Sections, recorded_views
+from suites.detection import Sections, recorded_views
 
 RECORDED_EACH, PHOTOS_EACH, RECORDED_WEIGHT = 40, 60, 2.0
 """Frames of each recording, and photos without its part; each counts for so many."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from arview.evaluation import Scene, load_scene
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "samples" / "bracket_plate"
 SHARED = Path(os.environ.get("ARVIEW_DATA", ROOT.parent / "shared" / "data"))
 DATA = SHARED / "sequences"

@@ -18,7 +18,7 @@ from arview.detection.search.global_search import QUICK
 from arview.detection.search.local_search import Hypothesis
 from arview.evaluation.semisynthetic.random_solids import random_solid, random_twin
 from arview.geometry import Array, exp_so3, log_so3, rigid, turned
-from judge_examples import REFINED_APART, REFINED_NEAR, is_near, pictures_of
+from profile_ranker_examples import REFINED_APART, REFINED_NEAR, is_near, pictures_of
 from seeded_files import still_to_make
 
 TWINS, ASIDE, MOST = 6, 4, 8

@@ -22,8 +22,8 @@ from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews.surface import reduced_surface, surface_about
 from arview.refinement.projection import intrinsics_of
-from judge_examples import ANYWHERE, OCCLUDER, noisy, some_solids
-from line_examples import covered_picture, crowded_picture, lone_picture
+from edge_net_examples import covered_picture, crowded_picture, lone_picture
+from profile_ranker_examples import ANYWHERE, OCCLUDER, noisy, some_solids
 from seeded_files import still_to_make
 
 LEAST_COMPONENTS = 4

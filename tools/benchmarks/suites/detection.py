@@ -44,9 +44,9 @@ from arview.guideviews.cache import cached_guide_views
 from arview.pose import TrackingState
 from arview.tracking import TrackingSession
 from arview.video import Image
-from lines import Line, timing, watched
 from photos import all_photos, background_photos
 from recordings import SAMPLE
+from rows import Line, timing, watched
 
 SCENE_FRAMES = 200
 LOOK_ALIKE_FRAMES = 60

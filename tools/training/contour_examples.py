@@ -16,7 +16,7 @@ from arview.detection.scoring.contour_verifier import raw_strips
 from arview.detection.search.global_search import Candidate
 from arview.detection.search.local_search import Hypothesis
 from arview.geometry import Array
-from judge_examples import REFINED_APART, REFINED_NEAR, pictures_of, told
+from profile_ranker_examples import REFINED_APART, REFINED_NEAR, pictures_of, told
 from seeded_files import still_to_make
 
 VERIFIED = 8

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ahead import made_ahead
 from arview.detection.features.denoiser import SHOWN_MEAN, SHOWN_RANGE
-from layers import write_picture_network
-from line_examples import read_lined_pictures
-from line_fitting import compressed, with_flat_things
-from pyramid import pyramid
-from widening import GONE_ON, begin_as, in_use, torch_with_onnx
+from edge_net_examples import read_lined_pictures
+from edge_net_fitting import compressed, with_flat_things
+from networks.layers import write_picture_network
+from networks.net2net import GONE_ON, begin_as, in_use, torch_with_onnx
+from networks.prefetch import made_ahead
+from networks.unet import pyramid
 
 WIDTHS = (24, 32, 48)
 """Of the levels, at half the picture's size and each half as large as that before."""

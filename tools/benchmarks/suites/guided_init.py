@@ -11,8 +11,8 @@ from arview.geometry import Array, apply, exp_so3, rigid, rotation_angle_rad
 from arview.tracking import SessionOptions
 from arview.tracking.guided_init import Snap
 from arview.video import Image
-from lines import Line, timing, watched
-from sections import BOXES, box_symmetries
+from rows import Line, timing, watched
+from suites.detection import BOXES, box_symmetries
 
 NEAR_COUNT, FAR_COUNT = 60, 120
 FRAMES = 20

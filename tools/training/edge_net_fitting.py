@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from arview.detection.features.denoiser import Denoiser
 from arview.detection.features.edge_net import CONTRAST, SHRINK
 from arview.detection.features.response_maps import ORIENTATIONS
-from layers import normalised, residual, write_picture_network
-from line_examples import FINE, LinedPicture, read_lined_pictures
-from pyramid import pyramid
-from widening import GONE_ON, begin_as, in_use, torch_with_onnx
+from edge_net_examples import FINE, LinedPicture, read_lined_pictures
+from networks.layers import normalised, residual, write_picture_network
+from networks.net2net import GONE_ON, begin_as, in_use, torch_with_onnx
+from networks.unet import pyramid
 
 WIDTHS = (16, 32, 56, 80, 96)
 """Of the levels, each half as large as that before."""

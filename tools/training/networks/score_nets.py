@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ahead import made_ahead
-from layers import exported, halfway, halving, write
-from widening import GONE_ON, begin_as, beginning_as, in_use
+from networks.layers import exported, halfway, halving, write
+from networks.net2net import GONE_ON, begin_as, beginning_as, in_use
+from networks.prefetch import made_ahead
 
 LAST_WIDTH, DROPPED = 48, 0.2
 Example = TypeVar("Example")

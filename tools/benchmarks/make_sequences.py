@@ -29,11 +29,11 @@ from recordings import SEQUENCES
 DESCRIPTION = """\
 Render CAD along trajectories over real photos, with exact truth, as BOP scenes that `arview evaluate` reads.
 
-  tools/make_sequences --shape all --variant all -o out/sequences     six shapes × four variants, 100 frames each
-  tools/make_sequences --shape flange --variant light --frames 300 --seed 2 -o out/sequences
-  tools/make_sequences --cad samples/bracket_plate/part.toml --variant occlusion -o out/sequences
-  tools/make_sequences --cad my.glb --trajectory ../shared/data/sequences/plate -o out/sequences
-  tools/make_sequences --shape assembly --lookalike -o out/look_alikes
+  make_sequences.py --shape all --variant all -o out/sequences     six shapes × four variants, 100 frames each
+  make_sequences.py --shape flange --variant light --frames 300 --seed 2 -o out/sequences
+  make_sequences.py --cad samples/bracket_plate/part.toml --variant occlusion -o out/sequences
+  make_sequences.py --cad my.glb --trajectory ../shared/data/sequences/plate -o out/sequences
+  make_sequences.py --shape assembly --lookalike -o out/look_alikes
 
 Pictures are 640×512 px with f = 650 px; a part turns about 7° and moves about 15 mm from frame to frame, at all
 sides of it, 450 to 1000 mm away. The same seed and backgrounds give the same pictures; what is there is kept."""

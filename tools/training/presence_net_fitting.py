@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from arview.assembly.presence_net import GLOBALS, SIDE_PX, overall
 from arview.detection.scoring.pose_verifier import CHANNELS, LINES
-from component_examples import Looked
-from judge_examples import read_examples
-from score_networks import Design, Shown, fit, fit_score_network, scored, together
-from verifier_fitting import network_input
-from widening import torch_with_onnx
+from networks.net2net import torch_with_onnx
+from networks.score_nets import Design, Shown, fit, fit_score_network, scored, together
+from pose_verifier_fitting import network_input
+from presence_net_examples import Looked
+from profile_ranker_examples import read_examples
 
 DESIGN = Design(
     "components", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (24, 24, 48, 48, 64, 64), deepened=(3, 5), rate=2e-3

@@ -20,8 +20,8 @@ from arview.evaluation.clouds import score_cloud
 from arview.geometry import Array, apply, invert, rotation_angle_rad
 from arview.reconstruction.dense import read_ply
 from arview.reconstruction.scale.similarity import Similarity, fit_points
-from lines import Line
 from recordings import PhotoSet
+from rows import Line
 
 
 @dataclass(frozen=True)

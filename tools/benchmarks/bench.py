@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 
 from arview.cad import default_view_range
+from arview.detection import Detector
 from arview.errors import ArviewError
 from arview.evaluation import Scene, evaluate_scene, scene_guide_views
 from arview.guideviews import GuideViewOptions, load_guide_views, make_guide_views
-from arview.detection import Detector
 from arview.tracking import SessionOptions
-from living import live_latencies
 from recordings import SAMPLE, sample_command, scenes, skip, table
-from registering import MEASURED, REFERENCE, registrations
+from suites.live_latency import live_latencies
+from suites.registration import MEASURED, REFERENCE, registrations
 
 Row = tuple[str, str, str]
 MODALITIES = {"region+edge": SessionOptions(use_feature=False), "all three": SessionOptions()}

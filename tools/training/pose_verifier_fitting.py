@@ -22,11 +22,11 @@ from arview.detection.scoring.pose_verifier import (
     with_gradients,
 )
 from arview.detection.scoring.score_net import DOWNWARD, RIGHTWARD, mirrored
-from component_examples import Looked
-from judge_examples import Looks, read_examples
-from score_networks import Design, Shown, fit, fit_score_network, scored, telling_loss, together
-from twin_examples import Twins
-from widening import torch_with_onnx
+from networks.net2net import torch_with_onnx
+from networks.score_nets import Design, Shown, fit, fit_score_network, scored, telling_loss, together
+from pair_examples import Twins
+from presence_net_examples import Looked
+from profile_ranker_examples import Looks, read_examples
 
 DESIGN = Design(
     "verifier", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (24, 24, 48, 48, 96, 128), deepened=(3, 5), rate=2e-3

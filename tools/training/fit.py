@@ -1,21 +1,21 @@
 #!/usr/bin/env python
 """Fit what finds parts, and tells right poses from wrong ones, on random solids before photos. Needs torch and onnx.
 
-  tools/fit_judge pictures --solids 60 --photos DIR   pictures and the lines in them, 60 for each, to out/judge
-  tools/fit_judge lines --epochs 40                   the line network from that: out/judge/lines.onnx
-  tools/fit_judge denoiser --epochs 70                the denoiser from that: out/judge/denoiser.onnx
-  tools/fit_judge collect --solids 100 --photos DIR   what the detector tries on each, with the truth, to out/judge
-  tools/fit_judge fit                                 the judge's networks from that: out/judge/judge.npz
-  tools/fit_judge verifier                            the verifier's: out/judge/verifier.onnx
-  tools/fit_judge cut --from 900 --solids 150 --photos DIR    strips across what the detector ends with, to out/judge
-  tools/fit_judge strips --epochs 14                  the network that looks at them from that: out/judge/strips.onnx
-  tools/fit_judge turn --from 40000 --solids 180 --photos DIR    poses of nearly symmetric solids and twins of them
-  tools/fit_judge twins --epochs 8                    the network that tells them apart from that: out/judge/twins.onnx
-  tools/fit_judge assemblies --solids 300 --photos DIR    components of random assemblies, right and wrong, to out/judge
-  tools/fit_judge components                          the component network from that: out/judge/components.onnx
-  tools/fit_judge probability --from 500 --solids 40 --photos DIR    what a quality must be made of, with these
+  fit.py pictures --solids 60 --photos DIR   pictures and the lines in them, 60 for each, to out/judge
+  fit.py lines --epochs 40                   the line network from that: out/judge/lines.onnx
+  fit.py denoiser --epochs 70                the denoiser from that: out/judge/denoiser.onnx
+  fit.py collect --solids 100 --photos DIR   what the detector tries on each, with the truth, to out/judge
+  fit.py fit                                 the judge's networks from that: out/judge/judge.npz
+  fit.py verifier                            the verifier's: out/judge/verifier.onnx
+  fit.py cut --from 900 --solids 150 --photos DIR    strips across what the detector ends with, to out/judge
+  fit.py strips --epochs 14                  the network that looks at them from that: out/judge/strips.onnx
+  fit.py turn --from 40000 --solids 180 --photos DIR    poses of nearly symmetric solids and twins of them
+  fit.py twins --epochs 8                    the network that tells them apart from that: out/judge/twins.onnx
+  fit.py assemblies --solids 300 --photos DIR    components of random assemblies, right and wrong, to out/judge
+  fit.py components                          the component network from that: out/judge/components.onnx
+  fit.py probability --from 500 --solids 40 --photos DIR    what a quality must be made of, with these
 
-  tools/fit_judge desks --solids 120 --photos DIR --things CUTOUTS    more backgrounds, to out/judge/desks
+  fit.py desks --solids 120 --photos DIR --things CUTOUTS    more backgrounds, to out/judge/desks
 
 DIR holds at least 20 photos of anything but parts that will be looked for: what a photo shows, the networks take for
 clutter. In few photos do many small things lie side by side as on a shop floor: `desks` strews cut-out pictures of
@@ -43,23 +43,25 @@ import argparse
 import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))  # photos and recordings are shared
+
 from arview.errors import ArviewError, InputError
-from component_examples import collect_components
-from component_fitting import fit_components
+from composite_backgrounds import make_desks
+from confidence_fitting import fit_probability
+from contour_examples import collect_strips
+from contour_fitting import fit_strips
 from denoiser_fitting import fit_denoiser
-from desks import make_desks
-from judge_examples import collect_examples
-from judge_fitting import fit_networks
-from judge_probability import fit_probability
-from line_examples import collect_lined_pictures
-from line_fitting import fit_lines
+from edge_net_examples import collect_lined_pictures
+from edge_net_fitting import fit_lines
 from options import positive, seed
+from pair_examples import collect_twins
+from pair_fitting import fit_twins
 from photos import fitting_photos
-from strip_examples import collect_strips
-from strip_fitting import fit_strips
-from twin_examples import collect_twins
-from twin_fitting import fit_twins
-from verifier_fitting import fit_verifier
+from pose_verifier_fitting import fit_verifier
+from presence_net_examples import collect_components
+from presence_net_fitting import fit_components
+from profile_ranker_examples import collect_examples
+from profile_ranker_fitting import fit_networks
 
 STEPS = (
     "desks",

@@ -31,14 +31,14 @@ from arview.evaluation.semisynthetic import SHAPES
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.pose import Pose, TrackingState
 from arview.tracking import SessionOptions, Tracker, TrackingSession
-from lines import Line
-from measuring import measure_lines
 from options import positive
-from reconstructing import reconstruct_lines
 from recordings import SAMPLE, photo_sets, sample_command, scenes, skip, table
-from relearning import relearn_lines
-from sections import Sections
-from snapping import snap_lines
+from rows import Line
+from suites.detection import Sections
+from suites.guided_init import snap_lines
+from suites.measurement import measure_lines
+from suites.reconstruction import reconstruct_lines
+from suites.relocalization import relearn_lines
 
 TRUSTED = (TrackingState.TRACKED, TrackingState.CRITICAL)
 START_COUNT = 50

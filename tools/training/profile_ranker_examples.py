@@ -39,7 +39,7 @@ from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, exp_so3, rigid
 from arview.guideviews.cache import cached_guide_views
-from line_examples import coloured, crowded_picture, recoloured
+from edge_net_examples import coloured, crowded_picture, recoloured
 from seeded_files import still_to_make
 
 FRAMES_EACH = 4
@@ -144,7 +144,7 @@ def read_examples(folder: Path, pattern: str, every: int) -> tuple[list[Any], li
     """
     examples = [example for path in sorted(folder.glob(pattern)) for example in pickle.loads(path.read_bytes())]
     if not examples:
-        raise InputError(f"{folder}: no examples; run tools/fit_judge collect first")
+        raise InputError(f"{folder}: no examples; run tools/training/fit.py collect first")
     solids = sorted({example.solid for example in examples})
     held_out = set(solids[::every]) if len(solids) > 1 else set()
     fitted, left = ([e for e in examples if (e.solid in held_out) == is_left] for is_left in (False, True))

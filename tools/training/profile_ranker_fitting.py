@@ -20,8 +20,8 @@ from arview.detection.scoring.profile_ranker import (
 )
 from arview.detection.scoring.profile_ranker import network as in_use_network
 from arview.errors import InputError
-from judge_examples import Group, read_examples
-from widening import GONE_ON
+from networks.net2net import GONE_ON
+from profile_ranker_examples import Group, read_examples
 
 WIDTH, LAST_WIDTH = 16, 32
 """Of the layers for each line, and of that for all together."""

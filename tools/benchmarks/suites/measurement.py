@@ -22,9 +22,9 @@ from arview.measurement.datums.photo_datums import DatumOptions, measure_datums
 from arview.measurement.folder import read_folder
 from arview.measurement.photo import load_views
 from arview.measurement.uncertainty.decision import decide
-from lines import Line
-from reconstructing import timed_run
 from recordings import PhotoSet
+from rows import Line
+from suites.reconstruction import timed_run
 
 TOLERANCE_MM = 0.5
 CLOUD_TARGET_MM = 0.20

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.detection.scoring.pair_comparator import SHOWN, SIDE_PX
-from judge_examples import read_examples
-from layers import exported, halving, normalised, write
-from score_networks import fit
-from twin_examples import Twins
-from verifier_fitting import network_input
-from widening import torch_with_onnx
+from networks.layers import exported, halving, normalised, write
+from networks.net2net import torch_with_onnx
+from networks.score_nets import fit
+from pair_examples import Twins
+from pose_verifier_fitting import network_input
+from profile_ranker_examples import read_examples
 
 WIDTHS, PAIR_WIDTHS = (16, 24, 32, 32), (32, 48, 48)
 """Of the convolutions that see one pose, every other halving the picture, and of those that see two at once."""

@@ -12,8 +12,8 @@ from arview.evaluation import PoseMeter, Scene
 from arview.evaluation.run import COARSE, IN_VIEW
 from arview.pose import TrackingState
 from arview.tracking import SessionOptions, TrackingSession
-from lines import Line, watched
-from sections import BOXES, box_symmetries, recorded_views
+from rows import Line, watched
+from suites.detection import BOXES, box_symmetries, recorded_views
 
 LOSSES = 30
 

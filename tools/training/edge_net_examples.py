@@ -109,7 +109,7 @@ def read_lined_pictures(folder: Path) -> list[LinedPicture]:
     """
     pictures = [picture for path in sorted(folder.glob("lines_*.pkl")) for picture in pickle.loads(path.read_bytes())]
     if len(pictures) < FEWEST_PICTURES:
-        raise InputError(f"{folder}: too few pictures; run tools/fit_judge pictures first")
+        raise InputError(f"{folder}: too few pictures; run tools/training/fit.py pictures first")
     return pictures
 
 

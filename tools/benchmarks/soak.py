@@ -22,14 +22,14 @@ from urllib.parse import parse_qs, urlsplit
 import cv2
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "samples" / "bracket_plate"
 sys.path.insert(0, str(ROOT / "tests"))  # the client is that of the tests
 
-from arview.live.addresses import LOOPBACK  # noqa: E402
-from arview.video import Image, open_source  # noqa: E402
-from live_client import Camera, Http, Phone  # noqa: E402
-from live_server import live_server  # noqa: E402
+from arview.live.addresses import LOOPBACK
+from arview.video import Image, open_source
+from live_client import Camera, Http, Phone
+from live_server import live_server
 
 FPS, WIDTH, HEIGHT = 30.0, 640, 360
 WARM_UP_SHARE = 0.2  # of the time: compiled loops, learned views and buffers are filled by then

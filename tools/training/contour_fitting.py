@@ -28,10 +28,10 @@ from arview.detection.scoring.contour_verifier import (
     ROWS,
     shown,
 )
-from judge_examples import read_examples
-from score_networks import Design, Shown, fit, fit_score_network, scored, telling_loss, together
-from strip_examples import Stripped
-from widening import torch_with_onnx
+from contour_examples import Stripped
+from networks.net2net import torch_with_onnx
+from networks.score_nets import Design, Shown, fit, fit_score_network, scored, telling_loss, together
+from profile_ranker_examples import read_examples
 
 DESIGN = Design("strips", (CHANNELS, ROWS, COLUMNS), GLOBALS, (24, 24, 48, 48, 64), deepened=(3,), rate=2e-3)
 PICTURES, POSES = 8, 12

@@ -1,0 +1,1 @@
+"""Suites of the evaluation and of the speed benchmark."""

@@ -1,0 +1,1 @@
+"""What the trained networks are made of, and how they are trained and written."""
