@@ -13,7 +13,7 @@ from arview.assembly.monitor import (
     EDGES_ALONE,
     OPEN_FRAMES,
     SUSPICIOUS_FRAMES,
-    ComponentCheck,
+    AssemblyMonitor,
     Look,
     together,
 )
@@ -27,8 +27,8 @@ MOVED_MM = 20.0
 
 
 @cache
-def check() -> ComponentCheck:
-    return ComponentCheck(assembly_views(), assembly(), CAMERA)
+def check() -> AssemblyMonitor:
+    return AssemblyMonitor(assembly_views(), CAMERA, assembly())
 
 
 changed = partial(changed_from, assembly())
@@ -79,7 +79,7 @@ def card_over(name: str, pose: Array, margin_px: int = 30) -> tuple[int, int, in
     return max(left, 0), max(top, 0), min(right, CAMERA.width), min(bottom, CAMERA.height)
 
 
-def watch(frames: list[tuple[NDArray[np.uint8], Array]]) -> ComponentCheck:
+def watch(frames: list[tuple[NDArray[np.uint8], Array]]) -> AssemblyMonitor:
     """The check after frames with their poses."""
     check().reset()
     for image, pose in frames:
@@ -100,7 +100,7 @@ def test_one_picture_names_what_is_missing_moved_or_swapped() -> None:
     for number, (parts, model) in enumerate(LOOK_ALIKES.items()):
         for k, pose in enumerate(views_of(2, seed=number)):
             image = picture(pose, model, seed=k, scene=(number + k) % 9, noise=4.0)
-            found = named(check().single_look(image, about(pose, k)))
+            found = named(check().mismatches_in(image, about(pose, k)))
             pictures += 1
             hits += bool(found & set(parts))
             others += bool(found - set(parts))
@@ -112,24 +112,24 @@ def test_one_picture_names_what_is_missing_moved_or_swapped() -> None:
 def test_a_right_part_is_not_named(noise: float, gain: float) -> None:
     for k, pose in enumerate(views_of(8, seed=50)):
         image = picture(pose, seed=k, scene=k % 9, noise=noise, gain=gain)
-        assert check().single_look(image, about(pose, k)) == (), f"view {k}"
+        assert check().mismatches_in(image, about(pose, k)) == (), f"view {k}"
 
 
 def test_a_component_a_little_off_nominal_is_not_named() -> None:
     near = changed(post_1=(1.0, -0.7), block_1=(-0.8, 0.8))
     for k, pose in enumerate(views_of(6, seed=60)):
-        assert check().single_look(picture(pose, near, seed=k, scene=k % 9), about(pose, k)) == (), f"view {k}"
+        assert check().mismatches_in(picture(pose, near, seed=k, scene=k % 9), about(pose, k)) == (), f"view {k}"
 
 
 def test_frames_add_up_and_reset_forgets() -> None:
     seen = watch(walk(changed(post_3=None), 4))
     assert named(seen.mismatches) == {"post_3"}
-    assert seen.doubtful == ()
+    assert seen.uncertain == ()
     seen.reset()
-    assert seen.mismatches == () and seen.doubtful == ()
+    assert seen.mismatches == () and seen.uncertain == ()
     for image, pose in walk(None, 4):
         seen.update(image, pose)
-    assert seen.mismatches == () and seen.doubtful == ()
+    assert seen.mismatches == () and seen.uncertain == ()
 
 
 def test_a_component_set_right_is_cleared() -> None:
@@ -146,7 +146,7 @@ def test_a_component_set_right_is_cleared() -> None:
 def test_a_moved_component_stays_named_where_it_looks_right_along_the_way_it_moved(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     count = len(assembly().components)
     flags, shares = np.zeros(count, dtype=bool), np.zeros(count)
 
@@ -167,7 +167,7 @@ def test_a_moved_component_stays_named_where_it_looks_right_along_the_way_it_mov
 
 
 def test_what_blurred_pictures_said_is_soon_taken_back_from_the_same_direction(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     count = len(assembly().components)
     flags, shares = np.zeros(count, dtype=bool), np.zeros(count)
     said = itertools.chain([3.0, 3.0], itertools.repeat(-2.5))
@@ -183,28 +183,28 @@ def test_what_blurred_pictures_said_is_soon_taken_back_from_the_same_direction(m
     assert len(seen.mismatches) == 1
     for _ in range(4 * SUSPICIOUS_FRAMES):
         seen.update(blank, pose)
-    assert seen.mismatches == () and seen.doubtful == ()
+    assert seen.mismatches == () and seen.uncertain == ()
 
 
 @pytest.mark.parametrize(("second", "is_named"), [(3.0, True), (-1.2, False)])
 def test_one_frame_of_a_watched_part_names_nothing(
     monkeypatch: pytest.MonkeyPatch, second: float, is_named: bool
 ) -> None:
-    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     count = len(assembly().components)
     flags, shares = np.zeros(count, dtype=bool), np.zeros(count)
     said = iter([np.where(np.arange(count) == 2, ratio, -3.0) for ratio in (3.0, second)])
     monkeypatch.setattr(seen, "look", lambda *_: Look(next(said), flags, flags, shares, shares, shares, shares))
     blank, pose = np.zeros((480, 640, 3), np.uint8), pose_from(0, 45, 520)
     seen.update(blank, pose)
-    assert seen.mismatches == () and len(seen.doubtful) == 1
+    assert seen.mismatches == () and len(seen.uncertain) == 1
     seen.update(blank, pose)
     assert (len(seen.mismatches) == 1) == is_named
 
 
 @pytest.mark.parametrize(("was_shown", "frames"), [(True, OPEN_FRAMES), (False, SUSPICIOUS_FRAMES)])
 def test_what_comes_into_view_is_looked_at_soon(monkeypatch: pytest.MonkeyPatch, was_shown: bool, frames: int) -> None:
-    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     count = len(assembly().components)
     others, shares = np.arange(count) != 2, np.zeros(count)
     flags = others | was_shown
@@ -224,7 +224,7 @@ def test_what_a_card_hides_is_no_mismatch() -> None:
     for name in ("post_1", "post_3", "block_1", "block_2"):
         for k, pose in enumerate(views_of(2, seed=70)):
             image = picture(pose, seed=k, scene=k, noise=3.0, card=card_over(name, pose))
-            assert name not in named(check().single_look(image, about(pose, k))), f"{name}, view {k}"
+            assert name not in named(check().mismatches_in(image, about(pose, k))), f"{name}, view {k}"
 
 
 def test_what_is_hidden_at_first_is_named_later_even_at_a_fast_turn() -> None:
@@ -243,20 +243,20 @@ def test_a_component_is_unseen_until_it_is_seen_at_its_place(is_there: bool) -> 
     cards = [card_over("block_2", pose, 50) if k < 3 else None for k, pose in enumerate(poses)]
     frames = [(picture(p, model, seed=k, card=card), p) for k, (p, card) in enumerate(zip(poses, cards, strict=True))]
     seen = watch([])
-    assert set(seen.unseen) == set(assembly_views().component_names)
+    assert set(seen.unverified) == set(assembly_views().component_names)
     for image, pose in frames[:3]:
         seen.update(image, pose)
-    assert "block_2" in seen.unseen and len(seen.unseen) < len(assembly_views().component_names)
+    assert "block_2" in seen.unverified and len(seen.unverified) < len(assembly_views().component_names)
     for image, pose in frames[3:]:
         for _ in range(SUSPICIOUS_FRAMES):
             seen.update(image, pose)
-    assert ("block_2" in seen.unseen) != is_there
-    assert not set(seen.unseen) - {"block_2"}
+    assert ("block_2" in seen.unverified) != is_there
+    assert not set(seen.unverified) - {"block_2"}
 
 
 def test_a_sure_part_is_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     looks = []
-    seen = ComponentCheck(assembly_views(), assembly(), CAMERA)
+    seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     look = seen.look
     monkeypatch.setattr(seen, "look", lambda *of: looks.append(1) or look(*of))
     image = picture(pose_from(30, 45, 520))
@@ -266,11 +266,11 @@ def test_a_sure_part_is_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_part_of_one_component_has_nothing_to_mismatch() -> None:
-    alone = ComponentCheck(assembly_views(), block(), CAMERA)
+    alone = AssemblyMonitor(assembly_views(), CAMERA, block())
     pose = pose_from(30, 40, 520)
     alone.update(picture(pose), pose)
-    assert alone.single_look(picture(None), pose) == ()
-    assert alone.mismatches == () and alone.doubtful == () and alone.unseen == ()
+    assert alone.mismatches_in(picture(None), pose) == ()
+    assert alone.mismatches == () and alone.uncertain == () and alone.unverified == ()
 
 
 def test_a_session_never_calls_a_look_alike_tracked() -> None:

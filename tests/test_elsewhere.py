@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from arview.assembly.monitor import ComponentCheck
+from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.placement_search import Places, other_places
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
@@ -43,10 +43,10 @@ def walled() -> Model:
 
 
 @cache
-def check() -> ComponentCheck:
+def check() -> AssemblyMonitor:
     around = ViewRange((420.0, 560.0), elevation_deg=(15.0, 35.0), azimuth_deg=(-95.0, -60.0))
     views = make_guide_views(walled(), around, GuideViewOptions(renderer="zbuffer"))
-    return ComponentCheck(views, walled(), CAMERA)
+    return AssemblyMonitor(views, CAMERA, walled())
 
 
 POSES = [pose_from(azimuth, 24.0, 480.0, walled()) for azimuth in (-80.0, -77.0, -74.0, -71.0)]

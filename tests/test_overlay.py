@@ -258,12 +258,13 @@ def test_the_status_line_says_what_has_not_been_seen_yet(plate: Model, record: I
     renderer = OverlayRenderer(plate, CAMERA, record)
     seen = pose(orbit(20.0))
     plain, one, many = (
-        renderer.draw(GREY, replace(seen, unseen=names), 30.0, NOW)[-60:] for names in ((), ("nut",), tuple("abcdef"))
+        renderer.draw(GREY, replace(seen, unverified=names), 30.0, NOW)[-60:]
+        for names in ((), ("nut",), tuple("abcdef"))
     )
     assert (one != plain).any() and (many != one).any()
-    assert replace(seen, unseen=("nut",)).remark == "not surely seen yet: nut"
-    assert replace(seen, unseen=tuple("abcdef")).remark == "not surely seen yet: 6 components"
-    lost = replace(pose(None, TrackingState.LOST, "too dark"), unseen=("nut",))
+    assert replace(seen, unverified=("nut",)).remark == "not surely seen yet: nut"
+    assert replace(seen, unverified=tuple("abcdef")).remark == "not surely seen yet: 6 components"
+    lost = replace(pose(None, TrackingState.LOST, "too dark"), unverified=("nut",))
     assert lost.remark == "too dark"
 
 
@@ -273,7 +274,7 @@ def test_on_one_row_what_has_not_been_seen_gives_way_to_the_errors(plate: Model,
     bars = []
     for names in ((), ("nut",), ("n" * 300,)):
         bars.append(np.full((480, 1600, 3), 127, np.uint8))
-        line.draw(bars[-1], replace(pose(orbit(20.0)), unseen=names), 30.0, NOW)
+        line.draw(bars[-1], replace(pose(orbit(20.0)), unverified=names), 30.0, NOW)
     plain, one, long = bars
     right = slice(1600 - 500, None)
     assert (one != plain).any() and (long != one).any()

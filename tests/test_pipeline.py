@@ -43,8 +43,8 @@ class Walk:
             return Pose(None, None, 0.1, TrackingState.LOST, time_s, index, 0.5)
         place = np.eye(4)
         place[:3, 3] = [index, 0.0, 500.0]
-        unseen = ("nut",) if index == 5 else ("post", "nut")
-        return Pose(place, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.5, unseen=unseen)
+        unverified = ("nut",) if index == 5 else ("post", "nut")
+        return Pose(place, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.5, unverified=unverified)
 
 
 class Mark:
@@ -84,8 +84,10 @@ def test_video_and_poses_hold_every_frame_in_order(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in (tmp_path / "poses.jsonl").read_text().splitlines()]
     assert [line["index"] for line in lines] == list(range(12))
     pose = {"index", "time_s", "state", "quality", "cam_from_model", "covariance", "ms", "reason"}
-    assert set(lines[0]) == pose | {"mismatches", "unseen", "alternatives"}
-    assert lines[4]["unseen"] == ["post", "nut"] and lines[5]["unseen"] == ["nut"] and lines[3]["unseen"] == []
+    assert set(lines[0]) == pose | {"mismatches", "unverified", "alternatives"}
+    assert (
+        lines[4]["unverified"] == ["post", "nut"] and lines[5]["unverified"] == ["nut"] and lines[3]["unverified"] == []
+    )
     assert summary.never_seen == ("nut",)
     assert lines[5]["cam_from_model"][0] == [1.0, 0.0, 0.0, 5.0] and lines[5]["time_s"] == 0.5
     assert lines[3]["cam_from_model"] is None and lines[3]["state"] == "lost"

@@ -74,7 +74,7 @@ class AnnotateSummary:
         seconds: from the first frame asked for to the finished files.
         states: frames by tracking state.
         reasons: frames by state and reason, of the frames that have one.
-        never_seen: components that no frame has shown surely, see `Pose.unseen`; none without a pose.
+        never_seen: components that no frame has shown surely, see `Pose.unverified`; none without a pose.
         ms: (F,) time of detection and tracking of each frame.
         ended_reason: why the source ended before its time, or empty.
         is_interrupted: stopped by Ctrl-C; the files hold what was done until then.
@@ -152,7 +152,7 @@ def annotate(
                 if pose.reason:
                     reasons.setdefault(str(pose.state), Counter())[pose.reason] += 1
                 if pose.cam_from_model is not None:
-                    never_seen = tuple(name for name in pose.unseen if never_seen is None or name in never_seen)
+                    never_seen = tuple(name for name in pose.unverified if never_seen is None or name in never_seen)
                 ms.append(pose.ms)
                 if progress:
                     progress(len(ms), pose)
@@ -277,7 +277,7 @@ class PoseWriter:
 
     A line holds ``index``, ``time_s``, ``state``, ``quality``, ``cam_from_model`` (4×4 row-major, mm, or
     null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches`` (list),
-    ``unseen`` (components not seen yet) and ``alternatives`` (list of 4×4 poses that fit as well).
+    ``unverified`` (components not seen yet) and ``alternatives`` (list of 4×4 poses that fit as well).
 
     Raises:
         OutputError: the file cannot be written.
@@ -334,7 +334,7 @@ def pose_line(pose: Pose) -> str:
             "ms": round(pose.ms, 4),
             "reason": pose.reason,
             "mismatches": list(pose.mismatches),
-            "unseen": list(pose.unseen),
+            "unverified": list(pose.unverified),
             "alternatives": [alternative.tolist() for alternative in pose.alternatives],
         },
         allow_nan=False,

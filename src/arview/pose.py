@@ -37,8 +37,8 @@ class Pose:
         reason: for ``searching``, ``critical`` and ``lost``: why, in words.
         mismatches: what is not as the CAD says, e.g. ``mismatch: nut_2 not seen where expected``; a part with
             any is never ``tracked`` but ``critical``: it may be another part of the family.
-        unseen: names of components that no look so far has shown surely at their place, because they are hidden or face
-            away, or because too little of them shows; one of them may be missing or elsewhere and nobody knows yet.
+        unverified: names of components not yet confirmed at their place by any observation, because they are hidden,
+            face away or are too small in the picture. They may be missing or misplaced.
         alternatives: other poses (4,4) that the frames so far bear out as well; not empty: the view is ambiguous.
         guide_cam_from_model: (4,4) where the user should bring the part; None unless the session waits for that.
     """
@@ -52,14 +52,14 @@ class Pose:
     ms: float = 0.0
     reason: str = ""
     mismatches: tuple[str, ...] = ()
-    unseen: tuple[str, ...] = ()
+    unverified: tuple[str, ...] = ()
     alternatives: tuple[Array, ...] = ()
     guide_cam_from_model: Array | None = None
 
     @property
     def remark(self) -> str:
         """What a status line says beside the state: the reason, or which components have not been seen yet."""
-        if self.state is not TrackingState.TRACKED or not self.unseen:
+        if self.state is not TrackingState.TRACKED or not self.unverified:
             return self.reason
-        few = ", ".join(self.unseen) if len(self.unseen) <= MOST_NAMED else f"{len(self.unseen)} components"
+        few = ", ".join(self.unverified) if len(self.unverified) <= MOST_NAMED else f"{len(self.unverified)} components"
         return f"not surely seen yet: {few}"

@@ -597,7 +597,7 @@ def together(by_edges: Array, by_network: Array, is_open: Array | float = 1.0) -
     return np.asarray(np.where(np.isnan(by_network), alone, both))
 
 
-class ComponentCheck:
+class AssemblyMonitor:
     """Watches whether the components of one part are where the CAD has them, for one camera.
 
     Args:
@@ -606,7 +606,7 @@ class ComponentCheck:
         camera: of the pictures.
     """
 
-    def __init__(self, views: GuideViewSet, model: Model, camera: Camera) -> None:
+    def __init__(self, views: GuideViewSet, camera: Camera, model: Model) -> None:
         self.views, self.model, self.camera = views, model, camera
         self._renderer = ZBufferRenderer(model, views.camera)
         self._edges = mesh_edges(model, views.options.crease_angle_deg)
@@ -626,13 +626,13 @@ class ComponentCheck:
         return self._messages(self._is_named)
 
     @property
-    def doubtful(self) -> tuple[str, ...]:
+    def uncertain(self) -> tuple[str, ...]:
         """Names of components that are to be looked at again before the part can be called right."""
         names = self.views.component_names
         return tuple(names[index] for index in np.flatnonzero((self._evidence > CLEARED) & ~self._is_named))
 
     @property
-    def unseen(self) -> tuple[str, ...]:
+    def unverified(self) -> tuple[str, ...]:
         """Names of components that no look so far has shown surely at their place; none of a part of one component."""
         if len(self.model.components) < 2:
             return ()
@@ -695,7 +695,7 @@ class ComponentCheck:
         points = np.bincount(sheet.component[sheet.is_own], minlength=len(self._was_shown))
         return bool(np.any((self._evidence > SURE) & ~self._was_shown & (points >= LEAST_POINTS)))
 
-    def single_look(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[str, ...]:
+    def mismatches_in(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[str, ...]:
         """Mismatches that one picture alone bears out; what was seen before does not count, nor is it changed."""
         if len(self.model.components) < 2:
             return ()

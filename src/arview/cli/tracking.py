@@ -190,7 +190,7 @@ CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP c
 (field of view along the longer side), exif, or profile:NAME (of `arview calibrate --profile`; profile alone
 takes the one for what the source says of its camera). Each line of a poses file is a JSON object: index, time_s,
 state, quality, cam_from_model (4x4 row-major, mm), covariance (6x6), ms, reason (why not tracked),
-mismatches, unseen (components that have not been seen yet), alternatives (poses that fit as well).
+mismatches, unverified (components that have not been seen yet), alternatives (poses that fit as well).
 Ctrl-C ends the run and finishes the files.""",
 )
 @click.argument("source")

@@ -31,7 +31,7 @@ def pose_document(tracked: Tracked, now_s: float) -> Document:
         "reason": pose.reason,
         "remark": pose.remark,
         "mismatches": list(pose.mismatches),
-        "unseen": list(pose.unseen),
+        "unverified": list(pose.unverified),
         "ambiguous": len(pose.alternatives),
         "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.ravel().tolist(),
         "guide_cam_from_model": None if guide is None else guide.ravel().tolist(),

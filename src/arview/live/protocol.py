@@ -80,7 +80,7 @@ Pose::
     {"type": "pose", "id": N, "revision": of the part document,
      "state": "searching" | "tracked" | "critical" | "lost", "quality": 0 to 1, "reason": words,
      "remark": the reason, or of a tracked part what has not been seen yet,
-     "mismatches": [words], "unseen": [components not seen yet], "ambiguous": how many other poses fit as well,
+     "mismatches": [words], "unverified": [components not seen yet], "ambiguous": how many other poses fit as well,
      "cam_from_model": [16] | null, "guide_cam_from_model": [16] | null,      the guide while waiting to be aligned with
      "camera": {"width", "height", "fx", "fy", "cx", "cy", "dist": [5]},   of the picture as the page has it
      "wait_ms": arrival to start of tracking, "track_ms": tracking, "server_ms": arrival to this answer,

@@ -42,7 +42,7 @@ def _about(subject: Subject, tracked: Tracked) -> Document:
         "quality": pose.quality,
         "reason": pose.reason,
         "mismatches": list(pose.mismatches),
-        "unseen": list(pose.unseen),
+        "unverified": list(pose.unverified),
         "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.tolist(),
         "camera": camera_document(tracked.camera),
         "is_camera_guessed": subject.options.camera is None,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.monitor import ComponentCheck
+from arview.assembly.monitor import AssemblyMonitor
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.detection.detector import (
@@ -135,7 +135,7 @@ class TrackingSession:
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
         self._snap: Snap | None = None
-        self.components = ComponentCheck(views, model, camera)
+        self.components = AssemblyMonitor(views, camera, model)
         self.learned = LearnedViews(views, camera)
         self.reset()
 
@@ -215,7 +215,7 @@ class TrackingSession:
             ms=ms,
             reason=reason,
             mismatches=self.components.mismatches,
-            unseen=self.components.unseen,
+            unverified=self.components.unverified,
             alternatives=tuple(estimate.cam_from_model @ turn for turn in self._rivals.model_from_twins),
         )
 
@@ -241,9 +241,9 @@ class TrackingSession:
         if self._borne_out:
             self.components.update(image, estimate.cam_from_model)
         reasons = [reason, *self.components.mismatches] if reason else [*self.components.mismatches]
-        doubtful = self.components.doubtful
-        if doubtful and not reasons:
-            reasons = [f"in doubt: {', '.join(doubtful)}"]
+        uncertain = self.components.uncertain
+        if uncertain and not reasons:
+            reasons = [f"in doubt: {', '.join(uncertain)}"]
         if reasons:
             self.state = TrackingState.CRITICAL
         return "; ".join(reasons)

@@ -273,7 +273,9 @@ class LookAlikeWalk:
         found = pose.mismatches
         is_named = any(part in words(text) for text in found for part in self.look_alike.components)
         wrong = tuple(self.look_alike.components)
-        return LookAlikeResult(self.look_alike.name, frame.index, str(pose.state), is_named, found, pose.unseen, wrong)
+        return LookAlikeResult(
+            self.look_alike.name, frame.index, str(pose.state), is_named, found, pose.unverified, wrong
+        )
 
 
 @dataclass(frozen=True)
@@ -285,7 +287,7 @@ class LookAlikeResult:
     state: str
     is_named: bool
     mismatches: tuple[str, ...]
-    unseen: tuple[str, ...]
+    unverified: tuple[str, ...]
     components: tuple[str, ...]
 
     @property
@@ -301,7 +303,7 @@ class LookAlikeResult:
     @property
     def is_clean(self) -> bool:
         """True when it was taken for the right part: nothing was named, and what is wrong passed for seen."""
-        return self.is_unnamed and not any(part in self.unseen for part in self.components)
+        return self.is_unnamed and not any(part in self.unverified for part in self.components)
 
 
 def _plain_error(meter: PoseMeter, estimate: Array, frame: SceneFrame) -> PoseError:
