@@ -1,9 +1,7 @@
-"""The package's convolutional networks, as ONNX Runtime runs them: in half the time that `cv2.dnn` takes."""
+"""Convolutional networks run by ONNX Runtime on the CPU."""
 
 from __future__ import annotations
 
-from functools import lru_cache
-from importlib.resources import files
 from typing import TYPE_CHECKING
 
 import cv2
@@ -17,30 +15,35 @@ if TYPE_CHECKING:
 
 
 class Network:
-    """A network of the package by the name of its file. All of one name are one, and threads may share it."""
+    """A network as an ONNX Runtime session; threads may share it.
 
-    def __init__(self, name: str) -> None:
-        self._session = _session(name)
+    Args:
+        model: bytes of the ONNX file, see `arview.weights.load_network`.
+    """
 
-    def __call__(self, **shown: NDArray[np.float32] | NDArray[np.int64]) -> NDArray[np.float32]:
-        """The answer to what it is shown, by the names of its inputs."""
-        return np.asarray(self._session.run(None, shown)[0])
+    def __init__(self, model: bytes) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = thread_count()
+        # Spinning threads would take the cores from the kernels of the searches.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        self._session: onnxruntime.InferenceSession = onnxruntime.InferenceSession(
+            model, options, providers=["CPUExecutionProvider"]
+        )
+
+    def __call__(self, **inputs: NDArray[np.float32] | NDArray[np.int64]) -> NDArray[np.float32]:
+        """The first output for inputs given by their names."""
+        return np.asarray(self._session.run(None, inputs)[0])
+
+    @property
+    def inputs(self) -> dict[str, list[int | str]]:
+        """Shape of each input by its name; a dimension of free size is a string."""
+        return {one.name: one.shape for one in self._session.get_inputs()}
 
 
-@lru_cache
-def _session(name: str) -> onnxruntime.InferenceSession:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = thread_count()
-    # Threads that wait by counting would take the cores from the searches' kernels.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    model = files("arview.weights").joinpath(name).read_bytes()
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-
-
-def extended(image: NDArray[np.uint8], cell_px: int) -> NDArray[np.uint8]:
-    """A picture (H,W,3) with its last rows and columns repeated until its sides are multiples of a cell's."""
+def padded_to_multiple(image: NDArray[np.uint8], cell_px: int) -> NDArray[np.uint8]:
+    """An image (H,W,3) with its last rows and columns repeated until both sides are multiples of ``cell_px``."""
     height, width = image.shape[:2]
     return np.asarray(
         cv2.copyMakeBorder(image, 0, -height % cell_px, 0, -width % cell_px, cv2.BORDER_REPLICATE), dtype=np.uint8

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.onnx_session import Network, extended
+from arview.core.onnx_session import padded_to_multiple
+from arview.weights import load_network
 
 CELL_PX = 8
 """The network takes pictures of multiples of this."""
@@ -54,7 +55,7 @@ class Denoiser:
     """The network; threads may share it."""
 
     def __init__(self) -> None:
-        self._network = Network("denoiser.onnx")
+        self._network = load_network("denoiser.onnx")
 
     def cleaned(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An RGB picture (H,W,3) without its grain; the same one if it has little."""
@@ -65,7 +66,7 @@ class Denoiser:
         for top in range(0, height, BAND_ROWS):
             bottom = min(top + BAND_ROWS, height)
             first, last = max(0, top - OVERLAP_ROWS), min(height, bottom + OVERLAP_ROWS)
-            band = extended(image[first:last], CELL_PX)
+            band = padded_to_multiple(image[first:last], CELL_PX)
             # Rounded, and held between black and white.
             rest = cv2.subtract(band, self._grain(band), dtype=cv2.CV_8U)
             clean[top:bottom] = rest[top - first : bottom - first, :width]

@@ -14,11 +14,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from arview.core.onnx_session import Network, extended
+from arview.core.onnx_session import padded_to_multiple
 from arview.detection.features.response_maps import ORIENTATIONS
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
 from arview.refinement.projection import project_lines
+from arview.weights import load_network
 
 LONGEST_SIDE_PX = 640
 """Larger pictures are shrunk to this. In pictures of this size it was fitted to half diameters of 30 to 300 px."""
@@ -39,7 +40,7 @@ class LineNetwork:
     """The network; threads may share it."""
 
     def __init__(self) -> None:
-        self._network = Network("edge_net.onnx")
+        self._network = load_network("edge_net.onnx")
 
     def lines(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """How likely each place of an RGB picture (H,W,3) is on a line of each orientation, and on a solid.
@@ -56,7 +57,7 @@ class LineNetwork:
             image = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
             height, width = image.shape[:2]
         mean = sum(cv2.mean(image)[:3]) / 3.0
-        image = extended(image, CELL_PX)
+        image = padded_to_multiple(image, CELL_PX)
         answers = self._network(picture=cv2.dnn.blobFromImage(image, 1.0 / CONTRAST, mean=(mean, mean, mean)))
         seen = answers[0, :, : -(-height // SHRINK), : -(-width // SHRINK)]
         lines = seen[:INSIDE]

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.onnx_session import Network
 from arview.core.parallel import pool
 from arview.detection.features.image_pyramid import Picture
 from arview.detection.scoring.pose_verifier import (
@@ -28,6 +27,7 @@ from arview.detection.scoring.pose_verifier import (
 )
 from arview.geometry import Array
 from arview.refinement.view_model import PartView
+from arview.weights import load_network
 
 SIDE_PX, RADIUS_PX = 128, 54.0
 """Side of the picture around the poses, and half the part's diameter in it."""
@@ -40,7 +40,7 @@ class TwinNetwork:
 
     def __init__(self, part: PartView) -> None:
         self._part = part
-        self._network = Network("pair_comparator.onnx")
+        self._network = load_network("pair_comparator.onnx")
 
     def leads(self, picture: Picture, poses: Sequence[Array]) -> Array:
         """Log odds (N,N) that each of some poses is right rather than each other, if one of them is.

@@ -14,7 +14,6 @@ the part at two sizes.
 from __future__ import annotations
 
 from functools import cache
-from importlib.resources import files
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +28,7 @@ from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
 from arview.refinement.projection import project_lines
 from arview.refinement.view_model import PartView
+from arview.weights import load_arrays
 
 ROUGH, FINE = ("rough",), ("fine", "close")
 """The networks for rough and for refined poses."""
@@ -76,8 +76,8 @@ class Network(NamedTuple):
 @cache
 def network(name: str) -> Network:
     """A network as fitted."""
-    with files("arview.weights").joinpath("profile_ranker.npz").open("rb") as file, np.load(file) as stored:
-        return Network(*(np.ascontiguousarray(stored[f"{name}_{field}"]) for field in Network._fields))
+    stored = load_arrays("profile_ranker.npz")
+    return Network(*(stored[f"{name}_{field}"] for field in Network._fields))
 
 
 def judge(

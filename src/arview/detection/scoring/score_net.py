@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.onnx_session import Network
 from arview.geometry import Array
+from arview.weights import load_network
 
 RIGHTWARD, DOWNWARD = 6, 7
 """Channels with the parts of the surface's normal to the right and down: mirrors turn them round."""
@@ -35,7 +35,7 @@ class ScoreNetwork:
     """
 
     def __init__(self, name: str, mirrors: Sequence[tuple[bool, bool]] = ((False, False),)) -> None:
-        self._network = Network(name)
+        self._network = load_network(name)
         self._mirrors = mirrors
 
     def scores(self, looks: Sequence[Look], in_mirrors: bool = True) -> Array:
