@@ -18,13 +18,13 @@ from aiortc import RTCConfiguration, RTCPeerConnection, RTCSessionDescription
 from aiortc.mediastreams import MediaStreamTrack
 from av.video.frame import VideoFrame
 
-from arview.live.addresses import LOOPBACK
-from arview.live.hub import Hub
 from arview.live.options import LiveOptions
-from arview.live.receiving import bind_to, make_prompt
-from arview.live.server import LiveServer, take_place
-from arview.live.stamp import read_stamp, stamped
-from arview.live.subject import Subject
+from arview.live.security.addresses import LOOPBACK
+from arview.live.server.hub import Hub
+from arview.live.server.live_server import LiveServer, take_place
+from arview.live.stream.stamp import read_stamp, stamped
+from arview.live.stream.subject import Subject
+from arview.live.transport.receiving import bind_to, make_prompt
 from arview.video import Image
 
 

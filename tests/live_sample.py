@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from arview.geometry import Array
-from arview.live.loading import load_subject
 from arview.live.options import LiveOptions
-from arview.live.subject import Subject
+from arview.live.server.loading import load_subject
+from arview.live.stream.subject import Subject
 from arview.video import Image, open_source
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "bracket_plate"

@@ -13,13 +13,19 @@ from pathlib import Path
 
 import pytest
 
-from arview.live import limits, serving
-from arview.live.access import Access
-from arview.live.addresses import LOOPBACK
-from arview.live.app import page_files
-from arview.live.frames import to_jpeg
-from arview.live.limits import CONTROL_BYTES, JPEG_BYTES, OFFER_BYTES, RateLimit
-from arview.live.refusals import Refusal
+from arview.live.security import limits
+from arview.live.security.access import Access
+from arview.live.security.addresses import LOOPBACK
+from arview.live.security.limits import (
+    CONTROL_BYTES,
+    JPEG_BYTES,
+    OFFER_BYTES,
+    RateLimit,
+)
+from arview.live.security.refusals import Refusal
+from arview.live.server import uvicorn_server
+from arview.live.server.app import page_files
+from arview.live.stream.frames import to_jpeg
 from live_client import Http, Running, running
 from live_sample import frames, loader, options
 
@@ -186,7 +192,7 @@ def test_bodies_that_are_no_wish(page: Http, content: bytes) -> None:
 
 def test_slow_headers_and_bodies_are_cut(server: Running, page: Http, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "BODY_TIMEOUT_S", 0.5)
-    monkeypatch.setattr(serving.PatientProtocol._await_headers, "__defaults__", (0.7,))
+    monkeypatch.setattr(uvicorn_server.PatientProtocol._await_headers, "__defaults__", (0.7,))
     began_s = time.monotonic()
     assert raw(server, b"GET / HTTP/1.1\r\nHost: x\r\nX-Slow: ", 8) == b""
     assert 0.3 < time.monotonic() - began_s < 5
@@ -200,7 +206,7 @@ def test_slow_headers_and_bodies_are_cut(server: Running, page: Http, monkeypatc
 
 
 def test_a_client_that_takes_no_answer_is_cut(server: Running, page: Http, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serving, "WRITE_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(uvicorn_server, "WRITE_TIMEOUT_S", 0.5)
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as line:
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         line.settimeout(10)

@@ -20,7 +20,7 @@ from click.testing import CliRunner
 
 from arview.cli import main
 from arview.errors import InputError
-from arview.live.addresses import LOOPBACK, bind
+from arview.live.security.addresses import LOOPBACK, bind
 from arview.video import open_source
 from live_client import Http
 from live_sample import CAMERA, CLIP, INSPECTION, PART

@@ -22,16 +22,16 @@ from arview.camera import Camera
 from arview.camera.read import guess_camera
 from arview.errors import InputError, MismatchError
 from arview.inspection import load_inspection, save_inspection
-from arview.live.documents import _source_name, pose_document
-from arview.live.drawing import KEPT_LOOKS, Drawing
-from arview.live.feed import KEPT_FRAMES, Feed, Tracked
-from arview.live.frames import Incoming, Picture
-from arview.live.inspection_file import InspectionFile
-from arview.live.newest import Inbox, NewestSlot
-from arview.live.notices import Notice
 from arview.live.protocol import NOTICE_CODES
-from arview.live.recording import Recorder, Recordings, _fitted
-from arview.live.subject import Look
+from arview.live.stream.documents import _source_name, pose_document
+from arview.live.stream.drawing import KEPT_LOOKS, Drawing
+from arview.live.stream.feed import KEPT_FRAMES, Feed, Tracked
+from arview.live.stream.frames import Incoming, Picture
+from arview.live.stream.inspection_file import InspectionFile
+from arview.live.stream.newest import Inbox, NewestSlot
+from arview.live.stream.notices import Notice
+from arview.live.stream.recording import Recorder, Recordings, _fitted
+from arview.live.stream.subject import Look
 from arview.pose import Pose, TrackingState
 from arview.video import Image, open_source
 from live_sample import INSPECTION, PART, options
@@ -296,11 +296,11 @@ def test_a_recording_ends_before_the_disk_is_full(
 ) -> None:
     subject: Any = Scripted()
     feed = closing(feed_of(subject))
-    monkeypatch.setattr("arview.live.recording._LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr("arview.live.stream.recording._LOOK_EVERY_S", 0.0)
     recorder = Recorder(feed, Drawing(subject), tmp_path / "out.mp4")
     feed.put(frame(1))
     time.sleep(0.2)
-    monkeypatch.setattr("arview.live.recording.FREE_BYTES", 1 << 60)
+    monkeypatch.setattr("arview.live.stream.recording.FREE_BYTES", 1 << 60)
     feed.put(frame(2))
     wait(lambda: not recorder.is_running)
     assert recorder.stop() and len(list(open_source(tmp_path / "out.mp4"))) == 1

@@ -21,11 +21,16 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from cryptography.x509.verification import PolicyBuilder, Store, VerificationError
 
 from arview.errors import InputError, OutputError
-from arview.live import addresses
-from arview.live.addresses import LOOPBACK, Interface, bind, choose_host
-from arview.live.certificates import AUTHORITY_DAYS, LEAF_DAYS, local_certificates, own_certificates
-from arview.live.server import LiveServer, take_place
-from arview.live.trust_page import apple_profile, fingerprint
+from arview.live.security import addresses
+from arview.live.security.addresses import LOOPBACK, Interface, bind, choose_host
+from arview.live.security.certificates import (
+    AUTHORITY_DAYS,
+    LEAF_DAYS,
+    local_certificates,
+    own_certificates,
+)
+from arview.live.security.trust_page import apple_profile, fingerprint
+from arview.live.server.live_server import LiveServer, take_place
 from live_sample import loader, options
 
 NOW = datetime(2026, 11, 22, 12, 0, tzinfo=UTC)

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image as PilImage
 
 import live_browser
-from arview.live.stamp import Stamp, strip
+from arview.live.stream.stamp import Stamp, strip
 from arview.overlay.guide import GUIDE_RGB
 from arview.video import VideoSink
 from live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
@@ -355,7 +355,7 @@ def test_screen_that_watches(chromium: Any, server: Running) -> None:
 
 
 def test_modules_agree_with_the_server(chromium: Any, server: Running) -> None:
-    """The page's stamp and lens are those of arview.live.stamp and arview.camera."""
+    """The page's stamp and lens are those of arview.live.stream.stamp and arview.camera."""
     lens = live_browser.camera(WIDTH, HEIGHT)
     points = np.random.default_rng(1).uniform([-250, -140, 450], [250, 140, 650], (50, 3))
     fields = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
@@ -363,7 +363,7 @@ def test_modules_agree_with_the_server(chromium: Any, server: Running) -> None:
         for stamp in (Stamp(0, 640, 360, 0), Stamp(987654, 1280, 720, 3), Stamp((1 << 20) - 1, 404, 718, 1)):
             drawn = page.evaluate(
                 """async ([id, width, height, turns]) => {
-                    const {drawStrip, readStamp, stripHeight} = await import("/static/stamp.js");
+                    const {drawStrip, readStamp, stripHeight} = await import("/static/transport/stamp.js");
                     const canvas = document.createElement("canvas");
                     [canvas.width, canvas.height] = [width, height + stripHeight(width)];
                     const context = canvas.getContext("2d");
@@ -377,7 +377,7 @@ def test_modules_agree_with_the_server(chromium: Any, server: Running) -> None:
             assert drawn[1]["turns"] == stamp.quarter_turns_clockwise
         pixels = page.evaluate(
             """async ([camera, points]) => {
-                const {Intrinsics} = await import("/static/projection.js");
+                const {Intrinsics} = await import("/static/scene/projection.js");
                 const lens = new Intrinsics(camera);
                 return points.map((point) => {
                     const pixel = lens.project(point);

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from arview.live.frames import from_jpeg, to_jpeg
+from arview.live.stream.frames import from_jpeg, to_jpeg
 from arview.video import open_source
 from live_client import Http, Running, running
 from live_sample import (

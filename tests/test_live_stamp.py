@@ -12,8 +12,8 @@ from av.video.frame import VideoFrame
 
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.live.frames import from_jpeg, from_stamped, to_jpeg
-from arview.live.stamp import Stamp, crc16, read_stamp, stamped, strip, strip_px
+from arview.live.stream.frames import from_jpeg, from_stamped, to_jpeg
+from arview.live.stream.stamp import Stamp, crc16, read_stamp, stamped, strip, strip_px
 
 SIZES = [(640, 480), (480, 640), (1280, 720), (720, 1280), (1920, 1080), (360, 640)]
 

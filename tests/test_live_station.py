@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from arview.errors import InputError
-from arview.live import station
-from arview.live.addresses import LOOPBACK
-from arview.live.frames import from_jpeg
 from arview.live.options import LiveOptions
+from arview.live.security.addresses import LOOPBACK
+from arview.live.stream import station
+from arview.live.stream.frames import from_jpeg
 from arview.video import Frame, FrameSource, Image, VideoSink, open_source
 from arview.video.sources import check_source
 from live_client import Http, Running, running

@@ -14,9 +14,13 @@ import numpy as np
 import pytest
 from aiortc.rtp import RtpPacket
 
-from arview.live.receiving import WAITING_FRAMES, PromptJitterBuffer, ShortQueue
-from arview.live.stamp import strip_px
-from arview.live.webrtc import MOST_CANDIDATES, _checked, _faster
+from arview.live.stream.stamp import strip_px
+from arview.live.transport.receiving import (
+    WAITING_FRAMES,
+    PromptJitterBuffer,
+    ShortQueue,
+)
+from arview.live.transport.webrtc import MOST_CANDIDATES, _checked, _faster
 from live_client import Camera, Phone, Running, running
 from live_sample import HEIGHT, WIDTH, errors, frames, loader, nearest, options, there_and_back, truth
 

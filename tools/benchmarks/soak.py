@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "samples" / "bracket_plate"
 sys.path.insert(0, str(ROOT / "tests"))  # the client is that of the tests
 
-from arview.live.addresses import LOOPBACK
+from arview.live.security.addresses import LOOPBACK
 from arview.video import Image, open_source
 from live_client import Camera, Http, Phone
 from live_server import live_server

@@ -18,7 +18,7 @@ from arview.errors import InputError
 from arview.evaluation.semisynthetic import photos_in
 from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.geometry import Array
-from arview.live.frames import to_jpeg
+from arview.live.stream.frames import to_jpeg
 from arview.video import Image
 from seeded_files import still_to_make
 

@@ -19,10 +19,10 @@ from arview.cli.common import EXIT_INTERRUPTED, RENDERER, UNIT, main, output_pat
 from arview.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
-    from arview.live.hub import Hub
     from arview.live.options import LiveOptions
-    from arview.live.server import LiveServer, Place
-    from arview.live.subject import Subject
+    from arview.live.server.hub import Hub
+    from arview.live.server.live_server import LiveServer, Place
+    from arview.live.stream.subject import Subject
 
 EXTRA = ("aiortc", "starlette", "uvicorn", "cryptography", "segno")
 _AGES_S = {"min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -134,7 +134,7 @@ def live(
     require_extra()
     from arview.cad.part import find_part_file
     from arview.live.options import LiveOptions
-    from arview.live.server import LiveServer, take_place
+    from arview.live.server.live_server import LiveServer, take_place
     from arview.video.sources import check_source
 
     find_part_file(part_path)
@@ -196,7 +196,7 @@ async def _serve(
     server: LiveServer, options: LiveOptions, part_path: str, views_path: str | None, renderer: str, unit: str | None
 ) -> None:
     from arview.guideviews import GuideViewOptions
-    from arview.live.loading import load_subject, warm_up
+    from arview.live.server.loading import load_subject, warm_up
 
     loop = asyncio.get_running_loop()
 
@@ -228,7 +228,7 @@ def _print_welcome(server: LiveServer, place: Place) -> None:
     certificates = place.certificates
     click.echo(f"page:  {server.link}")
     if place.trust_link is not None and certificates is not None and certificates.authority_der is not None:
-        from arview.live.trust_page import fingerprint
+        from arview.live.security.trust_page import fingerprint
 
         click.echo(f"first time on a phone:  {place.trust_link}")
         click.echo(f"fingerprint:  {fingerprint(certificates.authority_der)}")

@@ -1,4 +1,6 @@
-"""The live server: part tracked in the video of a phone or a station camera, shown in the browser.
+"""The live server: a part is tracked in the video of a phone or a station camera and shown in the browser.
 
-`arview.live.protocol` says what server and page tell each other; `arview.live.server.serve` runs it.
+`arview.live.protocol` defines the messages between server and page. Folders, each importing only those before it:
+``security`` (access, limits, certificates), ``stream`` (frames, tracking, drawing, recording), ``transport`` (WebRTC,
+motion JPEG) and ``server`` (application and life cycle). ``page`` holds the static files of the browser page.
 """

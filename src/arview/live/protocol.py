@@ -55,7 +55,7 @@ station; and **one** data channel ``arview``, ``{ordered: false, maxRetransmits:
 ``contentHint = "detail"`` and ``degradationPreference = "maintain-resolution"``: frames that arrive smaller are
 scaled back (notice ``frames_scaled``).
 
-Every video frame, in both directions, carries the stamp below its picture: see `arview.live.stamp`. Widths and
+Every video frame, in both directions, carries the stamp below its picture: see `arview.live.stream.stamp`. Widths and
 heights are even.
 
 - page to server: each camera frame, stamped with an id of the page;

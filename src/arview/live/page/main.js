@@ -1,11 +1,11 @@
 // The page: camera, connection, picture and controls put together.
 
 import { Camera, quarterTurns } from "./camera.js";
-import { Connection } from "./connection.js";
+import { Connection } from "./transport/connection.js";
 import { icon } from "./icons.js";
 import { Parts, tally } from "./parts.js";
 import { Player } from "./player.js";
-import { Stage } from "./stage.js";
+import { Stage } from "./scene/stage.js";
 import { Message, Notices, StatusBar, Toast } from "./status.js";
 
 const FIGURES_EVERY_MS = 500, LOOK_DELAY_MS = 150;

@@ -1,8 +1,8 @@
 // Which picture to show with which pose: a ghost only ever lies on the very frame that its pose was found in.
 
-import { FrameRing } from "./frames.js";
-import { Intrinsics } from "./projection.js";
-import { FRAME_IDS, isNewer } from "./stamp.js";
+import { FrameRing } from "./transport/frames.js";
+import { Intrinsics } from "./scene/projection.js";
+import { FRAME_IDS, isNewer } from "./transport/stamp.js";
 
 const KEPT_FRAMES = 20, KEPT_POSES = 60, KEPT_TIMES = 300;
 const STALE_MS = 700; // without an answer for so long the ghost goes and the camera is shown as it is

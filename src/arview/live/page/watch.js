@@ -1,6 +1,6 @@
 // A screen that only watches: the annotated picture as motion JPEG, and what is wrong in words.
 
-import { ask, getPart } from "./api.js";
+import { ask, getPart } from "./transport/api.js";
 import { Message, Notices } from "./status.js";
 
 const EVERY_MS = 2000;

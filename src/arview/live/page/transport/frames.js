@@ -1,6 +1,6 @@
 // The last frames, each with its id, so that an answer that comes later finds the very picture it speaks of.
 
-import { CANVAS_OPTIONS } from "./graphics.js";
+import { CANVAS_OPTIONS } from "../graphics.js";
 import { isNewer } from "./stamp.js";
 
 export class FrameRing {

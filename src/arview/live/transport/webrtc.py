@@ -20,14 +20,14 @@ from aiortc.mediastreams import MediaStreamError, MediaStreamTrack
 from av.video.frame import VideoFrame
 
 from arview.errors import InputError
-from arview.live.documents import Document, pose_document
-from arview.live.drawing import Drawing
-from arview.live.feed import Feed, Tracked
-from arview.live.frames import Incoming, from_stamped
-from arview.live.newest import Inbox
 from arview.live.protocol import CHANNEL, Way
-from arview.live.receiving import bind_to, make_prompt
-from arview.live.stamp import stamped
+from arview.live.stream.documents import Document, pose_document
+from arview.live.stream.drawing import Drawing
+from arview.live.stream.feed import Feed, Tracked
+from arview.live.stream.frames import Incoming, from_stamped
+from arview.live.stream.newest import Inbox
+from arview.live.stream.stamp import stamped
+from arview.live.transport.receiving import bind_to, make_prompt
 
 BEHIND_BYTES = 32_768
 """So much waiting on the data channel, some fifteen answers, and new ones are left out."""

@@ -1,6 +1,6 @@
 // The stage: where the picture lies on the screen, and what is drawn over it.
 
-import { CANVAS_OPTIONS } from "./graphics.js";
+import { CANVAS_OPTIONS } from "../graphics.js";
 import { Ghost } from "./ghost.js";
 import { Labels } from "./labels.js";
 

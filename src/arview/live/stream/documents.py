@@ -7,10 +7,10 @@ from typing import Any
 
 from arview.camera import Camera
 from arview.inspection import ComponentDeviation, Finding, Inspection
-from arview.live.feed import Feed, Tracked
-from arview.live.notices import Notice
 from arview.live.options import LiveOptions
-from arview.live.subject import Look, Subject
+from arview.live.stream.feed import Feed, Tracked
+from arview.live.stream.notices import Notice
+from arview.live.stream.subject import Look, Subject
 from arview.overlay.labels import arrow_scale, by_urgency, detail_text, value_text
 from arview.overlay.mesh import anchor_in_model, topology
 from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, OverlayOptions

@@ -14,16 +14,20 @@ from pathlib import Path
 from typing import TypeVar
 
 from arview.errors import InputError
-from arview.live.access import Access
-from arview.live.addresses import LOOPBACK, bind, choose_host
-from arview.live.app import make_app
-from arview.live.certificates import Certificates, local_certificates, own_certificates
-from arview.live.hub import Hub
 from arview.live.options import LiveOptions
-from arview.live.serving import Server
-from arview.live.subject import Subject
-from arview.live.trust_page import trust_app
-from arview.live.webrtc import raise_bitrates
+from arview.live.security.access import Access
+from arview.live.security.addresses import LOOPBACK, bind, choose_host
+from arview.live.security.certificates import (
+    Certificates,
+    local_certificates,
+    own_certificates,
+)
+from arview.live.security.trust_page import trust_app
+from arview.live.server.app import make_app
+from arview.live.server.hub import Hub
+from arview.live.server.uvicorn_server import Server
+from arview.live.stream.subject import Subject
+from arview.live.transport.webrtc import raise_bitrates
 
 logger = logging.getLogger("arview.live")
 T = TypeVar("T")

@@ -1,8 +1,8 @@
 // Transport by WebRTC: the camera goes up, poses come by a data channel, pictures of the server come as video.
 
-import { CANVAS_OPTIONS } from "./graphics.js";
+import { CANVAS_OPTIONS } from "../graphics.js";
 import { ask, join, leave } from "./api.js";
-import { watchFrames } from "./camera.js";
+import { watchFrames } from "../camera.js";
 import { drawStrip, readStamp, stripHeight } from "./stamp.js";
 
 const GATHER_MS = 1500, CONNECT_MS = 9000, SILENT_MS = 5000, RTT_EVERY_MS = 2000;

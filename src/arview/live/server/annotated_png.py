@@ -7,10 +7,10 @@ import json
 from datetime import UTC, datetime
 
 from arview import __version__
-from arview.live.documents import Document, camera_document
-from arview.live.drawing import Drawing
-from arview.live.feed import Tracked
-from arview.live.subject import Subject
+from arview.live.stream.documents import Document, camera_document
+from arview.live.stream.drawing import Drawing
+from arview.live.stream.feed import Tracked
+from arview.live.stream.subject import Subject
 
 CHUNK = "arview"
 """Name of the PNG's text chunk that holds the JSON."""

@@ -10,9 +10,9 @@ from arview.camera import Camera
 from arview.camera.read import guess_camera, load_camera
 from arview.guideviews import GuideViewSet
 from arview.inspection import Inspection
-from arview.live.inspection_file import InspectionFile
-from arview.live.notices import Notice
 from arview.live.options import LiveOptions
+from arview.live.stream.inspection_file import InspectionFile
+from arview.live.stream.notices import Notice
 from arview.overlay import OverlayOptions, OverlayRenderer
 from arview.overlay.options import EdgeMode
 from arview.tracking import TrackingSession

@@ -11,7 +11,7 @@ import numpy as np
 from av.video.frame import VideoFrame
 
 from arview.errors import InputError
-from arview.live.stamp import read_stamp
+from arview.live.stream.stamp import read_stamp
 from arview.video import Image
 from arview.video.color import rgb_from_video_frame
 

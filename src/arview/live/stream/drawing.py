@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from arview.camera import Camera
-from arview.live.feed import Tracked
-from arview.live.frames import to_jpeg
-from arview.live.subject import Look, Subject
+from arview.live.stream.feed import Tracked
+from arview.live.stream.frames import to_jpeg
+from arview.live.stream.subject import Look, Subject
 from arview.overlay import OverlayRenderer
 from arview.video import Image
 

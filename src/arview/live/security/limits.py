@@ -10,7 +10,7 @@ from typing import Any
 
 from starlette.requests import ClientDisconnect, Request
 
-from arview.live.refusals import Refusal
+from arview.live.security.refusals import Refusal
 
 BODY_TIMEOUT_S = 10.0
 JPEG_BYTES, OFFER_BYTES, CONTROL_BYTES = 4_000_000, 64_000, 4_000

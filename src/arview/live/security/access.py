@@ -13,9 +13,9 @@ from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from arview.live.limits import RateLimit
 from arview.live.protocol import COOKIE
-from arview.live.refusals import Refusal
+from arview.live.security.limits import RateLimit
+from arview.live.security.refusals import Refusal
 
 PAGES = ("/", "/watch")
 """Where a link may bring the token."""

@@ -15,10 +15,10 @@ import numpy as np
 from arview.camera import Camera
 from arview.camera.read import guess_camera
 from arview.errors import ArviewError
-from arview.live.frames import Incoming, Picture, to_jpeg
-from arview.live.newest import NewestSlot
-from arview.live.notices import Notice, without_folder
-from arview.live.subject import Subject
+from arview.live.stream.frames import Incoming, Picture, to_jpeg
+from arview.live.stream.newest import NewestSlot
+from arview.live.stream.notices import Notice, without_folder
+from arview.live.stream.subject import Subject
 from arview.pose import Pose, TrackingState
 from arview.tracking import TrackingSession
 

@@ -11,7 +11,7 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from arview.live.certificates import Certificates
+from arview.live.security.certificates import Certificates
 
 HEADERS_TIMEOUT_S = 10.0
 """A connection that has not sent a whole request by then is closed (Slowloris)."""

@@ -2,7 +2,7 @@
 //
 // The model is drawn as an ideal lens sees it into a texture, and the texture is bent like the lens over the picture.
 
-import { SAMPLES } from "./graphics.js";
+import { SAMPLES } from "../graphics.js";
 import { bend, eyeInModel, glProjection, glView, toCam } from "./projection.js";
 import { MeshEdges, welded } from "./mesh_edges.js";
 

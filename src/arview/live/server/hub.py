@@ -12,8 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from arview.errors import ArviewError, InputError
-from arview.live.clients import Client, check_control, one_of
-from arview.live.documents import (
+from arview.live.options import LiveOptions
+from arview.live.protocol import Transport, Way
+from arview.live.security.refusals import Refusal
+from arview.live.server.clients import Client, check_control, one_of
+from arview.live.server.glb import model_glb
+from arview.live.stream.documents import (
     Document,
     feed_document,
     loading_document,
@@ -21,17 +25,13 @@ from arview.live.documents import (
     notice_documents,
     part_document,
 )
-from arview.live.drawing import Drawing
-from arview.live.feed import Feed
-from arview.live.glb import model_glb
-from arview.live.notices import Notice
-from arview.live.options import LiveOptions
-from arview.live.protocol import Transport, Way
-from arview.live.recording import Recordings
-from arview.live.refusals import Refusal
-from arview.live.station import StationCamera
-from arview.live.subject import Subject
-from arview.live.webrtc import Connection
+from arview.live.stream.drawing import Drawing
+from arview.live.stream.feed import Feed
+from arview.live.stream.notices import Notice
+from arview.live.stream.recording import Recordings
+from arview.live.stream.station import StationCamera
+from arview.live.stream.subject import Subject
+from arview.live.transport.webrtc import Connection
 
 logger = logging.getLogger("arview.live")
 

@@ -9,10 +9,10 @@ import time
 import numpy as np
 
 from arview.errors import ArviewError
-from arview.live.feed import Feed
-from arview.live.frames import Incoming, Picture
-from arview.live.notices import Notice, without_folder
 from arview.live.protocol import FRAME_IDS
+from arview.live.stream.feed import Feed
+from arview.live.stream.frames import Incoming, Picture
+from arview.live.stream.notices import Notice, without_folder
 from arview.video import Frame, FrameSource, Image, open_source
 
 logger = logging.getLogger("arview.live")

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 
 from arview.errors import ArviewError
-from arview.live.drawing import Drawing
-from arview.live.feed import Feed, Tracked
-from arview.live.newest import NewestSlot
-from arview.live.notices import Notice
+from arview.live.stream.drawing import Drawing
+from arview.live.stream.feed import Feed, Tracked
+from arview.live.stream.newest import NewestSlot
+from arview.live.stream.notices import Notice
 from arview.video import Image, VideoSink
 
 logger = logging.getLogger("arview.live")

@@ -17,7 +17,7 @@ from arview.errors import ArviewError, MismatchError
 from arview.guideviews import GuideViewOptions, load_guide_views
 from arview.guideviews.cache import cached_guide_views
 from arview.live.options import LiveOptions
-from arview.live.subject import Subject
+from arview.live.stream.subject import Subject
 
 logger = logging.getLogger("arview.live")
 

@@ -18,17 +18,24 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from arview.errors import InputError
-from arview.live.access import Access, Gate
-from arview.live.clients import Client
-from arview.live.documents import Document, pose_document
-from arview.live.feed import Tracked
-from arview.live.frames import Incoming, Picture, from_jpeg
-from arview.live.hub import Hub
-from arview.live.limits import CONTROL_BYTES, JPEG_BYTES, OFFER_BYTES, RateLimit, body, json_body
-from arview.live.motion_jpeg import MotionJpeg
 from arview.live.protocol import ANSWER_HEADER, FRAME_IDS
-from arview.live.refusals import Refusal
-from arview.live.snapshot import snapshot_png
+from arview.live.security.access import Access, Gate
+from arview.live.security.limits import (
+    CONTROL_BYTES,
+    JPEG_BYTES,
+    OFFER_BYTES,
+    RateLimit,
+    body,
+    json_body,
+)
+from arview.live.security.refusals import Refusal
+from arview.live.server.annotated_png import snapshot_png
+from arview.live.server.clients import Client
+from arview.live.server.hub import Hub
+from arview.live.stream.documents import Document, pose_document
+from arview.live.stream.feed import Tracked
+from arview.live.stream.frames import Incoming, Picture, from_jpeg
+from arview.live.transport.motion_jpeg import MotionJpeg
 
 logger = logging.getLogger("arview.live")
 
@@ -94,7 +101,7 @@ class Handlers:
         self._hub.ready()
         if self._hub.watchers >= self._hub.options.watchers:
             raise Refusal(503, "busy", f"busy: {self._hub.watchers} screens watch already")
-        return MotionJpeg(self._hub)
+        return MotionJpeg(self._hub, self._hub.options.watch_fps)
 
     async def part(self, request: Request) -> Response:
         """*Part*."""

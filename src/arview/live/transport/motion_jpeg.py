@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import time
 from contextlib import suppress
+from typing import Protocol
 
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
-from arview.live.drawing import Drawing
-from arview.live.feed import Tracked
-from arview.live.hub import Hub
-from arview.live.subject import Look
+from arview.live.stream.drawing import Drawing
+from arview.live.stream.feed import Feed, Tracked
+from arview.live.stream.subject import Look
 
 BOUNDARY = "arview-frame"
 SEND_TIMEOUT_S = 10.0
@@ -21,12 +21,26 @@ WAIT_S = 2.0
 """Without a new picture for so long the last is sent again, so that a vanished screen is noticed."""
 
 
+class Watchable(Protocol):
+    """Whatever provides the stream that watching screens show; the hub of the server does.
+
+    Attributes:
+        watchers: number of screens that are being served.
+    """
+
+    watchers: int
+
+    def watched(self) -> tuple[Feed, Drawing] | None:
+        """The feed to show and its drawing, or None while there is none."""
+        ...
+
+
 class MotionJpeg(Response):
     """An endless answer: the newest annotated picture, again and again, as fast as the screen takes them."""
 
-    def __init__(self, hub: Hub) -> None:
+    def __init__(self, hub: Watchable, fps: float) -> None:
         super().__init__()
-        self._hub = hub
+        self._hub, self._fps = hub, fps
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send pictures until the screen goes."""
@@ -56,7 +70,7 @@ class MotionJpeg(Response):
             message = {"type": "http.response.body", "body": head.encode() + content + b"\r\n", "more_body": True}
             await asyncio.wait_for(send(message), SEND_TIMEOUT_S)
             shown, sent_s = newest, time.monotonic()
-            await asyncio.wait([gone], timeout=1.0 / self._hub.options.watch_fps)
+            await asyncio.wait([gone], timeout=1.0 / self._fps)
 
 
 def _jpeg(drawing: Drawing, tracked: Tracked) -> bytes:

@@ -9,13 +9,13 @@ from dataclasses import replace
 from typing import Any, get_args
 
 from arview.errors import InputError
-from arview.live.drawing import Drawing
-from arview.live.feed import Feed, Tracked
-from arview.live.newest import Inbox
 from arview.live.protocol import FRAME_IDS, Transport, Way
-from arview.live.refusals import Refusal
-from arview.live.subject import Look
-from arview.live.webrtc import Connection
+from arview.live.security.refusals import Refusal
+from arview.live.stream.drawing import Drawing
+from arview.live.stream.feed import Feed, Tracked
+from arview.live.stream.newest import Inbox
+from arview.live.stream.subject import Look
+from arview.live.transport.webrtc import Connection
 
 _LOOKS: dict[str, tuple[type, ...]] = {
     "ghost": (bool,),

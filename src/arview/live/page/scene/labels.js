@@ -1,6 +1,6 @@
 // Labels as HTML beside the part with leader lines, and arrows of displacement, over the picture.
 
-import { icon, make } from "./icons.js";
+import { icon, make } from "../icons.js";
 import { LabelLayout } from "./layout.js";
 import { toCam } from "./projection.js";
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from arview.cad.model import Model
 from arview.errors import ArviewError, MismatchError
 from arview.inspection import Inspection, load_inspection
-from arview.live.notices import Notice, without_folder
+from arview.live.stream.notices import Notice, without_folder
 from arview.overlay.status import age_text
 
 _State = tuple[int, int, int] | None

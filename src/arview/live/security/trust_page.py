@@ -12,7 +12,7 @@ from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from arview.live.certificates import Certificates
+from arview.live.security.certificates import Certificates
 
 CERTIFICATE_PATH, PROFILE_PATH = "/arview.crt", "/arview.mobileconfig"
 _HEADERS = {

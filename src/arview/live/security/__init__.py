@@ -1,0 +1,1 @@
+"""Access control, limits, certificates and addresses of the live server."""

@@ -1,0 +1,1 @@
+"""The live server: web application, shared state, start and stop."""

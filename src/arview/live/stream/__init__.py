@@ -1,0 +1,1 @@
+"""One stream of frames: its source, tracking, drawing, recording and JSON documents."""

@@ -1,0 +1,1 @@
+"""How frames and poses reach a page: WebRTC and motion JPEG."""
