@@ -28,7 +28,7 @@ sys.path.insert(0, str(ROOT / "tests"))  # the client is that of the tests
 
 from arview.live.security.addresses import LOOPBACK
 from arview.video import Image, open_source
-from live_client import Camera, Http, Phone
+from helpers.live_client import Camera, Http, Phone
 from live_server import live_server
 
 FPS, WIDTH, HEIGHT = 30.0, 640, 360

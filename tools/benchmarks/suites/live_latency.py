@@ -24,7 +24,7 @@ from recordings import ROOT, SAMPLE, skip
 
 sys.path.insert(0, str(ROOT / "tests"))  # the browser and its film are those of the tests
 
-import live_browser
+from helpers import live_browser
 
 WIDTH, HEIGHT, FPS, COUNT = 640, 480, 30, 44
 VIEWPORT = {"width": 660, "height": 760}

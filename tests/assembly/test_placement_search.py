@@ -1,0 +1,138 @@
+"""Components seen elsewhere: places where they may stand, and that what is hidden at its own place is found there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from arview.assembly.monitor import AssemblyMonitor
+from arview.assembly.placement_search import Places, other_places
+from arview.cad.model import Model, make_model
+from arview.cad.view_range import ViewRange
+from arview.geometry import exp_so3
+from arview.guideviews import GuideViewOptions, make_guide_views
+from helpers.cad_files import box
+from helpers.synthetic import CAMERA, assembly, block, changed, component, picture, pose_from, post, wrong
+
+NAMES = [part.name for part in assembly().components]
+TURN = exp_so3([0.3, -0.5, 0.8])
+
+
+@cache
+def places() -> Places:
+    return other_places(assembly())
+
+
+@cache
+def walled() -> Model:
+    """A plate with a wall, something small behind it, and posts before it."""
+    return make_model(
+        "walled",
+        (
+            component("plate", box((0, 0, 0), (160, 120, 12)), (0.62, 0.62, 0.64)),
+            component("wall", box((60, 50, 12), (120, 60, 62)), (0.55, 0.40, 0.65)),
+            component("hidden", post((98, 80), 9, 12, 26), (0.30, 0.55, 0.75)),
+            component("post_1", post((24, 30), 10, 12, 50), (0.80, 0.35, 0.25)),
+            component("post_2", post((132, 24), 8, 12, 40), (0.85, 0.70, 0.25)),
+            component("block", box((60, 14, 12), (96, 32, 30)), (0.35, 0.65, 0.40)),
+        ),
+    )
+
+
+@cache
+def check() -> AssemblyMonitor:
+    around = ViewRange((420.0, 560.0), elevation_deg=(15.0, 35.0), azimuth_deg=(-95.0, -60.0))
+    views = make_guide_views(walled(), around, GuideViewOptions(renderer="zbuffer"))
+    return AssemblyMonitor(views, CAMERA, walled())
+
+
+POSES = [pose_from(azimuth, 24.0, 480.0, walled()) for azimuth in (-80.0, -77.0, -74.0, -71.0)]
+
+
+def against(model: Model | None, seed: int, noise: float = 3.0) -> dict[str, float]:
+    """What a picture says against each component."""
+    pose = POSES[seed % len(POSES)]
+    image = picture(pose, model or walled(), seed=seed, scene=seed % 9, noise=noise)
+    look = check().look(image, wrong(pose, np.random.default_rng(seed), 0.2, 0.4, walled()))
+    return dict(zip([part.name for part in walled().components], look.against.tolist(), strict=True))
+
+
+def test_components_may_stand_elsewhere_on_the_plate_and_clear_of_each_other() -> None:
+    assert len(places().shifts[NAMES.index("plate")]) == 0
+    for index, shifts in enumerate(places().shifts):
+        if NAMES[index] == "plate":
+            continue
+        assert len(shifts) >= 8, NAMES[index]
+        assert np.abs(shifts[:, 2]).max() < 1e-9
+        far = np.linalg.norm(shifts, axis=1)
+        assert far.min() > 5.9 and far.max() < 30.1
+        low, high = assembly().components[index].bounds_in_model
+        for shift in shifts:
+            for other, part in enumerate(assembly().components):
+                if other in (index, NAMES.index("plate")):
+                    continue
+                apart = np.maximum(part.bounds_in_model[0] - high - shift, low + shift - part.bounds_in_model[1])
+                assert apart[:2].max() > -0.5, f"{NAMES[index]} in {part.name}"
+
+
+def test_places_turn_with_the_model() -> None:
+    turned = [replace(part, vertices_in_model=part.vertices_in_model @ TURN.T) for part in assembly().components]
+    for index, shifts in enumerate(other_places(make_model("turned", tuple(turned))).shifts):
+        assert (len(shifts) == 0) == (NAMES[index] == "plate")
+        if len(shifts):
+            assert np.abs(shifts @ TURN[:, 2]).max() < 0.03 * np.linalg.norm(shifts, axis=1).max()
+
+
+def test_a_post_sunk_into_the_plate_stands_on_it_and_what_floats_on_nothing() -> None:
+    plate = assembly().components[0]
+    sunk = component("sunk", post((40, 40), 8, 4, 50), (0.5, 0.5, 0.5))
+    floating = component("floating", post((110, 80), 8, 20, 50), (0.5, 0.5, 0.5))
+    found = other_places(make_model("both", (plate, sunk, floating)))
+    assert [len(shifts) > 0 for shifts in found.shifts] == [False, True, False]
+    assert found.swaps == ()
+
+
+def test_one_component_alone_has_no_places() -> None:
+    assert [len(shifts) for shifts in other_places(block()).shifts] == [0]
+
+
+def test_pairs_that_change_places_stand_foot_on_foot() -> None:
+    pairs = {(NAMES[one], NAMES[other]): shift for one, other, shift in places().swaps}
+    assert len(pairs) == 15
+    assert pairs["post_1", "post_3"] == pytest.approx([94.0, 66.0, 0.0], abs=0.5)
+    assert pairs["block_1", "block_2"] == pytest.approx([42.0, -27.0, 0.0], abs=0.5)
+
+
+def test_what_is_hidden_at_its_place_is_named_where_it_is_seen_elsewhere() -> None:
+    found = [against(changed(walled(), hidden=(26.0, 0.0)), seed) for seed in range(8)]
+    assert np.median([said["hidden"] for said in found]) > 1.0
+    assert sum(said["hidden"] > 0.5 for said in found) >= 6
+    assert all(ratio < 0.0 for said in found for name, ratio in said.items() if name != "hidden")
+
+
+@pytest.mark.parametrize("noise", [3.0, 8.0])
+def test_what_is_hidden_and_right_is_not_seen_elsewhere(noise: float) -> None:
+    for seed in range(8):
+        said = against(None, seed, noise)
+        assert said["hidden"] <= 0.1, f"picture {seed}"
+        assert max(said.values()) < 1.0, f"picture {seed}"
+
+
+def test_a_component_surely_seen_before_is_not_looked_for_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def never(*of: object) -> np.ndarray:
+        asked.append(of[-1])
+        return np.full(len(walled().components), -np.inf)
+
+    monkeypatch.setattr(check()._elsewhere, "against", never)
+    image = picture(POSES[0], walled(), seed=1, noise=3.0)
+    check().reset()
+    for _ in range(4):
+        check().update(image, POSES[0])
+    hidden = [part.name for part in walled().components].index("hidden")
+    assert asked[0].all()
+    assert np.flatnonzero(asked[-1]).tolist() == [hidden]

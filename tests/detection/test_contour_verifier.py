@@ -1,0 +1,144 @@
+"""Strips: the edge is in the middle of each where the pose is right, and the network says where it strays."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from arview.detection.features.edge_net import LineNetwork
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.scoring.contour_verifier import (
+    CHANNELS,
+    COLUMNS,
+    OUTLINE_ROWS,
+    RAW,
+    ROWS,
+    STEP_PX,
+    Strips,
+    picture_step,
+    raw_strips,
+    shown,
+)
+from arview.geometry import Array, rigid
+from arview.refinement.view_model import PartView
+from helpers.synthetic import CAMERA, assembly_views, background, half_hidden, pose_from, turned_about
+from helpers.synthetic import picture as drawn
+
+PART = PartView(assembly_views())
+TRUTH = pose_from(30.0, 45.0, 520.0) @ PART.model_from_body
+MIDDLE = COLUMNS // 2
+
+
+@cache
+def strips() -> Strips:
+    return Strips(PART)
+
+
+@cache
+def picture(noise: float = 4.0, is_hidden: bool = False) -> Picture:
+    pose = TRUTH @ PART.body_from_model
+    return Picture(drawn(pose, noise=noise, card=half_hidden(pose) if is_hidden else None), CAMERA, 12, LineNetwork())
+
+
+def scores(seen: Picture, poses: list[Array]) -> Array:
+    return strips().scores(seen, np.stack(poses))
+
+
+def aside(right_px: float) -> Array:
+    """The true pose moved to the right in the picture."""
+    return rigid(TRUTH[:3, :3], TRUTH[:3, 3] + [right_px * TRUTH[2, 3] / CAMERA.fx, 0.0, 0.0])
+
+
+def nearer(share: float) -> Array:
+    """The true pose at a share of its distance."""
+    return rigid(TRUTH[:3, :3], share * TRUTH[:3, 3])
+
+
+def edge_offsets_px(cut: NDArray[np.uint8]) -> Array:
+    """Where along each row of the outline that is all in the picture the colours change most."""
+    steps = shown(cut, 80.0)[0][RAW, :OUTLINE_ROWS]
+    return STEP_PX * (steps[(cut[3, :OUTLINE_ROWS] > 0).all(axis=1)].argmax(axis=1) - MIDDLE)
+
+
+def test_the_edge_is_in_the_middle_where_the_pose_is_right() -> None:
+    offsets = edge_offsets_px(raw_strips(picture(), PART, TRUTH))
+    assert len(offsets) > 0.7 * OUTLINE_ROWS
+    assert abs(np.median(offsets)) < 0.6
+    assert np.percentile(np.abs(offsets), 70) < 1.2
+
+
+def test_the_edge_is_inside_where_the_pose_is_too_near_and_outside_where_it_is_too_far() -> None:
+    near, far = (edge_offsets_px(raw_strips(picture(), PART, nearer(share))) for share in (0.97, 1.03))
+    # The outline is 60 to 110 px from the middle of the part: 3 % of that.
+    assert np.median(near) == pytest.approx(-2.7, abs=1.0)
+    assert np.median(far) == pytest.approx(2.7, abs=1.0)
+
+
+def test_inside_is_where_the_part_is_to_be() -> None:
+    cut = raw_strips(picture(), PART, TRUTH)
+    seen = cut[3, :OUTLINE_ROWS] > 0
+    inside, outside = cut[7, :OUTLINE_ROWS, : MIDDLE + 1], cut[7, :OUTLINE_ROWS, MIDDLE + 1 :]
+    assert set(np.unique(inside[seen[:, : MIDDLE + 1]])) <= {128, 255}
+    assert set(np.unique(outside[seen[:, MIDDLE + 1 :]])) <= {0, 128}
+    # The line network sees a solid on the one side and none on the other.
+    assert cut[6, :OUTLINE_ROWS, :4][inside[:, :4] == 255].mean() > 150.0
+    assert cut[6, :OUTLINE_ROWS, -4:][outside[:, -4:] == 0].mean() < 100.0
+
+
+def test_nothing_is_cut_outside_the_picture() -> None:
+    half_out = raw_strips(picture(), PART, aside(-310.0))
+    seen = half_out[3] > 0
+    assert 0.1 < seen[:OUTLINE_ROWS].mean() < 0.9
+    assert not half_out[:, ~seen].any()
+    behind = rigid(TRUTH[:3, :3], -TRUTH[:3, 3])
+    assert not raw_strips(picture(), PART, behind).any()
+    seen_behind, told = shown(raw_strips(picture(), PART, behind), 80.0)
+    assert np.isfinite(seen_behind).all() and np.isfinite(told).all()
+
+
+def test_large_pictures_are_cut_as_the_line_network_sees_them() -> None:
+    large = cv2.resize(picture().image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
+    twice = Picture(large, CAMERA.scaled(1280, 960), 12, LineNetwork())
+    assert (picture_step(picture()), picture_step(twice)) == (0, -4)
+    one, other = (raw_strips(seen, PART, TRUTH)[:3].astype(int) for seen in (picture(), twice))
+    assert np.abs(one - other).mean() < 4.0
+
+
+def test_what_is_shown_knows_no_brightness() -> None:
+    cut = raw_strips(picture(), PART, TRUTH)
+    dark = cut.copy()
+    dark[:3] = cut[:3] // 2
+    (seen, told), (seen_dark, told_dark) = shown(cut, 80.0), shown(dark, 80.0)
+    assert seen.shape == (CHANNELS, ROWS, COLUMNS)
+    assert np.abs(seen - seen_dark)[:3].mean() < 0.15
+    assert np.abs(seen - seen_dark)[RAW].mean() < 0.05
+    assert told_dark[1] < told[1] - 0.2
+
+
+@pytest.mark.parametrize("noise", [2.0, 8.0])
+def test_poses_off_by_a_few_pixels_say_less(noise: float) -> None:
+    seen = picture(noise)
+    near = scores(seen, [TRUTH, *turned_about(TRUTH, 0.7, 6)])
+    off = scores(seen, [aside(4.0), aside(-4.0), nearer(0.95), nearer(1.05)])
+    turned = scores(seen, [*turned_about(TRUTH, 8.0, 20)])
+    assert near.min() > max(off.max(), turned.max())
+    assert near.mean() > off.mean() + 3.0
+    assert near.mean() > turned.mean() + 6.0
+
+
+def test_the_true_pose_says_more_than_any_on_clutter() -> None:
+    clutter = [Picture(background(seed), CAMERA, 12, LineNetwork()) for seed in range(4)]
+    highest = max(scores(seen, [*turned_about(TRUTH, 20.0, 20)]).max() for seen in clutter)
+    assert scores(picture(), [TRUTH])[0] > highest + 5.0
+    # A card over half of the outline takes its share, not all.
+    assert scores(picture(is_hidden=True), [TRUTH])[0] > highest + 3.0
+
+
+def test_scores_are_the_same_alone_and_together() -> None:
+    poses = [TRUTH, *turned_about(TRUTH, 5.0, 10)]
+    alone = [scores(picture(), [pose])[0] for pose in poses]
+    np.testing.assert_allclose(scores(picture(), poses), alone, atol=1e-4)

@@ -1,0 +1,200 @@
+"""The verifier: right poses before wrong ones and before pictures without the part, and the lines it is shown."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from arview.detection.features.edge_net import LineNetwork
+from arview.detection.features.image_pyramid import Picture
+from arview.detection.scoring.pose_verifier import (
+    BAND_PX,
+    CHANNELS,
+    PLAIN,
+    RADIUS_PX,
+    SIDE_PX,
+    Verifier,
+    contrasted,
+    raw_look,
+    with_gradients,
+)
+from arview.geometry import Array, apply
+from arview.refinement.view_model import PartView
+from arview.rendering.rasterizer import rasterise
+from helpers.synthetic import CAMERA, assembly, assembly_views, background, half_hidden, pose_from, turned_about
+from helpers.synthetic import picture as drawn
+
+PART = PartView(assembly_views())
+TRUTH = pose_from(30.0, 45.0, 520.0) @ PART.model_from_body
+KNOWN = np.array([3.0, 1.0, 0.5])
+"""What evidence, judge and scatter say: the same of every pose here, so that the picture alone decides."""
+
+
+@cache
+def verifier() -> Verifier:
+    return Verifier(PART)
+
+
+def picture(noise: float = 6.0, is_hidden: bool = False) -> Picture:
+    pose = TRUTH @ PART.body_from_model
+    card = half_hidden(pose) if is_hidden else None
+    return Picture(drawn(pose, noise=noise, card=card), CAMERA, 12, lines())
+
+
+@cache
+def lines() -> LineNetwork:
+    return LineNetwork()
+
+
+def scores(seen: Picture, poses: Array) -> Array:
+    return verifier().scores(seen, poses, np.tile(KNOWN, (len(poses), 1)))
+
+
+def shown(pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The picture around a pose, and what is drawn there."""
+    return looked_at(picture(), pose)[:2]
+
+
+def looked_at(seen: Picture, pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
+    return raw_look(seen, PART, pose, float(seen.radii_px(PART.views.diameter_mm, pose[None])[0]))
+
+
+def turned(angle_deg: float, count: int) -> Array:
+    return turned_about(TRUTH, angle_deg, count)
+
+
+@pytest.mark.parametrize("noise", [3.0, 12.0])
+def test_the_true_pose_is_verified_and_poses_far_off_are_not(noise: float) -> None:
+    seen = picture(noise)
+    true, others = scores(seen, TRUTH[None])[0], scores(seen, turned(30.0, 60))
+    assert true > others.max() + 1.0
+    assert true > 0.0 > np.median(others)
+
+
+def test_the_further_off_the_less_is_a_pose_verified() -> None:
+    seen = picture()
+    by_angle = [float(np.mean(scores(seen, turned(angle, 40)))) for angle in (1.0, 6.0, 12.0, 25.0)]
+    assert by_angle == sorted(by_angle, reverse=True)
+
+
+def test_a_picture_without_the_part_verifies_no_pose() -> None:
+    clutter = [Picture(background(seed), CAMERA, 12, lines()) for seed in range(6)]
+    true = scores(picture(), TRUTH[None])[0]
+    assert max(scores(seen, turned(20.0, 20)).max() for seen in clutter) < true - 2.0
+
+
+def test_the_outline_that_is_shown_is_that_of_the_mesh() -> None:
+    pixels, drawn_part = shown(TRUTH)
+    is_inside = around_truth(rendered()[1] >= 0) > 0.5
+    outside_px = cv2.distanceTransform((~is_inside).astype(np.uint8), cv2.DIST_L2, 5)
+    inside_px = cv2.distanceTransform(is_inside.astype(np.uint8), cv2.DIST_L2, 5)
+    expected = np.clip(np.where(is_inside, 0.5 - inside_px, outside_px - 0.5) / BAND_PX, -1.0, 1.0)
+    assert np.mean((drawn_part[0] < 0) == is_inside) > 0.98
+    assert np.mean(np.abs(drawn_part[0] - expected) * BAND_PX) < 0.5
+    assert 0.02 < np.mean(drawn_part[1] > 0.5) < 0.3
+    assert np.mean(drawn_part[0][drawn_part[1] > 0.5] < 1.0 / BAND_PX) > 0.95
+    assert (pixels[..., 3] == 255).all()
+
+
+def test_the_surface_that_is_shown_is_that_of_the_mesh() -> None:
+    _, drawn_part = shown(TRUTH)
+    normals, depth = drawn_part[2:5], drawn_part[5]
+    inverse_depth, face_ids = rendered()
+    is_inside = cv2.erode(around_truth(face_ids >= 0), np.ones((3, 3))) > 0.99
+    assert np.mean((drawn_part[4] != 0.0) == (around_truth(face_ids >= 0) > 0.5)) > 0.98
+    assert np.linalg.norm(normals, axis=0)[is_inside] == pytest.approx(1.0, abs=0.02)
+    assert (normals[2] > 0.0)[is_inside].mean() > 0.98
+    depth_mm = around_truth(np.where(face_ids >= 0, 1.0 / np.maximum(inverse_depth, 1e-9), 0.0))
+    expected = (depth_mm - TRUTH[2, 3]) / (0.5 * PART.views.diameter_mm)
+    assert np.median(np.abs(depth - expected)[is_inside]) < 0.02
+    vertices, faces, _ = assembly().mesh
+    a, b, c = apply(TRUTH @ PART.body_from_model, vertices)[faces].transpose(1, 0, 2)
+    flat = np.cross(b - a, c - a)
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    flat[np.sum(flat * a, axis=1) > 0.0] *= -1.0
+    for axis, sign in ((0, 1.0), (1, 1.0), (2, -1.0)):
+        true = around_truth(np.where(face_ids >= 0, sign * flat[face_ids, axis], 0.0))
+        assert np.median(np.abs(normals[axis] - true)[is_inside]) < 0.05
+
+
+def test_the_lines_that_are_shown_lie_where_the_outline_is_and_solids_where_the_part_is() -> None:
+    _, drawn_part, seen = looked_at(picture(), TRUTH)
+    strongest, along, solids = seen.astype(float) / 255.0
+    is_inside = around_truth(rendered()[1] >= 0) > 0.5
+    at_outline = np.abs(drawn_part[0]) < 1.0 / BAND_PX
+    far_off = drawn_part[0] == 1.0
+    assert np.median(strongest[at_outline]) > 0.6 > 0.2 > np.median(strongest[far_off])
+    assert np.median(along[at_outline]) > 0.5
+    assert not along[np.abs(drawn_part[0]) == 1.0].any()
+    assert (along <= strongest).all()
+    assert np.median(solids[is_inside & ~at_outline]) > 0.6 > 0.3 > np.median(solids[far_off])
+
+
+def test_without_a_line_network_no_lines_are_shown() -> None:
+    assert not looked_at(Picture(picture().image, CAMERA, 12), TRUTH)[2].any()
+
+
+def rendered() -> tuple[Array, NDArray[np.int32]]:
+    """Inverse depth and face ids (H,W) of the assembly at the true pose, by the rasteriser."""
+    vertices, faces, _ = assembly().mesh
+    seen_from = apply(TRUTH @ PART.body_from_model, vertices)
+    c = CAMERA
+    return rasterise(seen_from, faces, c.fx, c.fy, c.cx, c.cy, c.width, c.height)
+
+
+def around_truth(values: Array) -> Array:
+    """What the picture (H,W) has around the true pose, (S,S)."""
+    zoom = RADIUS_PX / (0.5 * (CAMERA.fx + CAMERA.fy) * 0.5 * PART.views.diameter_mm / np.linalg.norm(TRUTH[:3, 3]))
+    center = CAMERA.project(TRUTH[None, :3, 3])[0]
+    columns, rows = np.meshgrid(*[(np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1)) / zoom + c for c in center])
+    maps = columns.astype(np.float32), rows.astype(np.float32)
+    return np.asarray(cv2.remap(values.astype(np.float32), *maps, cv2.INTER_LINEAR))
+
+
+def shaded(strength: float, noise: float) -> tuple[Array, float]:
+    """The shading found on the true pose's surface when it has some, (S,S), and the share that it explains."""
+    pixels, drawn_part = shown(TRUTH)
+    light = 0.3 + np.maximum(np.tensordot([0.4, -0.5, 0.77], drawn_part[2:5], axes=1), 0.0)
+    rng = np.random.default_rng(4)
+    grays = 60.0 + strength * light + rng.normal(0.0, noise, light.shape)
+    pixels[..., :3] = np.clip(grays, 0, 255)[..., None]
+    seen, explained = with_gradients(contrasted(pixels, drawn_part)[0])
+    return seen[PLAIN + 4 :], float(explained)
+
+
+def test_the_brightness_that_a_light_gives_the_surface_is_explained_and_noise_is_not() -> None:
+    _, drawn_part = shown(TRUTH)
+    is_surface = drawn_part[4] != 0.0
+    (shading, rest), explained = shaded(100.0, 2.0)
+    assert explained > 0.9
+    assert not shading[~is_surface].any() and not rest[~is_surface].any()
+    assert np.std(rest[is_surface]) < 0.3 * np.std(shading[is_surface])
+    assert abs(shaded(0.0, 20.0)[1]) < 0.1
+
+
+def test_what_hides_a_part_of_the_part_does_not_turn_a_right_pose_into_a_wrong_one() -> None:
+    seen = picture(is_hidden=True)
+    assert scores(seen, TRUTH[None])[0] > scores(seen, turned(30.0, 60)).max()
+
+
+def test_a_pose_outside_the_picture_is_scored_without_a_picture() -> None:
+    aside = TRUTH.copy()
+    aside[0, 3] += 2000.0
+    plain, contrast = contrasted(*shown(aside))
+    seen, explained = with_gradients(plain)
+    assert seen.shape == (CHANNELS, SIDE_PX, SIDE_PX)
+    assert not seen[:4].any() and not seen[PLAIN:].any()
+    assert explained == 0.0
+    assert contrast < 0.01
+    assert scores(picture(), aside[None])[0] < scores(picture(), TRUTH[None])[0]
+
+
+def test_many_poses_are_scored_as_each_alone() -> None:
+    seen, poses = picture(), np.concatenate([TRUTH[None], turned(10.0, 20)])
+    together = scores(seen, poses)
+    alone = [scores(seen, pose[None])[0] for pose in poses]
+    assert together == pytest.approx(np.array(alone), abs=1e-3)

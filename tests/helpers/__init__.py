@@ -1,0 +1,1 @@
+"""What tests share: scenes with known truth, makers of files, clients of the live server."""

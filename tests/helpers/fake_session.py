@@ -1,0 +1,34 @@
+"""A tracking session that does not track: for tests of what surrounds it."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+import numpy as np
+
+from arview.geometry import look_at
+from arview.pose import Pose, TrackingState
+
+POSE = look_at([320.0, 30.0, 250.0], [30.0, 30.0, 5.0], [0.0, 0.0, 1.0])
+
+
+class FakeSession:
+    """Stands still where it is told to, or at POSE; takes the time of a slow tracker when asked to."""
+
+    def __init__(
+        self,
+        views: Any,
+        model: Any,
+        camera: Any,
+        options: Any,
+        initial_cam_from_model: Any = None,
+        guide_cam_from_model: Any = None,
+    ) -> None:
+        self.pose = POSE if initial_cam_from_model is None else initial_cam_from_model
+        self.seconds = float(os.environ.get("FAKE_SESSION_S", "0"))
+
+    def process(self, image: object, index: int, time_s: float) -> Pose:
+        time.sleep(self.seconds)
+        return Pose(self.pose, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.0)

@@ -1,0 +1,73 @@
+"""The sample clip as somebody's camera: small frames, their true poses, and how far a pose is from them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+
+from arview.geometry import Array
+from arview.live.options import LiveOptions
+from arview.live.server.loading import load_subject
+from arview.live.stream.subject import Subject
+from arview.video import Image, open_source
+from helpers.paths import SAMPLES
+
+SAMPLE = SAMPLES / "bracket_plate"
+PART, CAMERA, INSPECTION, CLIP = (SAMPLE / name for name in ("part.toml", "camera.json", "inspection.json", "clip.mp4"))
+WIDTH, HEIGHT = 640, 360
+START, STRIDE, COUNT = 27, 3, 16
+"""Every third frame: the part moves 2.3 to 4.6 mm from one to the next, far more than a pose is wrong."""
+CENTER_IN_MODEL = np.array([0.0, 0.0, 26.0])
+
+
+@cache
+def frames() -> list[Image]:
+    """(360,640,3) frames of the clip in which the part is in full view."""
+    source = open_source(CLIP, START, START + COUNT * STRIDE, STRIDE)
+    return [cv2.resize(frame.image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in source]
+
+
+@cache
+def truth() -> list[Array]:
+    """``cam_from_model`` (4,4) mm of each."""
+    described = json.loads((SAMPLE / "truth.json").read_text())["frames"]
+    return [np.array(described[START + STRIDE * k]["cam_from_model"]) for k in range(COUNT)]
+
+
+def there_and_back() -> list[int]:
+    """Order in which the frames are played over and over, without a jump."""
+    return [*range(COUNT), *range(COUNT - 2, 0, -1)]
+
+
+def options(**more: Any) -> LiveOptions:
+    """Of a server for phones that show the sample."""
+    usual: dict[str, Any] = {
+        "camera": str(CAMERA), "inspection": INSPECTION, "width": WIDTH, "height": HEIGHT,
+        "requests_per_s": 1e6, "requests_burst": 1e6, "joins_per_s": 1e6, "joins_burst": 1e6,
+        "jpeg_silence_s": 120.0, "connect_timeout_s": 60.0,  # tests share their cores
+    }  # fmt: skip
+    return LiveOptions(**{**usual, **more})
+
+
+def loader(chosen: LiveOptions) -> Callable[[], Subject]:
+    """Loads the sample's part."""
+    return lambda: load_subject(str(PART), None, None, chosen)
+
+
+def errors(answer: dict[str, Any], cam_from_model: Array) -> tuple[float, float]:
+    """How far the middle of the part is off, mm, and the rotation, degrees."""
+    found = np.array(answer["cam_from_model"]).reshape(4, 4)
+    center = np.append(CENTER_IN_MODEL, 1.0)
+    turn = found[:3, :3].T @ cam_from_model[:3, :3]
+    angle_deg = np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0)))
+    return float(np.linalg.norm((found @ center - cam_from_model @ center)[:3])), float(angle_deg)
+
+
+def nearest(answer: dict[str, Any]) -> int:
+    """Which of the frames has the pose that is nearest to the answer's."""
+    return int(np.argmin([errors(answer, pose)[0] for pose in truth()]))

@@ -1,0 +1,227 @@
+"""Learned views: kept where they show something new, found again near where they were seen, never believed alone."""
+
+from __future__ import annotations
+
+import time
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from arview.errors import InputError, MismatchError, OutputError
+from arview.geometry import Array, apply, rotation_angle_rad
+from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
+from arview.pose import TrackingState
+from arview.refinement.evidence import Evidence
+from arview.tracking import Estimate, SessionOptions, TrackingSession
+from arview.tracking.appearance_memory import SIDE, LearnedOptions, LearnedViews
+from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, bracket, error, path, picture, pose_from
+
+SIDES = [(azimuth, elevation) for azimuth in (-40, 0, 40) for elevation in (30, 55)]
+
+
+def estimate(pose: Array, quality: float = 1.0, support: float = 0.9, in_picture: float = 1.0) -> Estimate:
+    return Estimate(pose, np.eye(6), quality, Evidence(support, 0.9, 0.3, 0.9, 0.9, 0.3, in_picture))
+
+
+def taught(sides: list[tuple[int, int]], **options: int) -> LearnedViews:
+    """Views of the assembly from some sides, each seen for a while."""
+    learned = LearnedViews(assembly_views(), CAMERA, LearnedOptions(**options))
+    for azimuth, elevation in sides:
+        pose = pose_from(azimuth, elevation, 520)
+        image = picture(pose, seed=100 + azimuth + elevation, scene=1)
+        for _ in range(8):
+            learned.learn(image, estimate(pose), True)
+    return learned
+
+
+@cache
+def six_sides() -> LearnedViews:
+    return taught(SIDES)
+
+
+def is_near(found: Array, truth: Array) -> bool:
+    """Within 15° and 15 % of the distance, and as near across."""
+    center = assembly().center_in_model
+    a, b = apply(found, center), apply(truth, center)
+    turned = np.rad2deg(rotation_angle_rad(found, truth))
+    across_mm = error(found, truth)[1]
+    return bool(turned < 15 and abs(a[2] / b[2] - 1) < 0.15 and across_mm < 0.15 * assembly().diameter_mm)
+
+
+def moved(azimuth: float, elevation: float, rng: np.random.Generator) -> Array:
+    """About that side, at another place, distance and roll."""
+    azimuth, elevation = azimuth + rng.uniform(-6, 6), elevation + rng.uniform(-6, 6)
+    pose = pose_from(azimuth, elevation, rng.uniform(440, 620), None, rng.uniform(-180, 180))
+    pose[:2, 3] += rng.uniform([-90, -50], [90, 50])
+    return pose
+
+
+def test_kept_sides_are_found_anywhere_in_other_scenes_and_light() -> None:
+    learned, rng = six_sides(), np.random.default_rng(5)
+    assert len(learned) == len(SIDES)
+    right = 0
+    for k in range(24):
+        truth = moved(*SIDES[k % len(SIDES)], rng)
+        image = picture(truth, seed=k, scene=k % 9, noise=6.0, gain=rng.uniform(0.7, 1.3))
+        proposals = learned.propose(image)
+        assert len(proposals) <= learned.options.proposals
+        right += any(is_near(p.cam_from_model, truth) for p in proposals)
+    assert right >= 16
+
+
+def test_near_the_last_pose_it_is_found_in_little_time() -> None:
+    learned, rng = taught(SIDES), np.random.default_rng(6)
+    for azimuth in range(-75, 76, 10):
+        for elevation in (20, 42, 65):
+            pose = pose_from(azimuth, elevation, 520)
+            learned._keep(picture(pose, scene=1), pose, is_new=True)
+    assert len(learned) == learned.options.max_views
+    right, seconds = 0, []
+    for k in range(12):
+        last = pose_from(*SIDES[k % len(SIDES)], 520)
+        truth = pose_from(
+            SIDES[k % 6][0] + rng.uniform(-15, 15),
+            SIDES[k % 6][1] + 5,
+            rng.uniform(450, 600),
+            None,
+            rng.uniform(-25, 25),
+        )
+        truth[:2, 3] += rng.uniform([-90, -50], [90, 50])
+        image = picture(truth, seed=k, scene=k % 9)
+        began = time.thread_time()
+        proposals = learned.propose(image, last)
+        seconds.append(time.thread_time() - began)
+        right += any(is_near(p.cam_from_model, truth) for p in proposals)
+    assert right >= 10
+    assert np.median(seconds) < 0.1  # about 25 ms on a quiet core
+
+
+def test_memory_is_bounded_and_the_most_crowded_views_go() -> None:
+    learned = taught([*SIDES, (-40, 33), (37, 30)], max_views=4, view_step_deg=2)
+    assert len(learned) == 4
+    directions = learned.rotations[:, 2]
+    cosines = directions @ directions.T - 2 * np.eye(4)
+    assert cosines.max() < np.cos(np.deg2rad(10.0))
+
+
+def test_only_what_is_tracked_well_and_new_is_learned() -> None:
+    learned = LearnedViews(assembly_views(), CAMERA)
+    pose = pose_from(0, 40, 520)
+    image = picture(pose, scene=1)
+
+    def see(frames: int, seen: Estimate, is_sure: bool = True, shown: np.ndarray = image) -> int:
+        for _ in range(frames):
+            learned.learn(shown, seen, is_sure)
+        return len(learned)
+
+    assert see(30, estimate(pose), is_sure=False) == 0
+    assert see(30, estimate(pose, quality=0.5)) == 0
+    assert see(30, estimate(pose, in_picture=0.5)) == 0
+    assert see(30, estimate(pose)) == 1
+    assert see(60, estimate(pose)) == 1
+    assert see(30, estimate(pose_from(30, 40, 520), support=0.5)) == 1  # a hand over it
+    # From the same side, but quite another look.
+    other = np.asarray(cv2.GaussianBlur(255 - image, (0, 0), 8))
+    assert see(30, estimate(pose), shown=other) == 2
+    began = time.thread_time()
+    see(400, estimate(pose))
+    assert (time.thread_time() - began) / 400 < 0.5e-3  # 0.02 ms on a quiet core
+
+
+def test_the_silhouette_is_that_of_the_part() -> None:
+    learned = LearnedViews(assembly_views(), CAMERA)
+    for azimuth, elevation in SIDES:
+        pose = pose_from(azimuth, elevation, 480)
+        cut = learned._cut(picture(pose, scene=2), pose)
+        assert cut is not None
+        shown, mask = cut
+        assert shown.shape == (SIDE, SIDE, 3)
+        empty = learned._cut(picture(None, scene=2), pose)
+        assert empty is not None
+        is_part = np.abs(shown.astype(int) - empty[0]).max(axis=2) > 12
+        inside = mask > 0
+        assert np.count_nonzero(is_part & inside) > 0.8 * np.count_nonzero(is_part | inside)
+    far = pose_from(0, 40, 20000)
+    assert learned._cut(picture(None, scene=2), far) is None
+
+
+def test_nothing_is_believed_where_there_is_no_part_or_another_side_of_it() -> None:
+    options = SessionOptions(eager_frames=0, search_every=1000)
+    session = TrackingSession(assembly_views(), assembly(), CAMERA, options)
+    session.learned = six_sides()
+    session.state = TrackingState.LOST
+    for k in range(12):
+        session._last_seen = pose_from(*SIDES[k % 6], 520)
+        assert session.process(picture(None, seed=k, scene=10 + k), k, 0.0).cam_from_model is None
+    # The bracket is another part, in the same place.
+    for k in range(6):
+        session._last_seen = pose_from(*SIDES[k], 520)
+        image = picture(pose_from(*SIDES[k], 400, bracket()), bracket(), seed=k, scene=k)
+        assert session.process(image, k, 0.0).cam_from_model is None
+
+
+def test_a_lost_part_is_found_in_any_frame_where_it_looks_as_it_did() -> None:
+    found = {}
+    for use_learned in (True, False):
+        # The detector never searches the whole picture.
+        options = SessionOptions(eager_frames=0, search_every=10_000, use_learned=use_learned)
+        session = TrackingSession(assembly_views(), assembly(), CAMERA, options, initial_cam_from_model=path(1)[0])
+        for k, pose in enumerate(path(20)):
+            tracked = session.process(picture(pose, seed=k, scene=1), k, k / 30)
+        assert tracked.state == TrackingState.TRACKED
+        assert len(session.learned) == (1 if use_learned else 0)
+        while session.state != TrackingState.LOST:
+            session.process(np.full((480, 640, 3), 90, dtype=np.uint8), 20, 1.0)
+        truth = path(20)[-1]
+        truth[:2, 3] += [-90, -40]
+        pose = session.process(picture(truth, seed=99, scene=1), 21, 1.0).cam_from_model
+        found[use_learned] = pose is not None and error(pose, truth)[0] < 5
+    assert found == {True: True, False: False}
+
+
+def test_views_are_saved_and_loaded(tmp_path: Path) -> None:
+    learned, file = six_sides(), tmp_path / "assembly.learned"
+    learned.save(file)
+    assert [p.name for p in tmp_path.iterdir()] == [file.name]
+    other = LearnedViews(assembly_views(), CAMERA)
+    other.load(file)
+    assert np.array_equal(other.rotations, learned.rotations)
+    image = picture(pose_from(2, 32, 500), scene=3)
+    mine, theirs = learned.propose(image), other.propose(image)
+    assert mine and np.allclose(mine[0].cam_from_model, theirs[0].cam_from_model)
+    small = LearnedViews(assembly_views(), CAMERA, LearnedOptions(max_views=3))
+    small.load(file)
+    assert len(small) == 3
+
+
+@cache
+def bracket_views() -> GuideViewSet:
+    return make_guide_views(bracket(), RANGE, GuideViewOptions(subdivisions=2, renderer="zbuffer"))
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "views.learned"
+    six_sides().save(file)
+    with pytest.raises(MismatchError, match=r"views\.learned: learned views of model 'assembly'.*'bracket'"):
+        LearnedViews(bracket_views(), CAMERA).load(file)
+    whole = file.read_bytes()
+    learned = LearnedViews(assembly_views(), CAMERA)
+    for content in (b"", b"text", whole[: len(whole) // 2], whole[:-4000] + bytes(4000)):
+        file.write_bytes(content)
+        with pytest.raises(InputError, match=r"views\.learned.*delete the file") as caught:
+            learned.load(file)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="cannot be read"):
+        learned.load(tmp_path / "none")
+    with pytest.raises(OutputError, match="cannot be written"):
+        learned.save(tmp_path / "no" / "folder")
+
+
+def test_options_without_sense_are_refused() -> None:
+    with pytest.raises(InputError, match="max_views"):
+        LearnedOptions(max_views=0)
+    with pytest.raises(InputError, match="stretch"):
+        LearnedOptions(stretch=1.0)
