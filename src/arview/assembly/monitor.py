@@ -20,13 +20,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.assembly.placement_search import ElsewhereSearch, other_places
 from arview.assembly.presence_net import ComponentNetwork, component_looks
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.detection.features.edge_net import LineNetwork
 from arview.geometry import Array, apply, rigid
 from arview.guideviews import GuideViewSet
@@ -170,7 +170,7 @@ class Look:
     surroundings: Array
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sample_edges(  # type: ignore[no-untyped-def]
     vertices, ends, faces, is_sharp, normals, component, cam_from_model, focal, middle, ids, depth, tolerance_mm
 ):  # fmt: skip
@@ -266,7 +266,7 @@ def _sample_edges(  # type: ignore[no-untyped-def]
     return points[:found], tangents[:found], pixels[:found], normals_px[:found], depths[:found], owners[:found]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _own_samples(  # type: ignore[no-untyped-def]
     pixels, normals_px, depths, owners, ids, depth, tolerance_mm, shared_px, shared_cos, occluder_px
 ):  # fmt: skip
@@ -298,7 +298,7 @@ def _own_samples(  # type: ignore[no-untyped-def]
     return own
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _thin_edges(slopes, weakest, edges, strength, directions):  # type: ignore[no-untyped-def]
     """Thin edges by the slope of the strongest channel (Canny, PAMI 1986).
 
@@ -351,7 +351,7 @@ def _thin_edges(slopes, weakest, edges, strength, directions):  # type: ignore[n
             direction_v[x] = np.int8(np.int32(dv * unit))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark_owners(pixels, depths, component, owners):  # type: ignore[no-untyped-def]
     """Set ``owners`` (H,W) int16 to the component whose edges pass within two pixels; -1 none, -2 several."""
     height, width = owners.shape
@@ -368,7 +368,7 @@ def _mark_owners(pixels, depths, component, owners):  # type: ignore[no-untyped-
                     owners[y, x] = -2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _strength_at(directions, strength, owners, c, places, normal, dx, dy):  # type: ignore[no-untyped-def]
     """Strongest edge within 25° of a direction at three places (3,2), shifted; others' edges do not count.
 
@@ -387,7 +387,7 @@ def _strength_at(directions, strength, owners, c, places, normal, dx, dy):  # ty
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_shift(  # type: ignore[no-untyped-def]
     directions, strength, owners, c, places, along, count, worth, shifts, costs, hit
 ):  # fmt: skip
@@ -412,7 +412,7 @@ def _best_shift(  # type: ignore[no-untyped-def]
     return share
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _contrast(image, pixels, normals, depths, sides, is_own, first, last, reach_px):  # type: ignore[no-untyped-def]
     """Mean over runs of 10 outline points of how many deviations the colours change across; -1 without runs."""
     height, width = image.shape[:2]
@@ -453,7 +453,7 @@ def _contrast(image, pixels, normals, depths, sides, is_own, first, last, reach_
     return total / runs if runs > 0 else -1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _surroundings(pixels, chosen, sizes, hit, c, wanted, least):  # type: ignore[no-untyped-def]
     """Share of other components' points that is borne out, of those nearest to its points that are not; 1 if few."""
     low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
@@ -487,7 +487,7 @@ def _surroundings(pixels, chosen, sizes, hit, c, wanted, least):  # type: ignore
     return hits / tried if tried >= least else 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def measure_components(  # type: ignore[no-untyped-def]
     image, slopes, edges, strength, directions, owners, points, tangents, component, sides, is_own, starts,
     cam_from_body, intrinsics, step_mm, near, near_costs, far, weakest, most_points, least_points, seen_well,

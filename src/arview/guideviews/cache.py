@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -11,18 +10,10 @@ from pathlib import Path
 from arview import __version__
 from arview.cad.model import Model
 from arview.cad.view_range import ViewRange
+from arview.core.cache_folder import cache_folder
 from arview.core.progress import StepProgress
 from arview.errors import ArviewError
 from arview.guideviews import GuideViewOptions, GuideViewSet, load_guide_views, make_guide_views
-
-
-def cache_folder() -> Path:
-    """``$ARVIEW_CACHE``, or ``arview`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
-    own = os.environ.get("ARVIEW_CACHE")
-    if own:
-        return Path(own)
-    shared = os.environ.get("XDG_CACHE_HOME")
-    return (Path(shared) if shared else Path.home() / ".cache") / "arview"
 
 
 def cached_path(model: Model, view_range: ViewRange, options: GuideViewOptions) -> Path:

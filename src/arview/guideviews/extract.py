@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, MeshEdges, sample_visible_edges
 from arview.rendering.renderers import Rendering
@@ -44,7 +44,7 @@ class ViewFeatures:
     edge_component: NDArray[np.int32]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _run_length(mask, u, v, du, dv, on_part, longest):  # type: ignore[no-untyped-def]
     """Steps of one pixel from (u, v) along (du, dv) for which the mask stays ``on_part``."""
     height, width = mask.shape
@@ -57,7 +57,7 @@ def _run_length(mask, u, v, du, dv, on_part, longest):  # type: ignore[no-untype
     return longest
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _describe_contour(mask, xs, ys, starts, ends_, half, longest):  # type: ignore[no-untyped-def]
     """Normals (pointing off the part) and run lengths at contour pixels chosen as indices into closed chains."""
     count = xs.shape[0]
@@ -98,7 +98,7 @@ def _describe_contour(mask, xs, ys, starts, ends_, half, longest):  # type: igno
     return u, v, normal, runs, ok
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest_sample(u, v, sample_pixels, width, height, reach):  # type: ignore[no-untyped-def]
     """Index of the nearest sample within ``reach`` px of each (u, v), or -1; by a pixel grid."""
     grid = np.full((height, width), -1, dtype=np.int32)

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.cad.model import Model
+from arview.core.kernel import kernel
 from arview.geometry import Array
 
 EDGE_CONTOUR = 1
@@ -91,7 +91,7 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def facing(eye, point, normals, first, second):  # type: ignore[no-untyped-def]
     """How far the two faces at an edge through a point are turned to the eye: > 0 is seen; 0 without a second face."""
     front0 = 0.0
@@ -103,7 +103,7 @@ def facing(eye, point, normals, first, second):  # type: ignore[no-untyped-def]
     return front0, front1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sample_visible(  # type: ignore[no-untyped-def]
     vertices, ends, faces, is_crease, is_sharp, normals, component, cam_from_model, fx, fy, cx, cy, depth,
     spacing_px, depth_tolerance

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.cad.model import Model
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.rendering.rasterizer import fill_buffers
 
@@ -49,7 +49,7 @@ def surface_about(
     return Surface(about, faces, normals.astype(np.float32), component)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids):  # type: ignore[no-untyped-def]
     """Draw a surface as an ideal camera sees it.
 

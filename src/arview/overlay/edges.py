@@ -8,9 +8,9 @@ major axis and weighing pixels by their distance from the line (Gupta & Sproull,
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.geometry import Array, apply, invert
 from arview.overlay.ghost import NEAR_MM, Ghost, GhostView
 from arview.overlay.mesh import Topology
@@ -85,7 +85,7 @@ class Edges:
         return cover, owner
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _faces_camera(normals, face_points, eye, face):  # type: ignore[no-untyped-def]
     return (
         normals[face, 0] * (eye[0] - face_points[face, 0])
@@ -94,7 +94,7 @@ def _faces_camera(normals, face_points, eye, face):  # type: ignore[no-untyped-d
     ) > 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _is_visible(column, row, limit, inverse_depth):  # type: ignore[no-untyped-def]
     """True when a surface within one pixel is no nearer than the inverse depth ``limit``."""
     height, width = inverse_depth.shape
@@ -107,7 +107,7 @@ def _is_visible(column, row, limit, inverse_depth):  # type: ignore[no-untyped-d
     return False
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _draw_edges(  # type: ignore[no-untyped-def]
     points, ends, faces, is_crease, is_closed, owners, normals, face_points, eye,
     fx, fy, cx, cy, inverse_depth, width_px, with_hidden, cover, owner,

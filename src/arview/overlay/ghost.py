@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.geometry import Array, apply
 from arview.overlay.mesh import Topology
 from arview.rendering.rasterizer import rasterise
@@ -159,7 +159,7 @@ def _ideal_pixels(camera: Camera) -> NDArray[np.int16]:
     return np.round(pixels).astype(np.int16)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _look_up(ideal_pixels, window, origin, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
     """Depth and faces of a window of the real image from those of the ideal image."""
     u0, v0, u1, v1 = window
@@ -175,7 +175,7 @@ def _look_up(ideal_pixels, window, origin, inverse_depth, face_ids):  # type: ig
     return depth, faces
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _faces_to_draw(points, faces, winding, component_of_face, shade):  # type: ignore[no-untyped-def]
     """Faces that may be seen (first ``count`` rows), their components and ``count``; fills ``shade``."""
     kept = np.empty_like(faces)
@@ -198,7 +198,7 @@ def _faces_to_draw(points, faces, winding, component_of_face, shade):  # type: i
     return kept, components, count
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def blend(image, u0, v0, face_ids, shade, components, ghost_style, edge_cover, edge_owner, edge_style):  # type: ignore[no-untyped-def]
     """Blend ghost and edges over the image in place.
 
@@ -238,7 +238,7 @@ def blend(image, u0, v0, face_ids, shade, components, ghost_style, edge_cover, e
             image[v0 + row, u0 + column, 2] = np.uint8(b + np.float32(0.5))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def count_cells(u0, v0, face_ids, components, weight, cells, seen_px):  # type: ignore[no-untyped-def]
     """Add ``weight`` (C,) per cell of the image (in pixel areas) and visible pixels per component.
 

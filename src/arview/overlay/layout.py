@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.overlay.ghost import CELL_PX
 
@@ -266,7 +266,7 @@ class LabelLayout:
                 slot.opacity = min(1.0, slot.opacity + 1.0 / _FADE_FRAMES)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_rows(rows, heights, gap, bottom, x0, widths, anchors, previous, integral, cover_cost):  # type: ignore[no-untyped-def]
     """Rows (N,) of labels in a column, in order and apart, of least total cost (dynamic programming).
 

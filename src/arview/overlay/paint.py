@@ -8,9 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.overlay.options import PANEL_RGB, Rgb
 
@@ -148,7 +148,7 @@ def arrow(image: Image, tail_px: Array, tip_px: Array, rgb: Rgb, width_px: float
     cv2.fillPoly(image, [fixed], rgb, cv2.LINE_AA, _SHIFT)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _blend_mask(image, mask, x, y, r, g, b):  # type: ignore[no-untyped-def]
     height, width = image.shape[0], image.shape[1]
     for i in range(max(0, -y), min(mask.shape[0], height - y)):
@@ -162,7 +162,7 @@ def _blend_mask(image, mask, x, y, r, g, b):  # type: ignore[no-untyped-def]
                     image[y + i, x + j, k] = np.uint8(old + alpha * (color - old) + np.float32(0.5))
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _blend_sprite(image, rgb, alpha, x, y, opacity):  # type: ignore[no-untyped-def]
     height, width = image.shape[0], image.shape[1]
     for i in range(max(0, -y), min(alpha.shape[0], height - y)):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.reconstruction.features import Descriptors, Features
 
@@ -17,7 +17,7 @@ MAX_ANGLE_RAD = 0.7  # between descriptors of one place
 _BLOCK = 512  # rows of similarities held at a time: they stay in the cache
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best(similarity, first_row, partner, best, second, column_best, column_row):  # type: ignore[no-untyped-def]
     """Best and second best column of each row, best row of each column; rows start at ``first_row``."""
     for i in range(similarity.shape[0]):
@@ -65,7 +65,7 @@ def epipolar_inliers(ones: Features, others: Features, matches: Matches, max_err
     return matches[mask.ravel() > 0]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _match_along(  # type: ignore[no-untyped-def]
     rays,
     other_px,

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 
@@ -76,7 +76,7 @@ class EdgeSteps:
     support: Array
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  # type: ignore[no-untyped-def]
     """contour_support, inner_support, inner_share, sharpness, points_in_picture and scatter_px, see Evidence."""
     hits = np.zeros(2)
@@ -128,7 +128,7 @@ def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  #
     return support[0], support[1], share, sharp / max(counts[0], 1.0), inside, scatter
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def region_evidence(mean, information, agreement, tolerance_px):  # type: ignore[no-untyped-def]
     """Support by information and mean information of the lines looked at; support -1 when there are none."""
     total = 0.0

@@ -7,10 +7,11 @@ at the centre. For a residual along a unit image direction n, J = [p × a, a] wi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from arview.core.kernel import kernel
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline=True)
 def add_line(hessian, gradient, point, cam_from_body, x, y, z, nu, nv, intrinsics, residual, weight):  # type: ignore[no-untyped-def]
     """Add weight · (Jᵀ J, Jᵀ r) of one residual along (nu, nv) to the system; lower triangle only."""
     ax = nu * intrinsics[0] / z
@@ -31,7 +32,7 @@ def add_line(hessian, gradient, point, cam_from_body, x, y, z, nu, nv, intrinsic
             hessian[a, b] += wa * jac[b]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solve_step(hessian, gradient, damping):  # type: ignore[no-untyped-def]
     """Twist (6,) that solves (H + diag(damping)) x = -g, H given by its lower triangle; zeros when singular."""
     lower = np.zeros((6, 6))
@@ -62,7 +63,7 @@ def solve_step(hessian, gradient, damping):  # type: ignore[no-untyped-def]
     return twist
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def apply_twist(cam_from_body, twist):  # type: ignore[no-untyped-def]
     """``cam_from_body`` after a small twist on the right: rotation by Rodrigues, then translation in the body."""
     wx, wy, wz = twist[0], twist[1], twist[2]
@@ -98,7 +99,7 @@ def apply_twist(cam_from_body, twist):  # type: ignore[no-untyped-def]
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def relative_twist(cam_from_before, cam_from_after):  # type: ignore[no-untyped-def]
     """Twist (6,) with ``apply_twist(cam_from_before, twist) = cam_from_after``, for turns below 180°."""
     a, b = cam_from_before, cam_from_after

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from arview.core.kernel import kernel
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.evidence import edge_evidence, region_evidence
 from arview.refinement.gauss_newton import apply_twist, solve_step
@@ -18,7 +18,7 @@ from arview.refinement.modalities.texture import add_features
 from arview.refinement.projection import project_lines
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def nearest_view(directions, cam_from_body):  # type: ignore[no-untyped-def]
     """Index of the direction (N,3) nearest to that of the camera."""
     r = cam_from_body
@@ -35,7 +35,7 @@ def nearest_view(directions, cam_from_body):  # type: ignore[no-untyped-def]
     return index
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def run_stages(  # type: ignore[no-untyped-def]
     image, gray, bin_of, odds, edge_function, part, cam_from_body, intrinsics, step_mm, stages, damping,
     region_weight, edge_weight, edge_sigma_px, edge_threshold, match_points, match_pixels, match_weights,
@@ -128,7 +128,7 @@ def run_stages(  # type: ignore[no-untyped-def]
     return pose, hessian
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def run_evidence(  # type: ignore[no-untyped-def]
     image, gray, bin_of, odds, has_colours, edge_function, part, cam_from_body, intrinsics, step_mm,
     edge_threshold, tolerance_px
@@ -157,7 +157,7 @@ def run_evidence(  # type: ignore[no-untyped-def]
     return contour, inner, share, sharpness, region, region_information, inside, scatter
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def run_edge_steps(gray, part, cam_from_body, intrinsics, step_mm, edge_threshold, tolerance_px):  # type: ignore[no-untyped-def]
     """Outline and design edges at a pose: pixels (N,2), normals (N,2), and support (N,) beyond chance, -1 to 1."""
     directions, _, _, _, _, e_start, e_points, e_tangents, e_kinds = part
@@ -180,7 +180,7 @@ def run_edge_steps(gray, part, cam_from_body, intrinsics, step_mm, edge_threshol
     return pixels[chosen], normals[chosen], support[chosen]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def count_colours(image, bin_of, part, cam_from_body, intrinsics, step_mm, fore, back):  # type: ignore[no-untyped-def]
     """Add the colours inside and outside of the contour at a pose to the histograms."""
     directions, c_start, c_points, c_normals, c_runs, _, _, _, _ = part
@@ -192,7 +192,7 @@ def count_colours(image, bin_of, part, cam_from_body, intrinsics, step_mm, fore,
     add_histograms(image, bin_of, pixels, normals, depths, c_runs[first:last], intrinsics[0], fore, back, 20.0, 1.5)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def median_brightness_ratio(gray, before, step):  # type: ignore[no-untyped-def]
     """Median ratio of the brightness to that of the last frame on a grid, by a histogram of logarithms.
 

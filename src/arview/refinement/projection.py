@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.geometry import Array
 
 
@@ -14,7 +14,7 @@ def intrinsics_of(camera: Camera) -> Array:
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0])
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline=True)
 def project(x, y, z, intrinsics):  # type: ignore[no-untyped-def]
     """Pixel of a camera-frame point; ``intrinsics`` is (10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted."""
     xn = x / z
@@ -28,7 +28,7 @@ def project(x, y, z, intrinsics):  # type: ignore[no-untyped-def]
     return intrinsics[0] * xn + intrinsics[2], intrinsics[1] * yn + intrinsics[3]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_lines(points, directions, across, cam_from_body, intrinsics, step_mm):  # type: ignore[no-untyped-def]
     """Pixels (N,2) of body points and unit image directions (N,2) of 3D directions at them, and depths (N,).
 

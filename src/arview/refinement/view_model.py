@@ -11,9 +11,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.geometry import invert, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
@@ -82,7 +82,7 @@ def is_crowded(views: GuideViewSet) -> NDArray[np.bool_]:
     return crowded
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _mark_crowded(directions, starts, points, tangents, is_design, diameter_mm, crowded):  # type: ignore[no-untyped-def]
     """Mark edge points, see `is_crowded`; what is in line with the view's direction is left as it is."""
     nearest, furthest = np.float32(SAME_LINE) * diameter_mm, np.float32(APART) * diameter_mm

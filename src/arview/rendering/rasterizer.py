@@ -8,13 +8,13 @@ inside; triangles that cross the near plane are clipped (Sutherland & Hodgman 19
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline=True)
 def _fill(u0, v0, w0, u1, v1, w1, u2, v2, w2, face, x_low, y_low, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
     """Fill one projected triangle; w is 1/z at the corners; (x_low, y_low) is the origin of the buffers."""
     height, width = inverse_depth.shape
@@ -52,7 +52,7 @@ def _fill(u0, v0, w0, u1, v1, w1, u2, v2, w2, face, x_low, y_low, inverse_depth,
             w += w_du
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_buffers(points, faces, fx, fy, cx, cy, near, x_low, y_low, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
     """The kernel of `rasterise`: see there; the buffers (H,W), zero and -1 before, become what it returns."""
     height, width = inverse_depth.shape

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from arview.core.kernel import kernel
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -33,7 +33,7 @@ class Hierarchy(NamedTuple):
     order: NDArray[np.int32]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _build(low, high, leaf_size):  # type: ignore[no-untyped-def]
     """Nodes over boxes (F,3), (F,3): bounds (M,6), links (M,2), order (F,)."""
     bins = 12
@@ -123,7 +123,7 @@ def _build(low, high, leaf_size):  # type: ignore[no-untyped-def]
     return bounds[:nodes].copy(), links[:nodes].copy(), order
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline=True)
 def _enter(bounds, node, ox, oy, oz, ix, iy, iz, limit):  # type: ignore[no-untyped-def]
     """Distance at which the ray enters a node's box, 1e300 when it misses it or only beyond ``limit``."""
     a, b = (bounds[node, 0] - ox) * ix, (bounds[node, 3] - ox) * ix
@@ -139,7 +139,7 @@ def _enter(bounds, node, ox, oy, oz, ix, iy, iz, limit):  # type: ignore[no-unty
     return near
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cast_ray(hierarchy, ox, oy, oz, dx, dy, dz, limit, any_hit):  # type: ignore[no-untyped-def]
     """Distance (in lengths of the direction) and face of the nearest hit nearer than ``limit``.
 
@@ -196,7 +196,7 @@ def cast_ray(hierarchy, ox, oy, oz, dx, dy, dz, limit, any_hit):  # type: ignore
         node = stack[depth]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cast_rays(hierarchy, origins, directions, distances, faces):  # type: ignore[no-untyped-def]
     for i in range(origins.shape[0]):
         distance, face = cast_ray(

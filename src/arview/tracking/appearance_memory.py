@@ -16,11 +16,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.atomic import replacing
+from arview.core.kernel import kernel
 from arview.errors import InputError, MismatchError, OutputError
 from arview.geometry import Array, are_near, exp_so3, rigid, rolls_between, turns_to_rays
 from arview.guideviews import GuideViewSet
@@ -496,7 +496,7 @@ class _Windows:
         return found
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _correlation(image, picture, mask, u, v, roll, ratio):  # type: ignore[no-untyped-def]
     """Masked normalised correlation of a view with an image at a place, roll and ratio of sizes; all channels as one.
 
@@ -539,7 +539,7 @@ def _correlation(image, picture, mask, u, v, roll, ratio):  # type: ignore[no-un
     return (sum_ab - sum_a * sum_b / count) / np.sqrt(var_a * var_b) * count / (count + missed)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search(image, picture, mask, start, steps, halvings):  # type: ignore[no-untyped-def]
     """Pattern search (Hooke & Jeeves, 1961) for the best correlation of a view.
 

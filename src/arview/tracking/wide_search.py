@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core import parallel as threads
+from arview.core.kernel import kernel
 from arview.detection.features.response_maps import response_maps, score_around
 from arview.detection.search.pattern_search import climb
 from arview.detection.search.template_bank import choose_apart
@@ -171,7 +171,7 @@ class NonlocalSearch:
         return response_maps(crop, 1, 0, pool), intrinsics
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _with_odds(image, bin_of, odds):  # type: ignore[no-untyped-def]
     """(H,W,4): a picture with the probability that a pixel is of the part, 0–255, as its fourth channel."""
     height, width = image.shape[0], image.shape[1]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+
+@kernel(fastmath=True)
 def apply_tables(
     signal: NDArray[np.uint16],
     light_of_signal: NDArray[np.float32],

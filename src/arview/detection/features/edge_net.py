@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.core.onnx_session import padded_to_multiple
 from arview.detection.features.response_maps import ORIENTATIONS
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
@@ -92,7 +92,7 @@ def lines_at(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) 
     return sized
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def line_support(maps, part, pose, intrinsics, step_mm):  # type: ignore[no-untyped-def]
     """Mean answer 0–1 of the network under the outline and the design edges of a part; these count half at most.
 

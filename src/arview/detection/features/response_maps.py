@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
@@ -56,7 +56,7 @@ def colour_gradients(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Plane
     return np.asarray(smooth), x, y, magnitude
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _strongest(gx, gy):  # type: ignore[no-untyped-def]
     """Gradient (H,W) of the channel with the strongest one (Dalal & Triggs 2005), and its magnitude in grey levels."""
     channels, height, width = gx.shape
@@ -81,7 +81,7 @@ def _strongest(gx, gy):  # type: ignore[no-untyped-def]
     return x, y, magnitude
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _oriented(phase, magnitude, around, peak, pool):  # type: ignore[no-untyped-def]
     """(8, H / pool, W / pool) strength of thin edges by orientation, relative to the contrast around.
 
@@ -115,7 +115,7 @@ def _oriented(phase, magnitude, around, peak, pool):  # type: ignore[no-untyped-
     return own
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _without_common(spread, pad):  # type: ignore[no-untyped-def]
     """What an orientation has beyond a share of the mean of all, stretched and padded by zeros."""
     count, height, width = spread.shape
@@ -147,7 +147,7 @@ def orientation_bins(normals_px: Array) -> NDArray[np.uint8]:
     return (np.round(position).astype(np.intp) % ORIENTATIONS).astype(np.uint8)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, room):  # type: ignore[no-untyped-def]
     """Project a guide view's outline and design edges; returns the number of points.
 
@@ -185,7 +185,7 @@ def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_co
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def score_around(  # type: ignore[no-untyped-def]
     maps, part, cam_from_body, intrinsics, step_mm, turns, stretches, shift_px, shift_step, contour_count, edge_count
 ):
@@ -236,7 +236,7 @@ def score_around(  # type: ignore[no-untyped-def]
     return scores, poses
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def best_shift(maps, room, count, shift_px, shift_step, sums):  # type: ignore[no-untyped-def]
     """Highest sum of responses under the first ``count`` points over all shifts, and that shift dx, dy in px.
 

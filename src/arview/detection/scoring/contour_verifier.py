@@ -12,9 +12,9 @@ judge, verifier and lines.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.detection.features.edge_net import INSIDE, LONGEST_SIDE_PX
 from arview.detection.features.image_pyramid import Picture, steps_to
@@ -79,7 +79,7 @@ def raw_strips(picture: Picture, part: PartView, pose: Array) -> NDArray[np.uint
     return strips
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _cut(colours, answers, part, pose, intrinsics, step_mm, strips):  # type: ignore[no-untyped-def]
     """Write the samples of `raw_strips`."""
     height, width = colours.shape[:2]
@@ -125,7 +125,7 @@ def _cut(colours, answers, part, pose, intrinsics, step_mm, strips):  # type: ig
             strips[7, row, column] = 128 if abs(t) > run_px else 255 if is_inner or t <= 0.0 else 0
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _shown(strips):  # type: ignore[no-untyped-def]
     """What the network is shown (CHANNELS, ROWS, COLUMNS) float32, the contrast, and the share of rows seen."""
     out = np.zeros((CHANNELS, ROWS, COLUMNS), dtype=np.float32)

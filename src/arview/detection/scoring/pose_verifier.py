@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.detection.features.edge_net import INSIDE
 from arview.detection.features.image_pyramid import Picture, steps_to
@@ -168,7 +168,7 @@ def with_lines(shown: NDArray[np.float32], lines: NDArray[np.uint8]) -> NDArray[
     return np.concatenate([shown, lines.astype(np.float32) / np.float32(255.0)])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lines_around(answers, shrunk, zoom, shift, outline):  # type: ignore[no-untyped-def]
     """What the line network sees around a pose (3,S,S) uint8: see LINES.
 
@@ -197,7 +197,7 @@ def lines_around(answers, shrunk, zoom, shift, outline):  # type: ignore[no-unty
     return seen
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def contrasted(pixels, drawn):  # type: ignore[no-untyped-def]
     """A raw look with colours less their mean, in units of their deviation (PLAIN,S,S), and that deviation."""
     plain = np.zeros((PLAIN, *pixels.shape[:2]), dtype=np.float32)
@@ -205,7 +205,7 @@ def contrasted(pixels, drawn):  # type: ignore[no-untyped-def]
     return plain, relative_colours(pixels, plain)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def relative_colours(pixels, plain):  # type: ignore[no-untyped-def]
     """Write colours (H,W,4) less their mean in units of their deviation, which it returns; 1 where the 4th is not 0.
 
@@ -234,7 +234,7 @@ def relative_colours(pixels, plain):  # type: ignore[no-untyped-def]
     return contrast
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def with_gradients(plain):  # type: ignore[no-untyped-def]
     """All that the network is shown (CHANNELS,S,S) from what is plain, and the share of brightness that is explained.
 
@@ -274,7 +274,7 @@ def with_gradients(plain):  # type: ignore[no-untyped-def]
     return shown, _explain(plain, shown[PLAIN + 4], shown[PLAIN + 5])
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _explain(plain, shading, rest):  # type: ignore[no-untyped-def]
     """Write the shading (S,S) that the normals explain, and the rest of the brightness; the share explained.
 
@@ -326,7 +326,7 @@ def _explain(plain, shading, rest):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _slope_at(plane, v, u, slope):  # type: ignore[no-untyped-def]
     """Slopes of a plane at a pixel by Sobel's weights, to the right and down; beyond the rim it goes on as there."""
     up, low = max(v - 1, 0), min(v + 1, plane.shape[0] - 1)
@@ -342,7 +342,7 @@ def overall(radius_px: float, contrast: float, known: Array, explained: float) -
     return np.concatenate([both, (known - MEANS) / DEVIATIONS, [explained]]).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def draw_lines(part, pose, intrinsics, step_mm, zoom, shift, drawn):  # type: ignore[no-untyped-def]
     """Draw the lines of the part at a pose: see DRAWN.
 

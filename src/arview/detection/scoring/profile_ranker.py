@@ -17,9 +17,9 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.detection.features.edge_net import INSIDE
 from arview.detection.features.image_pyramid import Picture, steps_to
@@ -136,7 +136,7 @@ def _looks(picture: Picture, part: PartView, poses: Array, radius_px: float) -> 
     return [(step, some) for step, some in halves if len(some)]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def judge_poses(gradients, part, poses, log_lines, diameter_mm, weights):  # type: ignore[no-untyped-def]
     """Scores (N,), see `judge`; ``part`` as in `PartView.arrays`, ``weights`` a `Network`."""
     first, first_bias, second, second_bias, third, third_bias, last, last_bias = weights
@@ -174,7 +174,7 @@ def judge_poses(gradients, part, poses, log_lines, diameter_mm, weights):  # typ
     return scores
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  # type: ignore[no-untyped-def]
     """Write what the network is shown of a pose to ``lines`` (L, FEATURES) and ``both`` (GLOBALS,), float32.
 
@@ -271,7 +271,7 @@ def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  
     both[5] = LINES_WEIGHT * log_lines
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def chosen_lines(part, pose, most_outline, most_inner):  # type: ignore[no-untyped-def]
     """Evenly spread lines of the nearest view: points and directions (L,3), runs (L,2), how many are of the outline.
 

@@ -8,8 +8,8 @@ points away, which gradient methods follow.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from arview.core.kernel import kernel
 from arview.detection.features.response_maps import best_shift, collect_points
 from arview.detection.search.template_bank import (
     SECTORS,
@@ -20,7 +20,7 @@ from arview.detection.search.template_bank import (
 from arview.refinement.kernels import nearest_view
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pose_score(maps, part, pose, intrinsics, step_mm, contour_count, edge_count, shift_px, shift_step, room, sums):  # type: ignore[no-untyped-def]
     """Mean response 0–1 at a pose and the best shift dx, dy of the picture in px; 0 with too few points.
 
@@ -41,7 +41,7 @@ def pose_score(maps, part, pose, intrinsics, step_mm, contour_count, edge_count,
     return best / (255.0 * count), dx, dy
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _stepped(pose, axis, amount):  # type: ignore[no-untyped-def]
     """A pose turned about axis 0–2 of the camera through the part's centre, or moved in distance (axis 3)."""
     moved = pose.copy()
@@ -57,7 +57,7 @@ def _stepped(pose, axis, amount):  # type: ignore[no-untyped-def]
     return moved
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def climb(  # type: ignore[no-untyped-def]
     maps, part, poses, intrinsics, step_mm, turn_step_rad, stretch_step, rounds, halvings, shift_px, shift_step,
     contour_count, edge_count
@@ -112,7 +112,7 @@ def climb(  # type: ignore[no-untyped-def]
     return scores, found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def outline_score(  # type: ignore[no-untyped-def]
     maps, points, angles, roll, radius_px, nearness, x0, y0, shift_px, shift_step, is_sparing, room, sums, sectors
 ):  # fmt: skip
@@ -136,7 +136,7 @@ def outline_score(  # type: ignore[no-untyped-def]
     return _sum_but_a_pair(maps, room, count, dx, dy, sectors) / (255.0 * count * (1.0 - SPARED_SHARE)), dx, dy
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_but_a_pair(maps, room, count, dx, dy, sums):  # type: ignore[no-untyped-def]
     """Sum of the responses under the points of an outline at a shift, but of the pair of sectors with the least."""
     height, width = maps.shape[1], maps.shape[2]
@@ -148,7 +148,7 @@ def _sum_but_a_pair(maps, room, count, dx, dy, sums):  # type: ignore[no-untyped
     return np.sum(sums) - least_pair(sums)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def climb_outlines(  # type: ignore[no-untyped-def]
     maps, points, angles, neighbours, turns, views, rolls, radii_px, places, focal_px, roll_step_rad, stretch_step,
     rounds, shift_px, shift_step, is_sparing

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from arview.core.kernel import kernel
 from arview.detection.features.response_maps import orientation_bins
 from arview.errors import InputError
 from arview.geometry import Array, rolls_between
@@ -165,13 +165,13 @@ def by_sector(shown: Array) -> NDArray[np.intp]:
     return mixed.reshape(SECTORS, -1, FIRST_POINTS // SECTORS).swapaxes(0, 1).ravel()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sector_of(place):  # type: ignore[no-untyped-def]
     """The sector of a point by its place in the order of outlines."""
     return place // (FIRST_POINTS // SECTORS) % SECTORS
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def least_pair(sums):  # type: ignore[no-untyped-def]
     """The least that two sectors side by side have of the sums (SECTORS,) of all."""
     least = sums[SECTORS - 1] + sums[0]
@@ -300,7 +300,7 @@ def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(padded.reshape(count, rows, step, columns, step).transpose(0, 2, 4, 1, 3))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_points(total, flat, source, shift, start, size, first, last):  # type: ignore[no-untyped-def]
     """Add the responses under points first to last to the sums of a tile, four points at a time in 8 bits."""
     for i in range(first, last, 4):
@@ -312,7 +312,7 @@ def _add_points(total, flat, source, shift, start, size, first, last):  # type: 
             total[k] += np.uint8(a[k] + b[k] + c[k] + d[k])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_but_a_pair(total, own, least, flat, source, shift, start, size):  # type: ignore[no-untyped-def]
     """Add the responses under the first points, but those of the pair of sectors that have the least."""
     each = FIRST_POINTS // SECTORS
@@ -331,7 +331,7 @@ def _add_but_a_pair(total, own, least, flat, source, shift, start, size):  # typ
         total[k] -= least[k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bar(votes, kept):  # type: ignore[no-untyped-def]
     """The key that about ``kept`` of the matches counted in ``votes`` (1024,) reach."""
     above = 0
@@ -342,14 +342,14 @@ def _bar(votes, kept):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _still_in(keys, groups, found, votes, kept):  # type: ignore[no-untyped-def]
     """Indices of those of the first ``found`` matches that clear the bars of their groups by now."""
     bars = np.array([_bar(votes[g], kept) for g in range(len(votes))])
     return np.array([i for i in range(found) if keys[i] >= bars[groups[i]]], dtype=np.int64)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def match_templates(  # type: ignore[no-untyped-def]
     phases, offsets, bins, gains, groups, first_template, last_template, kept, lowest, votes, is_sparing
 ):
@@ -471,7 +471,7 @@ def match_templates(  # type: ignore[no-untyped-def]
     return keys[best], templates[best], places
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def choose_apart(rotations, positions, reach, cosine, distance_ratio, most):  # type: ignore[no-untyped-def]
     """Indices of at most ``most`` poses, best first as given, none near a better one.
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.geometry import Array, apply
 from arview.rendering.rasterizer import rasterise
 
@@ -141,7 +141,7 @@ def corner_normals(vertices: Array, faces: NDArray[np.int32], smooth_below_deg: 
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _corner_normals(faces, normals, doubled, owners, starts, smooth_cosine):  # type: ignore[no-untyped-def]
     corners = np.empty((faces.shape[0], 3, 3))
     for face in range(faces.shape[0]):
@@ -164,7 +164,7 @@ def _corner_normals(faces, normals, doubled, owners, starts, smooth_cosine):  # 
     return corners
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _shade(  # type: ignore[no-untyped-def]
     inverse_depth, face_ids, points, faces, normals, colors, lens, toward, strength, ambient, surroundings,
     diffuse, specular, mirror, gloss,

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -178,7 +178,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)), thread_name_prefix="closest")
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _smooth(corner, normals, angles, faces_around, ends, least_cosine):  # type: ignore[no-untyped-def]
     """(F,3,3) normals at the corners of faces, of the faces around that meet them at a small angle."""
     out = np.zeros((len(corner), 3, 3))
@@ -196,7 +196,7 @@ def _smooth(corner, normals, angles, faces_around, ends, least_cosine):  # type:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _build(middles, lows, highs, order, low, high, right, start, count):  # type: ignore[no-untyped-def]
     """Boxes of a tree in depth-first order (left child follows its parent); returns their number."""
     stack = np.empty((128, 3), dtype=np.int64)
@@ -249,7 +249,7 @@ def _tree(triangles: Array, used: NDArray[np.int64]) -> tuple[NDArray, ...]:  # 
     return order, low[:nodes].copy(), high[:nodes].copy(), right[:nodes], start[:nodes], count[:nodes]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline=True)
 def _to_box(x, y, z, low, high):  # type: ignore[no-untyped-def]
     """Squared distance of a point to a box."""
     dx = max(low[0] - x, 0.0, x - high[0])
@@ -258,7 +258,7 @@ def _to_box(x, y, z, low, high):  # type: ignore[no-untyped-def]
     return dx * dx + dy * dy + dz * dz
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(numpy_errors=True)
 def _on_triangle(px, py, pz, t):  # type: ignore[no-untyped-def]
     """Weights of corners 1 and 2 at the closest point of a triangle, and where: 0 inside, 1–3 side, 4–6 corner."""
     abx, aby, abz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
@@ -292,7 +292,7 @@ def _on_triangle(px, py, pz, t):  # type: ignore[no-untyped-def]
     return vb / total, vc / total, 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(numpy_errors=True)
 def _query(  # type: ignore[no-untyped-def]
     points, hints, reach2, triangles, sides, edges, corner_normals, low, high, right, start, count, order,
     out_points, out_faces, out_distances, out_normals, out_edges,

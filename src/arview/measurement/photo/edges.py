@@ -10,11 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.cad.model import make_model
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.geometry import Array, apply, invert, rigid
 from arview.guideviews.mesh_edges import EDGE_CREASE, EDGE_SILHOUETTE, mesh_edges, sample_visible_edges
 from arview.measurement.photo.component import MeasuredComponent
@@ -291,7 +291,7 @@ _SIGMA_PX = 0.3
 """Of a strong step; what residuals show replaces it."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(numpy_errors=True)
 def _vote(hypotheses, worth, directions, shifts, width, share):  # type: ignore[no-untyped-def]
     """(T,) sum over points of the best step near where shifts (T,3) put it.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 
 TUKEY = 4.685
@@ -165,7 +165,7 @@ def _correlated(rows: Array, residuals: Array, places: Array, stride: int = 1) -
     return np.asarray(variance * (rows.T @ rows + stride * _spread(bins, alike, rows)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _distance_bins(places, edges):  # type: ignore[no-untyped-def]
     n, d = places.shape
     bins = np.empty((n, n), dtype=np.uint8)
@@ -182,7 +182,7 @@ def _distance_bins(places, edges):  # type: ignore[no-untyped-def]
     return bins
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _binned_products(bins, residuals, size):  # type: ignore[no-untyped-def]
     products, counts = np.zeros(size), np.zeros(size)
     for i in range(bins.shape[0]):
@@ -192,7 +192,7 @@ def _binned_products(bins, residuals, size):  # type: ignore[no-untyped-def]
     return products, counts
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _spread(bins, alike, rows):  # type: ignore[no-untyped-def]
     n, b = rows.shape
     result = np.zeros((b, b))

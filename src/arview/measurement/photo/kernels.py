@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from arview.core.kernel import kernel
 
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
 """Sums may be done in any order: four numbers at a time."""
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=_FAST, numpy_errors=True)
 def sweep_scores(patches, is_on, shades, normals, steps, views, stack, least_contrast):  # type: ignore[no-untyped-def]
     """Mean correlation (ZNCC) over all pairs of views of patches moved along their normals.
 
@@ -136,7 +137,7 @@ def sweep_scores(patches, is_on, shades, normals, steps, views, stack, least_con
     return scores, count, alike
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def choose_views(visible, cosines, directions, most):  # type: ignore[no-untyped-def]
     """The views (N,most) that see a sample best and from different sides, -1 for none.
 
@@ -165,7 +166,7 @@ def choose_views(visible, cosines, directions, most):  # type: ignore[no-untyped
     return views
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def vote_shifts(scores, steps, normals, shifts, floor):  # type: ignore[no-untyped-def]
     """(T,) sum over samples of their score, above ``floor``, where shifts (T,3) put them along their normals."""
     votes = np.zeros(shifts.shape[0])

@@ -6,13 +6,13 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.cad.model import Component, Model, make_model
 from arview.cad.part import Part
 from arview.cad.samples import Samples
 from arview.cad.symmetry import Symmetry, find_symmetries
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import mesh_edges
 from arview.rendering.raycast import RayCaster
@@ -127,7 +127,7 @@ def _symmetries(vertices: bytes, faces: bytes) -> tuple[Symmetry, ...]:
     return tuple(item.symmetry for item in found if item.is_exact)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearer_than(points, corners, reach):  # type: ignore[no-untyped-def]
     """Whether each point is nearer than ``reach`` to any triangle (T,3,3), to its plane or its edges."""
     count = corners.shape[0]

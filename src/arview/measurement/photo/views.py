@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply
@@ -181,7 +181,7 @@ def apply_all(cam_from_model: Array, point: Array) -> Array:
     return np.asarray(cam_from_model[:, :3, :3] @ point + cam_from_model[:, :3, 3])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _all_visible(groups, pose, lens, size, ideal, origin, inverse_depth, ids, component):  # type: ignore[no-untyped-def]
     margin = 2.0
     height, width = inverse_depth.shape

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.core.progress import Progress
 from arview.geometry import Array, invert
 from arview.reconstruction.dense.depth import DepthMap
@@ -164,7 +164,7 @@ def _fellows(maps: Sequence[DepthMap], index: int) -> NDArray[np.int64]:
     return order[likeness[order] > 0.0]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline=True)
 def _seen_at(j, p0, p1, p2, layout, cameras, poses):  # type: ignore[no-untyped-def]
     """Index of the pixel of map j that a point falls on (-1: none) and the point in that camera."""
     m = poses
@@ -179,7 +179,7 @@ def _seen_at(j, p0, p1, p2, layout, cameras, poses):  # type: ignore[no-untyped-
     return at, x, y, z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(numpy_errors=True)
 def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # type: ignore[no-untyped-def]
     """Merged depth, its standard deviation and the number of views of each pixel of view i that enough agree on."""
     first, width, height = layout[i]
@@ -266,7 +266,7 @@ def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # typ
             merged[at, 0], merged[at, 1], merged[at, 2] = mean, sigma, views
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _drop_crumbs(merged):  # type: ignore[no-untyped-def]
     """Set pixels to 0 that hardly any neighbour is on a surface with."""
     height, width = merged.shape[:2]

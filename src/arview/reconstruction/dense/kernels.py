@@ -13,8 +13,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import float32, int32, njit, uint32
+from numba import float32, int32, uint32
 from numpy.typing import NDArray
+
+from arview.core.kernel import kernel
 
 RADIUS = 5
 SAMPLES = 40
@@ -77,7 +79,7 @@ def make_scratch(shift: float = 0.0, is_dense: bool = False) -> tuple[NDArray[np
     return scratch, np.zeros(SAMPLES, dtype=np.int32)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, numpy_errors=True)
 def take_window(grey, s, x, y):  # type: ignore[no-untyped-def]
     """Weights (sum 1) and weighted, centred greys of the view's window into the scratch; returns its variance.
 
@@ -107,7 +109,7 @@ def take_window(grey, s, x, y):  # type: ignore[no-untyped-def]
     return variance
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def warp(m, k, x, y, w, du, dv):  # type: ignore[no-untyped-def]
     """The homography of the window into source k as three linear forms of (dx, dy): (value, slopes) each."""
     tx, ty, tz = m[k, 9], m[k, 10], m[k, 11]
@@ -120,7 +122,7 @@ def warp(m, k, x, y, w, du, dv):  # type: ignore[no-untyped-def]
     return x0, xu, xv, y0, yu, yv, z0, zu, zv
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def falls_inside(sizes, k, h):  # type: ignore[no-untyped-def]
     """Whether the whole warped window lies in source k."""
     x0, xu, xv, y0, yu, yv, z0, zu, zv = h
@@ -136,7 +138,7 @@ def falls_inside(sizes, k, h):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, numpy_errors=True)
 def sample(pixels, sizes, s, index, k, h):  # type: ignore[no-untyped-def]
     """The window in source k: four neighbours (A to D) and fractions (FU, FV) of each sample into the scratch."""
     x0, xu, xv, y0, yu, yv, z0, zu, zv = h
@@ -159,7 +161,7 @@ def sample(pixels, sizes, s, index, k, h):  # type: ignore[no-untyped-def]
         s[D, i] = pixels[at + uint32(1)]
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, numpy_errors=True)
 def zncc(pixels, sizes, s, index, k, h, variance, noise):  # type: ignore[no-untyped-def]
     """Correlation of the window with source k; noise counts as contrast that does not agree."""
     sample(pixels, sizes, s, index, k, h)
@@ -176,7 +178,7 @@ def zncc(pixels, sizes, s, index, k, h, variance, noise):  # type: ignore[no-unt
     return both / np.sqrt((variance + noise) * (contrast + noise))
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, numpy_errors=True)
 def disagreement_px(maps, sizes, warps, step, k, h, w):  # type: ignore[no-untyped-def]
     """How far the element lies from the depth map of source k, in px of parallax, at most 3."""
     u, v = (h[0] / h[6] + _HALF) / step, (h[3] / h[6] + _HALF) / step
@@ -190,7 +192,7 @@ def disagreement_px(maps, sizes, warps, step, k, h, w):  # type: ignore[no-untyp
     return min(abs(there - w / h[6]) * warps[k, PARALLAX], MAX_ERROR_PX)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
     """Whether the element is in front of the camera and seen at less than 81°."""
     if not w > _ZERO:
@@ -201,7 +203,7 @@ def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
     return w * w > LEAST_SQUARED_COSINE * (a * a + b * b + c * c) * (xn * xn + yn * yn + _ONE)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, numpy_errors=True)
 def element_cost(pixels, maps, sizes, warps, numbers, s, index, x, y, w, du, dv, variance, limit):  # type: ignore[no-untyped-def]
     """Mean of the best sources' 1 - ZNCC, plus their disagreement with its depth: 0 (best) to 2.
 

@@ -9,8 +9,9 @@ reads the other colour only, so that the result does not depend on threads.
 from __future__ import annotations
 
 import numpy as np
-from numba import float32, njit, uint32
+from numba import float32, uint32
 
+from arview.core.kernel import kernel
 from arview.reconstruction.dense.kernels import FX, FY, element_cost, take_window
 
 _ZERO = float32(0.0)
@@ -29,7 +30,7 @@ NEIGHBOURS = np.array(
 """Near and far neighbours of the other colour, (dx, dy); the best of each row is tried."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def draw(seed, x, y, turn):  # type: ignore[no-untyped-def]
     """A number in [-1, 1) hashed from its arguments (the mixing step of MurmurHash3)."""
     h = uint32(seed) ^ (uint32(x) * uint32(0x9E3779B1)) ^ (uint32(y) * uint32(0x85EBCA77))
@@ -42,7 +43,7 @@ def draw(seed, x, y, turn):  # type: ignore[no-untyped-def]
     return float32(np.float64(h) / 2147483648.0 - 1.0)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def try_hypotheses(p, s, index, planes, costs, hypotheses, spread, randoms, lowest, highest, seed):  # type: ignore[no-untyped-def]
     """Set each pixel to the best of hypotheses (C,H,W,3) and of random ones.
 
@@ -84,7 +85,7 @@ def try_hypotheses(p, s, index, planes, costs, hypotheses, spread, randoms, lowe
                     planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, du, dv
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def sweep(p, s, index, planes, costs, regions, color, step_w, step_tilt, seed):  # type: ignore[no-untyped-def]
     """One half of a checkerboard iteration: the best neighbours' planes, then a perturbation.
 

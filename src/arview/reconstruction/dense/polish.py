@@ -7,8 +7,9 @@ of its own (Gruen 1985; Furukawa & Ponce 2010). Whatever hypothesis an element c
 from __future__ import annotations
 
 import numpy as np
-from numba import float32, njit
+from numba import float32
 
+from arview.core.kernel import kernel
 from arview.reconstruction.dense.kernels import (
     CENTRED,
     DX,
@@ -41,7 +42,7 @@ _SLOPE_PRIOR = 0.05
 """Weight of the slopes' start, as a share of the evidence for w: keeps them where texture is poor."""
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, numpy_errors=True)
 def _normal_equations(pixels, sizes, warps, s, index, k, h, variance, noise, system):  # type: ignore[no-untyped-def]
     """Add source k to the system (H upper, gradient, squares); returns its correlation. Gain and offset eliminated."""
     sample(pixels, sizes, s, index, k, h)
@@ -113,7 +114,7 @@ def _normal_equations(pixels, sizes, warps, s, index, k, h, variance, noise, sys
     return score
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(numpy_errors=True)
 def _solve(q):  # type: ignore[no-untyped-def]
     """Step (3,) of the damped system and the variance of its first unknown for unit noise."""
     a, b, c = q[0], q[1], q[2]
@@ -132,7 +133,7 @@ def _solve(q):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(numpy_errors=True)
 def polish(p, s, index, planes, scores, sigmas, step_px, iterations, unit_w):  # type: ignore[no-untyped-def]
     """Refine the planes (H,W,3) in place; mean correlation (H,W) and standard deviation of w (H,W) out.
 

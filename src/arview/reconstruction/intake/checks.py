@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.reconstruction.intake.reading import Pixels
 
 _FINE, _COARSE = 1.0, 2.0  # px, the two scales whose gradients are compared
@@ -94,7 +94,7 @@ def blur_and_texture(gray: Pixels) -> tuple[float, float]:
     return worst, textured
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _edge_points(
     fine: NDArray[np.float32], coarse: NDArray[np.float32], floor: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:

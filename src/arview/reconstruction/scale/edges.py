@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 
 HYPOTHESES = 4
@@ -26,7 +26,7 @@ def linear_light(gray: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.ascontiguousarray(cv2.GaussianBlur(linear.astype(np.float32)[gray], (0, 0), 0.7))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_steps(gray, pixels, normals, reach_px, half_width_px, threshold):  # type: ignore[no-untyped-def]
     """Extrema of the slope along the normal of each point.
 

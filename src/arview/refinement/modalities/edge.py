@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.gauss_newton import add_line
 from arview.refinement.projection import project
@@ -27,7 +27,7 @@ def smoothed(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.blur(gray, (3, 3)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # type: ignore[no-untyped-def]
     """Intensity steps along the normal of each point.
 
@@ -104,7 +104,7 @@ def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # 
     return positions, strengths, seen
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_edges(  # type: ignore[no-untyped-def]
     hessian, gradient, points, kinds, cam_from_body, intrinsics, pixels, normals, positions, strengths,
     strength_half, sigma_px, spread_px, weight

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
+from arview.core.kernel import kernel
 from arview.errors import InputError
 from arview.geometry import Array, invert
 from arview.refinement.modalities.patch_alignment import Pyramid
@@ -100,7 +100,7 @@ class Keyframe:
     last_used: int
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline=True)
 def to_camera(m, x, y, z):  # type: ignore[no-untyped-def]
     """A point mapped by a (4,4) rigid transform."""
     return (
@@ -110,7 +110,7 @@ def to_camera(m, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tangent_jacobian(point, tangents, cam_from_body, intrinsics, out):  # type: ignore[no-untyped-def]
     """Pixel, depth, and (2,2) px per mm along the two tangents (central differences over about 4 px)."""
     x, y, z = to_camera(cam_from_body, point[0], point[1], point[2])
@@ -131,7 +131,7 @@ def tangent_jacobian(point, tangents, cam_from_body, intrinsics, out):  # type: 
     return u, v, z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_corners(response, threshold, cell):  # type: ignore[no-untyped-def]
     """The strongest pixel of each ``cell`` × ``cell`` square if a local maximum: (N,3) u, v, response."""
     height, width = response.shape
@@ -155,7 +155,7 @@ def _best_corners(response, threshold, cell):  # type: ignore[no-untyped-def]
     return found[:count].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unproject(u, v, intrinsics):  # type: ignore[no-untyped-def]
     """Ideal x, y at z = 1 of a pixel; distortion is removed by iteration."""
     x = xd = (u - intrinsics[2]) / intrinsics[0]
@@ -168,7 +168,7 @@ def _unproject(u, v, intrinsics):  # type: ignore[no-untyped-def]
     return x, y
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _place_corners(hierarchy, body_from_cam, corners, intrinsics, margin_px,  # type: ignore[no-untyped-def]
                    distance_px, flatness_px, min_facing, most):  # fmt: skip
     """Corners that lie on a smooth piece of the part's surface, strongest first.
@@ -242,7 +242,7 @@ def _place_corners(hierarchy, body_from_cam, corners, intrinsics, margin_px,  # 
     return used, kept, points, tangents
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _all_jacobians(points, tangents, cam_from_body, intrinsics):  # type: ignore[no-untyped-def]
     """(N,2,2) of `tangent_jacobian`."""
     jacobians = np.empty((points.shape[0], 2, 2))

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from arview.core.kernel import kernel
 
 Pyramid = tuple[NDArray[np.uint8], ...]
 
@@ -23,7 +24,7 @@ def build_pyramid(gray: NDArray[np.uint8], levels: int) -> Pyramid:
     return tuple(pyramid)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def sample_patch(image, u, v, warp, half, out):  # type: ignore[no-untyped-def]
     """Fill out (2·half+1)² with the image at (u, v) + warp · offset; False when it leaves the image."""
     height, width = image.shape
@@ -46,7 +47,7 @@ def sample_patch(image, u, v, warp, half, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def prepare_template(patch, side, template, across, down):  # type: ignore[no-untyped-def]
     """Zero-mean template of unit norm and its gradients made orthogonal to it and to a constant.
 
@@ -96,7 +97,7 @@ def prepare_template(patch, side, template, across, down):  # type: ignore[no-un
     return (yy / det, -xy / det, xx / det), norm
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def align_template(image, u, v, side, template, across, down, normal, norm, steps, stop_px):  # type: ignore[no-untyped-def]
     """Shift a prepared template onto the image from (u, v); returns u, v, correlation (-1 = failed).
 
@@ -152,7 +153,7 @@ def align_template(image, u, v, side, template, across, down, normal, norm, step
     return u, v, -1.0
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def common_shift(key_image, image, scale, key_pixels, pixels, warps, chosen, reach):  # type: ignore[no-untyped-def]
     """One shift (du, dv) in px of the finest level that lays the chosen patches best onto a coarse image.
 

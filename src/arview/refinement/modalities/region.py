@@ -10,9 +10,9 @@ lines that see nothing weigh nothing.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.refinement.gauss_newton import add_line
 from arview.refinement.projection import project
@@ -38,7 +38,7 @@ def value_bins(gain: float) -> NDArray[np.int64]:
     return np.minimum(np.arange(256) / gain / (256 / BINS), BINS - 1).astype(np.int64)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_histograms(image, bin_of, pixels, normals, depths, runs_mm, focal, fore, back, reach_px, gap_px):  # type: ignore[no-untyped-def]
     """Count the colours within ``reach_px`` inside and outside of the contour into fore and back (4096,)."""
     height, width = image.shape[0], image.shape[1]
@@ -63,7 +63,7 @@ def add_histograms(image, bin_of, pixels, normals, depths, runs_mm, focal, fore,
                 step += 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def log_odds(fore, back, out):  # type: ignore[no-untyped-def]
     """Log-odds (4096,) of "part" against "background" per colour; unseen colours say nothing."""
     total_fore = fore.sum() + 1e-9
@@ -75,7 +75,7 @@ def log_odds(fore, back, out):  # type: ignore[no-untyped-def]
         out[i] = np.log(f / b)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds, edge_function, scale):  # type: ignore[no-untyped-def]
     """Displacement of the contour along each line.
 
@@ -152,7 +152,7 @@ def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds,
     return mean, information, agreement
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_region(  # type: ignore[no-untyped-def]
     hessian,
     gradient,

@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.surface import Surface, draw_surface
 from arview.refinement.gauss_newton import apply_twist, relative_twist
@@ -89,7 +89,7 @@ def curved_share(surface: Surface) -> float:
     return float(areas[curved].sum() / max(areas.sum(), 1e-12))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def corner_normals(surface):  # type: ignore[no-untyped-def]
     """Unit normals (F,3,3) float32 at the corners of a surface's faces: the mean of those around that go on smoothly.
 
@@ -154,7 +154,7 @@ def look_at(gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_fro
     return LookedAt(bright, focal_px, (center - first + 0.5) * zoom - 0.5 - focal_px * place[:2] / place[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shade(  # type: ignore[no-untyped-def]
     bright, focal_px, middle_px, surface, corners, diameter_mm, cam_from_body, information, gain
 ):
@@ -210,7 +210,7 @@ def shade(  # type: ignore[no-untyped-def]
     return pose, best, explained
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _determines(information):  # type: ignore[no-untyped-def]
     """Whether information (6,6) leaves no direction open, its units taken out of it."""
     sizes = np.sqrt(np.maximum(np.diag(information), 0.0))
@@ -219,7 +219,7 @@ def _determines(information):  # type: ignore[no-untyped-def]
     return np.linalg.eigvalsh(information / np.outer(sizes, sizes))[0] > LEAST_DETERMINED
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _smooth(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm):  # type: ignore[no-untyped-def]
     """Replace the normals of faces by those between the normals of their corners (Phong, CACM 1975)."""
     points, faces = surface[0], surface[1]
@@ -261,7 +261,7 @@ def _smooth(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diamet
             drawn[0, v, u], drawn[1, v, u], drawn[2, v, u] = x / size, y / size, z / size
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _inner_places(drawn, face_ids):  # type: ignore[no-untyped-def]
     """Rows and columns (N,2) of the pixels looked at."""
     height, width = face_ids.shape
@@ -286,14 +286,14 @@ def _inner_places(drawn, face_ids):  # type: ignore[no-untyped-def]
     return places[:count]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline=True)
 def _functions(x, y, z, out):  # type: ignore[no-untyped-def]
     """Write what a light's coefficients belong to, at a normal: right, down, towards the camera."""
     out[0], out[1], out[2], out[3] = 1.0, x, y, z
     out[4], out[5], out[6], out[7], out[8] = x * y, x * z, y * z, x * x - y * y, 3.0 * z * z - 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fitted_light(values, functions, light, is_known):  # type: ignore[no-untyped-def]
     """The light (9,) that explains grey levels (N,) best, and what each of them counts (N,); see `PRIOR`.
 
@@ -313,14 +313,14 @@ def _fitted_light(values, functions, light, is_known):  # type: ignore[no-untype
     return light, weights
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _weigh(left, weights):  # type: ignore[no-untyped-def]
     scale = LEAST_DEVIATION + OUTLYING * np.median(np.abs(left))
     for i in range(len(left)):
         weights[i] = 1.0 / (1.0 + (left[i] / scale) ** 2) ** 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _motion(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_mm):  # type: ignore[no-untyped-def]
     """By how much the brightness at each place changes with each part of a twist (N,6), see `solver`.
 
@@ -365,7 +365,7 @@ def _motion(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_
     return jacobian
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _reduced(motion, functions, values, weights, light):  # type: ignore[no-untyped-def]
     """The system (6,6), (6,) of the pose after the light was taken out of it, and the share that is explained.
 

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.refinement.gauss_newton import add_line, apply_twist, solve_step
@@ -56,7 +56,7 @@ class Matches(NamedTuple):
     tried: int
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _agree_with_neighbours(predicted, pixels, weights, limit_px):  # type: ignore[no-untyped-def]
     """Clear the weights of points displaced unlike the median of their seven nearest neighbours."""
     count = predicted.shape[0]
@@ -97,7 +97,7 @@ def _agree_with_neighbours(predicted, pixels, weights, limit_px):  # type: ignor
             weights[i] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_features(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px):  # type: ignore[no-untyped-def]
     """Add the reprojection residuals of matched points to the 6×6 system.
 
@@ -129,7 +129,7 @@ def add_features(hessian, gradient, points, cam_from_body, intrinsics, pixels, w
     return sum_square, sum_weight, inliers
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _align_pose(points, cam_from_body, intrinsics, pixels, weights, damping, sigma_px):  # type: ignore[no-untyped-def]
     """Pose that lays points on their pixels: Gauss-Newton, robust limit shrinking from 40 to 3 px."""
     hessian = np.zeros((6, 6))
@@ -144,7 +144,7 @@ def _align_pose(points, cam_from_body, intrinsics, pixels, weights, damping, sig
     return cam_from_body
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count_near(points, cam_from_body, intrinsics, pixels, weights, limit_px):  # type: ignore[no-untyped-def]
     """How many points of positive weight project to within ``limit_px`` of their pixels."""
     count = 0
@@ -157,7 +157,7 @@ def _count_near(points, cam_from_body, intrinsics, pixels, weights, limit_px):  
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _facing_camera(anchors, hierarchy, cam_from_body, min_facing, check_occlusion):  # type: ignore[no-untyped-def]
     """(N,) whether each trusted anchor faces the camera and is not hidden behind the part itself."""
     r = cam_from_body
@@ -186,7 +186,7 @@ def _facing_camera(anchors, hierarchy, cam_from_body, min_facing, check_occlusio
     return wanted
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _predict(anchors, cam_from_body, intrinsics, width, height, wanted, predicted, warps):  # type: ignore[no-untyped-def]
     """Fill predicted pixels (N,2) and the warps (N,2,2) from frame to keyframe px of the tangent planes.
 
@@ -215,7 +215,7 @@ def _predict(anchors, cam_from_body, intrinsics, width, height, wanted, predicte
         wanted[i] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _align_level(level, key_pyramid, pyramid, key_pixels, warps, wanted, min_ncc, pixels, scores):  # type: ignore[no-untyped-def]
     """Align wanted patches on one level from ``pixels`` on, in place; scores (N,) = correlation or 0."""
     side = 9
@@ -242,7 +242,7 @@ def _align_level(level, key_pyramid, pyramid, key_pixels, warps, wanted, min_ncc
             scores[i] = ncc
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def match_features(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intrinsics,  # type: ignore[no-untyped-def]
                    damping, search_px, check_occlusion, min_facing, min_ncc, neighbour_px):  # fmt: skip
     """Find a keyframe's features in a new frame.

@@ -1,0 +1,63 @@
+"""Compilation of all kernels ahead, with all cores, so that no command has to compile later.
+
+``kernel_signatures.json`` says with which types arview's commands and tests call each kernel. It is written by
+``tools/kernel_signatures.py``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from typing import Any
+
+from arview.core.kernel import all_kernels
+from arview.core.kernel_cache import prune_kernels
+from arview.core.kernel_signatures import decode_type, recorded_signatures
+from arview.core.progress import StepProgress
+
+
+def warm_up(progress: StepProgress | None = None, processes: int | None = None) -> int:
+    """Compile every kernel for all recorded signatures into the user's cache folder.
+
+    Args:
+        progress: told how many kernels are done, of how many.
+        processes: that compile at the same time; None: one for each core.
+
+    Returns:
+        How many signatures were compiled; the others were in the cache.
+    """
+    prune_kernels()
+    jobs = recorded_signatures()
+    compiled = 0
+    # Kernels of one module stay together: they call each other. Large modules come first, so that no core waits long.
+    modules: dict[str, dict[str, list[Any]]] = {}
+    for name, signatures in jobs.items():
+        modules.setdefault(name.split(":")[0], {})[name] = signatures
+    ordered = sorted(modules.values(), key=lambda module: -sum(map(len, module.values())))
+    done = 0
+    with ProcessPoolExecutor(processes or os.cpu_count() or 1, get_context("spawn")) as pool:
+        futures = {pool.submit(compile_kernels, module): len(module) for module in ordered}
+        for future in as_completed(futures):
+            compiled += future.result()
+            done += futures[future]
+            if progress is not None:
+                progress(done, len(jobs))
+    return compiled
+
+
+def compile_kernels(signatures_of: dict[str, list[Any]]) -> int:
+    """Compile kernels, ``module:name``, for their signatures; how many signatures were not in the cache.
+
+    Raises:
+        KeyError: no such kernel.
+    """
+    compiled = 0
+    for name, signatures in signatures_of.items():
+        importlib.import_module(name.split(":")[0])
+        dispatcher = all_kernels()[name]
+        for signature in signatures:
+            dispatcher.compile(tuple(decode_type(part) for part in signature))
+        compiled += sum(dispatcher.stats.cache_misses.values())
+    return compiled
