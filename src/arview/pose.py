@@ -1,4 +1,4 @@
-"""Pose: where the part is in one frame, how sure that is, and in which state the tracking is."""
+"""Pose: the result of detection and tracking for one frame, with its uncertainty and the tracking state."""
 
 from __future__ import annotations
 
@@ -17,29 +17,30 @@ class TrackingState(StrEnum):
     LOST = "lost"
 
 
-MOST_NAMED = 3
-"""More components are counted, not named, in a status line."""
+MAX_NAMES = 3
+"""Unverified components listed by name in a status line; of more than these only the number is given."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """The answer for one frame.
+    """The result for one frame.
 
     Attributes:
         cam_from_model: (4,4) OpenCV camera from model, mm; None while searching or lost.
         covariance: (6,6) of the twist (rotation rad, translation mm) applied on the right of
-            ``cam_from_model`` about the model's centre; None when there is no pose.
-        quality: 0–1, separates right from wrong poses at about 0.5.
-        state: see TrackingState.
+            ``cam_from_model`` about the model's centre; None without a pose.
+        quality: 0–1; right poses mostly exceed 0.5, wrong ones mostly do not.
+        state: see `TrackingState`.
         time_s: time stamp of the frame.
         index: index of the frame in its source.
         ms: time spent on detection and tracking of this frame, milliseconds.
-        reason: for ``searching``, ``critical`` and ``lost``: why, in words.
-        mismatches: what is not as the CAD says, e.g. ``mismatch: nut_2 not seen where expected``; a part with
-            any is never ``tracked`` but ``critical``: it may be another part of the family.
-        unverified: names of components not yet confirmed at their place by any observation, because they are hidden,
-            face away or are too small in the picture. They may be missing or misplaced.
-        alternatives: other poses (4,4) that the frames so far bear out as well; not empty: the view is ambiguous.
+        reason: why the state is ``searching``, ``critical`` or ``lost``, in words.
+        mismatches: components that are not as in the CAD, e.g. ``mismatch: nut_2 not seen where expected``. A part
+            with any is ``critical``, never ``tracked``, because it may be another member of a product family.
+        unverified: names of the components that no frame so far has shown clearly at their nominal place, because
+            they are hidden, face away or show too little. Any of them may be missing or displaced.
+        alternatives: other poses (4,4) that the frames so far support equally well; if there are any, the view is
+            ambiguous.
         guide_cam_from_model: (4,4) where the user should bring the part; None unless the session waits for that.
     """
 
@@ -58,8 +59,8 @@ class Pose:
 
     @property
     def remark(self) -> str:
-        """What a status line says beside the state: the reason, or which components have not been seen yet."""
+        """Text for a status line: the reason, or, of a tracked part, the components not verified yet."""
         if self.state is not TrackingState.TRACKED or not self.unverified:
             return self.reason
-        few = ", ".join(self.unverified) if len(self.unverified) <= MOST_NAMED else f"{len(self.unverified)} components"
-        return f"not surely seen yet: {few}"
+        few = ", ".join(self.unverified) if len(self.unverified) <= MAX_NAMES else f"{len(self.unverified)} components"
+        return f"not yet verified: {few}"

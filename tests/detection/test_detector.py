@@ -35,7 +35,7 @@ from arview.geometry import apply, are_near, exp_so3, rigid, turned
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.guideviews.sphere import icosphere_directions
 from arview.pose import TrackingState
-from arview.refinement.evidence import EdgeSteps, Evidence
+from arview.refinement.evidence import EdgeSteps, PoseEvidence
 from arview.tracking import TrackingSession
 from helpers.cad_files import box
 from helpers.synthetic import (
@@ -321,8 +321,8 @@ def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
 
 
 def test_a_small_part_a_plain_view_and_a_close_rival_are_doubted_and_a_pose_a_little_aside_is_no_rival() -> None:
-    evidence = Evidence(0.6, 0.6, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
-    weaker = Evidence(0.58, 0.58, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
+    evidence = PoseEvidence(0.6, 0.6, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
+    weaker = PoseEvidence(0.58, 0.58, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
 
     def quality(distance_mm: float, rival_aside_mm: float | None, turn_deg: float, share: float = 1.0) -> float:
         pose, lines = pose_from(30, 40, distance_mm), share * detector().local.usual_lines

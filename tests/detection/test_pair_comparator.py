@@ -36,7 +36,7 @@ def plate(key_mm: float) -> Model:
 @cache
 def part_of(key_mm: float) -> PartView:
     views = make_guide_views(plate(key_mm), ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=2))
-    return Tracker(views, CAMERA, TrackerOptions(use_feature=False)).part
+    return Tracker(views, CAMERA, TrackerOptions(use_texture=False)).part
 
 
 def twins_of(truth: Array, key_mm: float) -> list[Array]:

@@ -262,8 +262,8 @@ def test_the_status_line_says_what_has_not_been_seen_yet(plate: Model, record: I
         for names in ((), ("nut",), tuple("abcdef"))
     )
     assert (one != plain).any() and (many != one).any()
-    assert replace(seen, unverified=("nut",)).remark == "not surely seen yet: nut"
-    assert replace(seen, unverified=tuple("abcdef")).remark == "not surely seen yet: 6 components"
+    assert replace(seen, unverified=("nut",)).remark == "not yet verified: nut"
+    assert replace(seen, unverified=tuple("abcdef")).remark == "not yet verified: 6 components"
     lost = replace(pose(None, TrackingState.LOST, "too dark"), unverified=("nut",))
     assert lost.remark == "too dark"
 

@@ -8,8 +8,8 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import apply, exp_se3, invert, look_at, rotation_angle_rad
 from arview.refinement.gauss_newton import apply_twist, solve_step
-from arview.refinement.modalities.keyframes import FeatureOptions
-from arview.refinement.modalities.texture import FeatureModality, add_features
+from arview.refinement.modalities.keyframes import TextureOptions
+from arview.refinement.modalities.texture import TextureModality, add_features
 from arview.rendering.raycast import RayCaster
 
 HALF = np.array([60.0, 40.0, 25.0])
@@ -62,7 +62,7 @@ def picture(camera, cam_from_body, seed=0, gain=1.0, offset=0.0, noise=2.0):
 
 
 def modality(camera=CAMERA, options=None):
-    return FeatureModality(*box(), camera, options)
+    return TextureModality(*box(), camera, options)
 
 
 def errors_px(camera, cam_from_body, matches):
@@ -182,8 +182,8 @@ def test_points_hidden_by_the_part_itself_are_not_tried(first):
     wall, wall_faces = box(np.array([30.0, 1.0, 30.0]), center=(30.0, -100.0, 30.0))
     both = np.concatenate([vertices, wall])
     both_faces = np.concatenate([faces, wall_faces + 8]).astype(np.int32)
-    seen = FeatureModality(both, both_faces, CAMERA, FeatureOptions(check_occlusion=False))
-    aware = FeatureModality(both, both_faces, CAMERA)
+    seen = TextureModality(both, both_faces, CAMERA, TextureOptions(check_occlusion=False))
+    aware = TextureModality(both, both_faces, CAMERA)
     above = look_at([0.0, -160.0, 330.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     image = picture(CAMERA, above, seed=7)
     assert seen.add_keyframe(image, above) == aware.add_keyframe(image, above)
@@ -203,7 +203,7 @@ def test_corners_keep_off_edges_and_background(first):
 
 
 def test_keyframe_bank_is_bounded_and_returns_to_known_views():
-    features = modality(options=FeatureOptions(max_keyframes=3, max_corners=40))
+    features = modality(options=TextureOptions(max_keyframes=3, max_corners=40))
     poses = [START @ exp_se3([0.0, 0.0, 0.3 * k, 0.0, 0.0, 0.0]) for k in range(4)]
     for k, pose in enumerate(poses):
         assert features.wants_keyframe(pose, 100)
@@ -266,7 +266,7 @@ def test_bad_input_is_refused(first):
     with pytest.raises(InputError, match="image is 320×240"):
         features.pyramid(first[::2, ::2])
     with pytest.raises(InputError, match="levels is 1"):
-        FeatureOptions(levels=1)
+        TextureOptions(levels=1)
     assert features.add_keyframe(np.full_like(first, 128), START) == 0
     away = START.copy()
     away[0, 3] += 5000

@@ -14,21 +14,21 @@ from arview.errors import InputError, MismatchError, OutputError
 from arview.geometry import Array, apply, rotation_angle_rad
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.pose import TrackingState
-from arview.refinement.evidence import Evidence
+from arview.refinement.evidence import PoseEvidence
 from arview.tracking import Estimate, SessionOptions, TrackingSession
-from arview.tracking.appearance_memory import SIDE, LearnedOptions, LearnedViews
+from arview.tracking.appearance_memory import SIDE, AppearanceMemory, AppearanceMemoryOptions
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, bracket, error, path, picture, pose_from
 
 SIDES = [(azimuth, elevation) for azimuth in (-40, 0, 40) for elevation in (30, 55)]
 
 
 def estimate(pose: Array, quality: float = 1.0, support: float = 0.9, in_picture: float = 1.0) -> Estimate:
-    return Estimate(pose, np.eye(6), quality, Evidence(support, 0.9, 0.3, 0.9, 0.9, 0.3, in_picture))
+    return Estimate(pose, np.eye(6), quality, PoseEvidence(support, 0.9, 0.3, 0.9, 0.9, 0.3, in_picture))
 
 
-def taught(sides: list[tuple[int, int]], **options: int) -> LearnedViews:
+def taught(sides: list[tuple[int, int]], **options: int) -> AppearanceMemory:
     """Views of the assembly from some sides, each seen for a while."""
-    learned = LearnedViews(assembly_views(), CAMERA, LearnedOptions(**options))
+    learned = AppearanceMemory(assembly_views(), CAMERA, AppearanceMemoryOptions(**options))
     for azimuth, elevation in sides:
         pose = pose_from(azimuth, elevation, 520)
         image = picture(pose, seed=100 + azimuth + elevation, scene=1)
@@ -38,7 +38,7 @@ def taught(sides: list[tuple[int, int]], **options: int) -> LearnedViews:
 
 
 @cache
-def six_sides() -> LearnedViews:
+def six_sides() -> AppearanceMemory:
     return taught(SIDES)
 
 
@@ -108,7 +108,7 @@ def test_memory_is_bounded_and_the_most_crowded_views_go() -> None:
 
 
 def test_only_what_is_tracked_well_and_new_is_learned() -> None:
-    learned = LearnedViews(assembly_views(), CAMERA)
+    learned = AppearanceMemory(assembly_views(), CAMERA)
     pose = pose_from(0, 40, 520)
     image = picture(pose, scene=1)
 
@@ -132,7 +132,7 @@ def test_only_what_is_tracked_well_and_new_is_learned() -> None:
 
 
 def test_the_silhouette_is_that_of_the_part() -> None:
-    learned = LearnedViews(assembly_views(), CAMERA)
+    learned = AppearanceMemory(assembly_views(), CAMERA)
     for azimuth, elevation in SIDES:
         pose = pose_from(azimuth, elevation, 480)
         cut = learned._cut(picture(pose, scene=2), pose)
@@ -151,7 +151,7 @@ def test_the_silhouette_is_that_of_the_part() -> None:
 def test_nothing_is_believed_where_there_is_no_part_or_another_side_of_it() -> None:
     options = SessionOptions(eager_frames=0, search_every=1000)
     session = TrackingSession(assembly_views(), assembly(), CAMERA, options)
-    session.learned = six_sides()
+    session.appearance_memory = six_sides()
     session.state = TrackingState.LOST
     for k in range(12):
         session._last_seen = pose_from(*SIDES[k % 6], 520)
@@ -165,20 +165,20 @@ def test_nothing_is_believed_where_there_is_no_part_or_another_side_of_it() -> N
 
 def test_a_lost_part_is_found_in_any_frame_where_it_looks_as_it_did() -> None:
     found = {}
-    for use_learned in (True, False):
+    for use_appearance_memory in (True, False):
         # The detector never searches the whole picture.
-        options = SessionOptions(eager_frames=0, search_every=10_000, use_learned=use_learned)
+        options = SessionOptions(eager_frames=0, search_every=10_000, use_appearance_memory=use_appearance_memory)
         session = TrackingSession(assembly_views(), assembly(), CAMERA, options, initial_cam_from_model=path(1)[0])
         for k, pose in enumerate(path(20)):
             tracked = session.process(picture(pose, seed=k, scene=1), k, k / 30)
         assert tracked.state == TrackingState.TRACKED
-        assert len(session.learned) == (1 if use_learned else 0)
+        assert len(session.appearance_memory) == (1 if use_appearance_memory else 0)
         while session.state != TrackingState.LOST:
             session.process(np.full((480, 640, 3), 90, dtype=np.uint8), 20, 1.0)
         truth = path(20)[-1]
         truth[:2, 3] += [-90, -40]
         pose = session.process(picture(truth, seed=99, scene=1), 21, 1.0).cam_from_model
-        found[use_learned] = pose is not None and error(pose, truth)[0] < 5
+        found[use_appearance_memory] = pose is not None and error(pose, truth)[0] < 5
     assert found == {True: True, False: False}
 
 
@@ -186,13 +186,13 @@ def test_views_are_saved_and_loaded(tmp_path: Path) -> None:
     learned, file = six_sides(), tmp_path / "assembly.learned"
     learned.save(file)
     assert [p.name for p in tmp_path.iterdir()] == [file.name]
-    other = LearnedViews(assembly_views(), CAMERA)
+    other = AppearanceMemory(assembly_views(), CAMERA)
     other.load(file)
     assert np.array_equal(other.rotations, learned.rotations)
     image = picture(pose_from(2, 32, 500), scene=3)
     mine, theirs = learned.propose(image), other.propose(image)
     assert mine and np.allclose(mine[0].cam_from_model, theirs[0].cam_from_model)
-    small = LearnedViews(assembly_views(), CAMERA, LearnedOptions(max_views=3))
+    small = AppearanceMemory(assembly_views(), CAMERA, AppearanceMemoryOptions(max_views=3))
     small.load(file)
     assert len(small) == 3
 
@@ -206,9 +206,9 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "views.learned"
     six_sides().save(file)
     with pytest.raises(MismatchError, match=r"views\.learned: learned views of model 'assembly'.*'bracket'"):
-        LearnedViews(bracket_views(), CAMERA).load(file)
+        AppearanceMemory(bracket_views(), CAMERA).load(file)
     whole = file.read_bytes()
-    learned = LearnedViews(assembly_views(), CAMERA)
+    learned = AppearanceMemory(assembly_views(), CAMERA)
     for content in (b"", b"text", whole[: len(whole) // 2], whole[:-4000] + bytes(4000)):
         file.write_bytes(content)
         with pytest.raises(InputError, match=r"views\.learned.*delete the file") as caught:
@@ -222,6 +222,6 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 def test_options_without_sense_are_refused() -> None:
     with pytest.raises(InputError, match="max_views"):
-        LearnedOptions(max_views=0)
+        AppearanceMemoryOptions(max_views=0)
     with pytest.raises(InputError, match="stretch"):
-        LearnedOptions(stretch=1.0)
+        AppearanceMemoryOptions(stretch=1.0)

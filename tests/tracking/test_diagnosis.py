@@ -11,26 +11,28 @@ from arview.annotation import reasons_text
 from arview.detection.detector import Rejected
 from arview.geometry import Array
 from arview.pose import TrackingState
-from arview.refinement.evidence import Evidence
+from arview.refinement.evidence import PoseEvidence
 from arview.tracking import Estimate, TrackingSession
 from arview.tracking.diagnosis import (
     BLURRED,
     NOTHING,
+    diagnose_loss,
+    diagnose_search,
     edge_widths_px,
     poor_picture,
-    why_lost,
-    why_not,
 )
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, background, picture, pose_from
 
 TRUTH = pose_from(30, 40, 520)
-GOOD = Evidence(0.9, 0.8, 0.4, 0.9, 0.9, 0.2, 1.0)
-WEAK = Evidence(0.31, 0.2, 0.4, 0.4, 0.4, 0.1, 1.0)
+GOOD = PoseEvidence(0.9, 0.8, 0.4, 0.9, 0.9, 0.2, 1.0)
+WEAK = PoseEvidence(0.31, 0.2, 0.4, 0.4, 0.4, 0.1, 1.0)
 
 
-def why(image: NDArray[np.uint8], pose: Array | None = None, evidence: Evidence = WEAK, quality: float = 0.2) -> str:
+def why(
+    image: NDArray[np.uint8], pose: Array | None = None, evidence: PoseEvidence = WEAK, quality: float = 0.2
+) -> str:
     rejected = None if pose is None else Rejected(pose, evidence, quality)
-    return why_not(image, CAMERA, assembly_views(), rejected)
+    return diagnose_search(image, CAMERA, assembly_views(), rejected)
 
 
 def on_plain(image: NDArray[np.uint8], level: float = 150.0) -> NDArray[np.uint8]:
@@ -147,7 +149,7 @@ def test_directions_and_rolls_outside_the_declared_range() -> None:
 def test_partly_outside_the_picture(shift_mm: tuple[float, float], edge: str) -> None:
     pose = TRUTH.copy()
     pose[:2, 3] += shift_mm
-    evidence = Evidence(0.5, 0.5, 0.4, 0.5, 0.5, 0.1, 0.5)
+    evidence = PoseEvidence(0.5, 0.5, 0.4, 0.5, 0.5, 0.1, 0.5)
     assert why(picture(pose), pose, evidence) == f"partly outside the picture at the {edge} edge"
 
 
@@ -171,9 +173,9 @@ def lost(pose: Array, step_mm: float, in_picture: float, image: NDArray[np.uint8
     before = [pose.copy(), pose.copy()]
     before[0][0, 3] -= 2 * step_mm
     before[1][0, 3] -= step_mm
-    evidence = Evidence(0.1, 0.1, 0.4, 0.2, 0.1, 0.1, in_picture)
+    evidence = PoseEvidence(0.1, 0.1, 0.4, 0.2, 0.1, 0.1, in_picture)
     estimate = Estimate(pose, np.eye(6), 0.02, evidence)
-    return why_lost(image, estimate, (before[0], before[1]), CAMERA, assembly_views(), is_possible)
+    return diagnose_loss(image, estimate, (before[0], before[1]), CAMERA, assembly_views(), is_possible)
 
 
 def test_why_a_part_was_lost() -> None:

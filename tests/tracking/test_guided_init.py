@@ -21,7 +21,7 @@ from arview.overlay import OverlayOptions, OverlayRenderer
 from arview.pose import Pose, TrackingState
 from arview.tracking import SessionOptions, TrackingSession
 from arview.tracking.guide_pose import guide_names, guide_pose
-from arview.tracking.guided_init import Snap
+from arview.tracking.guided_init import GuidedInit
 from arview.tracking.session import ALIGN
 from helpers.cad_files import box, obj_text
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, block, error, picture, pose_from
@@ -36,8 +36,8 @@ def part_of(*guides: Guide) -> Part:
 
 
 @cache
-def snap() -> Snap:
-    return Snap(assembly_views(), CAMERA)
+def guided_init() -> GuidedInit:
+    return GuidedInit(assembly_views(), CAMERA)
 
 
 def moved(
@@ -165,7 +165,7 @@ def test_guides_of_a_part_file(tmp_path: Path) -> None:
         assert words in str(caught.value)
 
 
-# --- Snap -----------------------------------------------------------------------------------------------
+# --- GuidedInit -----------------------------------------------------------------------------------------------
 
 
 def test_the_part_snaps_from_within_15_degrees_and_15_percent() -> None:
@@ -176,7 +176,7 @@ def test_the_part_snaps_from_within_15_degrees_and_15_percent() -> None:
             rng.uniform(-70, 70), rng.uniform(22, 68), rng.uniform(450, 600), roll_deg=rng.uniform(-15, 15)
         )
         guide = moved(truth, rng, 15.0, 0.15, 0.15)
-        found = snap().lock(picture(truth, seed=k, scene=k % 9, noise=4.0), guide, 0.8)
+        found = guided_init().lock(picture(truth, seed=k, scene=k % 9, noise=4.0), guide, 0.8)
         if found is not None:
             mm, _, deg = error(found.cam_from_model, truth)
             assert mm < 5.0 and deg < 2.0
@@ -198,9 +198,9 @@ def test_nothing_snaps_without_the_part_or_when_it_is_elsewhere() -> None:
         else:
             guide = truth.copy()
             guide[0, 3] += 0.6 * assembly().diameter_mm
-        if k % 4 == 1 and snap().is_near(guide, truth):
+        if k % 4 == 1 and guided_init().is_near(guide, truth):
             continue
-        assert snap().lock(picture(seen, seed=k, scene=k, noise=4.0), guide, 0.8) is None
+        assert guided_init().lock(picture(seen, seed=k, scene=k, noise=4.0), guide, 0.8) is None
 
 
 def test_a_figure_inside_a_larger_one_is_not_taken_for_the_part() -> None:
@@ -209,7 +209,7 @@ def test_a_figure_inside_a_larger_one_is_not_taken_for_the_part() -> None:
                              GuideViewOptions(subdivisions=3, renderer="zbuffer"))  # fmt: skip
     small, large = pose_from(40, 35, 560, block()), pose_from(40, 35, 260, block())
     image = picture(small, block(), noise=3.0, contrast=3.0)
-    of_block = Snap(views, CAMERA)
+    of_block = GuidedInit(views, CAMERA)
     found = of_block.lock(image, small, 0.8)
     assert found is not None
     assert error(found.cam_from_model, small, block())[0] < 5.0
@@ -229,8 +229,8 @@ def test_a_pose_behind_the_camera_or_outside_the_picture_finds_nothing() -> None
     behind[2, 3] -= 2000.0
     outside[0, 3] += 5000.0
     for pose in (behind, outside):
-        assert snap().lock(image, pose, 0.8) is None
-    assert snap().find(image, behind) is None
+        assert guided_init().lock(image, pose, 0.8) is None
+    assert guided_init().find(image, behind) is None
 
 
 # --- Session --------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from arview.geometry import Array, exp_so3, rigid
 from arview.refinement.schedules import LAST_STAGES
 from arview.tracking import Tracker, TrackerOptions
 from arview.tracking.motion import squared_motion_distance
-from arview.tracking.pose_recheck import SecondLook
+from arview.tracking.pose_recheck import LocalSearchRecheck
 from helpers.synthetic import CAMERA, assembly, assembly_views, error, half_hidden, path, picture, pose_from, wrong
 
 SLOW = path(12)
@@ -31,8 +31,8 @@ def local() -> LocalSearch:
 
 
 @cache
-def second_look() -> SecondLook:
-    return SecondLook(local())
+def second_look() -> LocalSearchRecheck:
+    return LocalSearchRecheck(local())
 
 
 def in_body(cam_from_model: Array) -> Array:
@@ -125,7 +125,7 @@ def test_a_verified_hypothesis_keeps_its_place_in_the_list() -> None:
     assert verified[1].logit > verified[0].logit + 3.0
 
 
-class Watched(SecondLook):
+class Watched(LocalSearchRecheck):
     """Counts how often it is asked."""
 
     asked = 0
@@ -136,10 +136,10 @@ class Watched(SecondLook):
 
 
 def follow(
-    poses: list[Array], second: SecondLook | None, noise: float, is_hidden: bool = False
+    poses: list[Array], second: LocalSearchRecheck | None, noise: float, is_hidden: bool = False
 ) -> list[tuple[float, float, float]]:
     """Errors of each frame: mm, mm across, degrees; begun again at the truth after each that is off by 5°."""
-    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_feature=False), assembly(), second)
+    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_texture=False), assembly(), second)
     tracker.start(picture(poses[0], noise=noise), poses[0])
     errors = []
     for k, truth in enumerate(poses[1:], 1):

@@ -18,7 +18,7 @@ from arview.pose import Pose, TrackingState
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.schedules import TRACK_STAGES
 from arview.tracking import Estimate, SessionOptions, Tracker, TrackerOptions, TrackingSession
-from arview.tracking.wide_search import NonlocalSearch
+from arview.tracking.wide_search import WideSearch
 from helpers.synthetic import (
     CAMERA,
     assembly,
@@ -35,8 +35,8 @@ from helpers.synthetic import (
 
 MODALITIES = {
     "all": TrackerOptions(),
-    "region": TrackerOptions(use_edge=False, use_feature=False),
-    "edge": TrackerOptions(use_region=False, use_feature=False),
+    "region": TrackerOptions(use_edge=False, use_texture=False),
+    "edge": TrackerOptions(use_region=False, use_texture=False),
     "feature": TrackerOptions(use_region=False, use_edge=False),
 }
 PATH = path(40)
@@ -125,7 +125,7 @@ def test_a_start_that_is_off_is_pulled_in() -> None:
 def test_a_part_that_moved_far_between_frames_is_found() -> None:
     """20° to 35° and up to a quarter of the diameter aside in one frame; the next ones need no search."""
     rng = np.random.default_rng(3)
-    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_feature=False))
+    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_texture=False))
     right = 0
     for k in range(12):
         first = pose_from(rng.uniform(-60, 60), rng.uniform(25, 60), 520)
@@ -142,9 +142,9 @@ def test_a_part_that_moved_far_between_frames_is_found() -> None:
 def test_a_part_that_moved_a_tenth_of_its_size_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """6° to 10° and 16 to 30 mm in one frame, with noise: stages in which colours lead reach it (27 of 30, without
     them 1)."""
-    monkeypatch.setattr(NonlocalSearch, "find", lambda *_: [])
+    monkeypatch.setattr(WideSearch, "find", lambda *_: [])
     rng = np.random.default_rng(5)
-    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_feature=False))
+    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_texture=False))
     right = 0
     for k in range(12):
         first = pose_from(rng.uniform(-60, 60), rng.uniform(25, 60), 520)
@@ -159,7 +159,7 @@ def test_tracking_before_a_start_is_a_mistake() -> None:
     with pytest.raises(RuntimeError, match=r"before Tracker\.start"):
         Tracker(assembly_views(), CAMERA).track(clip()[0])
     with pytest.raises(InputError, match="at least one modality"):
-        TrackerOptions(use_region=False, use_edge=False, use_feature=False)
+        TrackerOptions(use_region=False, use_edge=False, use_texture=False)
 
 
 # --- Covariance and quality -----------------------------------------------------------------------------
@@ -200,7 +200,7 @@ def test_covariance_is_never_too_small_on_ideal_pictures_and_grows_with_hiding()
 def test_quality_parts_right_from_wrong_poses() -> None:
     """Wrong starts that the stages alone leave elsewhere must not be believed; the search finds the part from them."""
     rng = np.random.default_rng(5)
-    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_feature=False))
+    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_texture=False))
     right, mistaken, found = [], [], 0
     for k in range(40):
         truth = pose_from(

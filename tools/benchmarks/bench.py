@@ -27,7 +27,7 @@ from suites.live_latency import live_latencies
 from suites.registration import MEASURED, REFERENCE, registrations
 
 Row = tuple[str, str, str]
-MODALITIES = {"region+edge": SessionOptions(use_feature=False), "all three": SessionOptions()}
+MODALITIES = {"region+edge": SessionOptions(use_texture=False), "all three": SessionOptions()}
 DETECTED_FRAMES = 12
 
 

@@ -287,7 +287,7 @@ def annotate(
             guide_cam_from_model=guide,
         )
         if learned_file is not None and learned_file.exists():
-            session.learned.load(learned_file)
+            session.appearance_memory.load(learned_file)
         overlay = sink = None
         if video_path is not None:
             looks = OverlayOptions(
@@ -313,8 +313,8 @@ def annotate(
         say(f"warning: {sink.audio_note}")
     _print_annotated(summary, [path for path in (video_path, poses_file) if path is not None])
     if learned_file is not None:
-        session.learned.save(learned_file)
-        click.echo(f"wrote {learned_file}: {len(session.learned)} learned views")
+        session.appearance_memory.save(learned_file)
+        click.echo(f"wrote {learned_file}: {len(session.appearance_memory)} learned views")
     if summary.is_interrupted:
         say("interrupted")
         ctx.exit(EXIT_INTERRUPTED)
@@ -424,9 +424,9 @@ def _session_options(modalities: tuple[str, ...]) -> SessionOptions:
     return SessionOptions(
         use_region="region" in modalities,
         use_edge="edge" in modalities,
-        use_feature="feature" in modalities,
+        use_texture="feature" in modalities,
         # It asks edges and colours.
-        use_second_look={"region", "edge"} <= set(modalities),
+        use_recheck={"region", "edge"} <= set(modalities),
     )
 
 

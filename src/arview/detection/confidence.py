@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from arview.refinement.evidence import Evidence
+from arview.refinement.evidence import PoseEvidence
 
 
-def found_features(evidence: Evidence, lines: float, radius_px: float) -> tuple[float, ...]:
+def found_features(evidence: PoseEvidence, lines: float, radius_px: float) -> tuple[float, ...]:
     """What speaks for a pose that was found without history, for `found_logit`."""
     share = min(0.5, evidence.inner_share)
     colours = max(evidence.region_support, 0.0) * min(evidence.region_information / 0.2, 1.0)
@@ -69,7 +69,7 @@ class Leads:
     elsewhere: float
 
 
-def found_logit(evidence: Evidence, lines: float, radius_px: float) -> float:
+def found_logit(evidence: PoseEvidence, lines: float, radius_px: float) -> float:
     """By how much one of many hypotheses of a picture is likelier than another.
 
     Args:

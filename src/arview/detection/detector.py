@@ -36,7 +36,7 @@ from arview.errors import InputError
 from arview.geometry import Array, turned
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
-from arview.refinement.evidence import Evidence
+from arview.refinement.evidence import PoseEvidence
 
 SURE_QUALITY = 0.6
 """So much is wanted of a quick search alone: with few rivals looked at, a lead says less. Of 600 semi-synthetic frames
@@ -115,7 +115,7 @@ class Rejected:
     """The best hypothesis that the detector did not believe: ``cam_from_model`` (4,4), evidence and quality."""
 
     cam_from_model: Array
-    evidence: Evidence
+    evidence: PoseEvidence
     quality: float
 
 

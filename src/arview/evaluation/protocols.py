@@ -19,7 +19,7 @@ from arview.evaluation.run import COARSE, IN_VIEW
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.tracking import Tracker
-from arview.tracking.pose_recheck import SecondLook
+from arview.tracking.pose_recheck import LocalSearchRecheck
 
 EQUAL_SIDES = 0.05
 """Sides of a box that differ by less are taken for equal."""
@@ -88,7 +88,9 @@ def track_with_resets(scene: Scene, views: GuideViewSet, step: int = 1, most_fra
         most_frames: look at no more of the scene than its first frames.
     """
     frames = scene.frames[:most_frames:step]
-    tracker = Tracker(views, scene.camera, model=scene.part.model, recheck=SecondLook(LocalSearch(views, scene.camera)))
+    tracker = Tracker(
+        views, scene.camera, model=scene.part.model, recheck=LocalSearchRecheck(LocalSearch(views, scene.camera))
+    )
     meter = PoseMeter(scene.part.model, scene.camera, symmetries=scene.part.symmetries)
     tracker.start(scene.image(frames[0]), true_pose(frames[0]))
     right, ms = 0, []

@@ -16,7 +16,7 @@ from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PoseEvidence:
     """Evidence for a pose.
 
     Attributes:
@@ -40,8 +40,8 @@ class Evidence:
     scatter_px: float = 0.5
 
     @property
-    def worth(self) -> float:
-        """Sum of what speaks for the pose, 0 to about 1.5; right and wrong poses part at about RIGHT_WORTH.
+    def score(self) -> float:
+        """Sum of what speaks for the pose, 0 to about 1.5; right and wrong poses part at about DECISION_SCORE.
 
         Outline and, as far as the part has them, design edges count; colours that change along the outline add
         to it, by how sure they are, where design edges are few: on soft or blurred
@@ -55,16 +55,16 @@ class Evidence:
     @property
     def quality(self) -> float:
         """0–1, 0.5 where right and wrong poses part on the recorded sequences."""
-        return quality_of(self.worth) if self.points_in_picture > 0.05 else 0.0
+        return quality_of(self.score) if self.points_in_picture > 0.05 else 0.0
 
 
-RIGHT_WORTH = 0.58
-"""Between the worths of right and wrong poses on the recorded sequences."""
+DECISION_SCORE = 0.58
+"""Between the scores of right and wrong poses on the recorded sequences."""
 
 
-def quality_of(worth: float) -> float:
-    """Logistic of a worth, 0–1."""
-    return float(1.0 / (1.0 + np.exp(-(worth - RIGHT_WORTH) * 16.0)))
+def quality_of(score: float) -> float:
+    """Logistic of a score, 0–1."""
+    return float(1.0 / (1.0 + np.exp(-(score - DECISION_SCORE) * 16.0)))
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class EdgeSteps:
 
 @kernel
 def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  # type: ignore[no-untyped-def]
-    """contour_support, inner_support, inner_share, sharpness, points_in_picture and scatter_px, see Evidence."""
+    """contour_support, inner_support, inner_share, sharpness, points_in_picture and scatter_px, see PoseEvidence."""
     hits = np.zeros(2)
     chances = np.zeros(2)
     counts = np.zeros(2)

@@ -133,7 +133,7 @@ def run_evidence(  # type: ignore[no-untyped-def]
     image, gray, bin_of, odds, has_colours, edge_function, part, cam_from_body, intrinsics, step_mm,
     edge_threshold, tolerance_px
 ):  # fmt: skip
-    """The numbers of `Evidence` at a pose."""
+    """The numbers of `PoseEvidence` at a pose."""
     directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
     view = nearest_view(directions, cam_from_body)
     first, last = e_start[view], e_start[view + 1]

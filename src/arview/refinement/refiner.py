@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.refinement.evidence import EdgeSteps, Evidence
+from arview.refinement.evidence import EdgeSteps, PoseEvidence
 from arview.refinement.kernels import count_colours, run_edge_steps, run_evidence, run_stages
 from arview.refinement.modalities.region import BINS, EDGE_FUNCTION, log_odds, value_bins
 from arview.refinement.modalities.shading import GAIN, look_at, shade
-from arview.refinement.modalities.texture import Matches
+from arview.refinement.modalities.texture import TextureMatches
 from arview.refinement.projection import intrinsics_of
 from arview.refinement.schedules import Stage
 from arview.refinement.view_model import PartView
 
-NO_MATCHES = Matches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
+NO_MATCHES = TextureMatches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
 """Matches of a frame in which texture is not used."""
 
 
@@ -163,7 +163,7 @@ class PoseRefiner:
         cam_from_body: Array,
         stages: tuple[Stage, ...],
         appearance: Appearance,
-        matches: Matches = NO_MATCHES,
+        matches: TextureMatches = NO_MATCHES,
     ) -> tuple[Array, Array]:
         """Pose and information after the given stages.
 
@@ -221,9 +221,9 @@ class PoseRefiner:
         cam_from_body: Array,
         appearance: Appearance,
         tolerance_px: float = 1.5,
-    ) -> Evidence:
+    ) -> PoseEvidence:
         """How well the picture supports a pose (4,4); steps count within a tolerance."""
-        return Evidence(
+        return PoseEvidence(
             *run_evidence(
                 image, gray, appearance.bin_of, appearance.odds, appearance.is_known, EDGE_FUNCTION,
                 self.part.arrays, cam_from_body, self.intrinsics, self._step_mm, self.options.edge_threshold,

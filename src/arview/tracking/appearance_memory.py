@@ -45,7 +45,7 @@ HOPPED, HOPS, HOP_DEG = 3, 6, 40.0
 
 
 @dataclass(frozen=True)
-class LearnedOptions:
+class AppearanceMemoryOptions:
     """Options of the learned views.
 
     Attributes:
@@ -102,17 +102,17 @@ class Proposal:
     view: int
 
 
-class LearnedViews:
+class AppearanceMemory:
     """A bounded number of views of one part, learned while it was tracked.
 
     Args:
         views: guide views of the part; they say where its silhouette is.
         camera: intrinsics of the frames; kept views serve with any camera.
-        options: see LearnedOptions.
+        options: see AppearanceMemoryOptions.
     """
 
-    def __init__(self, views: GuideViewSet, camera: Camera, options: LearnedOptions | None = None) -> None:
-        self.options = o = options or LearnedOptions()
+    def __init__(self, views: GuideViewSet, camera: Camera, options: AppearanceMemoryOptions | None = None) -> None:
+        self.options = o = options or AppearanceMemoryOptions()
         self.views = views
         self.camera = camera
         self._focal = 0.5 * (camera.fx + camera.fy)

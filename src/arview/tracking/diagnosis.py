@@ -46,7 +46,7 @@ FAST = 0.07
 BLURRED = "blurred"
 
 
-def why_not(image: NDArray[np.uint8], camera: Camera, views: GuideViewSet, rejected: Rejected | None) -> str:
+def diagnose_search(image: NDArray[np.uint8], camera: Camera, views: GuideViewSet, rejected: Rejected | None) -> str:
     """The likeliest reason why the part is not found.
 
     Args:
@@ -151,7 +151,7 @@ def outside_range(place: Viewpoint, view_range: ViewRange, is_fitting: bool) -> 
     return ""
 
 
-def why_lost(
+def diagnose_loss(
     image: NDArray[np.uint8],
     estimate: Estimate,
     recent: tuple[Array, Array] | None,

@@ -10,7 +10,7 @@ DECIDED = 0.25
 """The same for the sum of the differences over frames."""
 
 
-class Rivals:
+class HypothesisSet:
     """Twins of a tracked pose, told from it by what the frames bear out.
 
     Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from arview.geometry import Array
-from arview.refinement.evidence import Evidence
+from arview.refinement.evidence import PoseEvidence
 
 
 @dataclass(frozen=True)
@@ -15,11 +15,11 @@ class Estimate:
     Attributes:
         cam_from_model: (4,4) mm.
         information: (6,6) of the twist (rad, mm) about the model's centre.
-        quality: 0–1, see `Evidence.quality`.
+        quality: 0–1, see `PoseEvidence.quality`.
         evidence: of the picture for the pose.
     """
 
     cam_from_model: Array
     information: Array
     quality: float
-    evidence: Evidence
+    evidence: PoseEvidence

@@ -1,4 +1,4 @@
-"""Snap: finds the part near a given pose, quickly enough to be tried on every frame of a video.
+"""Guided initialisation: finds the part near a given pose, quickly enough to be tried on every frame of a video.
 
 The picture around the pose is made small, so that the part always spans the same few pixels. Turns, distances and
 shifts within reach are scored there by oriented edges, the best again at a higher resolution, and the best of those
@@ -19,7 +19,7 @@ from arview.detection.features.response_maps import response_maps, score_around
 from arview.geometry import Array, apply, are_near, rotation_angle_rad, turn_ball
 from arview.guideviews import GuideViewSet
 from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
-from arview.refinement.evidence import Evidence
+from arview.refinement.evidence import PoseEvidence
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.projection import intrinsics_of
 from arview.refinement.refiner import PoseRefiner
@@ -28,7 +28,7 @@ from arview.refinement.view_model import PartView
 
 
 @dataclass(frozen=True)
-class SnapOptions:
+class GuidedInitOptions:
     """Options of the snap.
 
     Attributes:
@@ -36,27 +36,28 @@ class SnapOptions:
             taken for the part; the distance is a share, the offset in diameters of the part. They are wider than
             the search (15°, 15 % and 15 %), because the best pose on its rim may lie just outside.
         min_in_picture: less of the outline inside the picture is not judged.
-        least_coarse, least_fine: edge scores of the two rounds below which the part is not there.
-        least_worth: of a pose less what its view is plain by; right and wrong poses part a little below.
-        rival_worth: a nearer pose around the found one that is worth this share of it makes the found one doubtful.
+        min_coarse, min_fine: edge scores of the two rounds below which the part is not there.
+        min_score: of a pose less what its view is plain by; right and wrong poses part a little below.
+        rival_score_share: a nearer pose around the found one with this share of its score makes
+            the found one doubtful.
     """
 
     turn_limit_deg: float = 20.0
     distance_limit: float = 0.2
     offset_limit: float = 0.2
     min_in_picture: float = 0.4
-    rival_worth: float = 0.8
-    least_coarse: float = 0.34
-    least_fine: float = 0.4
-    least_worth: float = 0.6
+    rival_score_share: float = 0.8
+    min_coarse: float = 0.34
+    min_fine: float = 0.4
+    min_score: float = 0.6
 
 
 @dataclass(frozen=True)
-class Snapped:
+class GuidedPose:
     """A pose found near a given one: ``cam_from_model`` (4,4), its evidence and its quality."""
 
     cam_from_model: Array
-    evidence: Evidence
+    evidence: PoseEvidence
     quality: float
 
 
@@ -91,29 +92,29 @@ RIVAL_DISTANCE = 0.55
 NEARER = 0.85
 """A rival at a larger share of the distance is the same pose."""
 SPREAD_PX = 2
-PLAIN_WORTH = 0.3
+PLAIN_SCORE = 0.3
 """What a view without any line of its own takes from a pose's worth."""
 CROP_REACH = 1.35
 """Radii around the part's middle that are looked at: it may be nearer than the given pose says."""
 
 
-class Snap:
+class GuidedInit:
     """Search for one part with one camera around given poses.
 
     Args:
         views: guide views of the part.
         camera: intrinsics of the frames.
-        options: see SnapOptions.
+        options: see GuidedInitOptions.
     """
 
-    def __init__(self, views: GuideViewSet, camera: Camera, options: SnapOptions | None = None) -> None:
-        self.options = options or SnapOptions()
+    def __init__(self, views: GuideViewSet, camera: Camera, options: GuidedInitOptions | None = None) -> None:
+        self.options = options or GuidedInitOptions()
         self.camera = camera
         self._views = views
         self._center_in_model = views.center_in_model
         self._refiner = PoseRefiner(PartView(views), camera)
 
-    def find(self, image: NDArray[np.uint8], cam_from_model: Array) -> Snapped | None:
+    def find(self, image: NDArray[np.uint8], cam_from_model: Array) -> GuidedPose | None:
         """The best pose within 15°, 15 % of the distance and 15 % of the diameter aside.
 
         Its quality says whether it is right; it is returned even when that is low.
@@ -131,27 +132,27 @@ class Snap:
         near = self._search(image, start, [start], COARSE)
         return self._best(image, [start, *self._search(image, start, near, FINE)])
 
-    def lock(self, image: NDArray[np.uint8], cam_from_model: Array, min_quality: float) -> Snapped | None:
+    def lock(self, image: NDArray[np.uint8], cam_from_model: Array, min_quality: float) -> GuidedPose | None:
         """The part's pose when it is near the given one beyond doubt, else None.
 
-        A pose must be good, near enough (see `SnapOptions`) and borne out the better the plainer the part looks
+        A pose must be good, near enough (see `GuidedInitOptions`) and borne out the better the plainer the part looks
         from there. A plain part must not be a figure inside itself either: print on a box may look like a smaller
         box, and then a nearer pose around it fits as well. Most pictures without the part are done with after the
         first round.
         """
         start = cam_from_model @ self._refiner.part.model_from_body
-        near = self._search(image, start, [start], COARSE, self.options.least_coarse)
-        found = self._best(image, self._search(image, start, near, FINE, self.options.least_fine))
+        near = self._search(image, start, [start], COARSE, self.options.min_coarse)
+        found = self._best(image, self._search(image, start, near, FINE, self.options.min_fine))
         if found is None or found.quality < min_quality or not self.is_near(found.cam_from_model, cam_from_model):
             return None
         lines = view_lines(self._views.nearest(found.cam_from_model), self._views.diameter_mm)
         plainness = max(1.0 - lines / (2.0 * PLAIN_LINES), 0.0)
-        if found.evidence.worth - PLAIN_WORTH * plainness < self.options.least_worth:
+        if found.evidence.score - PLAIN_SCORE * plainness < self.options.min_score:
             return None
         return None if lines < PLAIN_LINES and self._has_rival(image, found) else found
 
     def is_near(self, cam_from_model: Array, guide_cam_from_model: Array) -> bool:
-        """Whether a pose is within the limits of `SnapOptions` around a given one."""
+        """Whether a pose is within the limits of `GuidedInitOptions` around a given one."""
         o = self.options
         center = apply(cam_from_model, self._center_in_model)
         wanted = apply(guide_cam_from_model, self._center_in_model)
@@ -164,14 +165,14 @@ class Snap:
             and aside_mm <= o.offset_limit * self._refiner.diameter_mm
         )
 
-    def _has_rival(self, image: NDArray[np.uint8], found: Snapped) -> bool:
+    def _has_rival(self, image: NDArray[np.uint8], found: GuidedPose) -> bool:
         """Whether a much nearer pose around the found one fits about as well."""
         pose = found.cam_from_model @ self._refiner.part.model_from_body
         nearer = pose.copy()
         nearer[:3, 3] *= RIVAL_DISTANCE
         starts = self._search(image, nearer, self._search(image, nearer, [nearer], RIVAL), FINE)
         rival = self._best(image, starts)
-        if rival is None or rival.evidence.worth < self.options.rival_worth * found.evidence.worth:
+        if rival is None or rival.evidence.score < self.options.rival_score_share * found.evidence.score:
             return False
         center = apply(rival.cam_from_model, self._center_in_model)
         return bool(np.linalg.norm(center) < NEARER * np.linalg.norm(pose[:3, 3]))
@@ -234,21 +235,21 @@ class Snap:
         intrinsics[2:4] += pad
         return response_maps(part, SPREAD_PX, pad), intrinsics
 
-    def _best(self, image: NDArray[np.uint8], starts: list[Array]) -> Snapped | None:
+    def _best(self, image: NDArray[np.uint8], starts: list[Array]) -> GuidedPose | None:
         """The start that is worth most after refinement."""
         if not starts:
             return None
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
-        def refine(start: Array) -> Snapped:
+        def refine(start: Array) -> GuidedPose:
             pose = self._refiner.refine_fresh(image, gray, start, SETTLING_STAGES)
             look = self._refiner.appearance_at(image, pose)
             evidence = self._refiner.evidence(image, gray, pose, look)
             is_inside = evidence.points_in_picture >= self.options.min_in_picture
             quality = evidence.quality if is_inside else 0.0
-            return Snapped(pose @ self._refiner.part.body_from_model, evidence, quality)
+            return GuidedPose(pose @ self._refiner.part.body_from_model, evidence, quality)
 
-        return max(pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.worth))
+        return max(pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.score))
 
     def _same(self, a: Array, b: Array, angle_deg: float) -> bool:
         return are_near(a, b, 0.01 * angle_deg * self._refiner.diameter_mm, angle_deg)

@@ -37,7 +37,7 @@ LEAST_LEAD = 1.0
 """By so much another pose must be likelier than the tracked one."""
 
 
-class SecondLook:
+class LocalSearchRecheck:
     """Looks again where a tracked pose surprises.
 
     Args:

@@ -26,12 +26,12 @@ from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, check_rigid, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
-from arview.tracking.appearance_memory import LearnedViews, Proposal
-from arview.tracking.diagnosis import NOTHING, poor_picture, why_lost, why_not
-from arview.tracking.disambiguation import Rivals
+from arview.tracking.appearance_memory import AppearanceMemory, Proposal
+from arview.tracking.diagnosis import NOTHING, diagnose_loss, diagnose_search, poor_picture
+from arview.tracking.disambiguation import HypothesisSet
 from arview.tracking.estimate import Estimate
-from arview.tracking.guided_init import Snap
-from arview.tracking.pose_recheck import SecondLook
+from arview.tracking.guided_init import GuidedInit
+from arview.tracking.pose_recheck import LocalSearchRecheck
 from arview.tracking.tracker import Tracker, TrackerOptions
 
 ALIGN = "align the part with the outline"
@@ -43,9 +43,9 @@ class SessionOptions:
     """Options of a session.
 
     Attributes:
-        use_region, use_edge, use_feature: modalities of the tracker.
-        use_second_look: ask the detector's local search where a tracked pose surprises, see `SecondLook`.
-        use_learned: remember how the part looks while it is tracked well, and look for that after a loss.
+        use_region, use_edge, use_texture: modalities of the tracker.
+        use_recheck: ask the detector's local search where a tracked pose surprises, see `LocalSearchRecheck`.
+        use_appearance_memory: remember how the part looks while it is tracked well, and look for that after a loss.
         lock_quality: a detection must be this good to be believed at once; a weaker one must hold a second frame.
         tracked_quality: at least this to be or become ``tracked``.
         critical_quality: a tracked pose turns ``critical`` only below this (hysteresis).
@@ -61,9 +61,9 @@ class SessionOptions:
 
     use_region: bool = True
     use_edge: bool = True
-    use_feature: bool = True
-    use_second_look: bool = True
-    use_learned: bool = True
+    use_texture: bool = True
+    use_recheck: bool = True
+    use_appearance_memory: bool = True
     lock_quality: float = 0.8
     tracked_quality: float = 0.5
     critical_quality: float = 0.25
@@ -125,18 +125,18 @@ class TrackingSession:
             TrackerOptions(
                 use_region=self.options.use_region,
                 use_edge=self.options.use_edge,
-                use_feature=self.options.use_feature,
+                use_texture=self.options.use_texture,
             ),
             model,
-            SecondLook(self._local) if self.options.use_second_look else None,
+            LocalSearchRecheck(self._local) if self.options.use_recheck else None,
             self._local.refiner.part,
         )
         self._detector: Detector | None = None
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
-        self._snap: Snap | None = None
+        self._guided_init: GuidedInit | None = None
         self.components = AssemblyMonitor(views, camera, model)
-        self.learned = LearnedViews(views, camera)
+        self.appearance_memory = AppearanceMemory(views, camera)
         self.reset()
 
     @property
@@ -147,11 +147,11 @@ class TrackingSession:
         return self._detector
 
     @property
-    def snap(self) -> Snap:
+    def guided_init(self) -> GuidedInit:
         """The search around a given pose, made when first needed."""
-        if self._snap is None:
-            self._snap = Snap(self._views, self.camera)
-        return self._snap
+        if self._guided_init is None:
+            self._guided_init = GuidedInit(self._views, self.camera)
+        return self._guided_init
 
     @property
     def is_aligning(self) -> bool:
@@ -170,7 +170,7 @@ class TrackingSession:
         self._was_found = False
         self._recent: list[Array] = []
         self._last_seen: Array | None = None
-        self._rivals = Rivals([])
+        self._hypotheses = HypothesisSet([])
         self._why = self._why_lost = ""
 
     def process(self, image: NDArray[np.uint8], index: int, time_s: float) -> Pose:
@@ -197,8 +197,8 @@ class TrackingSession:
             estimate, reason = self._tell_apart(image, estimate, reason)
             reason = self._compare(image, estimate, reason)
             is_sure = self.state == TrackingState.TRACKED and self._confirmed
-            if self.options.use_learned:
-                self.learned.learn(image, estimate, is_sure)
+            if self.options.use_appearance_memory:
+                self.appearance_memory.learn(image, estimate, is_sure)
             if is_sure:
                 self._last_seen = estimate.cam_from_model
         ms = (time.perf_counter() - started) * 1e3
@@ -216,19 +216,19 @@ class TrackingSession:
             reason=reason,
             mismatches=self.components.mismatches,
             unverified=self.components.unverified,
-            alternatives=tuple(estimate.cam_from_model @ turn for turn in self._rivals.model_from_twins),
+            alternatives=tuple(estimate.cam_from_model @ turn for turn in self._hypotheses.model_from_twins),
         )
 
     def _tell_apart(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> tuple[Estimate, str]:
         """Watch the twins of an ambiguous pose until the frames say which is right."""
-        if not self._rivals:
+        if not self._hypotheses:
             return estimate, reason
-        twins = [estimate.cam_from_model @ turn for turn in self._rivals.model_from_twins]
-        better = self._rivals.update(estimate.evidence.worth, self.tracker.scores_near(image, twins))
+        twins = [estimate.cam_from_model @ turn for turn in self._hypotheses.model_from_twins]
+        better = self._hypotheses.update(estimate.evidence.score, self.tracker.scores_near(image, twins))
         if better is not None:
-            self._rivals = Rivals([])
+            self._hypotheses = HypothesisSet([])
             return self._begun(image, estimate.cam_from_model @ better), reason
-        count = len(self._rivals.model_from_twins)
+        count = len(self._hypotheses.model_from_twins)
         if count == 0 or reason:
             return estimate, reason
         self.state = TrackingState.CRITICAL
@@ -258,7 +258,7 @@ class TrackingSession:
         self._poor = self._poor + 1 if poor else 0
         if self._poor >= o.lost_frames or (poor and not self._confirmed):
             recent = (self._recent[0], self._recent[1]) if len(self._recent) == 2 else None
-            return self._lose(why_lost(image, estimate, recent, self.camera, self._views, is_possible))
+            return self._lose(diagnose_loss(image, estimate, recent, self.camera, self._views, is_possible))
         if not poor:
             self._recent = [*self._recent[-1:], estimate.cam_from_model]
         if not poor and quality >= (o.critical_quality if self._borne_out else o.tracked_quality):
@@ -273,7 +273,7 @@ class TrackingSession:
         return estimate, "the outline is hardly seen"
 
     def _lose(self, reason: str) -> tuple[None, str]:
-        self._rivals = Rivals([])
+        self._hypotheses = HypothesisSet([])
         self._poor = self._critical = 0
         if self._guide is not None and not self._confirmed:
             # It was aligned, but did not hold the second frame: go on as before.
@@ -295,11 +295,11 @@ class TrackingSession:
         o = self.options
         self._lost_frames += 1
         if self._initial is not None:
-            snapped = self.snap.find(image, self._initial)
+            found = self.guided_init.find(image, self._initial)
             self._initial = None
-            if snapped is None:
+            if found is None:
                 return None, "the part is outside the picture at the initial pose"
-            start = snapped.cam_from_model
+            start = found.cam_from_model
         elif self.state == TrackingState.SEARCHING and self._guide is not None:
             return self._align(image, self._guide)
         else:
@@ -313,7 +313,7 @@ class TrackingSession:
             if not detections:
                 return None, self._why_not(image, self.detector.best_rejected)
             start = detections[0].cam_from_model
-            self._rivals = Rivals([invert(start) @ twin for twin in detections[0].alternatives])
+            self._hypotheses = HypothesisSet([invert(start) @ twin for twin in detections[0].alternatives])
         estimate = self._begun(image, start)
         if estimate.quality < o.tracked_quality or not self._is_possible(estimate):
             return None, self._why_not(image, Rejected(estimate.cam_from_model, estimate.evidence, estimate.quality))
@@ -334,10 +334,10 @@ class TrackingSession:
         """Look for the part, first where it looks as it did; nowhere else while the search rests."""
         o = self.options
         proposals: list[Proposal] = []
-        if o.use_learned and self._last_seen is not None and (rests or self._lost_frames <= o.eager_frames):
-            proposals = self.learned.propose(image, self._last_seen)
-        if o.use_learned and not proposals and not rests:
-            proposals = self.learned.propose(image)
+        if o.use_appearance_memory and self._last_seen is not None and (rests or self._lost_frames <= o.eager_frames):
+            proposals = self.appearance_memory.propose(image, self._last_seen)
+        if o.use_appearance_memory and not proposals and not rests:
+            proposals = self.appearance_memory.propose(image)
         least = o.likely_look if rests else 0.0
         guesses = [proposal.cam_from_model for proposal in proposals if proposal.score >= least]
         if rests:
@@ -349,11 +349,11 @@ class TrackingSession:
 
     def _align(self, image: NDArray[np.uint8], guide_cam_from_model: Array) -> tuple[Estimate | None, str]:
         """Look whether the part has been brought near the guide pose; what is found must hold a second frame."""
-        snapped = self.snap.lock(image, guide_cam_from_model, self.options.lock_quality)
-        if snapped is not None:
-            estimate = self._begun(image, snapped.cam_from_model)
+        found = self.guided_init.lock(image, guide_cam_from_model, self.options.lock_quality)
+        if found is not None:
+            estimate = self._begun(image, found.cam_from_model)
             is_good = estimate.quality >= self.options.lock_quality and self._is_possible(estimate)
-            if is_good and self.snap.is_near(estimate.cam_from_model, guide_cam_from_model):
+            if is_good and self.guided_init.is_near(estimate.cam_from_model, guide_cam_from_model):
                 self._why = ALIGN
                 self._poor = self._critical = 0
                 self._confirmed = False
@@ -366,7 +366,7 @@ class TrackingSession:
 
     def _why_not(self, image: NDArray[np.uint8], rejected: Rejected | None) -> str:
         """Why a search found nothing; a lost part's loss says more than that nothing is in view."""
-        reason = why_not(image, self.camera, self._views, rejected)
+        reason = diagnose_search(image, self.camera, self._views, rejected)
         is_told = self.state == TrackingState.LOST and reason.startswith(NOTHING)
         self._why = self._why_lost if is_told else reason
         if self.is_aligning and self.state == TrackingState.LOST:

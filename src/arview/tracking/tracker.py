@@ -21,19 +21,19 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
-from arview.refinement.evidence import Evidence, quality_of
+from arview.refinement.evidence import PoseEvidence, quality_of
 from arview.refinement.gauss_newton import apply_twist, relative_twist
 from arview.refinement.kernels import median_brightness_ratio
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.modalities.region import value_bins
-from arview.refinement.modalities.texture import FeatureModality, Matches
+from arview.refinement.modalities.texture import TextureMatches, TextureModality
 from arview.refinement.refiner import NO_MATCHES, Appearance, PoseRefiner, RefinerOptions
 from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES, PLAIN_SHARE, TRACK_STAGES, Stage
 from arview.refinement.view_model import PartView
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import squared_motion_distance
-from arview.tracking.wide_search import NonlocalSearch
+from arview.tracking.wide_search import WideSearch
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class TrackerOptions(RefinerOptions):
     """Options of the tracker, beside those of the refinement.
 
     Attributes:
-        use_feature: match the part's own texture; needs the model's surface.
+        use_texture: match the part's own texture; needs the model's surface.
         use_shading: use the brightness of curved surfaces.
         stages: schedule of a usual frame.
         feature_min_count: fewer texture matches are not used.
@@ -63,7 +63,7 @@ class TrackerOptions(RefinerOptions):
         velocity_decay: share of the last frame's motion that is expected in the next frame.
     """
 
-    use_feature: bool = True
+    use_texture: bool = True
     use_shading: bool = True
     stages: tuple[Stage, ...] = TRACK_STAGES
     feature_min_count: int = 12
@@ -84,7 +84,7 @@ class TrackerOptions(RefinerOptions):
     velocity_decay: float = 0.9
 
     def __post_init__(self) -> None:
-        if not (self.use_region or self.use_edge or self.use_feature):
+        if not (self.use_region or self.use_edge or self.use_texture):
             raise InputError("tracker: at least one modality must be on")
 
 
@@ -124,8 +124,8 @@ class Candidate(NamedTuple):
 
     cam_from_body: Array
     information: Array
-    evidence: Evidence
-    matches: Matches | None
+    evidence: PoseEvidence
+    matches: TextureMatches | None
 
 
 class Proposal(NamedTuple):
@@ -142,7 +142,7 @@ class Proposal(NamedTuple):
 
     cam_from_body: Array
     stages: tuple[Stage, ...]
-    matches: Matches | None = None
+    matches: TextureMatches | None = None
     min_gain: float = 0.0
     motion_penalty: float = 0.0
     is_final: bool = False
@@ -169,7 +169,7 @@ class TrackedFrame:
     predicted: Array
     start: Array
     pyramid: Pyramid | None = None
-    matches: Matches | None = None
+    matches: TextureMatches | None = None
     found_share: float = 0.0
     best: Candidate | None = None
 
@@ -205,14 +205,14 @@ class Tracker:
         self.camera = camera
         self.refiner = PoseRefiner(part or PartView(views), camera, self.options)
         self._recheck = recheck
-        self._search = NonlocalSearch(self.refiner.part.arrays, camera, self.refiner.intrinsics, self.diameter_mm)
+        self._search = WideSearch(self.refiner.part.arrays, camera, self.refiner.intrinsics, self.diameter_mm)
         self._state: TrackerState | None = None
         self._gray = np.zeros((0, 0), dtype=np.uint8)
         self._smooth = np.zeros((0, 0), dtype=np.uint8)
-        self._features: FeatureModality | None = None
-        if self.options.use_feature and model is not None:
+        self._features: TextureModality | None = None
+        if self.options.use_texture and model is not None:
             vertices, faces, _ = model.mesh
-            self._features = FeatureModality(vertices - views.center_in_model, faces, camera)
+            self._features = TextureModality(vertices - views.center_in_model, faces, camera)
 
     @property
     def diameter_mm(self) -> float:
@@ -241,7 +241,7 @@ class Tracker:
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             self._features.add_keyframe(self._features.pyramid(gray), state.cam_from_body)
         _, smooth = self._gray_around(image, state.cam_from_body)
-        state.usual_score = self.refiner.evidence(image, smooth, state.cam_from_body, state.appearance).worth
+        state.usual_score = self.refiner.evidence(image, smooth, state.cam_from_body, state.appearance).score
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
         """Pose in the next frame (H,W,3) uint8 RGB, with its evidence.
@@ -271,14 +271,14 @@ class Tracker:
         """Other schedules where the score is less than usual."""
         o, usual = self.options, self.state.usual_score
         first = frame.found
-        if first.evidence.worth >= o.other_schedules_share * usual:
+        if first.evidence.score >= o.other_schedules_share * usual:
             return
         yield Proposal(frame.start, LAST_STAGES, frame.matches)
         if o.use_edge and first.evidence.inner_share > PLAIN_SHARE:
             yield Proposal(frame.start, NEAR_STAGES, frame.matches)
             yield Proposal(first.cam_from_body, NEAR_STAGES, frame.matches)
         for stages in FAR_STAGES:
-            if frame.found.evidence.worth >= o.far_schedules_share * usual:
+            if frame.found.evidence.score >= o.far_schedules_share * usual:
                 return
             yield Proposal(frame.start, stages, frame.matches, o.min_gain)
 
@@ -292,7 +292,7 @@ class Tracker:
         for start in self._search.find(frame.image, colours, frame.predicted):
             yield Proposal(start, o.stages, None, o.min_gain, o.motion_penalty)
         # When a search of the whole neighbourhood finds nothing better, this score is usual from now on.
-        state.usual_score = frame.found.evidence.worth
+        state.usual_score = frame.found.evidence.score
 
     def _rechecked(self, frame: TrackedFrame) -> Iterator[Proposal]:
         """The pose of the recheck where the best one is far from the prediction."""
@@ -330,7 +330,7 @@ class Tracker:
         if frame.best is None:
             return True
         penalty = proposal.motion_penalty
-        score, best = candidate.evidence.worth, frame.best.evidence.worth
+        score, best = candidate.evidence.score, frame.best.evidence.score
         if penalty:
             score -= penalty * self._motion(frame, candidate)
             best -= penalty * self._motion(frame, frame.best)
@@ -342,7 +342,7 @@ class Tracker:
     def _is_suspicious(self, frame: TrackedFrame) -> bool:
         """Whether the part may be elsewhere: the score is low, lower than usual, or the pose off the prediction."""
         o, evidence = self.options, frame.found.evidence
-        share = evidence.worth / max(self.state.usual_score, 1e-6)
+        share = evidence.score / max(self.state.usual_score, 1e-6)
         is_less = share < o.wide_search_share or (
             share < o.surprise_share and self._motion(frame, frame.found) > o.surprise
         )
@@ -352,7 +352,7 @@ class Tracker:
         """Quality of the selected pose; the part's own texture supports it where a hand hides the outline."""
         evidence = frame.found.evidence
         if frame.found.matches is not None and evidence.points_in_picture > 0.05:
-            return quality_of(evidence.worth + 0.5 * frame.found_share)
+            return quality_of(evidence.score + 0.5 * frame.found_share)
         return evidence.quality
 
     # --- State --------------------------------------------------------------------------------------------
@@ -376,7 +376,7 @@ class Tracker:
         """Carry pose, motion, usual score, colours and texture over to the next frame."""
         state, o = self.state, self.options
         pose, evidence = frame.found.cam_from_body, frame.found.evidence
-        state.usual_score += 0.1 * (evidence.worth - state.usual_score)
+        state.usual_score += 0.1 * (evidence.score - state.usual_score)
         state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
         state.cam_from_body = pose
         if quality > o.min_learning_quality:
@@ -449,12 +449,12 @@ class Tracker:
     # --- Other poses of the last frame, and covariance ----------------------------------------------------
 
     def scores_near(self, image: NDArray[np.uint8], cams_from_model: list[Array]) -> list[float]:
-        """Scores (see `Evidence.worth`) of other poses (4,4) in this frame, each after a fine refinement."""
+        """Scores (see `PoseEvidence.score`) of other poses (4,4) in this frame, each after a fine refinement."""
         appearance, fine = self.state.appearance, self.options.stages[-2:]
         smooth = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
         poses = [self.refiner.refine(image, smooth, pose, fine, appearance)[0] for pose in in_body]
-        return [self.refiner.evidence(image, smooth, pose, appearance).worth for pose in poses]
+        return [self.refiner.evidence(image, smooth, pose, appearance).score for pose in poses]
 
     def covariance(self, estimate: Estimate) -> Array:
         """(6,6) covariance of the twist (rad, mm) about the model's centre.

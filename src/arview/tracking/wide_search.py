@@ -25,7 +25,7 @@ from arview.refinement.modalities.region import BINS
 
 
 @dataclass(frozen=True)
-class NonlocalOptions:
+class WideSearchOptions:
     """Options of the search.
 
     Attributes:
@@ -48,7 +48,7 @@ class NonlocalOptions:
     kept: int = 4
 
 
-class NonlocalSearch:
+class WideSearch:
     """Search for one part with one camera.
 
     Args:
@@ -63,9 +63,9 @@ class NonlocalSearch:
         camera: Camera,
         intrinsics: Array,
         diameter_mm: float,
-        options: NonlocalOptions | None = None,
+        options: WideSearchOptions | None = None,
     ) -> None:
-        self.options = options or NonlocalOptions()
+        self.options = options or WideSearchOptions()
         self._part = part
         self._camera = camera
         self._intrinsics = intrinsics

@@ -9,7 +9,7 @@ import numpy as np
 from arview.evaluation import PoseMeter, Scene, scene_guide_views
 from arview.geometry import Array, apply, exp_so3, rigid, rotation_angle_rad
 from arview.tracking import SessionOptions
-from arview.tracking.guided_init import Snap
+from arview.tracking.guided_init import GuidedInit
 from arview.video import Image
 from rows import Line, timing, watched
 from suites.detection import BOXES, box_symmetries
@@ -48,7 +48,7 @@ class _Snapping:
         size = (scene.camera.height, scene.camera.width)
         self.others = [image for image in others if image.shape[:2] == size]
         self.model = scene.part.model
-        self.snap = Snap(scene_guide_views(scene), scene.camera)
+        self.guided_init = GuidedInit(scene_guide_views(scene), scene.camera)
         self.meter = PoseMeter(
             self.model,
             scene.camera,
@@ -85,7 +85,7 @@ class _Snapping:
     def try_at(self, image: Image, guide: Array, truth: Array | None) -> bool | None:
         """Whether the snap is right; None when it does not snap."""
         began = time.perf_counter()
-        found = self.snap.lock(image, guide, SessionOptions.lock_quality)
+        found = self.guided_init.lock(image, guide, SessionOptions.lock_quality)
         self.ms.append(1000.0 * (time.perf_counter() - began))
         if found is None:
             return None

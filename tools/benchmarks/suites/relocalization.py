@@ -51,7 +51,7 @@ def relearn_lines(found: dict[str, Scene], details: dict[str, Any], losses: int 
     return lines
 
 
-def lose_and_find(name: str, scene: Scene, use_learned: bool, losses: int) -> Relearned:
+def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: int) -> Relearned:
     """Track the first half; before frames of the second the camera is covered until the part is lost.
 
     The guide views are those of the full sphere. Where a frame does not find the part, the session goes on from truth.
@@ -63,7 +63,7 @@ def lose_and_find(name: str, scene: Scene, use_learned: bool, losses: int) -> Re
         symmetries=box_symmetries(model) if name in BOXES else scene.part.symmetries,
         symmetric_poses=scene.symmetric_poses,
     )
-    options = SessionOptions(use_learned=use_learned)
+    options = SessionOptions(use_appearance_memory=use_appearance_memory)
     frames = [f for f in scene.frames if f.cam_from_model is not None]
     half = len(frames) // 2
     step = max(1, round((len(frames) - half) / losses))
@@ -89,8 +89,8 @@ def lose_and_find(name: str, scene: Scene, use_learned: bool, losses: int) -> Re
         right += is_right
         wrong += pose.cam_from_model is not None and not is_right
         if not is_right:
-            kept = session.learned
+            kept = session.appearance_memory
             session = TrackingSession(views, model, scene.camera, options, frame.cam_from_model)
-            session.learned = kept
+            session.appearance_memory = kept
             session.process(image, frame.index, number / 30.0)
-    return Relearned(count, right, wrong, tuple(cpu_ms), len(session.learned))
+    return Relearned(count, right, wrong, tuple(cpu_ms), len(session.appearance_memory))

@@ -38,7 +38,7 @@ from arview.detection.search.pattern_search import climb
 from arview.detection.search.template_bank import ShownLines, choose_apart
 from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
-from arview.refinement.evidence import RIGHT_WORTH, Evidence
+from arview.refinement.evidence import DECISION_SCORE, PoseEvidence
 from arview.refinement.refiner import PoseRefiner
 from arview.refinement.schedules import NEAR_STAGES, SETTLING_STAGES, Stage
 from arview.refinement.view_model import PartView
@@ -57,7 +57,7 @@ COARSE_STAGES = (_coarse_stages(1.0), _coarse_stages(20.0))
 """Tries from the likeliest starts: edges lead; colours lead, on plain and glossy parts."""
 COPY_DEG = 5.0
 """Refined poses this near to each other are copies of one."""
-HOPELESS_WORTH = 0.35
+HOPELESS_SCORE = 0.35
 """A pose worth less is not searched around: the part is not there."""
 CLIMBED_WORTH = 12.0
 """A weighed response of 1 more after the pattern search is worth as much of what the judge says: in pictures of random
@@ -117,7 +117,7 @@ class Hypothesis:
     """
 
     cam_from_body: Array
-    evidence: Evidence
+    evidence: PoseEvidence
     judgement: float
     lines: float
     radius_px: float
@@ -281,7 +281,7 @@ class LocalSearch:
         others = [h for h in refined[o.finalists :] if not self._same(h.cam_from_body, refined[0].cam_from_body, 25.0)]
         coarse = refined[: o.finalists] + self.ordered(others, 15.0, o.rivals)
         finished = self.finished(picture, [found.cam_from_body for found in coarse])
-        if finished and HOPELESS_WORTH <= finished[0].evidence.worth < RIGHT_WORTH:
+        if finished and HOPELESS_SCORE <= finished[0].evidence.score < DECISION_SCORE:
             finished += self.finished(picture, _around(finished[0].cam_from_body, 0.05))
         return self.ordered(finished, 5.0, o.verified)
 
@@ -331,7 +331,7 @@ class LocalSearch:
     ) -> list[Hypothesis]:
         """Where some stages lead from each of some starts."""
 
-        def refine(way: tuple[Array, tuple[Stage, ...]]) -> tuple[Array, Evidence]:
+        def refine(way: tuple[Array, tuple[Stage, ...]]) -> tuple[Array, PoseEvidence]:
             pose = self.refiner.refine_fresh(picture.image, picture.gray, *way)
             look = self.refiner.appearance_at(picture.image, pose)
             return pose, self.refiner.evidence(picture.image, picture.gray, pose, look, tolerance_px)

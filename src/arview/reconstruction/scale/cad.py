@@ -190,7 +190,7 @@ def _search(
 ) -> tuple[list[Vote], Array, NotFound]:
     """Votes of the detections, turns (N,3,3) that make the part look much the same, and why not when no vote."""
     from arview.detection.detector import options_for
-    from arview.tracking.diagnosis import why_not
+    from arview.tracking.diagnosis import diagnose_search
 
     detectors: dict[tuple[float, ...], Detector] = {}
     sightings: list[Sighting] = []
@@ -213,7 +213,7 @@ def _search(
         if found and found[0].quality >= FOUND_QUALITY:
             sure += 1
         elif not found:
-            reasons.append(why_not(image, camera, views, detector.best_rejected))
+            reasons.append(diagnose_search(image, camera, views, detector.best_rejected))
         for d in found:
             poses = (d.cam_from_model, *d.alternatives)
             sightings += [Sighting(index, photos[index].cam_from_scan, pose, d.quality) for pose in poses]

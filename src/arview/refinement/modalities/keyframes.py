@@ -24,7 +24,7 @@ _RESPONSE = (8.0 / (4 * 255)) ** 2
 
 
 @dataclass(frozen=True)
-class FeatureOptions:
+class TextureOptions:
     """Options of the feature modality.
 
     Attributes:
@@ -257,7 +257,7 @@ def make_keyframe(
     outline: Array,
     caster: RayCaster,
     intrinsics: Array,
-    options: FeatureOptions,
+    options: TextureOptions,
 ) -> Keyframe | None:
     """Keyframe of a picture, or None when too few corners lie on the part.
 

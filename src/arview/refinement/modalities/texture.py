@@ -22,8 +22,8 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.refinement.gauss_newton import add_line, apply_twist, solve_step
 from arview.refinement.modalities.keyframes import (
-    FeatureOptions,
     Keyframe,
+    TextureOptions,
     make_keyframe,
     tangent_jacobian,
     to_camera,
@@ -40,7 +40,7 @@ from arview.refinement.projection import project
 from arview.rendering.raycast import RayCaster, cast_ray
 
 
-class Matches(NamedTuple):
+class TextureMatches(NamedTuple):
     """Features found in one frame.
 
     Attributes:
@@ -250,7 +250,7 @@ def match_features(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intr
     Common shift on the coarsest level; patches alone on level 2; a pose from these, where they agree on one,
     predicts anew; patches alone on levels 1 and 0. ``pyramid`` and ``key_pyramid`` are of frame and keyframe,
     ``hierarchy`` of the part's triangles in the body, ``cam_from_body`` (4,4) the predicted pose, ``damping``
-    (6,) of the coarse pose as in `solve_step`; the rest as in `FeatureOptions`.
+    (6,) of the coarse pose as in `solve_step`; the rest as in `TextureOptions`.
 
     Returns:
         pixels (N,2); weights (N,), 0 = not found; expected (N,) whether the feature should be in view.
@@ -292,7 +292,7 @@ def match_features(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intr
     return pixels, weights, expected
 
 
-class FeatureModality:
+class TextureModality:
     """Texture of one part, matched from a bank of keyframes."""
 
     def __init__(
@@ -300,10 +300,10 @@ class FeatureModality:
         vertices_in_body: Array,
         faces: NDArray[np.int32],
         camera: Camera,
-        options: FeatureOptions | None = None,
+        options: TextureOptions | None = None,
     ) -> None:
         """Prepare for a part of vertices (V,3) mm about its centre and faces (F,3), and a camera."""
-        self.options = options or FeatureOptions()
+        self.options = options or TextureOptions()
         self.camera = camera
         self.keyframes: list[Keyframe] = []
         self._caster = RayCaster(vertices_in_body, faces)
@@ -386,7 +386,7 @@ class FeatureModality:
             return np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
         return np.asarray(cv2.convexHull(pixels.astype(np.float32))[:, 0], dtype=np.float64)
 
-    def measure(self, pyramid: Pyramid, cam_from_body: Array) -> Matches:
+    def measure(self, pyramid: Pyramid, cam_from_body: Array) -> TextureMatches:
         """Find the features of the nearest keyframe in a frame.
 
         Args:
@@ -397,7 +397,7 @@ class FeatureModality:
         keyframe, _ = self._nearest(cam_from_body)
         if keyframe is None:
             self._last = None
-            return Matches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
+            return TextureMatches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
         self._clock += 1
         keyframe.last_used = self._clock
         pixels, weights, expected = match_features(
@@ -408,9 +408,9 @@ class FeatureModality:
         found = np.flatnonzero(weights > 0.0)
         self._last = (keyframe, found, pixels[found])
         tried = int(np.count_nonzero(expected))
-        return Matches(keyframe.anchors.points[found], pixels[found], weights[found], tried)
+        return TextureMatches(keyframe.anchors.points[found], pixels[found], weights[found], tried)
 
-    def align(self, matches: Matches, cam_from_body: Array) -> Array:
+    def align(self, matches: TextureMatches, cam_from_body: Array) -> Array:
         """Pose (4,4) from the matches alone, started at and held towards a pose: a pre-alignment."""
         points, pixels, weights, _ = matches
         return np.asarray(_align_pose(points, cam_from_body, self._intrinsics, pixels, weights, self._damping, 1.0))
