@@ -16,7 +16,6 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from arview.calibration.board import board_pdf, fit_board, parse_paper, place_board, spec_of
 from arview.calibration.choose import ChoiceOptions, choose_views
 from arview.calibration.plot import draw
 from arview.calibration.run import calibrate, record_of
@@ -36,10 +35,10 @@ from arview.camera.read import load_camera
 from arview.camera.write import FORMATS, write_camera
 from arview.cli import main
 from arview.errors import InputError
+from arview.fiducials.board import Board, cv_board, parse_board, spec_of
+from arview.fiducials.board_sheet import board_pdf, fit_board, parse_paper, place_board
 from arview.geometry import Array
 from arview.reconstruction.intake.lenses import Lens, lenses_of
-from arview.reconstruction.scale import Board, parse_board
-from arview.reconstruction.scale.targets import cv_board
 from helpers.board_scene import BOARD, LENS, photograph, pose
 from helpers.video_files import write_clip
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.calibration.board import rectangles_mm
 from arview.camera import Camera
+from arview.fiducials.board import Board, parse_board
+from arview.fiducials.board_sheet import rectangles_mm
 from arview.geometry import Array, exp_so3, rigid
-from arview.reconstruction.scale import Board, parse_board
 
 BOARD = parse_board("charuco:11x8:21:16:DICT_5X5_100")
 LENS = Camera(640, 480, 563.0, 561.2, 326.4, 233.7, np.array([-0.16, 0.07, 6e-4, -4e-4, -0.015]))

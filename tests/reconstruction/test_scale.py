@@ -19,9 +19,9 @@ from arview.cad.model import Component, Model, make_model
 from arview.cad.part import ComponentSettings, load_part
 from arview.camera import Camera
 from arview.errors import InputError
+from arview.fiducials.board import Board, parse_board, parse_tags
 from arview.geometry import Array, apply, exp_se3, exp_so3, invert, look_at, rigid, rotation_angle_rad
 from arview.reconstruction.scale import (
-    Board,
     CadOptions,
     Rig,
     ScaleEvidence,
@@ -31,9 +31,7 @@ from arview.reconstruction.scale import (
     find_scale,
     load_rig,
     load_scale_file,
-    parse_board,
     parse_scale_bar,
-    parse_tags,
 )
 from arview.reconstruction.scale.find import combine
 from arview.reconstruction.scale.similarity import fit_points
@@ -174,7 +172,7 @@ def test_specs() -> None:
     [
         (parse_board, "charuco:8x6:30", "expected charuco:COLUMNSxROWS"),
         (parse_board, "charuco:8x6:20:22:DICT_5X5_100", "do not fit"),
-        (parse_board, "charuco:8x6:30:22:DICT_9X9", "unknown dictionary"),
+        (parse_board, "charuco:8x6:30:22:DICT_9X9", "unknown marker dictionary"),
         (parse_board, "charuco:1x1:30:22:5x5_100", "at least 3×3"),
         (parse_tags, "20", "expected DICTIONARY:SIDE_MM"),
         (parse_tags, "apriltag36h11:-3", "not a positive length"),

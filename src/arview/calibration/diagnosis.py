@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.fiducials.board import Board, cv_board
 from arview.geometry import Array
-from arview.reconstruction.scale import Board
-from arview.reconstruction.scale.targets import cv_board
 
 if TYPE_CHECKING:
     from arview.calibration.views import BoardFinder, Sightings

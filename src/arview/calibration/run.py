@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from arview import __version__
-from arview.calibration.board import spec_of
 from arview.calibration.choose import ChoiceOptions, choose_views
 from arview.calibration.solve import PARAMETERS, K, Solution, SolveOptions, solve
 from arview.calibration.verdict import Judgement, VerdictOptions, judge
@@ -20,7 +19,7 @@ from arview.camera import Camera
 from arview.camera.profiles import lens_record
 from arview.core.progress import StepProgress
 from arview.errors import InputError
-from arview.reconstruction.scale import Board
+from arview.fiducials.board import Board, spec_of
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
 from arview.core.progress import StepProgress
 from arview.errors import InputError
+from arview.fiducials.board import Board, cv_board
 from arview.geometry import Array
-from arview.reconstruction.scale import Board
-from arview.reconstruction.scale.targets import cv_board
 
 LEAST_CORNERS = 8
 """A picture with fewer says little and is easily wrong."""

@@ -65,8 +65,8 @@ show whether the printer kept it. What to give to `arview calibrate --board` is 
 @click.option("--board", "board_spec", metavar="SPEC", help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY.")
 def board(output: str, paper: str, squares: str | None, board_spec: str | None) -> None:
     """Write a ChArUco board as PDF whose lengths are exact."""
-    from arview.calibration.board import board_pdf, fit_board, parse_paper, place_board, spec_of
-    from arview.reconstruction.scale import parse_board
+    from arview.fiducials.board import parse_board, spec_of
+    from arview.fiducials.board_sheet import board_pdf, fit_board, parse_paper, place_board
 
     target = output_path(output, [])
     size = parse_paper(paper)
@@ -131,7 +131,7 @@ def lens(
     from arview.calibration.run import record_of
     from arview.camera.profiles import profile_name, profile_path
     from arview.camera.write import holds_distortion, write_camera
-    from arview.reconstruction.scale import parse_board
+    from arview.fiducials.board import parse_board
 
     if not outputs and profile is None:
         raise InputError("nothing to write: give -o camera.json or --profile")

@@ -121,13 +121,12 @@ def _sources(
     """What is known in the scene, from the options and the file together."""
     from dataclasses import replace
 
+    from arview.fiducials.board import parse_board, parse_tags
     from arview.reconstruction.scale import (
         ScaleSources,
         load_rig,
         load_scale_file,
-        parse_board,
         parse_scale_bar,
-        parse_tags,
     )
 
     known = load_scale_file(scale_file) if scale_file else ScaleSources()

@@ -1,8 +1,7 @@
 """Registration of points to points (ICP): for references that are scans, and for the studies.
 
 Point to point (Besl & McKay 1992), point to plane (Chen & Medioni 1992) and generalized ICP, plane to plane
-(Segal, Haehnel & Thrun 2009). A CAD is registered to by its exact surface instead:
-`arview.measurement.cloud.registration`.
+(Segal, Haehnel & Thrun 2009). Registration to a CAD uses its exact surface instead: `measurement.cloud.registration`.
 """
 
 from __future__ import annotations

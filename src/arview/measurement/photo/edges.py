@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from arview.cad.model import make_model
 from arview.camera import Camera
 from arview.core.kernel import kernel
+from arview.core.subpixel_edges import choose_steps, find_steps, linear_light
 from arview.geometry import Array, apply, invert, rigid
 from arview.guideviews.mesh_edges import EDGE_CREASE, EDGE_SILHOUETTE, mesh_edges, sample_visible_edges
 from arview.measurement.photo.component import MeasuredComponent
@@ -23,7 +24,6 @@ from arview.measurement.photo.options import EdgeOptions
 from arview.measurement.photo.surface import near_others
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
-from arview.reconstruction.scale.edges import choose_steps, find_steps, linear_light
 
 
 @dataclass(frozen=True)

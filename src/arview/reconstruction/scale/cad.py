@@ -15,11 +15,11 @@ from arview.cad.view_range import ViewRange
 from arview.camera import Camera
 from arview.core.parallel import pool
 from arview.core.progress import Progress
+from arview.core.subpixel_edges import linear_light
 from arview.detection import Detector
 from arview.geometry import Array, invert, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
-from arview.reconstruction.scale.edges import linear_light
 from arview.reconstruction.scale.refine import Fit, JointRefiner, RefineOptions, Support, View
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.vote import Sighting, Vote, vote

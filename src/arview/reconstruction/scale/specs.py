@@ -7,53 +7,15 @@ import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from arview.errors import InputError
+from arview.fiducials.board import DEFAULT_DICTIONARY, Board, Tags, dictionary_name, parse_board, parse_length_mm
 from arview.geometry import Array, check_rigid
 
-BOARD_FORMS = (
-    "charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY or grid:COLUMNSxROWS:MARKER_MM:GAP_MM:DICTIONARY, "
-    "e.g. charuco:8x6:30:22:DICT_5X5_100"
-)
-TAG_FORM = "DICTIONARY:SIDE_MM, e.g. apriltag36h11:20"
 BAR_FORM = "ID1:ID2:LENGTH_MM or DICTIONARY:ID1:ID2:LENGTH_MM, e.g. 3:7:500.02"
-DEFAULT_DICTIONARY = "DICT_APRILTAG_36h11"
-
-
-@dataclass(frozen=True)
-class Board:
-    """A printed board of OpenCV.
-
-    Attributes:
-        is_charuco: chessboard with markers in its white squares, else a grid of markers.
-        columns, rows: squares (ChArUco) or markers.
-        cell_mm: side of a square; of a grid, from marker to marker.
-        marker_mm: side of a marker.
-        dictionary: OpenCV's name.
-    """
-
-    is_charuco: bool
-    columns: int
-    rows: int
-    cell_mm: float
-    marker_mm: float
-    dictionary: str
-
-    def __str__(self) -> str:
-        kind = "ChArUco board" if self.is_charuco else "marker board"
-        return f"{kind} {self.columns}×{self.rows}, {self.cell_mm:g} mm"
-
-
-@dataclass(frozen=True)
-class Tags:
-    """All tags of a dictionary that are no part of a board: the side of each, mm; ``ids`` empty means any."""
-
-    dictionary: str
-    side_mm: float
-    ids: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,40 +47,6 @@ class ScaleSources:
     rig: Rig | None = None
 
 
-def dictionary_name(text: str) -> str:
-    """OpenCV's name of a dictionary of markers: ``DICT_5X5_100``, ``5x5_100``, ``apriltag36h11``, ``tag36h11``."""
-    import cv2
-
-    known = {name.upper(): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
-    wanted = text.strip().upper().replace("-", "_")
-    family = re.fullmatch(r"(?:APRIL_?)?TAG_?(\d\dH\d\d)", wanted)
-    for name in (wanted, f"DICT_{wanted}", f"DICT_APRILTAG_{family[1]}" if family else ""):
-        if name in known:
-            return known[name]
-    some = "DICT_4X4_50, DICT_5X5_100, DICT_6X6_250, DICT_ARUCO_ORIGINAL, apriltag36h11, apriltag25h9, apriltag16h5"
-    raise InputError(f"unknown dictionary of markers {text!r}; there are e.g. {some}")
-
-
-def parse_board(text: str) -> Board:
-    """Board of a command line, see BOARD_FORMS. Raises InputError."""
-    match = re.fullmatch(r"(charuco|grid):(\d+)x(\d+):([\d.]+):([\d.]+):([\w-]+)", text.strip(), re.IGNORECASE)
-    if not match:
-        raise InputError(f"board {text!r}: expected {BOARD_FORMS}")
-    kind, columns, rows, first, second, dictionary = match.groups()
-    if kind.lower() == "charuco":
-        return _board(text, True, int(columns), int(rows), _length(text, first), _length(text, second), dictionary)
-    marker = _length(text, first)
-    return _board(text, False, int(columns), int(rows), marker + _length(text, second), marker, dictionary)
-
-
-def parse_tags(text: str) -> Tags:
-    """Tags of a command line, see TAG_FORM. Raises InputError."""
-    dictionary, _, side = text.rpartition(":")
-    if not dictionary:
-        raise InputError(f"tag {text!r}: expected {TAG_FORM}")
-    return Tags(dictionary_name(dictionary), _length(text, side))
-
-
 def parse_scale_bar(text: str, default_dictionary: str = DEFAULT_DICTIONARY) -> ScaleBar:
     """Scale bar of a command line, see BAR_FORM. Raises InputError."""
     match = re.fullmatch(r"(?:([A-Za-z][\w-]*|\d+x[\w-]+):)?(\d+):(\d+):([\d.]+)", text.strip())
@@ -126,7 +54,7 @@ def parse_scale_bar(text: str, default_dictionary: str = DEFAULT_DICTIONARY) -> 
         raise InputError(f"scale bar {text!r}: expected {BAR_FORM}")
     dictionary, first, second, length = match.groups()
     name = dictionary_name(dictionary) if dictionary else default_dictionary
-    return _bar(text, name, int(first), int(second), _length(text, length))
+    return _bar(text, name, int(first), int(second), parse_length_mm(text, length))
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -170,25 +98,16 @@ def load_scale_file(path: str | Path) -> ScaleSources:
         boards.append(parse_board(str(entry["spec"])))
     for entry in _entries(content, "tag", ("dictionary", "side_mm"), ("ids",), path):
         ids = tuple(int(i) for i in entry.get("ids", ()))
-        tags.append(Tags(dictionary_name(str(entry["dictionary"])), _length(f"{path}", entry["side_mm"]), ids))
+        tags.append(Tags(dictionary_name(str(entry["dictionary"])), parse_length_mm(f"{path}", entry["side_mm"]), ids))
     for entry in _entries(content, "scale_bar", ("ids", "length_mm"), ("dictionary", "std_mm"), path):
         if not isinstance(entry["ids"], list) or len(entry["ids"]) != 2:
             raise InputError(f"{path}: [[scale_bar]] ids = {entry['ids']!r}: expected two numbers of tags")
         name = dictionary_name(str(entry.get("dictionary", DEFAULT_DICTIONARY)))
         first, second = (int(i) for i in entry["ids"])
-        std_mm = _length(f"{path}", entry.get("std_mm", ScaleBar.std_mm))
-        bars.append(_bar(f"{path}", name, first, second, _length(f"{path}", entry["length_mm"]), std_mm))
+        std_mm = parse_length_mm(f"{path}", entry.get("std_mm", ScaleBar.std_mm))
+        bars.append(_bar(f"{path}", name, first, second, parse_length_mm(f"{path}", entry["length_mm"]), std_mm))
     rig = _rig(content["rig"], f"{path}: [rig]") if "rig" in content else None
     return ScaleSources(tuple(boards), tuple(tags), tuple(bars), rig)
-
-
-def _board(text: str, charuco: bool, columns: int, rows: int, cell: float, marker: float, dictionary: str) -> Board:
-    least = 3 if charuco else 1
-    if columns < least or rows < least or columns * rows > 2000:
-        raise InputError(f"board {text!r}: {columns}×{rows} cells, expected at least {least}×{least}")
-    if marker >= cell:
-        raise InputError(f"board {text!r}: markers of {marker:g} mm do not fit in cells of {cell:g} mm")
-    return Board(charuco, columns, rows, cell, marker, dictionary_name(dictionary))
 
 
 def _bar(text: str, dictionary: str, first: int, second: int, length_mm: float, std_mm: float = 0.02) -> ScaleBar:
@@ -234,16 +153,3 @@ def _only(table: dict[str, Any], allowed: tuple[str, ...], where: str) -> None:
     for key in table:
         if key not in allowed:
             raise InputError(f"{where} unknown key {key!r}; allowed: {', '.join(allowed)}")
-
-
-def _length(text: str, value: object) -> float:
-    def fail() -> NoReturn:
-        raise InputError(f"{text}: {value!r} is not a positive length in mm")
-
-    try:
-        length = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        fail()
-    if not 0 < length < 1e6:
-        fail()
-    return length

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from arview.errors import InputError
+from arview.fiducials.board import Board, cv_board, spec_of
 from arview.geometry import Array
-from arview.reconstruction.scale import Board
-from arview.reconstruction.scale.targets import cv_board
 
 PAPERS_MM = {
     "A4": (297.0, 210.0), "A3": (420.0, 297.0), "A2": (594.0, 420.0), "A1": (841.0, 594.0), "A0": (1189.0, 841.0),
@@ -49,12 +48,6 @@ class Sheet:
     left_mm: float
     top_mm: float
     ruler_mm: float
-
-
-def spec_of(board: Board) -> str:
-    """The board as it is given on the command line."""
-    sizes = f"{board.cell_mm:g}:{board.marker_mm:g}"
-    return f"charuco:{board.columns}x{board.rows}:{sizes}:{board.dictionary}"
 
 
 def parse_paper(text: str) -> tuple[float, float]:
