@@ -274,7 +274,7 @@ def test_a_part_of_one_component_has_nothing_to_mismatch() -> None:
 
 
 def test_a_session_never_calls_a_look_alike_tracked() -> None:
-    session = TrackingSession(assembly_views(), assembly(), CAMERA, initial_cam_from_model=path(1, 4)[0])
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=path(1, 4)[0])
     for k, pose in enumerate(path(5, 4)):
         result = session.process(picture(pose, changed(post_1=None), seed=k, scene=4, noise=4.0), k, k / 30)
         if k >= 1:

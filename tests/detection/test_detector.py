@@ -346,7 +346,7 @@ def test_a_small_part_a_plain_view_and_a_close_rival_are_doubted_and_a_pose_a_li
 def test_the_poses_of_an_ambiguous_view_say_which_others_fit() -> None:
     model = knob(1.8)
     views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
-    session = TrackingSession(views, model, CAMERA)
+    session = TrackingSession(views, CAMERA, model)
     truth = pose_from(15.0, 50.0, 380.0, model)
     pose = session.process(picture(truth, model, seed=1, scene=1), 0, 0.0)
     assert pose.state == TrackingState.CRITICAL and pose.reason.startswith("ambiguous")

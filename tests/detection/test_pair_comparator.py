@@ -17,7 +17,6 @@ from arview.detection.symmetry import TELLING
 from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.refinement.view_model import PartView
-from arview.tracking.tracker import Tracker, TrackerOptions
 from helpers.synthetic import CAMERA, box, component, picture, pose_from, post
 
 GREY = (0.55, 0.55, 0.6)
@@ -36,7 +35,7 @@ def plate(key_mm: float) -> Model:
 @cache
 def part_of(key_mm: float) -> PartView:
     views = make_guide_views(plate(key_mm), ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=2))
-    return Tracker(views, CAMERA, TrackerOptions(use_texture=False)).part
+    return PartView(views)
 
 
 def twins_of(truth: Array, key_mm: float) -> list[Array]:

@@ -150,7 +150,7 @@ def test_the_silhouette_is_that_of_the_part() -> None:
 
 def test_nothing_is_believed_where_there_is_no_part_or_another_side_of_it() -> None:
     options = SessionOptions(eager_frames=0, search_every=1000)
-    session = TrackingSession(assembly_views(), assembly(), CAMERA, options)
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), options)
     session.appearance_memory = six_sides()
     session.state = TrackingState.LOST
     for k in range(12):
@@ -168,7 +168,7 @@ def test_a_lost_part_is_found_in_any_frame_where_it_looks_as_it_did() -> None:
     for use_appearance_memory in (True, False):
         # The detector never searches the whole picture.
         options = SessionOptions(eager_frames=0, search_every=10_000, use_appearance_memory=use_appearance_memory)
-        session = TrackingSession(assembly_views(), assembly(), CAMERA, options, initial_cam_from_model=path(1)[0])
+        session = TrackingSession(assembly_views(), CAMERA, assembly(), options, initial_cam_from_model=path(1)[0])
         for k, pose in enumerate(path(20)):
             tracked = session.process(picture(pose, seed=k, scene=1), k, k / 30)
         assert tracked.state == TrackingState.TRACKED

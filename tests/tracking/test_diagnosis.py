@@ -199,7 +199,7 @@ def test_why_a_part_was_lost() -> None:
 
 
 def test_a_session_says_what_the_detector_rejected() -> None:
-    session = TrackingSession(assembly_views(), assembly(), CAMERA)
+    session = TrackingSession(assembly_views(), CAMERA, assembly())
     far = pose_from(30, 40, 820)
     session.detector.detect = lambda *_, **__: []  # type: ignore[method-assign]
     session.detector.best_rejected = Rejected(far, GOOD, 0.9)
@@ -209,7 +209,7 @@ def test_a_session_says_what_the_detector_rejected() -> None:
 
 
 def test_a_lost_part_keeps_the_reason_of_its_loss() -> None:
-    session = TrackingSession(assembly_views(), assembly(), CAMERA, initial_cam_from_model=TRUTH)
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=TRUTH)
     reasons: list[str] = []
     for k in range(40):
         pose = TRUTH.copy()

@@ -250,7 +250,7 @@ def aligning(count: int) -> list[Array]:
 
 
 def test_the_session_waits_snaps_and_tracks() -> None:
-    session = TrackingSession(assembly_views(), assembly(), CAMERA, guide_cam_from_model=GUIDE)
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     poses = aligning(16)
     results = [session.process(picture(pose, seed=k, scene=3), k, 0.0) for k, pose in enumerate(poses)]
     states = [result.state for result in results]
@@ -271,7 +271,7 @@ def test_the_session_waits_snaps_and_tracks() -> None:
 
 def test_the_outline_comes_back_when_a_lost_part_is_not_found_for_long() -> None:
     options = SessionOptions(align_again_frames=4)
-    session = TrackingSession(assembly_views(), assembly(), CAMERA, options, guide_cam_from_model=GUIDE)
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), options, guide_cam_from_model=GUIDE)
     for k in range(4):
         result = session.process(picture(GUIDE, seed=k, scene=3), k, 0.0)
     assert result.state == TrackingState.TRACKED
@@ -286,7 +286,7 @@ def test_the_outline_comes_back_when_a_lost_part_is_not_found_for_long() -> None
 
 
 def test_an_unconfirmed_snap_goes_back_to_waiting() -> None:
-    session = TrackingSession(assembly_views(), assembly(), CAMERA, guide_cam_from_model=GUIDE)
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     assert session.process(picture(GUIDE, seed=0, scene=3), 0, 0.0).state == TrackingState.CRITICAL
     result = session.process(picture(None, seed=1, scene=3), 1, 0.0)
     assert (result.state, result.cam_from_model, result.reason) == (TrackingState.SEARCHING, None, ALIGN)
@@ -294,7 +294,7 @@ def test_an_unconfirmed_snap_goes_back_to_waiting() -> None:
 
 
 def test_a_dark_picture_is_said_to_be_dark_while_aligning() -> None:
-    session = TrackingSession(assembly_views(), assembly(), CAMERA, guide_cam_from_model=GUIDE)
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     result = session.process(picture(GUIDE, gain=0.1), 0, 0.0)
     assert (result.state, result.reason) == (TrackingState.SEARCHING, "too dark")
 

@@ -139,7 +139,7 @@ def follow(
     poses: list[Array], second: LocalSearchRecheck | None, noise: float, is_hidden: bool = False
 ) -> list[tuple[float, float, float]]:
     """Errors of each frame: mm, mm across, degrees; begun again at the truth after each that is off by 5°."""
-    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_texture=False), assembly(), second)
+    tracker = Tracker(assembly_views(), CAMERA, assembly(), TrackerOptions(use_texture=False), recheck=second)
     tracker.start(picture(poses[0], noise=noise), poses[0])
     errors = []
     for k, truth in enumerate(poses[1:], 1):

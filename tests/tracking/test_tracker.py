@@ -53,7 +53,7 @@ def follow(
     images: list[NDArray[np.uint8]], poses: list[Array], options: TrackerOptions | None = None
 ) -> tuple[Tracker, list[Estimate], Array]:
     """Tracker after all frames, its estimates, and their errors (N,3): mm, mm across, deg."""
-    tracker = Tracker(assembly_views(), CAMERA, options, assembly())
+    tracker = Tracker(assembly_views(), CAMERA, assembly(), options)
     tracker.start(images[0], poses[0])
     estimates = [tracker.track(image) for image in images[1:]]
     errors = [error(e.cam_from_model, truth) for e, truth in zip(estimates, poses[1:], strict=True)]
@@ -113,7 +113,7 @@ def test_a_start_that_is_off_is_pulled_in() -> None:
     rng = np.random.default_rng(8)
     ends = []
     for k in range(12):
-        tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(), assembly())
+        tracker = Tracker(assembly_views(), CAMERA, assembly())
         image = picture(PATH[3 * k], seed=k, scene=k)
         tracker.start(image, wrong(PATH[3 * k], rng, 3.0, 6.0))
         for _ in range(3):
@@ -125,7 +125,7 @@ def test_a_start_that_is_off_is_pulled_in() -> None:
 def test_a_part_that_moved_far_between_frames_is_found() -> None:
     """20° to 35° and up to a quarter of the diameter aside in one frame; the next ones need no search."""
     rng = np.random.default_rng(3)
-    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_texture=False))
+    tracker = Tracker(assembly_views(), CAMERA, options=TrackerOptions(use_texture=False))
     right = 0
     for k in range(12):
         first = pose_from(rng.uniform(-60, 60), rng.uniform(25, 60), 520)
@@ -144,7 +144,7 @@ def test_a_part_that_moved_a_tenth_of_its_size_needs_no_search(monkeypatch: pyte
     them 1)."""
     monkeypatch.setattr(WideSearch, "find", lambda *_: [])
     rng = np.random.default_rng(5)
-    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_texture=False))
+    tracker = Tracker(assembly_views(), CAMERA, options=TrackerOptions(use_texture=False))
     right = 0
     for k in range(12):
         first = pose_from(rng.uniform(-60, 60), rng.uniform(25, 60), 520)
@@ -200,7 +200,7 @@ def test_covariance_is_never_too_small_on_ideal_pictures_and_grows_with_hiding()
 def test_quality_parts_right_from_wrong_poses() -> None:
     """Wrong starts that the stages alone leave elsewhere must not be believed; the search finds the part from them."""
     rng = np.random.default_rng(5)
-    tracker = Tracker(assembly_views(), CAMERA, TrackerOptions(use_texture=False))
+    tracker = Tracker(assembly_views(), CAMERA, options=TrackerOptions(use_texture=False))
     right, mistaken, found = [], [], 0
     for k in range(40):
         truth = pose_from(
@@ -237,7 +237,7 @@ def test_quality_parts_right_from_wrong_poses() -> None:
 def hidden_run() -> tuple[list[Pose], list[Array]]:
     """70 frames: found and tracked for 20, hidden by a card for 30, in view again for 20."""
     poses = path(70, seed=3)
-    session = TrackingSession(assembly_views(), assembly(), CAMERA)
+    session = TrackingSession(assembly_views(), CAMERA, assembly())
     results = []
     for i, pose in enumerate(poses):
         card = part_box(pose, margin_px=25) if 20 <= i < 50 else None
@@ -280,7 +280,7 @@ def test_there_is_no_pose_without_the_part() -> None:
         if not is_seen:
             assert result.quality == 0.0
             assert result.reason
-    session = TrackingSession(assembly_views(), assembly(), CAMERA)
+    session = TrackingSession(assembly_views(), CAMERA, assembly())
     for i in range(4):
         result = session.process(picture(None, seed=i, scene=6), i, 0.0)
         assert (result.state, result.cam_from_model) == (TrackingState.SEARCHING, None)
@@ -291,7 +291,7 @@ def test_there_is_no_pose_without_the_part() -> None:
 
 
 def test_a_part_that_leaves_the_picture_is_lost() -> None:
-    session = TrackingSession(assembly_views(), assembly(), CAMERA, initial_cam_from_model=PATH[0])
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=PATH[0])
     states = []
     for i in range(20):
         pose = PATH[0].copy()
@@ -306,7 +306,7 @@ def test_a_part_that_leaves_the_picture_is_lost() -> None:
 
 def test_an_initial_pose_is_snapped_to() -> None:
     start = wrong(PATH[0], np.random.default_rng(1), 4.0, 8.0)
-    session = TrackingSession(assembly_views(), assembly(), CAMERA, initial_cam_from_model=start)
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
     result = session.process(clip()[0], 0, 0.0)
     assert result.state == TrackingState.TRACKED
     assert result.cam_from_model is not None
@@ -327,7 +327,7 @@ def test_an_initial_pose_is_snapped_to() -> None:
     ids=["width", "turned", "gray", "alpha", "float"],
 )
 def test_a_wrong_image_is_refused(image: NDArray[np.uint8]) -> None:
-    session = TrackingSession(assembly_views(), assembly(), CAMERA)
+    session = TrackingSession(assembly_views(), CAMERA, assembly())
     with pytest.raises(InputError, match=r"frame 7: .*expected \(480, 640, 3\) uint8"):
         session.process(image, 7, 0.0)
 
@@ -335,11 +335,11 @@ def test_a_wrong_image_is_refused(image: NDArray[np.uint8]) -> None:
 def test_guide_views_of_another_model_are_refused() -> None:
     coarse = GuideViewOptions(subdivisions=0, renderer="zbuffer")
     with pytest.raises(MismatchError, match=r"'bracket'.*'assembly'"):
-        TrackingSession(make_guide_views(bracket(), ViewRange((400.0, 700.0)), coarse), assembly(), CAMERA)
+        TrackingSession(make_guide_views(bracket(), ViewRange((400.0, 700.0)), coarse), CAMERA, assembly())
 
 
 def test_options_and_poses_without_sense_are_refused() -> None:
     with pytest.raises(InputError, match="lost_quality"):
         SessionOptions(lost_quality=0.9)
     with pytest.raises(InputError, match="initial pose"):
-        TrackingSession(assembly_views(), assembly(), CAMERA, initial_cam_from_model=2.0 * np.eye(4))
+        TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=2.0 * np.eye(4))

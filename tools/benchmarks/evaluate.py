@@ -30,7 +30,7 @@ from arview.evaluation import (
 from arview.evaluation.semisynthetic import SHAPES
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.pose import Pose, TrackingState
-from arview.tracking import SessionOptions, Tracker, TrackingSession
+from arview.tracking import Tracker, TrackingSession
 from options import positive
 from recordings import SAMPLE, photo_sets, sample_command, scenes, skip, table
 from rows import Line
@@ -241,7 +241,7 @@ def wrong_start_line(scene: Scene) -> Line:
     converged = 0
     for _ in range(10):
         start = disturbed(truth, center, rng, 10.0, 0.0)
-        session = TrackingSession(views, scene.part.model, scene.camera, SessionOptions(), start)
+        session = TrackingSession(views, scene.camera, scene.part.model, initial_cam_from_model=start)
         for number, frame in enumerate(scene.frames[:3]):
             pose = session.process(scene.image(frame), frame.index, number / 30.0)
         if pose.cam_from_model is not None and frame.cam_from_model is not None:

@@ -280,8 +280,8 @@ def annotate(
                 )
         session = TrackingSession(
             views,
-            part.model,
             camera,
+            part.model,
             _session_options(modalities),
             initial_cam_from_model=first_pose,
             guide_cam_from_model=guide,

@@ -202,7 +202,12 @@ def evaluate_scene(
         guide = guide_pose(init.removeprefix(GUIDE_PREFIX), scene.part, views.view_range, scene.camera)
     if make_session is None:
         session: Session = TrackingSession(
-            views, model, scene.camera, options or SessionOptions(), first_pose, guide_cam_from_model=guide
+            views,
+            scene.camera,
+            model,
+            options or SessionOptions(),
+            initial_cam_from_model=first_pose,
+            guide_cam_from_model=guide,
         )
     else:
         session = make_session(views, scene.camera, first_pose)

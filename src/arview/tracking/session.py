@@ -87,8 +87,8 @@ class TrackingSession:
 
     Args:
         views: guide views of the model.
-        model: the same model; its surface is needed by the feature modality.
         camera: intrinsics of the frames.
+        model: the CAD model of the guide views; the texture modality needs its surface.
         options: see SessionOptions.
         initial_cam_from_model: (4,4) mm; the first frame snaps to it and does not search.
         guide_cam_from_model: (4,4) mm; the part is first found by bringing it near this pose, not by a search,
@@ -104,9 +104,10 @@ class TrackingSession:
     def __init__(
         self,
         views: GuideViewSet,
-        model: Model,
         camera: Camera,
+        model: Model,
         options: SessionOptions | None = None,
+        *,
         initial_cam_from_model: Array | None = None,
         guide_cam_from_model: Array | None = None,
     ) -> None:
@@ -122,14 +123,14 @@ class TrackingSession:
         self.tracker = Tracker(
             views,
             camera,
+            model,
             TrackerOptions(
                 use_region=self.options.use_region,
                 use_edge=self.options.use_edge,
                 use_texture=self.options.use_texture,
             ),
-            model,
-            LocalSearchRecheck(self._local) if self.options.use_recheck else None,
-            self._local.refiner.part,
+            recheck=LocalSearchRecheck(self._local) if self.options.use_recheck else None,
+            part=self._local.refiner.part,
         )
         self._detector: Detector | None = None
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")

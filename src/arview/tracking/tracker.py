@@ -186,8 +186,8 @@ class Tracker:
     Args:
         views: guide views of the part.
         camera: intrinsics of the frames.
+        model: the part's CAD model; without it the texture modality is left out.
         options: see `TrackerOptions`.
-        model: the part's CAD; its surface is needed by the texture modality.
         recheck: asked where a pose is far from the prediction; None leaves it out.
         part: the views as the kernels need them; made when None.
     """
@@ -196,8 +196,9 @@ class Tracker:
         self,
         views: GuideViewSet,
         camera: Camera,
-        options: TrackerOptions | None = None,
         model: Model | None = None,
+        options: TrackerOptions | None = None,
+        *,
         recheck: PoseRecheck | None = None,
         part: PartView | None = None,
     ) -> None:

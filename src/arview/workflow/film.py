@@ -70,7 +70,7 @@ def make_film(
             total = frames.frame_count or 0
             summary = annotation.annotate(
                 frames,
-                TrackingSession(views, part.model, camera),
+                TrackingSession(views, camera, part.model),
                 OverlayRenderer(part.model, camera, inspection),
                 VideoSink(unfinished[0], frames.width, frames.height, frames.fps, frames),
                 unfinished[1],

@@ -239,7 +239,7 @@ class Sections:
         if not shown:
             return None
         session = TrackingSession(
-            full_sphere_views(scene.part.model, WALK_ROUND.distance_mm), scene.part.model, scene.camera
+            full_sphere_views(scene.part.model, WALK_ROUND.distance_mm), scene.camera, scene.part.model
         )
         return LookAlikeWalk(look_alike, scene, shown, session)
 

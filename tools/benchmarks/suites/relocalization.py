@@ -67,7 +67,7 @@ def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: 
     frames = [f for f in scene.frames if f.cam_from_model is not None]
     half = len(frames) // 2
     step = max(1, round((len(frames) - half) / losses))
-    session = TrackingSession(views, model, scene.camera, options, frames[0].cam_from_model)
+    session = TrackingSession(views, scene.camera, model, options, initial_cam_from_model=frames[0].cam_from_model)
     session.detector.detect(scene.image(frames[0]), max_results=1)  # compiled code is loaded
     covered = np.full((scene.camera.height, scene.camera.width, 3), 90, dtype=np.uint8)
     count, right, wrong, cpu_ms = 0, 0, 0, []
@@ -90,7 +90,7 @@ def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: 
         wrong += pose.cam_from_model is not None and not is_right
         if not is_right:
             kept = session.appearance_memory
-            session = TrackingSession(views, model, scene.camera, options, frame.cam_from_model)
+            session = TrackingSession(views, scene.camera, model, options, initial_cam_from_model=frame.cam_from_model)
             session.appearance_memory = kept
             session.process(image, frame.index, number / 30.0)
     return Relearned(count, right, wrong, tuple(cpu_ms), len(session.appearance_memory))

@@ -117,7 +117,7 @@ class Subject:
         guide = None
         if self.options.guide is not None:
             guide = guide_pose(self.options.guide, self.part, self.views.view_range, camera)
-        return TrackingSession(self.views, self.part.model, camera, guide_cam_from_model=guide)
+        return TrackingSession(self.views, camera, self.part.model, guide_cam_from_model=guide)
 
     def overlay(self, camera: Camera, look: Look) -> OverlayRenderer:
         """What draws for a feed with this camera."""
