@@ -111,7 +111,7 @@ def make_inspection() -> None:
     """A hand-written example: the as-built truth with a measurement's noise put on, by a fixed seed."""
     from datetime import UTC, datetime
 
-    from arview.cad.part import load_part
+    from arview.cad.part_file import load_part
     from arview.inspection.files import save_inspection
     from arview.inspection.record import ComponentDeviation, Inspection, Provenance, Verdict
 

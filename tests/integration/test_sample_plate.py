@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from arview.cad.part import load_part
+from arview.cad.part_file import load_part
 from helpers.paths import SAMPLES
 
 FOLDER = SAMPLES / "plate"

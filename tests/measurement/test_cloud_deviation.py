@@ -10,7 +10,8 @@ import pytest
 import trimesh
 
 from arview.cad.model import Component, make_model
-from arview.cad.part import ComponentSettings, Part, load_part
+from arview.cad.part import ComponentSettings, Part
+from arview.cad.part_file import load_part
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import apply, look_at

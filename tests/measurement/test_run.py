@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from arview.cad.part import ComponentSettings, Part, load_part
+from arview.cad.part import ComponentSettings, Part
+from arview.cad.part_file import load_part
 from arview.cli import main
 from arview.errors import InputError
 from arview.geometry import apply, exp_so3, invert, rigid

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from arview.cad import Part, ViewRange
 from arview.cad.model import Component, Model, make_model
-from arview.cad.part import ComponentSettings, load_part
+from arview.cad.part import ComponentSettings
+from arview.cad.part_file import load_part
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.fiducials.board import Board, parse_board, parse_tags

@@ -162,7 +162,7 @@ def pose_record(pose: Pose) -> Record:
         "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.tolist(),
         "covariance": None if pose.covariance is None else pose.covariance.tolist(),
         "mismatches": list(pose.mismatches),
-        "unverified": list(pose.unseen),
+        "unverified": list(pose.unverified),
         "alternatives": [alternative.tolist() for alternative in pose.alternatives],
     }
 

@@ -3,7 +3,8 @@
 from arview.cad.check import Finding, PartCheck, check_part
 from arview.cad.load import load_model
 from arview.cad.model import Component, Model, make_model
-from arview.cad.part import PART_FILE_EXAMPLE, ComponentSettings, Datum, Part, default_view_range, load_part
+from arview.cad.part import ComponentSettings, Datum, Part, default_view_range
+from arview.cad.part_file import PART_FILE_EXAMPLE, load_part
 from arview.cad.symmetry import Symmetry
 from arview.cad.view_range import ViewRange
 

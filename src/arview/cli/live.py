@@ -132,7 +132,7 @@ def live(
 ) -> None:
     """Serve the overlay of PART to phones and screens in the local network."""
     require_extra()
-    from arview.cad.part import find_part_file
+    from arview.cad.part_file import find_part_file
     from arview.live.options import LiveOptions
     from arview.live.server.live_server import LiveServer, take_place
     from arview.video.sources import check_source

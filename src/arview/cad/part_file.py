@@ -1,0 +1,278 @@
+"""Part files: TOML that names a CAD file and the settings of its components, read into a `Part`."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+from arview.cad.load import SUFFIXES, load_cad
+from arview.cad.model import Model, make_model
+from arview.cad.part import (
+    DOF_NAMES,
+    ComponentSettings,
+    Datum,
+    DatumFeature,
+    Guide,
+    Part,
+    Role,
+    Vector,
+    unknown_component,
+)
+from arview.cad.raw import UNIT_MM
+from arview.cad.symmetry import Symmetry
+from arview.cad.toml_table import TomlTable
+from arview.cad.view_range import ViewRange
+from arview.errors import InputError
+
+ROLES = ("base", "inspect", "ignore")
+DATUM_FEATURES = ("plane", "hole", "pin", "cylinder", "edge", "point", "fit")
+
+PART_FILE_EXAMPLE = """\
+# A part file. Lengths in mm, angles in degrees, positions in the frame of the CAD file.
+# Only [part] with its cad is required; everything else has a default.
+
+[part]
+name = "bracket plate"         # default: the name of this file, or of its folder for part.toml
+cad = "bracket_plate.step"     # relative to this file
+# unit = "mm"                  # mm, cm, m, inch: needed for OBJ, STL and PLY; overrides the unit of others
+tol_linear_mm = 0.1            # STEP: largest distance of the triangles from the true surface
+tol_angular_deg = 10.0         # STEP: largest angle between neighbouring triangles of a curved surface
+serial = "BP-0042"             # of the specimen at hand, shown in the overlay
+
+# From where the camera may look at the middle of the part's bounding box. Azimuth runs from +X to +Y,
+# elevation from the XY plane to +Z, roll 0 has +Z up in the picture. All but distance_mm may be left out.
+# Without this table: every direction and roll, from 1.5 to 6 diameters of the part.
+[view_range]
+distance_mm = [400.0, 900.0]
+elevation_deg = [20.0, 85.0]
+azimuth_deg = [-180.0, 180.0]
+roll_deg = [-30.0, 30.0]
+
+# Views of your own for --init guide:NAME, next to front, back, left, right, top, bottom, iso and middle.
+[guides.start]
+azimuth_deg = -60.0
+elevation_deg = 40.0
+roll_deg = 0.0                 # default: 0, or the middle of the declared rolls
+distance_mm = 650.0            # default: the part spans 60 % of the picture's smaller side
+
+# For components that do not say otherwise.
+[defaults]
+role = "inspect"
+position_tolerance_mm = 1.0
+
+# One table for each component that needs one. Names as `arview check` prints them; quote odd ones:
+# [components."sub_1/post"]
+[components.base_plate]
+role = "base"                  # base: carries the datums and is not judged; inspect: is measured and judged;
+                               # ignore: is left out of the model (a fixture that the camera never sees)
+color = "#8a8f98"              # sRGB, default: the colour in the CAD
+
+[components.post_1]
+role = "inspect"
+position_tolerance_mm = 0.5    # largest allowed distance from the nominal place (half of GD&T's zone)
+angle_tolerance_deg = 0.5      # largest allowed rotation from nominal
+# A rotation that changes nothing about the component: it cannot be measured and is not judged.
+symmetry = { axis = [0.0, 0.0, 1.0], through_mm = [60.0, 40.0, 0.0], order = "continuous" }
+
+# Rotations that change nothing about the whole part: order 2 is half a turn, 6 a hexagon's; or "continuous".
+# through_mm may be left out here: the middle of the bounding box.
+# [[symmetry]]
+# axis = [0.0, 0.0, 1.0]
+# order = 2
+
+# The features of the base that define the frame in which deviations are stated, in order of precedence: each
+# locks what it determines and those before it have left free (ISO 5459). What all leave free, here the
+# rotation about B, the best fit of the base decides; so it does without any datums.
+[datums.A]
+feature = "plane"              # plane, hole, pin (their rim), cylinder (the axis of a round face), edge (straight, of
+                               # two flat faces), point (where its normal meets the surface), or fit (of a component)
+component = "base_plate"
+point_mm = [0.0, 0.0, 0.0]
+normal = [0.0, 0.0, 1.0]
+
+[datums.B]
+feature = "hole"               # or "pin"
+component = "base_plate"
+point_mm = [-97.0, -67.0, 0.0] # on the axis, at the end that the camera sees
+axis = [0.0, 0.0, 1.0]
+diameter_mm = 12.0
+locks = ["tx", "ty"]           # default: all that it determines; of rx ry rz tx ty tz, axes of the model
+"""
+"""A complete part file with comments; what `arview check --help` shows."""
+
+
+def find_part_file(path: str | Path) -> Path:
+    """The part file or CAD file that is meant: of a folder its part.toml.
+
+    Raises:
+        InputError: there is none.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "part.toml"
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a part file (.toml) or a CAD file ({' '.join(SUFFIXES)})")
+    return path
+
+
+def load_part(path: str | Path, unit: str | None = None) -> Part:
+    """Part of a part file (TOML, see PART_FILE_EXAMPLE), of a folder with a part.toml, or of a bare CAD file.
+
+    ``unit`` (mm, cm, m, inch) overrides the unit of the part file and of the CAD.
+
+    Raises:
+        InputError: missing or broken file, unknown key, wrong type or value, a component that the CAD does
+            not have; and everything that load_cad raises.
+    """
+    path = find_part_file(path)
+    if path.suffix.lower() != ".toml":
+        cad = load_cad(path, unit)
+        settings = tuple(ComponentSettings(component.name) for component in cad.model.components)
+        return Part(path.stem, path, path, cad.model, settings, notes=cad.notes)
+    try:
+        content = tomllib.loads(path.read_bytes().decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    return _read_part(TomlTable(path, "", content), path, unit)
+
+
+def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
+    for key in ("part", "view_range", "guides", "defaults", "components", "symmetry", "datums"):
+        root.known(key)
+    root.finish()
+    head = root.table("part", required=True)
+    default_name = path.resolve().parent.name if path.stem == "part" else path.stem
+    name = head.text("name", default_name)
+    cad_path = path.parent / head.text("cad")
+    own_unit = head.choice("unit", tuple(UNIT_MM), None)
+    tol_linear_mm = head.positive("tol_linear_mm", 0.1)
+    tol_angular_deg = head.positive("tol_angular_deg", 10.0)
+    serial = head.text("serial", "") or None
+    head.finish()
+    if not cad_path.is_file():
+        raise InputError(f"{path}: [part] cad = {str(head.content['cad'])!r}: there is no file {cad_path}")
+    view_range = _read_view_range(root.table("view_range")) if "view_range" in root.content else None
+    guides = _read_guides(root.table("guides"))
+    cad = load_cad(cad_path, unit or own_unit, cast(float, tol_linear_mm), cast(float, tol_angular_deg))
+    names = [component.name for component in cad.model.components]
+    defaults = _read_settings(root.table("defaults"), "", cad.model, ComponentSettings(""))
+    tables = root.table("components")
+    for unknown in [key for key in tables.content if key not in names]:
+        raise InputError(f"{path}: [components] {unknown_component(unknown, names)}")
+    settings, components = [], []
+    for component in cad.model.components:
+        table = tables.table(component.name)
+        color = table.color("color")
+        setting = _read_settings(table, component.name, cad.model, defaults)
+        settings.append(setting)
+        if setting.role != "ignore":
+            components.append(replace(component, color=color) if color else component)
+    tables.finish()
+    if not components:
+        raise InputError(f"{path}: every component has the role 'ignore'; nothing is left to track")
+    model = make_model(cad.model.name, tuple(components))
+    symmetries = tuple(
+        _read_symmetry(table, tuple(model.center_in_model.tolist())) for table in root.tables("symmetry")
+    )
+    datums = _read_datums(root.table("datums"), cad.model)
+    return Part(
+        name=name,
+        path=path,
+        cad_path=cad_path,
+        model=model,
+        settings=tuple(settings),
+        view_range=view_range,
+        symmetries=symmetries,
+        datums=datums,
+        guides=guides,
+        serial=serial,
+        notes=cad.notes,
+    )
+
+
+def _read_view_range(table: TomlTable) -> ViewRange:
+    intervals: dict[str, tuple[float, float]] = {"distance_mm": table.interval("distance_mm")}
+    for key in ("elevation_deg", "azimuth_deg", "roll_deg"):
+        if table.known(key):
+            intervals[key] = table.interval(key)
+    table.finish()
+    try:
+        return ViewRange(**intervals)
+    except InputError as error:
+        raise InputError(f"{table.path}: [view_range] {error}") from error
+
+
+def _read_guides(tables: TomlTable) -> tuple[Guide, ...]:
+    guides = []
+    for name in tables.content:
+        table = tables.table(name)
+        guides.append(
+            Guide(
+                name,
+                azimuth_deg=table.angle("azimuth_deg"),
+                elevation_deg=table.angle("elevation_deg", 90.0),
+                roll_deg=table.angle("roll_deg") if table.known("roll_deg") else None,
+                distance_mm=table.positive("distance_mm"),
+            )
+        )
+        table.finish()
+    tables.finish()
+    return tuple(guides)
+
+
+def _read_settings(table: TomlTable, name: str, model: Model, defaults: ComponentSettings) -> ComponentSettings:
+    """Settings of one component, or of [defaults] when ``name`` is empty."""
+    symmetry = defaults.symmetry
+    if name and "symmetry" in table.content:
+        center = model.component(name).bounds_in_model.mean(axis=0)
+        symmetry = _read_symmetry(table.table("symmetry"), tuple(center.tolist()))
+    elif name:
+        table.known("symmetry")
+    settings = ComponentSettings(
+        name=name,
+        role=cast(Role, table.choice("role", ROLES, defaults.role)),
+        position_tolerance_mm=table.positive("position_tolerance_mm", defaults.position_tolerance_mm),
+        angle_tolerance_deg=table.positive("angle_tolerance_deg", defaults.angle_tolerance_deg),
+        symmetry=symmetry,
+    )
+    table.finish()
+    return settings
+
+
+def _read_symmetry(table: TomlTable, default_through: Vector) -> Symmetry:
+    axis = table.direction("axis")
+    through = table.vector("through_mm", default_through)
+    order = table.take("order")
+    table.finish()
+    if order == "continuous":
+        return Symmetry(axis, through, None)
+    if isinstance(order, bool) or not isinstance(order, int) or order < 2:
+        table.fail("order", order, 'a whole number of at least 2, or "continuous"')
+    return Symmetry(axis, through, order)
+
+
+def _read_datums(tables: TomlTable, model: Model) -> tuple[Datum, ...]:
+    datums = []
+    names = [component.name for component in model.components]
+    for label in tables.content:
+        table = tables.table(label)
+        feature = cast(DatumFeature, table.choice("feature", DATUM_FEATURES, required=True))
+        component = table.text("component")
+        if component not in names:
+            raise InputError(f"{table.path}: [{table.name}] {unknown_component(component, names)}")
+        x, y, z = model.component(component).bounds_in_model.mean(axis=0).tolist()
+        point, direction, diameter_mm = (x, y, z), (0.0, 0.0, 1.0), None
+        if feature != "fit":
+            point = table.vector("point_mm")
+            direction = table.direction("normal" if feature in ("plane", "point") else "axis")
+        if feature in ("hole", "pin", "cylinder"):
+            diameter_mm = table.positive("diameter_mm", required=True)
+        locks = table.choices("locks", DOF_NAMES)
+        table.finish()
+        datums.append(Datum(label, feature, component, point, direction, diameter_mm, locks))
+    tables.finish()
+    return tuple(datums)
