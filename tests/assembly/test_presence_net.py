@@ -20,7 +20,7 @@ from arview.assembly.presence_net import (
     shown,
 )
 from arview.cad.model import Model
-from arview.detection.features.edge_net import LineNetwork
+from arview.detection.features.edge_net import EdgeNet
 from arview.detection.scoring.pose_verifier import BAND_PX, CHANNELS, LINES
 from arview.geometry import Array, apply
 from arview.refinement.projection import intrinsics_of
@@ -38,8 +38,8 @@ def network() -> ComponentNetwork:
 
 
 @cache
-def line_network() -> LineNetwork:
-    return LineNetwork()
+def line_network() -> EdgeNet:
+    return EdgeNet()
 
 
 def without(name: str) -> Model:
@@ -51,7 +51,7 @@ def looks(image: NDArray[np.uint8], pose: Array, *names: str) -> list[ComponentL
     pose_of_body = pose @ PART.model_from_body
     return component_looks(
         image,
-        line_network().lines(image),
+        line_network().predict(image),
         intrinsics_of(CAMERA),
         PART.surface,
         PART.views.diameter_mm,

@@ -1,4 +1,4 @@
-"""Strips: the edge is in the middle of each where the pose is right, and the network says where it strays."""
+"""ContourVerifier: the edge is in the middle of each where the pose is right, and the network says where it strays."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.detection.features.edge_net import LineNetwork
-from arview.detection.features.image_pyramid import Picture
+from arview.detection.features.edge_net import EdgeNet
+from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.contour_verifier import (
     CHANNELS,
     COLUMNS,
@@ -18,9 +18,9 @@ from arview.detection.scoring.contour_verifier import (
     RAW,
     ROWS,
     STEP_PX,
-    Strips,
+    ContourVerifier,
+    contour_profiles,
     picture_step,
-    raw_strips,
     shown,
 )
 from arview.geometry import Array, rigid
@@ -34,17 +34,17 @@ MIDDLE = COLUMNS // 2
 
 
 @cache
-def strips() -> Strips:
-    return Strips(PART)
+def strips() -> ContourVerifier:
+    return ContourVerifier(PART)
 
 
 @cache
-def picture(noise: float = 4.0, is_hidden: bool = False) -> Picture:
+def picture(noise: float = 4.0, is_hidden: bool = False) -> ImagePyramid:
     pose = TRUTH @ PART.body_from_model
-    return Picture(drawn(pose, noise=noise, card=half_hidden(pose) if is_hidden else None), CAMERA, 12, LineNetwork())
+    return ImagePyramid(drawn(pose, noise=noise, card=half_hidden(pose) if is_hidden else None), CAMERA, 12, EdgeNet())
 
 
-def scores(seen: Picture, poses: list[Array]) -> Array:
+def scores(seen: ImagePyramid, poses: list[Array]) -> Array:
     return strips().scores(seen, np.stack(poses))
 
 
@@ -65,21 +65,21 @@ def edge_offsets_px(cut: NDArray[np.uint8]) -> Array:
 
 
 def test_the_edge_is_in_the_middle_where_the_pose_is_right() -> None:
-    offsets = edge_offsets_px(raw_strips(picture(), PART, TRUTH))
+    offsets = edge_offsets_px(contour_profiles(picture(), PART, TRUTH))
     assert len(offsets) > 0.7 * OUTLINE_ROWS
     assert abs(np.median(offsets)) < 0.6
     assert np.percentile(np.abs(offsets), 70) < 1.2
 
 
 def test_the_edge_is_inside_where_the_pose_is_too_near_and_outside_where_it_is_too_far() -> None:
-    near, far = (edge_offsets_px(raw_strips(picture(), PART, nearer(share))) for share in (0.97, 1.03))
+    near, far = (edge_offsets_px(contour_profiles(picture(), PART, nearer(share))) for share in (0.97, 1.03))
     # The outline is 60 to 110 px from the middle of the part: 3 % of that.
     assert np.median(near) == pytest.approx(-2.7, abs=1.0)
     assert np.median(far) == pytest.approx(2.7, abs=1.0)
 
 
 def test_inside_is_where_the_part_is_to_be() -> None:
-    cut = raw_strips(picture(), PART, TRUTH)
+    cut = contour_profiles(picture(), PART, TRUTH)
     seen = cut[3, :OUTLINE_ROWS] > 0
     inside, outside = cut[7, :OUTLINE_ROWS, : MIDDLE + 1], cut[7, :OUTLINE_ROWS, MIDDLE + 1 :]
     assert set(np.unique(inside[seen[:, : MIDDLE + 1]])) <= {128, 255}
@@ -90,26 +90,26 @@ def test_inside_is_where_the_part_is_to_be() -> None:
 
 
 def test_nothing_is_cut_outside_the_picture() -> None:
-    half_out = raw_strips(picture(), PART, aside(-310.0))
+    half_out = contour_profiles(picture(), PART, aside(-310.0))
     seen = half_out[3] > 0
     assert 0.1 < seen[:OUTLINE_ROWS].mean() < 0.9
     assert not half_out[:, ~seen].any()
     behind = rigid(TRUTH[:3, :3], -TRUTH[:3, 3])
-    assert not raw_strips(picture(), PART, behind).any()
-    seen_behind, told = shown(raw_strips(picture(), PART, behind), 80.0)
+    assert not contour_profiles(picture(), PART, behind).any()
+    seen_behind, told = shown(contour_profiles(picture(), PART, behind), 80.0)
     assert np.isfinite(seen_behind).all() and np.isfinite(told).all()
 
 
 def test_large_pictures_are_cut_as_the_line_network_sees_them() -> None:
     large = cv2.resize(picture().image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
-    twice = Picture(large, CAMERA.scaled(1280, 960), 12, LineNetwork())
+    twice = ImagePyramid(large, CAMERA.scaled(1280, 960), 12, EdgeNet())
     assert (picture_step(picture()), picture_step(twice)) == (0, -4)
-    one, other = (raw_strips(seen, PART, TRUTH)[:3].astype(int) for seen in (picture(), twice))
+    one, other = (contour_profiles(seen, PART, TRUTH)[:3].astype(int) for seen in (picture(), twice))
     assert np.abs(one - other).mean() < 4.0
 
 
 def test_what_is_shown_knows_no_brightness() -> None:
-    cut = raw_strips(picture(), PART, TRUTH)
+    cut = contour_profiles(picture(), PART, TRUTH)
     dark = cut.copy()
     dark[:3] = cut[:3] // 2
     (seen, told), (seen_dark, told_dark) = shown(cut, 80.0), shown(dark, 80.0)
@@ -131,7 +131,7 @@ def test_poses_off_by_a_few_pixels_say_less(noise: float) -> None:
 
 
 def test_the_true_pose_says_more_than_any_on_clutter() -> None:
-    clutter = [Picture(background(seed), CAMERA, 12, LineNetwork()) for seed in range(4)]
+    clutter = [ImagePyramid(background(seed), CAMERA, 12, EdgeNet()) for seed in range(4)]
     highest = max(scores(seen, [*turned_about(TRUTH, 20.0, 20)]).max() for seen in clutter)
     assert scores(picture(), [TRUTH])[0] > highest + 5.0
     # A card over half of the outline takes its share, not all.

@@ -65,7 +65,7 @@ def slopes(image: NDArray[np.uint8]) -> NDArray[np.float32]:
 def test_most_of_the_noise_is_taken_out_and_edges_stay_steep(noise: float) -> None:
     truth = seen_through_a_lens()
     grainy = noisy(truth, noise)
-    clean = network().cleaned(grainy)
+    clean = network().denoise(grainy)
     assert clean.shape == truth.shape and clean.dtype == np.uint8
     at_edges = slopes(truth) > 10.0
     away = cv2.dilate(at_edges.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
@@ -80,7 +80,7 @@ def test_most_of_the_noise_is_taken_out_and_edges_stay_steep(noise: float) -> No
 def test_edges_stay_where_they_are() -> None:
     ramp = np.clip((np.arange(320) - 160.3) + 0.5, 0.0, 1.0)
     truth = np.round(70.0 + 110.0 * np.tile(ramp, (240, 1)))[..., None].repeat(3, axis=2).astype(np.uint8)
-    clean = network().cleaned(noisy(truth, 12.0)).mean(axis=2)
+    clean = network().denoise(noisy(truth, 12.0)).mean(axis=2)
     # Where each row crosses the middle grey.
     near = clean[8:-8, 150:172]
     right = np.argmax(near > 125.0, axis=1)
@@ -96,12 +96,12 @@ def test_pictures_of_little_noise_stay_as_they_are() -> None:
     for noise in (0.0, 1.5):
         grainy = noisy(image, noise)
         assert noise_level(grainy) < LEAST_NOISE
-        assert network().cleaned(grainy) is grainy
+        assert network().denoise(grainy) is grainy
 
 
 @pytest.mark.parametrize("size", [(97, 131), (8, 8), (3, 5), (40, 600)])
 def test_any_size_is_cleaned(size: tuple[int, int]) -> None:
-    clean = network().cleaned(noisy(np.full((*size, 3), 128, dtype=np.uint8), 15.0))
+    clean = network().denoise(noisy(np.full((*size, 3), 128, dtype=np.uint8), 15.0))
     assert clean.shape == (*size, 3)
     assert np.std(clean.astype(float)) < 11.0
 
@@ -109,14 +109,14 @@ def test_any_size_is_cleaned(size: tuple[int, int]) -> None:
 def test_bands_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
     image = noisy(drawn(POSE, noise=0.0), 12.0)
     assert image.shape[0] == CAMERA.height <= denoiser.BAND_ROWS
-    whole = network().cleaned(image)
+    whole = network().denoise(image)
     monkeypatch.setattr(denoiser, "BAND_ROWS", 96)
-    banded = network().cleaned(image)
+    banded = network().denoise(image)
     assert np.max(np.abs(banded.astype(int) - whole)) <= 1
 
 
 def test_the_searches_see_noisy_pictures_clean() -> None:
     truth = seen_through_a_lens()
     grainy = noisy(truth, 14.0)
-    seen = LocalSearch(assembly_views(), CAMERA).picture(grainy).image
+    seen = LocalSearch(assembly_views(), CAMERA).pyramid(grainy).image
     assert off(seen, truth) < 0.5 * off(grainy, truth)

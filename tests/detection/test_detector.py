@@ -12,21 +12,21 @@ import pytest
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.detection import Detector, DetectorOptions
-from arview.detection.detector import SURE_QUALITY
-from arview.detection.features.image_pyramid import Picture
+from arview.detection.detector import MIN_QUICK_QUALITY
+from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.search.global_search import (
-    BY_GRADIENTS,
+    DOMAIN_DIRECTION,
     FARTHER,
+    GRADIENTS_ONLY,
     NEARER,
     QUICK,
     RESPONSE_WORTH,
-    WANTED_SIDE,
-    WHOLE,
+    UNTRIMMED,
     WIDE,
-    Candidate,
-    Effort,
-    Likely,
-    are_wanted,
+    CandidatePoses,
+    PoseCandidate,
+    SearchBudget,
+    in_fundamental_domain,
 )
 from arview.detection.search.local_search import BEFORE_WORTH, Hypothesis
 from arview.detection.symmetry import find_symmetries, telling
@@ -170,29 +170,29 @@ def test_of_views_that_symmetries_make_the_same_one_and_a_margin_is_looked_for()
     anywhere = rng.normal(size=(2000, 3))
     anywhere /= np.linalg.norm(anywhere, axis=1, keepdims=True)
     full = ViewRange((200.0, 500.0))
-    wanted = directions[are_wanted(directions, turns, full)]
+    wanted = directions[in_fundamental_domain(directions, turns, full)]
     assert 162 / 24 < len(wanted) < 162 / 6
     assert farthest_from_wanted_deg(anywhere, wanted, turns) < 11.0
     # A margin: by every direction there are templates on all sides that need no turn.
-    inside = anywhere[np.all((turns @ WANTED_SIDE - WANTED_SIDE) @ anywhere.T <= 0.0, axis=0)]
+    inside = anywhere[np.all((turns @ DOMAIN_DIRECTION - DOMAIN_DIRECTION) @ anywhere.T <= 0.0, axis=0)]
     assert len(inside) > 40
     assert farthest_from_wanted_deg(inside, wanted, np.eye(3)[None]) < 11.0
 
     above = ViewRange((200.0, 500.0), elevation_deg=(20.0, 90.0), azimuth_deg=(-100.0, 40.0))
     sought = directions[above.contains_direction(directions, 3.0)]
-    wanted = sought[are_wanted(sought, turns, above)]
+    wanted = sought[in_fundamental_domain(sought, turns, above)]
     assert len(wanted) < len(sought)
     declared = anywhere[above.contains_direction(anywhere)]
     assert farthest_from_wanted_deg(declared, wanted, turns) < 13.0
 
     upright = ViewRange((200.0, 500.0), roll_deg=(-20.0, 20.0))
-    assert are_wanted(directions, turns, upright).all()
-    assert are_wanted(directions, turns[:0], full).all()
+    assert in_fundamental_domain(directions, turns, upright).all()
+    assert in_fundamental_domain(directions, turns[:0], full).all()
 
 
 def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
     sought = Detector(make_guide_views(block(), ViewRange((250.0, 500.0)), GuideViewOptions(subdivisions=3)), CAMERA)
-    assert len(sought.same_turns) == 4
+    assert len(sought.exact_rotations) == 4
     rng = np.random.default_rng(5)
     found, wrong_ones = 0, 0
     for k in range(16):
@@ -202,7 +202,7 @@ def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
         if detections:
             body = detections[0].cam_from_model @ sought.local.refiner.part.model_from_body
             alike = [
-                body @ rigid(t, np.zeros(3)) @ sought.local.refiner.part.body_from_model for t in sought.same_turns
+                body @ rigid(t, np.zeros(3)) @ sought.local.refiner.part.body_from_model for t in sought.exact_rotations
             ]
             mm, _, deg = min((error(one, truth, block()) for one in alike), key=lambda of: of[2])
             found += mm < 8.0 and deg < 2.0
@@ -243,25 +243,27 @@ def test_a_key_decides_between_twins_and_where_it_cannot_be_seen_the_view_is_amb
 
 def test_a_pose_settled_a_little_aside_is_no_twin(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = pose_from(30, 40, 500.0)
-    seen = detector().local.picture(picture(truth))
+    seen = detector().local.pyramid(picture(truth))
     right = detector().hypotheses(seen)[0]
     (pose,) = turned(right.cam_from_body, [exp_so3(np.deg2rad([0.0, 10.0, 0.0]))])
-    aside = replace(right, cam_from_body=pose, strips=right.strips - 2.0)
+    aside = replace(right, cam_from_body=pose, contour_score=right.contour_score - 2.0)
     against = np.array([[0.0, -9.0], [9.0, 0.0]])
-    monkeypatch.setattr(detector(), "_ahead", lambda of, rivals: against[: len(rivals), : len(rivals)])
-    monkeypatch.setattr(detector().local, "finished", lambda of, starts: [])
-    best, twins = detector()._told_apart(seen, right, [aside])
+    monkeypatch.setattr(detector(), "_evidence_margins", lambda of, rivals: against[: len(rivals), : len(rivals)])
+    monkeypatch.setattr(detector().local, "refine_fine", lambda of, starts: [])
+    best, twins = detector()._disambiguate(seen, right, [aside])
     assert best is right and not twins
 
 
 def test_a_search_by_gradients_alone_takes_no_heed_of_the_line_network() -> None:
-    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
-    without = Picture(seen.image, CAMERA, seen.pad_px)
+    seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
+    without = ImagePyramid(seen.image, CAMERA, seen.pad_px)
     for one, other in zip(
-        detector().search.likely(seen, BY_GRADIENTS), detector().search.likely(without, WHOLE), strict=True
+        detector().global_search.candidates(seen, GRADIENTS_ONLY),
+        detector().global_search.candidates(without, UNTRIMMED),
+        strict=True,
     ):
         np.testing.assert_array_equal(one, other)
-    assert not np.array_equal(detector().search.likely(seen, WHOLE).responses, one)
+    assert not np.array_equal(detector().global_search.candidates(seen, UNTRIMMED).responses, one)
 
 
 def lid() -> Model:
@@ -282,18 +284,18 @@ def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
     part = sought.local.refiner.part
     for k in range(4):
         truth = pose_from(20.0 + 80.0 * k, 45.0, 380.0, model)
-        seen = sought.local.picture(picture(truth, model, seed=k, scene=k))
+        seen = sought.local.pyramid(picture(truth, model, seed=k, scene=k))
         (spun,) = turned(truth @ part.model_from_body, [exp_so3(np.deg2rad([0.0, 0.0, 23.0]))])
-        starts = sought._spun(seen, spun)
+        starts = sought._rotation_sweep(seen, spun)
         assert min(error(start @ part.body_from_model, truth, model)[2] for start in starts[:3]) < 6.0
-        best = sought.local.verified(seen, sought.local.finished(seen, [spun]))[0]
-        found, _ = sought._told_apart(seen, best, [])
+        best = sought.local.verify(seen, sought.local.refine_fine(seen, [spun]))[0]
+        found, _ = sought._disambiguate(seen, best, [])
         assert error(found.cam_from_body @ part.body_from_model, truth, model)[2] < 2.0
 
 
 def test_a_part_with_few_near_turns_is_not_spun() -> None:
     assert not len(detector().symmetries.axes)
-    assert detector()._spun(detector().local.picture(picture(pose_from(30, 40, 500.0))), np.eye(4)) == []
+    assert detector()._rotation_sweep(detector().local.pyramid(picture(pose_from(30, 40, 500.0))), np.eye(4)) == []
 
 
 def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
@@ -325,13 +327,13 @@ def test_a_small_part_a_plain_view_and_a_close_rival_are_doubted_and_a_pose_a_li
     weaker = PoseEvidence(0.58, 0.58, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
 
     def quality(distance_mm: float, rival_aside_mm: float | None, turn_deg: float, share: float = 1.0) -> float:
-        pose, lines = pose_from(30, 40, distance_mm), share * detector().local.usual_lines
+        pose, lines = pose_from(30, 40, distance_mm), share * detector().local.mean_view_lines
         radius_px = detector().local.refiner.radius_px(pose)
-        hypotheses = [Hypothesis(pose, evidence, 4.0, lines, radius_px, verification=1.0, strips=1.0)]
+        hypotheses = [Hypothesis(pose, evidence, 4.0, lines, radius_px, verifier_score=1.0, contour_score=1.0)]
         if rival_aside_mm is not None:
             other = pose_from(30 + turn_deg, 40, distance_mm)
             other[0, 3] += rival_aside_mm
-            hypotheses.append(Hypothesis(other, weaker, 4.0, lines, radius_px, verification=1.0, strips=1.0))
+            hypotheses.append(Hypothesis(other, weaker, 4.0, lines, radius_px, verifier_score=1.0, contour_score=1.0))
         return detector().qualities(hypotheses)[0]
 
     alone = quality(500.0, None, 0.0)
@@ -404,10 +406,10 @@ def test_options_without_sense_are_refused() -> None:
 
 
 def test_no_search_looks_beyond_the_declared_distances() -> None:
-    seen = detector().local.picture(picture(pose_from(30, 40, 500.0), noise=12.0))
+    seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0), noise=12.0))
     low, high = detector().views.view_range.distance_mm
-    likely = detector().search.likely(seen, WIDE).poses
-    climbed = detector().local.climbed(seen, detector().search.starts(seen, WIDE), WIDE.kept)
+    likely = detector().global_search.candidates(seen, WIDE).poses
+    climbed = detector().local.pattern_search(seen, detector().global_search.starts(seen, WIDE), WIDE.kept)
     poses = np.concatenate([likely, [candidate.cam_from_body for candidate in climbed]])
     distances_mm = np.linalg.norm(poses[:, :3, 3], axis=1)
     assert len(likely) > 100 and climbed
@@ -415,11 +417,11 @@ def test_no_search_looks_beyond_the_declared_distances() -> None:
 
 
 def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None:
-    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
+    seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
     pose = pose_from(10, 20, 480.0) @ detector().local.refiner.part.model_from_body
     responses = np.array([0.2, 0.7, 0.4])
-    alike = Likely(np.stack([pose] * 3), np.full(3, 12.0), responses)
-    found = detector().search.judged(seen, alike)
+    alike = CandidatePoses(np.stack([pose] * 3), np.full(3, 12.0), responses)
+    found = detector().global_search.rank(seen, alike)
     scores = [candidate.score for candidate in found]
     assert scores[0] - scores[1] == pytest.approx(0.3 * RESPONSE_WORTH) and scores[1] > scores[2]
 
@@ -427,8 +429,8 @@ def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None
 def test_matches_that_all_leave_the_declared_distances_are_no_detection(monkeypatch: pytest.MonkeyPatch) -> None:
     search = detector().search
     monkeypatch.setattr(search, "_reach_mm", (1.0, 2.0))
-    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
-    likely, lines, _ = search.likely(seen, WIDE)
+    seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
+    likely, lines, _ = search.candidates(seen, WIDE)
     assert likely.shape == (0, 4, 4) and lines.shape == (0,)
     assert detector().detect(seen.image) == []
 
@@ -436,38 +438,43 @@ def test_matches_that_all_leave_the_declared_distances_are_no_detection(monkeypa
 def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
     rng = np.random.default_rng(5)
     for k in range(4):
-        found = detector().hypotheses(detector().local.picture(picture(anywhere(rng), seed=k, scene=k, noise=12.0)))
+        found = detector().hypotheses(detector().local.pyramid(picture(anywhere(rng), seed=k, scene=k, noise=12.0)))
         logits = [hypothesis.logit for hypothesis in found]
         assert logits == sorted(logits, reverse=True)
         for i, a in enumerate(found):
-            assert a.verification is not None
+            assert a.verifier_score is not None
             for b in found[i + 1 :]:
                 assert not are_near(a.cam_from_body, b.cam_from_body, 0.04 * detector().views.diameter_mm, 4.0)
 
 
 def test_a_quick_search_ends_the_matter_only_when_it_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
-    likely, efforts = detector().search.likely, []
+    seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
+    likely, budgets = detector().search.likely, []
 
-    def watched(of: Picture, effort: Effort = QUICK) -> Likely:
-        efforts.append(effort)
+    def watched(of: ImagePyramid, effort: SearchBudget = QUICK) -> CandidatePoses:
+        budgets.append(effort)
         return likely(of, effort)
 
     monkeypatch.setattr(detector().search, "likely", watched)
-    for quality, expected in ((SURE_QUALITY, [QUICK]), (SURE_QUALITY - 0.01, [QUICK, WIDE, BY_GRADIENTS, WHOLE])):
+    for quality, expected in (
+        (MIN_QUICK_QUALITY, [QUICK]),
+        (MIN_QUICK_QUALITY - 0.01, [QUICK, WIDE, GRADIENTS_ONLY, UNTRIMMED]),
+    ):
         monkeypatch.setattr(detector(), "qualities", lambda found, quality=quality: [quality] * len(found))
-        efforts.clear()
+        budgets.clear()
         assert detector().hypotheses(seen)
-        assert efforts == expected
+        assert budgets == expected
 
 
 def test_what_spoke_for_a_pose_at_one_level_counts_at_the_next() -> None:
-    seen = detector().local.picture(picture(pose_from(30, 40, 500.0)))
-    poses = [candidate.cam_from_body for candidate in detector().search.starts(seen, QUICK)]
-    plain = detector().local.climbed(seen, [Candidate(0.0, pose) for pose in poses])
+    seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
+    poses = [candidate.cam_from_body for candidate in detector().global_search.starts(seen, QUICK)]
+    plain = detector().local.pattern_search(seen, [PoseCandidate(0.0, pose) for pose in poses])
     # The last of them, and it alone, was far ahead before.
-    found = detector().local.climbed(seen, [Candidate(1000.0 * (k == len(poses) - 1), p) for k, p in enumerate(poses)])
-    alone = detector().local.climbed(seen, [Candidate(0.0, poses[-1])])
+    found = detector().local.pattern_search(
+        seen, [PoseCandidate(1000.0 * (k == len(poses) - 1), p) for k, p in enumerate(poses)]
+    )
+    alone = detector().local.pattern_search(seen, [PoseCandidate(0.0, poses[-1])])
     np.testing.assert_allclose(found[0].cam_from_body, alone[0].cam_from_body, atol=1e-9)
     assert found[0].score == pytest.approx(alone[0].score + 1000.0 * BEFORE_WORTH**2)
     assert not np.allclose(plain[0].cam_from_body, alone[0].cam_from_body, atol=1e-3)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from arview.detection.features.edge_net import (
     INSIDE,
     LONGEST_SIDE_PX,
-    LineNetwork,
-    halved_lines,
-    lines_at,
+    EdgeNet,
+    halve_responses,
+    resize_responses,
 )
-from arview.detection.features.image_pyramid import Picture
+from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.features.response_maps import (
     ORIENTATIONS,
     orientation_bins,
@@ -35,8 +35,8 @@ POSE = pose_from(30.0, 45.0, 520.0)
 
 
 @cache
-def network() -> LineNetwork:
-    return LineNetwork()
+def network() -> EdgeNet:
+    return EdgeNet()
 
 
 def outline() -> tuple[Array, Array]:
@@ -60,7 +60,7 @@ def standing_out(maps: NDArray[np.uint8], quarter_turns: int = 0) -> float:
 @pytest.mark.parametrize("noise", [3.0, 9.0, 16.0])
 def test_the_outline_stands_out_before_clutter_and_noise_as_it_does_not_by_gradients(noise: float) -> None:
     image = drawn(POSE, noise=noise)
-    seen = network().lines(image)[:ORIENTATIONS]
+    seen = network().predict(image)[:ORIENTATIONS]
     assert standing_out(seen) > 6.0
     assert standing_out(seen) > 2.5 * standing_out(response_maps(image, 0, 0, 2))
     assert standing_out(seen, 1) < 0.3 * standing_out(seen)
@@ -69,14 +69,14 @@ def test_the_outline_stands_out_before_clutter_and_noise_as_it_does_not_by_gradi
 def test_it_hardly_answers_to_noise() -> None:
     rng = np.random.default_rng(0)
     noise = np.clip(110 + 14 * rng.standard_normal((480, 640, 3)), 0, 255).astype(np.uint8)
-    seen = network().lines(noise)
+    seen = network().predict(noise)
     assert np.mean(seen[:ORIENTATIONS].max(axis=0) > 128) < 0.01
     assert np.mean(seen[INSIDE] > 128) < 0.01
 
 
 @pytest.mark.parametrize("noise", [3.0, 9.0, 16.0])
 def test_it_sees_where_the_solid_is(noise: float) -> None:
-    seen = network().lines(drawn(POSE, noise=noise))[INSIDE]
+    seen = network().predict(drawn(POSE, noise=noise))[INSIDE]
     vertices, faces, _ = assembly().mesh
     c = CAMERA.scaled(seen.shape[1], seen.shape[0])
     _, face_ids = rasterise(apply(POSE, vertices), faces, c.fx, c.fy, c.cx, c.cy, c.width, c.height)
@@ -100,9 +100,9 @@ def test_answers_count_relative_to_the_clearest_nearby_but_hardly_any_stay_so() 
     seen = np.zeros((ORIENTATIONS + 1, 160, 320), dtype=np.float32)
     seen[3, :, 20], seen[5, 40, 200:], seen[1, 120, 200:] = 0.9, 0.3, 0.02
     seen[0, :, 30] = 0.3  # beside a clear one
-    lines = LineNetwork()
+    lines = EdgeNet()
     lines._network = Answers(seen)
-    found = lines.lines(np.zeros((320, 640, 3), dtype=np.uint8)).astype(float) / 255.0
+    found = lines.predict(np.zeros((320, 640, 3), dtype=np.uint8)).astype(float) / 255.0
     assert found[3, 60:100, 20].min() == 1.0
     assert found[5, 40, 240:280].min() == 1.0  # as clear as any around
     assert found[1, 120, 240:280].max() < 0.15
@@ -112,7 +112,7 @@ def test_answers_count_relative_to_the_clearest_nearby_but_hardly_any_stay_so() 
 def test_smaller_maps_keep_the_strongest_of_four() -> None:
     rng = np.random.default_rng(0)
     lines = rng.integers(0, 256, (ORIENTATIONS, 24, 40)).astype(np.uint8)
-    levels = halved_lines(lines)
+    levels = halve_responses(lines)
     assert [level.shape[1:] for level in levels] == [(24, 40), (12, 20), (6, 10), (3, 5)]
     for level, half in pairwise(levels):
         _, rows, columns = half.shape
@@ -122,32 +122,32 @@ def test_smaller_maps_keep_the_strongest_of_four() -> None:
 
 @pytest.mark.parametrize(("height", "width"), [(480, 640), (257, 331), (720, 1280), (40, 30)])
 def test_pictures_of_any_size_are_taken(height: int, width: int) -> None:
-    seen = network().lines(background(1, width, height))
+    seen = network().predict(background(1, width, height))
     share = min(1.0, LONGEST_SIDE_PX / max(height, width))
     assert abs(seen.shape[1] - share * height / 2) <= 1 and abs(seen.shape[2] - share * width / 2) <= 1
-    assert lines_at(seen, 50, 40, 1).shape == (8, 40, 50)
+    assert resize_responses(seen, 50, 40, 1).shape == (8, 40, 50)
 
 
 def test_lines_of_a_large_picture_are_where_they_are_in_a_small_one() -> None:
     image = drawn(POSE, noise=2.0)
     large = np.asarray(cv2.resize(image, None, fx=1.5, fy=1.5, interpolation=cv2.INTER_CUBIC))
-    small, again = (network().lines(of)[:ORIENTATIONS].max(axis=0) for of in (image, large))
+    small, again = (network().predict(of)[:ORIENTATIONS].max(axis=0) for of in (image, large))
     again = cv2.resize(again, small.shape[::-1]).astype(np.uint8)
     assert np.corrcoef(cv2.blur(small, (5, 5)).ravel(), cv2.blur(again, (5, 5)).ravel())[0, 1] > 0.8
 
 
 def test_a_picture_mixes_both_in_its_maps_and_without_a_network_has_gradients_only() -> None:
     image = drawn(POSE, noise=6.0)
-    plain, lined = Picture(image, CAMERA, 12), Picture(image, CAMERA, 12, network())
+    plain, lined = ImagePyramid(image, CAMERA, 12), ImagePyramid(image, CAMERA, 12, network())
     (by_gradients, one), (mixed, other) = plain.maps(-4), lined.maps(-4)
     np.testing.assert_array_equal(one, other)
     rows, columns = by_gradients.shape[1] - 24, by_gradients.shape[2] - 24
-    lines = lines_at(network().lines(image), columns, rows, 1)
+    lines = resize_responses(network().predict(image), columns, rows, 1)
     inside = np.s_[:, 12:-12, 12:-12]
     wanted = 0.5 * by_gradients[inside].astype(float) + 0.5 * lines
     assert np.abs(mixed[inside] - wanted).max() <= 1.0
     assert mixed[:, :12].max() == 0  # the rim stays empty
-    assert not plain.lines().answers.any()
-    np.testing.assert_array_equal(lined.without_lines.maps(-4)[0], by_gradients)
+    assert not plain.edge_responses().maps.any()
+    np.testing.assert_array_equal(lined.without_edge_net.maps(-4)[0], by_gradients)
     np.testing.assert_array_equal(lined.maps(-4)[0], mixed)  # as it was
-    assert lined.lines().answers.any() and lined.gradients(-4).lines.any()
+    assert lined.edge_responses().maps.any() and lined.gradients(-4).lines.any()

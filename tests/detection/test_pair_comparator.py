@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from arview.cad import Model, make_model
 from arview.cad.view_range import ViewRange
-from arview.detection.features.edge_net import LineNetwork
-from arview.detection.features.image_pyramid import Picture
-from arview.detection.scoring.pair_comparator import TwinNetwork
+from arview.detection.features.edge_net import EdgeNet
+from arview.detection.features.image_pyramid import ImagePyramid
+from arview.detection.scoring.pair_comparator import PairComparator
 from arview.detection.symmetry import TELLING
 from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
@@ -46,7 +46,7 @@ def twins_of(truth: Array, key_mm: float) -> list[Array]:
 
 def leads(key_mm: float, truth: Array, poses: list[Array], **drawn: object) -> Array:
     seen = picture(truth, plate(key_mm), **drawn)  # type: ignore[arg-type]
-    return TwinNetwork(part_of(key_mm)).leads(Picture(seen, CAMERA, 12, LineNetwork()), poses)
+    return PairComparator(part_of(key_mm)).log_odds(ImagePyramid(seen, CAMERA, 12, EdgeNet()), poses)
 
 
 @pytest.mark.parametrize("noise", [2.0, 10.0])
@@ -73,8 +73,8 @@ def test_it_does_not_matter_which_pose_comes_first() -> None:
 def test_what_hides_the_difference_decides_nothing() -> None:
     truth = pose_from(40.0, 80.0, 400.0, plate(10.0))
     flat = np.clip(np.random.default_rng(0).normal(120.0, 4.0, (CAMERA.height, CAMERA.width, 3)), 0, 255)
-    seen = Picture(flat.astype(np.uint8), CAMERA, 12, LineNetwork())
-    told = TwinNetwork(part_of(10.0)).leads(seen, twins_of(truth, 10.0))
+    seen = ImagePyramid(flat.astype(np.uint8), CAMERA, 12, EdgeNet())
+    told = PairComparator(part_of(10.0)).log_odds(seen, twins_of(truth, 10.0))
     assert np.abs(told).max() < TELLING, np.round(told, 1)
 
 

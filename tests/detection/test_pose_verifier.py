@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.detection.features.edge_net import LineNetwork
-from arview.detection.features.image_pyramid import Picture
+from arview.detection.features.edge_net import EdgeNet
+from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pose_verifier import (
     BAND_PX,
     CHANNELS,
     PLAIN,
     RADIUS_PX,
     SIDE_PX,
-    Verifier,
-    contrasted,
-    raw_look,
-    with_gradients,
+    PoseVerifier,
+    append_gradients,
+    normalise_colours,
+    pose_crop,
 )
 from arview.geometry import Array, apply
 from arview.refinement.view_model import PartView
@@ -35,22 +35,22 @@ KNOWN = np.array([3.0, 1.0, 0.5])
 
 
 @cache
-def verifier() -> Verifier:
-    return Verifier(PART)
+def verifier() -> PoseVerifier:
+    return PoseVerifier(PART)
 
 
-def picture(noise: float = 6.0, is_hidden: bool = False) -> Picture:
+def picture(noise: float = 6.0, is_hidden: bool = False) -> ImagePyramid:
     pose = TRUTH @ PART.body_from_model
     card = half_hidden(pose) if is_hidden else None
-    return Picture(drawn(pose, noise=noise, card=card), CAMERA, 12, lines())
+    return ImagePyramid(drawn(pose, noise=noise, card=card), CAMERA, 12, lines())
 
 
 @cache
-def lines() -> LineNetwork:
-    return LineNetwork()
+def lines() -> EdgeNet:
+    return EdgeNet()
 
 
-def scores(seen: Picture, poses: Array) -> Array:
+def scores(seen: ImagePyramid, poses: Array) -> Array:
     return verifier().scores(seen, poses, np.tile(KNOWN, (len(poses), 1)))
 
 
@@ -59,8 +59,8 @@ def shown(pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     return looked_at(picture(), pose)[:2]
 
 
-def looked_at(seen: Picture, pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
-    return raw_look(seen, PART, pose, float(seen.radii_px(PART.views.diameter_mm, pose[None])[0]))
+def looked_at(seen: ImagePyramid, pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
+    return pose_crop(seen, PART, pose, float(seen.radii_px(PART.views.diameter_mm, pose[None])[0]))
 
 
 def turned(angle_deg: float, count: int) -> Array:
@@ -82,7 +82,7 @@ def test_the_further_off_the_less_is_a_pose_verified() -> None:
 
 
 def test_a_picture_without_the_part_verifies_no_pose() -> None:
-    clutter = [Picture(background(seed), CAMERA, 12, lines()) for seed in range(6)]
+    clutter = [ImagePyramid(background(seed), CAMERA, 12, lines()) for seed in range(6)]
     true = scores(picture(), TRUTH[None])[0]
     assert max(scores(seen, turned(20.0, 20)).max() for seen in clutter) < true - 2.0
 
@@ -135,7 +135,7 @@ def test_the_lines_that_are_shown_lie_where_the_outline_is_and_solids_where_the_
 
 
 def test_without_a_line_network_no_lines_are_shown() -> None:
-    assert not looked_at(Picture(picture().image, CAMERA, 12), TRUTH)[2].any()
+    assert not looked_at(ImagePyramid(picture().image, CAMERA, 12), TRUTH)[2].any()
 
 
 def rendered() -> tuple[Array, NDArray[np.int32]]:
@@ -162,7 +162,7 @@ def shaded(strength: float, noise: float) -> tuple[Array, float]:
     rng = np.random.default_rng(4)
     grays = 60.0 + strength * light + rng.normal(0.0, noise, light.shape)
     pixels[..., :3] = np.clip(grays, 0, 255)[..., None]
-    seen, explained = with_gradients(contrasted(pixels, drawn_part)[0])
+    seen, explained = append_gradients(normalise_colours(pixels, drawn_part)[0])
     return seen[PLAIN + 4 :], float(explained)
 
 
@@ -184,8 +184,8 @@ def test_what_hides_a_part_of_the_part_does_not_turn_a_right_pose_into_a_wrong_o
 def test_a_pose_outside_the_picture_is_scored_without_a_picture() -> None:
     aside = TRUTH.copy()
     aside[0, 3] += 2000.0
-    plain, contrast = contrasted(*shown(aside))
-    seen, explained = with_gradients(plain)
+    plain, contrast = normalise_colours(*shown(aside))
+    seen, explained = append_gradients(plain)
     assert seen.shape == (CHANNELS, SIDE_PX, SIDE_PX)
     assert not seen[:4].any() and not seen[PLAIN:].any()
     assert explained == 0.0

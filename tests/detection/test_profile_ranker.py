@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from arview.detection.features.edge_net import LineNetwork
-from arview.detection.features.image_pyramid import Picture
+from arview.detection.features.edge_net import EdgeNet
+from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.profile_ranker import (
     FINE,
     INNER_LINES,
@@ -17,7 +17,7 @@ from arview.detection.scoring.profile_ranker import (
     ROUGH,
     SEEN,
     STRETCHES,
-    describe,
+    describe_poses,
     judge,
     network,
 )
@@ -33,9 +33,9 @@ TRUTH = pose_from(30.0, 45.0, 520.0) @ PART.model_from_body
 NETWORKS = pytest.mark.parametrize("networks", [ROUGH, FINE], ids=["rough", "fine"])
 
 
-def picture(noise: float = 6.0) -> Picture:
+def picture(noise: float = 6.0) -> ImagePyramid:
     """The assembly before clutter, with noise."""
-    return Picture(drawn(TRUTH @ PART.body_from_model, noise=noise), CAMERA, 12, LineNetwork())
+    return ImagePyramid(drawn(TRUTH @ PART.body_from_model, noise=noise), CAMERA, 12, EdgeNet())
 
 
 def turned(angle_deg: float, count: int) -> Array:
@@ -53,7 +53,7 @@ def elsewhere(count: int) -> Array:
     return np.stack(poses)
 
 
-def scores(seen: Picture, poses: Array, networks: tuple[str, ...]) -> Array:
+def scores(seen: ImagePyramid, poses: Array, networks: tuple[str, ...]) -> Array:
     return judge(seen, PART, poses, np.full(len(poses), 12.0), networks)
 
 
@@ -77,7 +77,7 @@ def test_the_kernel_scores_as_numpy_does(networks: tuple[str, ...]) -> None:
     seen, poses = picture(), np.concatenate([TRUTH[None], turned(8.0, 20), elsewhere(40)])
     expected = np.zeros(len(poses))
     for name in networks:
-        lines, both = describe(seen, PART, poses, np.full(len(poses), 12.0), RADII_PX[name])
+        lines, both = describe_poses(seen, PART, poses, np.full(len(poses), 12.0), RADII_PX[name])
         net = network(name)
         counts = lines[..., SEEN : SEEN + 1]
         hidden = np.maximum(lines @ net.first + net.first_bias, 0)
@@ -95,7 +95,7 @@ def test_the_kernel_scores_as_numpy_does(networks: tuple[str, ...]) -> None:
 def test_lines_outside_the_picture_are_empty_and_still_give_a_score() -> None:
     aside = TRUTH.copy()
     aside[0, 3] += 2000.0
-    lines, both = describe(picture(), PART, aside[None], np.array([12.0]), 48.0)
+    lines, both = describe_poses(picture(), PART, aside[None], np.array([12.0]), 48.0)
     assert lines.shape[1] == OUTLINE_LINES + INNER_LINES
     assert not lines.any()
     assert both[0, 2] == 0.0
@@ -105,7 +105,7 @@ def test_lines_outside_the_picture_are_empty_and_still_give_a_score() -> None:
 
 def test_it_is_shown_the_lines_of_the_line_network_and_where_that_sees_solids() -> None:
     seen = picture()
-    lines, _ = describe(seen, PART, TRUTH[None], np.full(1, 12.0), RADII_PX["rough"])
+    lines, _ = describe_poses(seen, PART, TRUTH[None], np.full(1, 12.0), RADII_PX["rough"])
     outline = lines[0, :OUTLINE_LINES]
     assert (outline[:, SEEN] == 1.0).all()
     alike, inside = np.split(outline[:, SEEN + 2 :].mean(axis=0), 2)
@@ -113,6 +113,6 @@ def test_it_is_shown_the_lines_of_the_line_network_and_where_that_sees_solids() 
     # A line there, no other beside it; solid on the inner side only.
     assert alike[REACH_PX - 1 : REACH_PX + 2].max() > 0.6 > 4.0 * alike[-3:].mean()
     assert inside[:3].mean() > 0.6 and inside[-3:].mean() < 0.3
-    without = Picture(seen.image, CAMERA, 12)
-    lines, _ = describe(without, PART, TRUTH[None], np.full(1, 12.0), RADII_PX["rough"])
+    without = ImagePyramid(seen.image, CAMERA, 12)
+    lines, _ = describe_poses(without, PART, TRUTH[None], np.full(1, 12.0), RADII_PX["rough"])
     assert not lines[0, :, SEEN + 2 :].any()

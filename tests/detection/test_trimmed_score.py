@@ -6,9 +6,9 @@ import pytest
 from arview.detection.search.pattern_search import outline_score
 from arview.detection.search.template_bank import (
     SECTORS,
-    by_sector,
-    least_pair,
+    min_adjacent_pair,
     sector_of,
+    sector_order,
 )
 
 RADIUS_PX = 40.0
@@ -18,11 +18,11 @@ def ring(points: int = 64) -> tuple[np.ndarray, np.ndarray]:
     """A circle's points in the order of outlines, and their angles, 256 to the half turn."""
     turn = 2.0 * np.pi * (np.arange(points) + 0.5) / points
     shown = np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)
-    order = by_sector(shown)
+    order = sector_order(shown)
     return shown[order].astype(np.float32), (np.round(turn[order] / np.pi * 256.0).astype(int) % 256).astype(np.uint8)
 
 
-def score(hidden_deg: tuple[float, float], is_sparing: bool) -> float:
+def score(hidden_deg: tuple[float, float], is_trimmed: bool) -> float:
     """Of a ring on maps that answer everywhere but in one stretch of directions about its middle."""
     points, angles = ring()
     y, x = np.mgrid[:128, :128] - 63.5
@@ -33,7 +33,7 @@ def score(hidden_deg: tuple[float, float], is_sparing: bool) -> float:
     room = np.empty((3, len(points)), dtype=np.int64)
     sectors = np.empty(SECTORS, dtype=np.int64)
     found, dx, dy = outline_score(
-        maps, points, angles, 0.0, RADIUS_PX, 0.0, 63.5, 63.5, 0, 2, is_sparing, room, sums, sectors
+        maps, points, angles, 0.0, RADIUS_PX, 0.0, 63.5, 63.5, 0, 2, is_trimmed, room, sums, sectors
     )
     assert (dx, dy) == (0, 0)
     return float(found)
@@ -49,8 +49,8 @@ def test_sectors_are_stretches_side_by_side() -> None:
 
 
 def test_the_least_pair_may_lie_across_the_end() -> None:
-    assert least_pair(np.array([1, 9, 9, 9, 5, 5, 9, 2])) == 3
-    assert least_pair(np.array([9, 9, 1, 0, 9, 9, 9, 2])) == 1
+    assert min_adjacent_pair(np.array([1, 9, 9, 9, 5, 5, 9, 2])) == 3
+    assert min_adjacent_pair(np.array([9, 9, 1, 0, 9, 9, 9, 2])) == 1
 
 
 @pytest.mark.parametrize("start_deg", [0.0, 45.0, 135.0, 270.0])

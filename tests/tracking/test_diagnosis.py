@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from arview.annotation import reasons_text
-from arview.detection.detector import Rejected
+from arview.detection.detector import RejectedHypothesis
 from arview.geometry import Array
 from arview.pose import TrackingState
 from arview.refinement.evidence import PoseEvidence
@@ -31,7 +31,7 @@ WEAK = PoseEvidence(0.31, 0.2, 0.4, 0.4, 0.4, 0.1, 1.0)
 def why(
     image: NDArray[np.uint8], pose: Array | None = None, evidence: PoseEvidence = WEAK, quality: float = 0.2
 ) -> str:
-    rejected = None if pose is None else Rejected(pose, evidence, quality)
+    rejected = None if pose is None else RejectedHypothesis(pose, evidence, quality)
     return diagnose_search(image, CAMERA, assembly_views(), rejected)
 
 
@@ -202,7 +202,7 @@ def test_a_session_says_what_the_detector_rejected() -> None:
     session = TrackingSession(assembly_views(), CAMERA, assembly())
     far = pose_from(30, 40, 820)
     session.detector.detect = lambda *_, **__: []  # type: ignore[method-assign]
-    session.detector.best_rejected = Rejected(far, GOOD, 0.9)
+    session.detector.best_rejected = RejectedHypothesis(far, GOOD, 0.9)
     result = session.process(picture(far), 0, 0.0)
     assert result.state == TrackingState.SEARCHING
     assert result.reason == "too far: about 820 mm, declared up to 640 mm"

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from arview.detection.detector import local_search_for
 from arview.detection.search.local_search import (
     FINE_TOLERANCE_PX,
-    Candidate,
     LocalSearch,
+    PoseCandidate,
 )
 from arview.geometry import Array, exp_so3, rigid
 from arview.refinement.schedules import LAST_STAGES
@@ -102,25 +102,25 @@ def test_the_window_sees_what_the_picture_shows() -> None:
     """A pose that is refined in a window is that refined in the whole picture."""
     truth = pose_from(-20, 45, 500)
     image = picture(truth, noise=6.0)
-    start = Candidate(1.0, in_body(wrong(truth, np.random.default_rng(2), 4.0, 4.0)))
-    whole = local().settled(local().picture(image), [start])[0]
+    start = PoseCandidate(1.0, in_body(wrong(truth, np.random.default_rng(2), 4.0, 4.0)))
+    whole = local().refine_and_verify(local().pyramid(image), [start])[0]
     left, top, camera = 120, 60, CAMERA.cropped(120, 60, 416, 352)
-    windowed = local().seen_by(camera)
+    windowed = local().with_camera(camera)
     crop = np.ascontiguousarray(image[top : top + camera.height, left : left + camera.width])
-    found = windowed.settled(windowed.picture(crop), [start])[0]
+    found = windowed.refine_and_verify(windowed.picture(crop), [start])[0]
     for one in (whole, found):
         mm, _, deg = error(in_model(one.cam_from_body), truth)
         assert mm < 2.0 and deg < 0.5
-    assert found.own_logit == pytest.approx(whole.own_logit, abs=1.0)
-    assert found.verification == pytest.approx(whole.verification, abs=3.0)
+    assert found.evidence_logit == pytest.approx(whole.evidence_logit, abs=1.0)
+    assert found.verifier_score == pytest.approx(whole.verifier_score, abs=3.0)
 
 
 def test_a_verified_hypothesis_keeps_its_place_in_the_list() -> None:
     truth = pose_from(30, 40, 520)
-    seen = local().picture(picture(truth, noise=6.0))
+    seen = local().pyramid(picture(truth, noise=6.0))
     far = rigid(exp_so3(np.array([0.0, 0.6, 0.0])) @ in_body(truth)[:3, :3], in_body(truth)[:3, 3])
-    found = local().refined(seen, [(far, ()), (in_body(truth), ())], FINE_TOLERANCE_PX)
-    verified = local().verified(seen, found)
+    found = local().refine_starts_through(seen, [(far, ()), (in_body(truth), ())], FINE_TOLERANCE_PX)
+    verified = local().verify(seen, found)
     assert [np.allclose(a.cam_from_body, b.cam_from_body) for a, b in zip(found, verified, strict=True)] == [True] * 2
     assert verified[1].logit > verified[0].logit + 3.0
 

@@ -48,14 +48,14 @@ class Outcome:
 
 
 def fit_probability(seeds: range, photos: Sequence[Path]) -> None:
-    """Print the weights of what speaks for a pose, in the order of `found_terms`, and how many are told then.
+    """Print the weights of what speaks for a pose, in the order of `confidence_terms`, and how many are told then.
 
     The bias in use is lowered from that of the fit until pictures like those of `_others` give hardly a false alarm.
 
     Pictures with the part in which the best hypothesis is wrong are left out: most are twins of the right pose.
     """
-    efforts = DetectorOptions().efforts
-    solids = ((str(seed), 1.0, pictures_of(seed, photos, efforts)) for seed in tqdm(seeds, desc="solids", disable=None))
+    budgets = DetectorOptions().budgets
+    solids = ((str(seed), 1.0, pictures_of(seed, photos, budgets)) for seed in tqdm(seeds, desc="solids", disable=None))
     recorded = ((name, RECORDED_WEIGHT, _recorded(name)) for name in scenes())
     outcomes = [outcome for part in chain(solids, recorded, _others()) for outcome in _outcomes(*part)]
     if len({outcome.is_right for outcome in outcomes}) < 2:
@@ -82,7 +82,7 @@ def fit_probability(seeds: range, photos: Sequence[Path]) -> None:
 
 def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Outcome]:
     for detector, image, truth in pictures:
-        found = detector.hypotheses(detector.local.picture(image))
+        found = detector.hypotheses(detector.local.pyramid(image))
         if not found:
             continue
         best = found[0]

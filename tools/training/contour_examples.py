@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from arview.core.atomic import replacing
 from arview.detection import Detector, DetectorOptions
-from arview.detection.scoring.contour_verifier import raw_strips
-from arview.detection.search.global_search import Candidate
+from arview.detection.scoring.contour_verifier import contour_profiles
+from arview.detection.search.global_search import PoseCandidate
 from arview.detection.search.local_search import Hypothesis
 from arview.geometry import Array
 from profile_ranker_examples import REFINED_APART, REFINED_NEAR, pictures_of, told
@@ -29,9 +29,9 @@ class Stripped:
 
     Attributes:
         solid: its seed.
-        strips: (N,RAW,ROWS,COLUMNS) uint8, see `raw_strips`.
+        strips: (N,RAW,ROWS,COLUMNS) uint8, see `contour_profiles`.
         radii_px: (N,) half the diameter in the picture.
-        known: (N,4) verification, logit of the evidence, judgement, support by lines.
+        known: (N,4) verification, logit of the evidence, profile_score, support by lines.
         is_right, is_told: (N,) bool: right, and that it is known whether so.
         is_given: (N,) bool: found from the true pose, not by the search.
         has_part: the part is in the picture.
@@ -51,7 +51,7 @@ def collect_strips(seeds: range, photos: Sequence[Path], folder: Path) -> None:
     """Write the verified poses of each solid's pictures to a file of its own, unless it is there."""
     for seed, path in still_to_make(seeds, folder, "strips_{}.pkl", "solids"):
         examples = []
-        for detector, image, truth in pictures_of(seed, photos, DetectorOptions().efforts):
+        for detector, image, truth in pictures_of(seed, photos, DetectorOptions().budgets):
             detector.local.options = replace(detector.local.options, verified=VERIFIED)
             example = strips_of(seed, detector, image, truth)
             examples += [example] if example is not None else []
@@ -61,9 +61,9 @@ def collect_strips(seeds: range, photos: Sequence[Path], folder: Path) -> None:
 
 def strips_of(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Array | None) -> Stripped | None:
     """The verified poses of a picture with the true ``cam_from_body`` of the part, or without it; None if none."""
-    picture, local = detector.local.picture(image), detector.local
+    picture, local = detector.local.pyramid(image), detector.local
     found: list[Hypothesis] = detector.hypotheses(picture)
-    given = local.settled(picture, [Candidate(0.0, truth)]) if truth is not None else []
+    given = local.refine_and_verify(picture, [PoseCandidate(0.0, truth)]) if truth is not None else []
     both = [*found, *given]
     if not both:
         return None
@@ -71,9 +71,11 @@ def strips_of(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
     right, is_told = told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
     return Stripped(
         seed,
-        np.stack([raw_strips(picture, local.refiner.part, pose) for pose in poses]),
+        np.stack([contour_profiles(picture, local.refiner.part, pose) for pose in poses]),
         picture.radii_px(detector.views.diameter_mm, poses),
-        np.array([(h.verification, h.own_logit, h.judgement, h.line_support) for h in both], dtype=np.float64),
+        np.array(
+            [(h.verifier_score, h.evidence_logit, h.profile_score, h.edge_response) for h in both], dtype=np.float64
+        ),
         right,
         is_told,
         np.arange(len(both)) >= len(found),

@@ -137,7 +137,7 @@ def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[n
     if rng.random() < MOTTLED:
         plain = plain * _mottles(rng) ** covered
     # As the searches are shown it.
-    shown = _denoiser().cleaned(_spoilt(plain, rng))
+    shown = _denoiser().denoise(_spoilt(plain, rng))
     if rng.random() < 0.5:
         shown, truth = shown[:, ::-1], truth[TURNED["mirrored"], :, ::-1]
     if rng.random() < 0.5:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from arview.core.atomic import replacing
 from arview.detection import Detector
-from arview.detection.features.image_pyramid import Picture
-from arview.detection.scoring.pair_comparator import raw_looks
+from arview.detection.features.image_pyramid import ImagePyramid
+from arview.detection.scoring.pair_comparator import pair_crops
 from arview.detection.search.global_search import QUICK
 from arview.detection.search.local_search import Hypothesis
 from arview.evaluation.semisynthetic.random_solids import random_solid, random_twin
@@ -36,8 +36,8 @@ class Twins:
 
     Attributes:
         solid: its seed.
-        picture: (S,S,4) uint8; drawn: (N,6,S,S) int8, 127 for 1; lines: (N,3,S,S) uint8: see `raw_looks`.
-        logits: (N,) see `Hypothesis.logit_without_strips`.
+        picture: (S,S,4) uint8; drawn: (N,6,S,S) int8, 127 for 1; lines: (N,3,S,S) uint8: see `pair_crops`.
+        logits: (N,) see `Hypothesis.logit_without_contour`.
         is_right: (N,) bool, at least one and not all.
     """
 
@@ -63,26 +63,30 @@ def collect_twins(seeds: range, photos: Sequence[Path], folder: Path) -> None:
             seed, photos, (QUICK,), random_twin if seed % OTHER_EVERY else random_solid
         ):
             if truth is not None:
-                examples += twins_of(seed, detector, detector.local.picture(image), truth, rng)
+                examples += twins_of(seed, detector, detector.local.pyramid(image), truth, rng)
         with replacing(path) as file:
             pickle.dump(examples, file)
 
 
-def twins_of(seed: int, detector: Detector, picture: Picture, truth: Array, rng: np.random.Generator) -> list[Twins]:
+def twins_of(
+    seed: int, detector: Detector, picture: ImagePyramid, truth: Array, rng: np.random.Generator
+) -> list[Twins]:
     """What becomes of poses turned from the true ``cam_from_body`` in a picture; empty where none is right or wrong."""
     local = detector.local
     starts = [_off(start, detector.views.diameter_mm, rng) for start in _turned(detector, truth, rng)]
-    found = local.ordered(local.verified(picture, local.ordered(local.finished(picture, starts), 5.0)), 5.0, MOST)
+    found = local.deduplicate(
+        local.verify(picture, local.deduplicate(local.refine_fine(picture, starts), 5.0)), 5.0, MOST
+    )
     poses = np.array([h.cam_from_body for h in found]).reshape(-1, 4, 4)
     limits = (REFINED_NEAR, REFINED_APART)
-    right, near = (is_near(detector, poses, truth, detector.same_turns, *limit) for limit in limits)
+    right, near = (is_near(detector, poses, truth, detector.exact_rotations, *limit) for limit in limits)
     # Between the two it is neither right nor wrong.
     kept: list[Hypothesis] = [h for h, is_told in zip(found, right | ~near, strict=True) if is_told]
     right = right[right | ~near]
     if not right.any() or right.all():
         return []
-    pixels, drawn, lines = raw_looks(picture, local.refiner.part, [h.cam_from_body for h in kept])
-    logits = np.array([h.logit_without_strips for h in kept])
+    pixels, drawn, lines = pair_crops(picture, local.refiner.part, [h.cam_from_body for h in kept])
+    logits = np.array([h.logit_without_contour for h in kept])
     return [Twins(seed, pixels, np.round(127.0 * drawn).astype(np.int8), lines, logits, right)]
 
 

@@ -17,9 +17,9 @@ from arview.detection.scoring.pose_verifier import (
     MEANS,
     PLAIN,
     SIDE_PX,
-    contrasted,
+    append_gradients,
+    normalise_colours,
     overall,
-    with_gradients,
 )
 from arview.detection.scoring.score_net import DOWNWARD, RIGHTWARD, mirrored
 from networks.net2net import torch_with_onnx
@@ -112,13 +112,13 @@ def network_input(
 ) -> tuple[NDArray[np.float32], list[float], list[float]]:
     """Some looks of a picture as networks take them, with their contrasts and shares explained; perhaps altered."""
     plain, contrasts = zip(
-        *(contrasted(looked.pixels[k], looked.drawn[k].astype(np.float32) / 127.0) for k in index), strict=True
+        *(normalise_colours(looked.pixels[k], looked.drawn[k].astype(np.float32) / 127.0) for k in index), strict=True
     )
     lines = looked.lines[list(index)].astype(np.float32) / np.float32(255.0)
     seen = np.concatenate([np.stack(plain), lines], axis=1)
     if rng is not None:
         seen = augmented(seen, rng)
-    shown, explained = zip(*map(with_gradients, np.ascontiguousarray(seen[:, :PLAIN])), strict=True)
+    shown, explained = zip(*map(append_gradients, np.ascontiguousarray(seen[:, :PLAIN])), strict=True)
     return np.concatenate([np.stack(shown), seen[:, PLAIN:]], axis=1), list(contrasts), list(explained)
 
 

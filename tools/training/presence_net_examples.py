@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from arview.assembly.presence_net import component_looks
 from arview.cad.model import Component, Model, make_model
 from arview.core.atomic import replacing
-from arview.detection.features.edge_net import LineNetwork
+from arview.detection.features.edge_net import EdgeNet
 from arview.evaluation.semisynthetic import CAMERA, VARIANTS, SequenceOptions, render_sequence, trajectory
 from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.evaluation.semisynthetic.look_alikes import look_alikes
@@ -90,7 +90,7 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
     variants += [_resized(model, rng) for _ in range(RESIZED)]
     surfaces = [surface_about(*reduced_surface(one), model.center_in_model) for one, _ in variants]
     surface = surface_about(*reduced_surface(model), model.center_in_model)
-    others, network = some_solids(seed), LineNetwork()
+    others, network = some_solids(seed), EdgeNet()
     for _ in range(PICTURES_EACH):
         is_right = rng.random() < RIGHT_SHARE
         number = -1 if is_right else int(rng.integers(len(variants)))
@@ -101,7 +101,7 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
         shown = _displaced(built, model, rng)
         image = _picture(shown, model, pose, options, (occluder, *others), photos, rng)
         cam_from_body = _off(pose, rng) @ rigid(np.eye(3), model.center_in_model)
-        seen = partial(component_looks, image, network.lines(image), intrinsics_of(CAMERA))
+        seen = partial(component_looks, image, network.predict(image), intrinsics_of(CAMERA))
         looks = seen(surface, model.diameter_mm, cam_from_body)
         is_wrong = [model.components[look.index].name in changed for look in looks]
         for k in rng.permutation(len(variants))[:EXPECTED]:

@@ -16,10 +16,10 @@ from arview.cad import Model
 from arview.core.atomic import replacing
 from arview.detection import Detector
 from arview.detection.detector import DetectorOptions
-from arview.detection.features.image_pyramid import Picture
-from arview.detection.scoring.pose_verifier import raw_look
-from arview.detection.scoring.profile_ranker import RADII_PX, describe
-from arview.detection.search.global_search import WIDE, Candidate, Effort
+from arview.detection.features.image_pyramid import ImagePyramid
+from arview.detection.scoring.pose_verifier import pose_crop
+from arview.detection.scoring.profile_ranker import RADII_PX, describe_poses
+from arview.detection.search.global_search import WIDE, PoseCandidate, SearchBudget
 from arview.detection.search.local_search import Hypothesis
 from arview.errors import InputError
 from arview.evaluation.protocols import full_sphere_range
@@ -111,7 +111,7 @@ class Looks:
 
     Attributes:
         solid: its seed.
-        pixels: (N,S,S,4) uint8; drawn: (N,6,S,S) int8, 127 for 1; lines: (N,3,S,S) uint8: see `verifier.raw_look`.
+        pixels: (N,S,S,4) uint8; drawn: (N,6,S,S) int8, 127 for 1; lines: (N,3,S,S) uint8: see `verifier.pose_crop`.
         radii_px: (N,) half the diameter in the picture.
         known: (N,3) what else the verifier is told of refined poses.
         is_refined, is_right: (N,) bool.
@@ -152,19 +152,22 @@ def read_examples(folder: Path, pattern: str, every: int) -> tuple[list[Any], li
 
 
 def pictures_of(
-    seed: int, photos: Sequence[Path], efforts: tuple[Effort, ...], solid_of: Callable[[int], Model] = random_solid
+    seed: int,
+    photos: Sequence[Path],
+    budgets: tuple[SearchBudget, ...],
+    solid_of: Callable[[int], Model] = random_solid,
 ) -> Iterator[tuple[Detector, NDArray[np.uint8], Array | None]]:
     """A detector of a solid, and pictures of it with the true ``cam_from_body``, or without it and none.
 
     ``solid_of`` makes the solid of its seed; those beside it are any.
     """
     rng = np.random.default_rng([seed, 4])
-    for detector, image, truth in _pictures_of(seed, photos, efforts, solid_of):
+    for detector, image, truth in _pictures_of(seed, photos, budgets, solid_of):
         yield detector, _unsharp(image, rng) if rng.random() < UNSHARP_SHARE else image, truth
 
 
 def _pictures_of(
-    seed: int, photos: Sequence[Path], efforts: tuple[Effort, ...], solid_of: Callable[[int], Model]
+    seed: int, photos: Sequence[Path], budgets: tuple[SearchBudget, ...], solid_of: Callable[[int], Model]
 ) -> Iterator[tuple[Detector, NDArray[np.uint8], Array | None]]:
     """The same, all as sharp as sequences are."""
     try:
@@ -173,7 +176,7 @@ def _pictures_of(
         return
     rng = np.random.default_rng([seed, 2])
     views = cached_guide_views(solid, full_sphere_range(*ANYWHERE.distance_mm))
-    detector = Detector(views, CAMERA, DetectorOptions(efforts=efforts))
+    detector = Detector(views, CAMERA, DetectorOptions(budgets=budgets))
     for variant in VARIANTS:
         shown = _in_other_colours(solid, rng) if rng.random() < RECOLOURED_SHARE else solid
         for frame in _rendered(shown, occluder, variant, FRAMES_EACH, photos, rng):
@@ -301,10 +304,10 @@ def _shadowed(image: NDArray[np.uint8], mask: NDArray[np.float32], rng: np.rando
 
 
 def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Array | None) -> Iterator[Group | Looks]:
-    picture = detector.local.picture(image)
-    likely = detector.search.likely(picture, WIDE)
-    climbed = detector.local.climbed(picture, detector.search.judged(picture, likely, WIDE), WIDE.kept)
-    refined = detector.local.settled(picture, climbed)
+    picture = detector.local.pyramid(image)
+    likely = detector.global_search.candidates(picture, WIDE)
+    climbed = detector.local.pattern_search(picture, detector.global_search.rank(picture, likely, WIDE), WIDE.kept)
+    refined = detector.local.refine_and_verify(picture, climbed)
     climbed_poses = np.array([c.cam_from_body for c in climbed]).reshape(-1, 4, 4)
     rng = np.random.default_rng(len(likely.poses))
     if truth is None:
@@ -321,7 +324,7 @@ def _examples(seed: int, detector: Detector, image: NDArray[np.uint8], truth: Ar
         index = index[known[index]]
         if right[index].any():
             yield _group(seed, "rough", detector, picture, poses[index], right[index])
-    refined += detector.local.settled(picture, [Candidate(0.0, truth)])
+    refined += detector.local.refine_and_verify(picture, [PoseCandidate(0.0, truth)])
     yield from _looks(seed, detector, picture, refined, climbed_poses, truth, rng)
     right, known = told(
         detector,
@@ -348,7 +351,7 @@ def told(
     if truth is None:
         return np.zeros(len(poses), dtype=bool), np.ones(len(poses), dtype=bool)
     angle_deg, place = (share * limit for limit in near)
-    right = is_near(detector, poses, truth, detector.same_turns, angle_deg, place)
+    right = is_near(detector, poses, truth, detector.exact_rotations, angle_deg, place)
     right |= is_alike(detector, poses, truth, place, SAME)
     angle_deg, place = (share * limit for limit in apart)
     unsure = is_near(detector, poses, truth, detector.turns, angle_deg, place)
@@ -358,7 +361,7 @@ def told(
 def _looks(
     seed: int,
     detector: Detector,
-    picture: Picture,
+    picture: ImagePyramid,
     refined: list[Hypothesis],
     climbed: Array,
     truth: Array | None,
@@ -369,7 +372,9 @@ def _looks(
     around = np.empty((0, 4, 4)) if truth is None else _around_truth(truth, detector.views.diameter_mm, rng)
     poses = np.concatenate([np.array([h.cam_from_body for h in refined]).reshape(-1, 4, 4), some, around])
     known = np.zeros((len(poses), 3))
-    known[: len(refined)] = [(h.own_logit, h.judgement, h.evidence.scatter_px) for h in refined] or np.empty((0, 3))
+    known[: len(refined)] = [(h.evidence_logit, h.profile_score, h.evidence.scatter_px) for h in refined] or np.empty(
+        (0, 3)
+    )
     is_refined = np.arange(len(poses)) < len(refined)
     right, is_told = told(detector, poses, truth, REFINED_NEAR, REFINED_APART, 1.0)
     index = np.flatnonzero(is_told & (poses[:, 2, 3] > 0))
@@ -379,7 +384,7 @@ def _looks(
     poses = poses[index]
     radii_px = picture.radii_px(part.views.diameter_mm, poses)
     pixels, drawn, lines = zip(
-        *(raw_look(picture, part, *of) for of in zip(poses, radii_px.tolist(), strict=True)), strict=True
+        *(pose_crop(picture, part, *of) for of in zip(poses, radii_px.tolist(), strict=True)), strict=True
     )
     yield Looks(
         seed, np.stack(pixels), np.round(127.0 * np.stack(drawn)).astype(np.int8), np.stack(lines),
@@ -407,7 +412,7 @@ def _group(
     seed: int,
     stage: str,
     detector: Detector,
-    picture: Picture,
+    picture: ImagePyramid,
     found: Array | list[Hypothesis],
     is_right: NDArray[np.bool_],
 ) -> Group:
@@ -416,7 +421,7 @@ def _group(
     view_lines = np.array([detector.local.view_lines(pose) for pose in poses])
     lines, both = {}, {}
     for name in ("fine", "close") if hypotheses else ("rough",):
-        seen, both[name] = describe(picture, detector.local.refiner.part, poses, view_lines, RADII_PX[name])
+        seen, both[name] = describe_poses(picture, detector.local.refiner.part, poses, view_lines, RADII_PX[name])
         lines[name] = np.round(255.0 * seen).astype(np.uint8)
-    logits = np.array([h.own_logit for h in hypotheses] or np.zeros(len(poses)), dtype=np.float32)
+    logits = np.array([h.evidence_logit for h in hypotheses] or np.zeros(len(poses)), dtype=np.float32)
     return Group(seed, stage, lines, both, logits, is_right)

@@ -27,7 +27,7 @@ from arview.assembly.presence_net import ComponentNetwork, component_looks
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.core.kernel import kernel
-from arview.detection.features.edge_net import LineNetwork
+from arview.detection.features.edge_net import EdgeNet
 from arview.geometry import Array, apply, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import facing, mesh_edges
@@ -612,7 +612,7 @@ class AssemblyMonitor:
         self._edges = mesh_edges(model, views.options.crease_angle_deg)
         self._model_from_body = rigid(np.eye(3), views.center_in_model)
         self._surface = views.surface
-        self._network, self._line_network = ComponentNetwork(), LineNetwork()
+        self._network, self._line_network = ComponentNetwork(), EdgeNet()
         self._elsewhere = ElsewhereSearch(other_places(model), self._surface, views.diameter_mm, self._network)
         low, high = model.bounds_in_model
         self._corners_in_model = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
@@ -745,7 +745,7 @@ class AssemblyMonitor:
             return at_home, moved
         window, intrinsics, _ = self._window(image, cam_from_model)
         cam_from_body = cam_from_model @ self._model_from_body
-        answers = self._line_network.lines(window)
+        answers = self._line_network.predict(window)
         looks = component_looks(
             window, answers, intrinsics, self._surface, self.views.diameter_mm, cam_from_body,
             np.flatnonzero(is_asked | is_open).tolist(),

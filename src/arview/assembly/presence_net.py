@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from arview.detection.scoring.pose_verifier import (
     BAND_PX,
     DRAWN,
-    contrasted,
-    lines_around,
-    with_gradients,
-    with_lines,
+    append_edge_responses,
+    append_gradients,
+    crop_edge_responses,
+    normalise_colours,
 )
-from arview.detection.scoring.score_net import Look, ScoreNetwork, size_and_contrast
+from arview.detection.scoring.score_net import NetworkInput, ScoreNet, size_and_contrast
 from arview.geometry import Array, apply
 from arview.guideviews.surface import Surface, draw_surface
 from arview.refinement.projection import project
@@ -75,18 +75,18 @@ class ComponentNetwork:
     """The network."""
 
     def __init__(self) -> None:
-        self._network = ScoreNetwork("presence_net.onnx", MIRRORS)
+        self._network = ScoreNet("presence_net.onnx", MIRRORS)
 
     def ratios(self, looks: list[ComponentLook], in_mirrors: bool = True) -> Array:
         """Log-likelihood ratios of "not where expected" to "as expected" (N,); without mirrors four times as fast."""
         return self._network.scores([shown(look) for look in looks], in_mirrors)
 
 
-def shown(look: ComponentLook) -> Look:
+def shown(look: ComponentLook) -> NetworkInput:
     """A look as the network takes it: (CHANNELS + LINES,S,S) and (GLOBALS,)."""
-    plain, contrast = contrasted(look.pixels, look.drawn)
-    seen, explained = with_gradients(plain)
-    return with_lines(seen, look.lines), overall(look.size_px, contrast, explained)
+    plain, contrast = normalise_colours(look.pixels, look.drawn)
+    seen, explained = append_gradients(plain)
+    return append_edge_responses(seen, look.lines), overall(look.size_px, contrast, explained)
 
 
 def overall(size_px: float, contrast: float, explained: float) -> NDArray[np.float32]:
@@ -107,7 +107,7 @@ def component_looks(
 
     Args:
         window: (H,W,3) RGB, the picture around the part.
-        answers: (9,h,w) of the line network to it, see `LineNetwork.lines`.
+        answers: (9,h,w) of the line network to it, see `EdgeNet.predict`.
         intrinsics: (10,) of the window, see `intrinsics_of`.
         surface: of the part, about its centre.
         diameter_mm: of the part.
@@ -165,7 +165,7 @@ def _look(
     middle, scale = np.median(drawn[5][is_own > 0]), diameter_mm / _extent(points_in_cam)
     drawn[5] = np.where(face_ids >= 0, np.clip(scale * (drawn[5] - middle), -1.0, 1.0), 0.0)
     shift = zoom * (0.5 - corner) - 0.5
-    lines = lines_around(answers, answers.shape[2] / window.shape[1], zoom, shift, drawn[0])
+    lines = crop_edge_responses(answers, answers.shape[2] / window.shape[1], zoom, shift, drawn[0])
     return ComponentLook(index, _cut(window, corner, side), drawn, lines, size_px)
 
 

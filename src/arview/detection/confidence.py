@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from arview.refinement.evidence import PoseEvidence
 
 
-def found_features(evidence: PoseEvidence, lines: float, radius_px: float) -> tuple[float, ...]:
-    """What speaks for a pose that was found without history, for `found_logit`."""
+def evidence_features(evidence: PoseEvidence, lines: float, radius_px: float) -> tuple[float, ...]:
+    """What speaks for a pose that was found without history, for `evidence_logit`."""
     share = min(0.5, evidence.inner_share)
     colours = max(evidence.region_support, 0.0) * min(evidence.region_information / 0.2, 1.0)
     return (
@@ -59,8 +59,8 @@ SMALL_PX = 60.0
 
 
 @dataclass(frozen=True)
-class Leads:
-    """Leads of a hypothesis' logit over the best ones for other poses at the same place and elsewhere.
+class Margins:
+    """Margins of a hypothesis' logit over the best ones for other poses at the same place and elsewhere.
 
     The right pose stands out; of many that fit by chance one is hardly better than the next. Infinite without rivals.
     """
@@ -69,7 +69,7 @@ class Leads:
     elsewhere: float
 
 
-def found_logit(evidence: PoseEvidence, lines: float, radius_px: float) -> float:
+def evidence_logit(evidence: PoseEvidence, lines: float, radius_px: float) -> float:
     """By how much one of many hypotheses of a picture is likelier than another.
 
     Args:
@@ -77,20 +77,26 @@ def found_logit(evidence: PoseEvidence, lines: float, radius_px: float) -> float
         lines: distinct lines that its view shows, see `view_lines`.
         radius_px: half the part's diameter in the picture: small ones fit by chance more often.
     """
-    return LOGIT_BIAS + _weighted(LOGIT_WEIGHTS, found_features(evidence, lines, radius_px))
+    return LOGIT_BIAS + _weighted(LOGIT_WEIGHTS, evidence_features(evidence, lines, radius_px))
 
 
-def found_terms(
-    seen: float, own_logit: float, judgement: float, strips: float, leads: Leads, shown: float, radius_px: float
+def confidence_terms(
+    seen: float,
+    evidence_logit: float,
+    profile_score: float,
+    strips: float,
+    leads: Margins,
+    shown: float,
+    radius_px: float,
 ) -> tuple[float, ...]:
-    """What speaks for the best hypothesis of a picture, for `found_probability`.
+    """What speaks for the best hypothesis of a picture, for `pose_probability`.
 
     Args:
         seen: what verifier and line network see there, see `Hypothesis`; on parts unlike those that they know the next
             two are the surer ones.
-        own_logit: see `found_logit`.
-        judgement: see `judge`.
-        strips: see `Strips`.
+        evidence_logit: see `evidence_logit`.
+        profile_score: see `judge`.
+        strips: see `ContourVerifier`.
         leads: over other hypotheses.
         shown: distinct lines that its view shows, against what the part's views show in the (geometric) mean. A plain
             view fits by chance where no other does: of 82 likely poses without the part half were among the plainest
@@ -100,11 +106,11 @@ def found_terms(
     here, elsewhere = min(leads.here, LARGEST_HERE), min(leads.elsewhere, LARGEST_ELSEWHERE)
     is_alone = float(min(leads.here, leads.elsewhere) >= LARGEST_HERE)
     rich, small = min(max(math.log(shown), LEAST_SHOWN), MOST_SHOWN), min(math.log(max(radius_px, 1.0) / SMALL_PX), 0.0)
-    return seen, own_logit, judgement, strips, here, elsewhere, is_alone, rich, small
+    return seen, evidence_logit, profile_score, strips, here, elsewhere, is_alone, rich, small
 
 
-def found_probability(terms: tuple[float, ...]) -> float:
-    """Probability that the best hypothesis of a picture is right, by its `found_terms`."""
+def pose_probability(terms: tuple[float, ...]) -> float:
+    """Probability that the best hypothesis of a picture is right, by its `confidence_terms`."""
     total = FOUND_BIAS + _weighted(FOUND_WEIGHTS, terms)
     return 1.0 / (1.0 + math.exp(-min(max(total, -50.0), 50.0)))
 

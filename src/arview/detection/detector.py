@@ -17,28 +17,28 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.parallel import pool
-from arview.detection.confidence import Leads, found_probability, found_terms
-from arview.detection.features.image_pyramid import Picture
-from arview.detection.scoring.pair_comparator import TwinNetwork
+from arview.detection.confidence import Margins, confidence_terms, pose_probability
+from arview.detection.features.image_pyramid import ImagePyramid
+from arview.detection.scoring.pair_comparator import PairComparator
 from arview.detection.search.global_search import (
-    BY_GRADIENTS,
+    GRADIENTS_ONLY,
     QUICK,
-    WHOLE,
+    UNTRIMMED,
     WIDE,
-    Candidate,
-    Effort,
-    FirstSearch,
+    GlobalSearch,
+    PoseCandidate,
+    SearchBudget,
     reach_mm,
 )
-from arview.detection.search.local_search import Hypothesis, LocalOptions, LocalSearch
-from arview.detection.symmetry import LEAD, TELLING, find_symmetries, telling, turns_about
+from arview.detection.search.local_search import Hypothesis, LocalSearch, LocalSearchOptions
+from arview.detection.symmetry import LEAD, TELLING, find_symmetries, rotations_about, telling
 from arview.errors import InputError
 from arview.geometry import Array, turned
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
 from arview.refinement.evidence import PoseEvidence
 
-SURE_QUALITY = 0.6
+MIN_QUICK_QUALITY = 0.6
 """So much is wanted of a quick search alone: with few rivals looked at, a lead says less. Of 600 semi-synthetic frames
 it is right in 9 of the 12 in which it ends at 0.6 to 0.75, and in 30 of the 36 in which it ends at 0.75 to 0.9."""
 ALIKE_ASIDE, ALIKE_ALONG, ALIKE_DEG = 0.12, 0.15, 20.0
@@ -50,7 +50,7 @@ SPINS_DEG = range(0, 360, 5)
 MOST_SPUN = 6
 """Of those so many are refined: in 98 pictures of a flange the right one is among the first four by its edges in 90."""
 LEAD_TELLS = 0.2
-"""A lead of 1 counts so much beside what the `TwinNetwork` and the edges tell of two twins. Of 162 pictures of nearly
+"""A lead of 1 counts so much beside what the pair comparator and the edges tell of two twins. Of 162 pictures of nearly
 symmetric random solids in which the right pose is among the twins it is ahead in 135 with all three, in 130 without the
 edges, in 129 by the network alone, and in 113 by what speaks for each pose on its own."""
 HERE_ASIDE, HERE_ALONG = 0.35, 0.25
@@ -65,7 +65,7 @@ class DetectorOptions:
         radius_px: half the part's diameter in the templates.
         roll_step_deg: spacing of the templates.
         subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
-        efforts: of the searches, each made if those before it did not settle the matter.
+        budgets: of the searches, each made if those before it did not settle the matter.
         local: of the search around the best matches; its radius_px is that of the templates.
         min_quality: a weaker result is no detection.
     """
@@ -73,8 +73,8 @@ class DetectorOptions:
     radius_px: float = 20.0
     roll_step_deg: float = 18.0
     subdivisions: int = 2
-    efforts: tuple[Effort, ...] = (QUICK, WIDE, BY_GRADIENTS, WHOLE)
-    local: LocalOptions = field(default_factory=LocalOptions)
+    budgets: tuple[SearchBudget, ...] = (QUICK, WIDE, GRADIENTS_ONLY, UNTRIMMED)
+    local: LocalSearchOptions = field(default_factory=LocalSearchOptions)
     min_quality: float = 0.5
 
     def __post_init__(self) -> None:
@@ -111,7 +111,7 @@ class Detection:
 
 
 @dataclass(frozen=True)
-class Rejected:
+class RejectedHypothesis:
     """The best hypothesis that the detector did not believe: ``cam_from_model`` (4,4), evidence and quality."""
 
     cam_from_model: Array
@@ -129,7 +129,7 @@ class Detector:
     """Detection of one part with one camera over the declared range of its guide views.
 
     ``best_rejected`` is the best hypothesis of the last frame when nothing was found, for the diagnosis.
-    ``same_turns`` (N,3,3) are the rotations that map the part onto itself, the identity among them; ``turns`` also
+    ``exact_rotations`` (N,3,3) are the rotations that map the part onto itself, the identity among them; ``turns`` also
     hold those that nearly do. ``local`` is the search around rough poses, see `local_search_for`.
     """
 
@@ -138,18 +138,19 @@ class Detector:
         views: GuideViewSet,
         camera: Camera,
         options: DetectorOptions | None = None,
+        *,
         local: LocalSearch | None = None,
     ) -> None:
         self.options = o = options or options_for(views)
         self.views = views
         self.camera = camera
-        self.best_rejected: Rejected | None = None
+        self.best_rejected: RejectedHypothesis | None = None
         self.local = local or local_search_for(views, camera, o)
-        self._twins = TwinNetwork(self.local.refiner.part)
+        self._pair_comparator = PairComparator(self.local.refiner.part)
         self.symmetries = find_symmetries(views)
-        self.same_turns = np.concatenate([np.eye(3)[None], self.symmetries.exact])
-        self.turns = np.concatenate([self.same_turns, self.symmetries.near])
-        self.search = FirstSearch(
+        self.exact_rotations = np.concatenate([np.eye(3)[None], self.symmetries.exact])
+        self.turns = np.concatenate([self.exact_rotations, self.symmetries.near])
+        self.global_search = GlobalSearch(
             views, self.local.refiner.part, camera, o.radius_px, o.roll_step_deg, o.subdivisions, self.symmetries.exact
         )
 
@@ -168,31 +169,33 @@ class Detector:
             is_thorough: search on among less likely matches when the likeliest come to nothing.
             guesses: rough poses (4,4) ``cam_from_model``; where one of them leads to the part, that is all.
         """
-        picture = self.local.picture(image)
+        picture = self.local.pyramid(image)
         if found := self._found_near(picture, guesses):
             return found
-        least = self.options.min_quality if is_thorough else max(SURE_QUALITY, self.options.min_quality)
+        least = self.options.min_quality if is_thorough else max(MIN_QUICK_QUALITY, self.options.min_quality)
         return self._found(picture, self.hypotheses(picture, is_thorough), max_results, least)
 
     def detect_near(self, image: NDArray[np.uint8], guesses: Sequence[Array]) -> list[Detection]:
         """The best pose (or none) that one of some rough poses (4,4) ``cam_from_model`` leads to."""
-        return self._found_near(self.local.picture(image), guesses)
+        return self._found_near(self.local.pyramid(image), guesses)
 
-    def _found_near(self, picture: Picture, guesses: Sequence[Array]) -> list[Detection]:
-        starts = [Candidate(1.0, guess @ self.local.refiner.part.model_from_body) for guess in guesses]
-        settled = self.local.settled(picture, self.local.climbed(picture, starts)) if starts else []
+    def _found_near(self, picture: ImagePyramid, guesses: Sequence[Array]) -> list[Detection]:
+        starts = [PoseCandidate(1.0, guess @ self.local.refiner.part.model_from_body) for guess in guesses]
+        settled = self.local.refine_and_verify(picture, self.local.pattern_search(picture, starts)) if starts else []
         return self._found(picture, settled, 1, self.options.min_quality)
 
-    def _found(self, picture: Picture, settled: list[Hypothesis], max_results: int, least: float) -> list[Detection]:
+    def _found(
+        self, picture: ImagePyramid, settled: list[Hypothesis], max_results: int, least: float
+    ) -> list[Detection]:
         """The hypotheses of at least a quality, best first."""
         qualities = self.qualities(settled)
         self.best_rejected = None
         if not settled or qualities[0] < least:
             if settled:
                 best = settled[0]
-                self.best_rejected = Rejected(self._in_model(best), best.evidence, qualities[0])
+                self.best_rejected = RejectedHypothesis(self._in_model(best), best.evidence, qualities[0])
             return []
-        best, twins = self._told_apart(picture, settled[0], settled[1:])
+        best, twins = self._disambiguate(picture, settled[0], settled[1:])
         found = [self._detection(best, qualities[0], twins)]
         for hypothesis, quality in zip(settled[1:], qualities[1:], strict=True):
             is_apart = all(not self._is_equal(hypothesis, h, self.turns, 0.25) for h in (best, *twins))
@@ -203,28 +206,36 @@ class Detector:
     def _detection(self, hypothesis: Hypothesis, quality: float, twins: list[Hypothesis]) -> Detection:
         return Detection(self._in_model(hypothesis), quality, tuple(map(self._in_model, twins)))
 
-    def hypotheses(self, picture: Picture, is_thorough: bool = True) -> list[Hypothesis]:
+    def hypotheses(self, picture: ImagePyramid, is_thorough: bool = True) -> list[Hypothesis]:
         """All that came out of the search, right or wrong, apart from each other, best first."""
         settled: list[Hypothesis] = []
-        least = max(SURE_QUALITY, self.options.min_quality)
-        for effort in self.options.efforts if is_thorough else self.options.efforts[:1]:
-            starts = self.local.climbed(picture, self.search.starts(picture, effort), effort.kept)
-            settled = self.local.ordered([*settled, *self.local.settled(picture, starts)], 5.0)
+        least = max(MIN_QUICK_QUALITY, self.options.min_quality)
+        for effort in self.options.budgets if is_thorough else self.options.budgets[:1]:
+            starts = self.local.pattern_search(picture, self.global_search.starts(picture, effort), effort.kept)
+            settled = self.local.deduplicate([*settled, *self.local.refine_and_verify(picture, starts)], 5.0)
             if settled and self.qualities(settled)[0] >= least:
                 break
         return settled
 
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
-        """Probability that each of several hypotheses, best first, is right: see `found_probability`."""
-        return [found_probability(self.terms(h, hypotheses[k + 1 :])) for k, h in enumerate(hypotheses)]
+        """Probability that each of several hypotheses, best first, is right: see `pose_probability`."""
+        return [pose_probability(self.terms(h, hypotheses[k + 1 :])) for k, h in enumerate(hypotheses)]
 
     def terms(self, best: Hypothesis, others: list[Hypothesis]) -> tuple[float, ...]:
-        """What speaks for a hypothesis before others, see `found_terms`."""
-        leads, shown = self.leads(best, others), best.lines / self.local.usual_lines
-        return found_terms(best.seen, best.own_logit, best.judgement, best.strips, leads, shown, best.radius_px)
+        """What speaks for a hypothesis before others, see `confidence_terms`."""
+        leads, shown = self.margins(best, others), best.view_lines / self.local.mean_view_lines
+        return confidence_terms(
+            best.appearance_score,
+            best.evidence_logit,
+            best.profile_score,
+            best.contour_score,
+            leads,
+            shown,
+            best.radius_px,
+        )
 
-    def leads(self, best: Hypothesis, others: list[Hypothesis]) -> Leads:
-        """Leads of a hypothesis over others for other poses; one a little aside of it is the same, badly settled."""
+    def margins(self, best: Hypothesis, others: list[Hypothesis]) -> Margins:
+        """Margins of a hypothesis over others for other poses; one a little aside of it is the same, badly settled."""
         here = elsewhere = -math.inf
         place = best.cam_from_body[:3, 3]
         distance_mm = float(np.linalg.norm(place))
@@ -239,40 +250,40 @@ class Detector:
                 here = max(here, other.logit)
             else:
                 elsewhere = max(elsewhere, other.logit)
-        return Leads(best.logit - here, best.logit - elsewhere)
+        return Margins(best.logit - here, best.logit - elsewhere)
 
     def _in_model(self, hypothesis: Hypothesis) -> Array:
         return np.asarray(hypothesis.cam_from_body @ self.local.refiner.part.body_from_model)
 
-    def _told_apart(
-        self, picture: Picture, best: Hypothesis, others: list[Hypothesis]
+    def _disambiguate(
+        self, picture: ImagePyramid, best: Hypothesis, others: list[Hypothesis]
     ) -> tuple[Hypothesis, list[Hypothesis]]:
         """The pose that is borne out best among the near symmetries of one found, and those that do as well.
 
-        What tells is what the `TwinNetwork` says of two, the edges that only one of them has, and all that speaks for
+        What tells is what the pair comparator says of two, the edges that only one of them has, and all that speaks for
         either. Those from which these do not part the best one are alternatives, unless an exact symmetry makes them
         the same pose.
         """
         pose = best.cam_from_body
-        starts = turned(pose, self.symmetries.near) + self._spun(picture, pose)
+        starts = turned(pose, self.symmetries.near) + self._rotation_sweep(picture, pose)
         reach_mm = 0.25 * self.views.diameter_mm
         rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
-        rivals = self.local.ordered(
-            [best, *self.local.verified(picture, self.local.finished(picture, starts)), *rivals], 5.0
+        rivals = self.local.deduplicate(
+            [best, *self.local.verify(picture, self.local.refine_fine(picture, starts)), *rivals], 5.0
         )
         first = rivals[0]
-        near = [h for h in rivals[1:] if h.logit_without_strips > first.logit_without_strips - LEAD]
+        near = [h for h in rivals[1:] if h.logit_without_contour > first.logit_without_contour - LEAD]
         rivals = [first, *(h for h in near if self._is_twin(h, first) or self._is_spun(h, first))][:MOST_RIVALS]
         if len(rivals) == 1:
             return first, []
-        ahead = self._ahead(picture, rivals)
+        ahead = self._evidence_margins(picture, rivals)
         # Ahead of all others, or by the least behind any.
         leader = int(np.argmax((ahead + np.diag(np.full(len(rivals), np.inf))).min(axis=1)))
         best = rivals[leader]
         twins = [h for k, h in enumerate(rivals) if k != leader and ahead[leader, k] < TELLING]
-        return best, [h for h in twins if not self._is_turned(h, best, self.same_turns, ALIKE_DEG)]
+        return best, [h for h in twins if not self._is_turned(h, best, self.exact_rotations, ALIKE_DEG)]
 
-    def _spun(self, picture: Picture, pose: Array) -> list[Array]:
+    def _rotation_sweep(self, picture: ImagePyramid, pose: Array) -> list[Array]:
         """A pose turned about each axis about which the part is nearly round, to where its edges are seen best.
 
         Such an outline holds at any turn; what breaks it are a few small edges, which no search is led by.
@@ -285,7 +296,7 @@ class Detector:
 
         starts = []
         for axis in self.symmetries.axes:
-            poses = turned(pose, turns_about(axis, SPINS_DEG))
+            poses = turned(pose, rotations_about(axis, SPINS_DEG))
             support = np.array(list(pool().map(seen, poses)))
             peaks = np.flatnonzero((support >= np.roll(support, 1)) & (support > np.roll(support, -1)))
             starts += [poses[k] for k in peaks[np.argsort(-support[peaks], kind="stable")][:MOST_SPUN]]
@@ -296,7 +307,7 @@ class Detector:
 
         One a little aside of another is the same, badly settled: what speaks for either tells them apart.
         """
-        is_alike = self._is_turned(a, b, self.same_turns, ALIKE_DEG)
+        is_alike = self._is_turned(a, b, self.exact_rotations, ALIKE_DEG)
         return not is_alike and self._is_turned(a, b, self.turns, ALIKE_DEG)
 
     def _is_spun(self, a: Hypothesis, b: Hypothesis) -> bool:
@@ -305,11 +316,11 @@ class Detector:
         cosines = np.sum((axes @ a.cam_from_body[:3, :3].T) * (axes @ b.cam_from_body[:3, :3].T), axis=1)
         return bool(np.any(cosines > np.cos(np.deg2rad(ALIKE_DEG))))
 
-    def _ahead(self, picture: Picture, rivals: list[Hypothesis]) -> Array:
+    def _evidence_margins(self, picture: ImagePyramid, rivals: list[Hypothesis]) -> Array:
         """By how much each of some twins is borne out better than each other (N,N)."""
         refiner = self.local.refiner
-        logits = np.array([h.logit_without_strips for h in rivals])
-        ahead = self._twins.leads(picture, [h.cam_from_body for h in rivals])
+        logits = np.array([h.logit_without_contour for h in rivals])
+        ahead = self._pair_comparator.log_odds(picture, [h.cam_from_body for h in rivals])
         ahead += LEAD_TELLS * (logits[:, None] - logits)
         steps = list(pool().map(lambda h: refiner.edge_steps(picture.gray, h.cam_from_body), rivals))
         for a, b in combinations(range(len(rivals)), 2):

@@ -75,7 +75,7 @@ def find_symmetries(views: GuideViewSet) -> Symmetries:
 
     def about(axis: Array) -> Symmetries:
         # What is a fifth is nearly five twelfths, too: one or the other.
-        usual, fifths = (among(turns_about(axis, angles_deg)) for angles_deg in (USUAL_DEG, FIFTHS_DEG))
+        usual, fifths = (among(rotations_about(axis, angles_deg)) for angles_deg in (USUAL_DEG, FIFTHS_DEG))
         found = max(usual, fifths, key=lambda found: len(found.exact) + len(found.near))
         is_many = len(found.near) > 0 and len(found.exact) + len(found.near) >= MANY_TURNS
         return replace(found, axes=axis[None]) if is_many else found
@@ -100,7 +100,7 @@ def _edge_points(views: GuideViewSet) -> Array:
     return np.asarray(points[chosen])
 
 
-def turns_about(axis: Array, angles_deg: Iterable[float]) -> Array:
+def rotations_about(axis: Array, angles_deg: Iterable[float]) -> Array:
     """(N,3,3) turns about an axis."""
     return np.stack([exp_so3(axis * np.deg2rad(angle)) for angle in angles_deg])
 
@@ -112,10 +112,10 @@ def _diagonal_turns() -> Array:
         for sign in (-1.0, 1.0):
             axis = np.zeros(3)
             axis[a], axis[b] = 1.0, sign
-            turns.append(turns_about(axis / np.linalg.norm(axis), (180.0,)))
+            turns.append(rotations_about(axis / np.linalg.norm(axis), (180.0,)))
     for x in (-1.0, 1.0):
         for y in (-1.0, 1.0):
-            turns.append(turns_about(np.array([x, y, 1.0]) / np.sqrt(3.0), (120.0, 240.0)))
+            turns.append(rotations_about(np.array([x, y, 1.0]) / np.sqrt(3.0), (120.0, 240.0)))
     return np.concatenate(turns)
 
 

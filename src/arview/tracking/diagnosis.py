@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from arview.cad.view_range import ViewRange
 from arview.cad.viewpoint import Viewpoint, viewpoint
 from arview.camera import Camera
-from arview.detection.detector import Rejected
+from arview.detection.detector import RejectedHypothesis
 from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 from arview.tracking.estimate import Estimate
@@ -46,7 +46,9 @@ FAST = 0.07
 BLURRED = "blurred"
 
 
-def diagnose_search(image: NDArray[np.uint8], camera: Camera, views: GuideViewSet, rejected: Rejected | None) -> str:
+def diagnose_search(
+    image: NDArray[np.uint8], camera: Camera, views: GuideViewSet, rejected: RejectedHypothesis | None
+) -> str:
     """The likeliest reason why the part is not found.
 
     Args:
@@ -206,7 +208,7 @@ def _span_px(camera: Camera, views: GuideViewSet, distance_mm: float) -> float:
     return views.diameter_mm * camera.fx / distance_mm
 
 
-def _too_small(camera: Camera, views: GuideViewSet, rejected: Rejected | None) -> str:
+def _too_small(camera: Camera, views: GuideViewSet, rejected: RejectedHypothesis | None) -> str:
     """Whether the part spans too few pixels: where it seems to be, or even at the nearest declared distance."""
     low = views.view_range.distance_mm[0]
     distance_mm = low
@@ -216,7 +218,7 @@ def _too_small(camera: Camera, views: GuideViewSet, rejected: Rejected | None) -
     return f"too far: the part spans only {span_px:.0f} px" if span_px < SMALLEST_PX else ""
 
 
-def _partly_outside(camera: Camera, views: GuideViewSet, rejected: Rejected) -> str:
+def _partly_outside(camera: Camera, views: GuideViewSet, rejected: RejectedHypothesis) -> str:
     center = apply(rejected.cam_from_model, views.center_in_model)
     if rejected.evidence.points_in_picture > 0.8 or center[2] <= 0:
         return ""

@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.detection.search.global_search import Candidate
+from arview.detection.search.global_search import PoseCandidate
 from arview.detection.search.local_search import (
     FINE_TOLERANCE_PX,
     Hypothesis,
-    LocalOptions,
     LocalSearch,
+    LocalSearchOptions,
 )
 from arview.geometry import Array
 from arview.tracking.motion import squared_motion_distance
 
-OPTIONS = LocalOptions(tried=6, finalists=3, rivals=0, verified=3)
+OPTIONS = LocalSearchOptions(tried=6, finalists=3, rivals=0, verified=3)
 """Fewer hypotheses than in a search over the whole picture."""
 KEPT = (6, 4)
 """So many after each level of the search."""
@@ -61,11 +61,11 @@ class LocalSearchRecheck:
         if window is None:
             return None
         left, top, camera = window
-        local = self._local.seen_by(camera)
-        picture = local.picture(np.ascontiguousarray(image[top : top + camera.height, left : left + camera.width]))
-        found = local.refined(picture, [(cam_from_body, ())], FINE_TOLERANCE_PX)
-        starts = local.climbed(picture, [Candidate(1.0, pose) for pose in poses], KEPT)
-        found = local.verified(picture, [*found, *local.refined_around(picture, starts)])
+        local = self._local.with_camera(camera)
+        picture = local.pyramid(np.ascontiguousarray(image[top : top + camera.height, left : left + camera.width]))
+        found = local.refine_starts_through(picture, [(cam_from_body, ())], FINE_TOLERANCE_PX)
+        starts = local.pattern_search(picture, [PoseCandidate(1.0, pose) for pose in poses], KEPT)
+        found = local.verify(picture, [*found, *local.refine_starts(picture, starts)])
         scores = [self._score(h, predicted[0]) for h in found]
         scores[0] += LEAST_LEAD
         best = int(np.argmax(scores))

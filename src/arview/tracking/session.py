@@ -19,7 +19,7 @@ from arview.detection.detector import (
     Detection,
     Detector,
     DetectorOptions,
-    Rejected,
+    RejectedHypothesis,
     local_search_for,
 )
 from arview.errors import InputError, MismatchError
@@ -317,7 +317,9 @@ class TrackingSession:
             self._hypotheses = HypothesisSet([invert(start) @ twin for twin in detections[0].alternatives])
         estimate = self._begun(image, start)
         if estimate.quality < o.tracked_quality or not self._is_possible(estimate):
-            return None, self._why_not(image, Rejected(estimate.cam_from_model, estimate.evidence, estimate.quality))
+            return None, self._why_not(
+                image, RejectedHypothesis(estimate.cam_from_model, estimate.evidence, estimate.quality)
+            )
         self._poor = self._critical = 0
         self._confirmed = estimate.quality >= o.lock_quality
         self._was_found |= self._confirmed
@@ -365,7 +367,7 @@ class TrackingSession:
             self._why = poor_picture(image) or ALIGN
         return None, self._why
 
-    def _why_not(self, image: NDArray[np.uint8], rejected: Rejected | None) -> str:
+    def _why_not(self, image: NDArray[np.uint8], rejected: RejectedHypothesis | None) -> str:
         """Why a search found nothing; a lost part's loss says more than that nothing is in view."""
         reason = diagnose_search(image, self.camera, self._views, rejected)
         is_told = self.state == TrackingState.LOST and reason.startswith(NOTHING)

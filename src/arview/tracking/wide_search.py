@@ -3,7 +3,7 @@
 After the idea of Tian et al., "Large-displacement 3D Object Tracking with Hybrid Non-local Optimization" (ECCV 2022):
 rotations are sampled widely, the rest is found for each, and the best are refined locally. Own here: turns, distances
 and shifts are scored by oriented edges of the picture and of the learned colours in a small crop (`matching`), and
-the best are climbed (`climb`) there and once more at twice the resolution.
+the best are climbed (`search_poses`) there and once more at twice the resolution.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from arview.camera import Camera
 from arview.core import parallel as threads
 from arview.core.kernel import kernel
 from arview.detection.features.response_maps import response_maps, score_around
-from arview.detection.search.pattern_search import climb
-from arview.detection.search.template_bank import choose_apart
+from arview.detection.search.pattern_search import search_poses
+from arview.detection.search.template_bank import select_distinct
 from arview.geometry import Array, turn_ball
 from arview.refinement.modalities.region import BINS
 
@@ -122,7 +122,7 @@ class WideSearch:
         points = self.options.points
 
         def search(starts: Array) -> tuple[Array, Array]:
-            return climb(
+            return search_poses(
                 maps, self._part, starts, intrinsics, 0.01 * self._diameter_mm, np.deg2rad(turn_deg), stretch,
                 2, 1, 2, 1, points, points,
             )  # fmt: skip
@@ -138,7 +138,7 @@ class WideSearch:
         order = np.argsort(-scores, kind="stable")[:400]
         scores, poses = scores[order], poses[order]
         reach = np.full(len(poses), 0.01 * apart_deg * self._diameter_mm) / poses[:, 2, 3]
-        chosen = choose_apart(
+        chosen = select_distinct(
             np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), reach,
             np.cos(np.deg2rad(apart_deg)), 1.0 + 0.01 * apart_deg, most,
         )  # fmt: skip

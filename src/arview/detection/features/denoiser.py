@@ -1,6 +1,6 @@
 """Grain taken out of noisy pictures before the part is looked for in them.
 
-Outlines and colours of a pose are judged on single pixels: in the grain of a dark shop they are drawn aside, and wrong
+Outline and colours of a pose are judged on single pixels: in the grain of a dark shop they are drawn aside, and wrong
 poses look no worse than right ones. Plain smoothing takes as much of the edges as of the grain, and nothing more is
 found after it. A small convolutional network says what of a picture is grain, which is then taken out: Zhang et al.,
 "Beyond a Gaussian Denoiser" (IEEE TIP 2017), on levels of half the resolution as in their FFDNet (IEEE TIP 2018). What
@@ -57,7 +57,7 @@ class Denoiser:
     def __init__(self) -> None:
         self._network = load_network("denoiser.onnx")
 
-    def cleaned(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def denoise(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An RGB picture (H,W,3) without its grain; the same one if it has little."""
         if noise_level(image) < LEAST_NOISE:
             return image

@@ -1,6 +1,6 @@
 """A small convolutional network that sees where lines of a part may run in a picture, and in which direction.
 
-Gradients answer to noise, to the texture of what lies around and to shadows as they do to the part. The network, shown
+Gradients respond to noise, to the texture of what lies around and to shadows as they do to the part. The network, shown
 a whole neighbourhood, answers to what looks like the outline or an edge of a solid, as learned edge detectors do (Xie &
 Tu, "Holistically-Nested Edge Detection", ICCV 2015); the layout is that of Ronneberger et al., "U-Net" (MICCAI 2015),
 but that levels are added. It knows nothing of a part: it was fitted to random solids before photos, see
@@ -36,13 +36,13 @@ CONTRAST = 64.0
 """Grey levels less their mean are shown in units of this."""
 
 
-class LineNetwork:
+class EdgeNet:
     """The network; threads may share it."""
 
     def __init__(self) -> None:
         self._network = load_network("edge_net.onnx")
 
-    def lines(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def predict(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """How likely each place of an RGB picture (H,W,3) is on a line of each orientation, and on a solid.
 
         Where it is sure of few lines, as of materials that it does not know or before some textures, its answers are
@@ -67,7 +67,7 @@ class LineNetwork:
         return np.asarray(np.round(255.0 * seen).astype(np.uint8))
 
 
-def halved_lines(lines: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+def halve_responses(lines: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
     """Maps (9,h,w), and again at half the size and so on as long as that is even; the strongest of four pixels."""
     levels = [lines]
     block = np.ones((2, 2), dtype=np.uint8)
@@ -77,8 +77,8 @@ def halved_lines(lines: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
     return levels
 
 
-def lines_at(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) -> NDArray[np.uint8]:
-    """Maps (8,H,W) of lines from `LineNetwork.lines`; the strongest of the pixels that one stands for, and spread."""
+def resize_responses(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) -> NDArray[np.uint8]:
+    """Maps (8,H,W) of lines from `EdgeNet.predict`; the strongest of the pixels that one stands for, and spread."""
     lines = lines[:ORIENTATIONS]
     shrunk = lines.shape[2] / width
     side = max(1, int(shrunk + 0.5))
@@ -93,11 +93,11 @@ def lines_at(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) 
 
 
 @kernel
-def line_support(maps, part, pose, intrinsics, step_mm):  # type: ignore[no-untyped-def]
+def mean_edge_response(maps, part, pose, intrinsics, step_mm):  # type: ignore[no-untyped-def]
     """Mean answer 0–1 of the network under the outline and the design edges of a part; these count half at most.
 
     Args:
-        maps: (8,H,W) uint8, see `SeenLines`; intrinsics: (10,) that belong to them.
+        maps: (8,H,W) uint8, see `EdgeResponses`; intrinsics: (10,) that belong to them.
         part: arrays of all guide views, see `PartView.arrays`; pose: (4,4) ``cam_from_body``.
         step_mm: length over which directions are projected.
     """

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.parallel import pool
-from arview.detection.features.edge_net import LineNetwork, halved_lines, lines_at
+from arview.detection.features.edge_net import EdgeNet, halve_responses, resize_responses
 from arview.detection.features.response_maps import (
     ORIENTATIONS,
     colour_gradients,
@@ -32,13 +32,13 @@ NO_LINES = np.zeros((ORIENTATIONS + 1, 1, 1), dtype=np.uint8)
 """Nothing is seen anywhere."""
 
 
-class Gradients(NamedTuple):
+class PyramidLevel(NamedTuple):
     """A picture as the judge takes it, see `judge`.
 
     Attributes:
         across, down: (H,W) float32, of each pixel's channel with the strongest gradient, grey levels per pixel.
         colours: (H,W,3) uint8, smoothed.
-        lines: (9,h,w) uint8, what the line network sees there, see `LineNetwork.lines`; zero without one.
+        lines: (9,h,w) uint8, what the line network sees there, see `EdgeNet.predict`; zero without one.
         intrinsics: (10,) of it.
     """
 
@@ -49,15 +49,15 @@ class Gradients(NamedTuple):
     intrinsics: Array
 
 
-class SeenLines(NamedTuple):
+class EdgeResponses(NamedTuple):
     """What the line network sees in a picture.
 
     Attributes:
-        answers: (8,h,w) uint8, spread as the response maps are, but without a rim.
+        maps: (8,h,w) uint8, spread as the response maps are, but without a rim.
         intrinsics: (10,) of them.
     """
 
-    answers: NDArray[np.uint8]
+    maps: NDArray[np.uint8]
     intrinsics: Array
 
 
@@ -72,14 +72,14 @@ def steps_to(radius_px: float, radii_px: Array) -> NDArray[np.int64]:
     return half * np.minimum(np.round(STEPS_PER_OCTAVE / half * np.log2(radius_px / radii_px)), 0).astype(np.int64)
 
 
-def make_gradients(image: NDArray[np.uint8], lines: NDArray[np.uint8], intrinsics: Array) -> Gradients:
+def make_level(image: NDArray[np.uint8], lines: NDArray[np.uint8], intrinsics: Array) -> PyramidLevel:
     """The gradients of an RGB picture, with the lines seen in it."""
     smooth, across, down, _ = colour_gradients(image)
     quarter = np.float32(0.25)  # of Sobel's sum
-    return Gradients(quarter * across, quarter * down, smooth, lines, intrinsics)
+    return PyramidLevel(quarter * across, quarter * down, smooth, lines, intrinsics)
 
 
-class Picture:
+class ImagePyramid:
     """A frame with what was made from it: response maps and gradients by scale, kept until the frame is done with.
 
     Args:
@@ -89,9 +89,7 @@ class Picture:
         network: the lines that it sees count in the maps as much as gradients; None: these alone count.
     """
 
-    def __init__(
-        self, image: NDArray[np.uint8], camera: Camera, pad_px: int, network: LineNetwork | None = None
-    ) -> None:
+    def __init__(self, image: NDArray[np.uint8], camera: Camera, pad_px: int, network: EdgeNet | None = None) -> None:
         self.image = image
         self.gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         self.pad_px = pad_px
@@ -101,12 +99,12 @@ class Picture:
         self._halved = _halved(image)
         self._lines: list[NDArray[np.uint8]] = []
         self._lock = Lock()
-        self._seen: SeenLines | None = None
+        self._seen: EdgeResponses | None = None
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
-        self._gradients: dict[int, Gradients] = {}
+        self._gradients: dict[int, PyramidLevel] = {}
 
     @cached_property
-    def without_lines(self) -> Picture:
+    def without_edge_net(self) -> ImagePyramid:
         """The same, but that gradients alone count in its maps."""
         other = copy.copy(self)
         other._network, other._lines, other._seen, other._maps, other._gradients = None, [], None, {}, {}
@@ -131,7 +129,7 @@ class Picture:
             self._maps[step] = self._make(step)
         return self._maps[step]
 
-    def lines(self) -> SeenLines:
+    def edge_responses(self) -> EdgeResponses:
         """What the network alone sees; nothing without a network."""
         self._see_lines()
         if self._seen is None:
@@ -139,28 +137,28 @@ class Picture:
             if self._lines:
                 height, width = self._lines[0].shape[1:]
             intrinsics = intrinsics_of(self._camera.scaled(width, height))
-            self._seen = SeenLines(self._lines_at(width, height), intrinsics)
+            self._seen = EdgeResponses(self._lines_at(width, height), intrinsics)
         return self._seen
 
     def _see_lines(self) -> None:
         with self._lock:
             if self._network is not None and not self._lines:
-                self._lines = halved_lines(self._network.lines(self.image))
+                self._lines = halve_responses(self._network.predict(self.image))
 
     def _lines_at(self, width: int, height: int) -> NDArray[np.uint8]:
         """What the network sees, spread (8,H,W)."""
         if not self._lines:
             return np.zeros((ORIENTATIONS, height, width), dtype=np.uint8)
-        return lines_at(_smallest(self._lines, width, 2), width, height, SPREAD_PX)
+        return resize_responses(_smallest(self._lines, width, 2), width, height, SPREAD_PX)
 
-    def gradients(self, step: int) -> Gradients:
-        """Gradients and colours of the picture at a scale, and the lines in it."""
+    def gradients(self, step: int) -> PyramidLevel:
+        """PyramidLevel and colours of the picture at a scale, and the lines in it."""
         if step not in self._gradients:
             width, height = self._size(step)
             self._see_lines()
             lines = _smallest(self._lines, width, 2) if self._lines else NO_LINES
             image = self._resized(width, height)
-            self._gradients[step] = make_gradients(image, lines, intrinsics_of(self._camera.scaled(width, height)))
+            self._gradients[step] = make_level(image, lines, intrinsics_of(self._camera.scaled(width, height)))
         return self._gradients[step]
 
     def _make(self, step: int) -> tuple[NDArray[np.uint8], Array]:

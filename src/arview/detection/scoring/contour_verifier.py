@@ -1,12 +1,10 @@
-"""Strips: the picture across the outline of a pose, straightened, and a network that looks at them.
+"""Contour profiles: the picture across the outline of a pose, straightened, and a network that looks at them.
 
-The verifier sees a part as a whole, 35 px from its centre to its rim: a pixel or two, by which the outline of another
-thing is off, are less than one of its own. Strips are of the picture's full resolution. Each row is a line across the
-outline, one after the other along it, below them such lines across the design edges inside; the middle column is where
-the pose has the edge. Where all is right there is one sharp step there, row after row, or what hides it, and the same
-material on one side of it. The outline of something else strays from the middle, at a slant. The network knows nothing
-of a part: it was fitted on random solids before photos, see ``tools/training/fit.py``, to what it says beyond evidence,
-judge, verifier and lines.
+The pose verifier works at 35 px half diameter, where an outline off by one or two image pixels differs by less than a
+pixel. Contour profiles are cut at full resolution: each row samples the image along a line across the outline, one
+row after the other along it, and below them across the design edges inside; the middle column is where the pose puts
+the edge. A right pose has one sharp step there in row after row, a wrong one has a step that drifts. The network was
+trained on random solids before photos to add to the evidence, profile ranker, pose verifier and edge responses.
 """
 
 from __future__ import annotations
@@ -17,13 +15,13 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.detection.features.edge_net import INSIDE, LONGEST_SIDE_PX
-from arview.detection.features.image_pyramid import Picture, steps_to
+from arview.detection.features.image_pyramid import ImagePyramid, steps_to
 from arview.detection.scoring.pose_verifier import (
     TYPICAL_RADIUS_PX,
-    relative_colours,
+    write_relative_colours,
 )
-from arview.detection.scoring.profile_ranker import chosen_lines
-from arview.detection.scoring.score_net import Look, ScoreNetwork, size_and_contrast
+from arview.detection.scoring.profile_ranker import sample_lines
+from arview.detection.scoring.score_net import NetworkInput, ScoreNet, size_and_contrast
 from arview.geometry import Array
 from arview.refinement.projection import project_lines
 from arview.refinement.view_model import PartView
@@ -45,30 +43,30 @@ LEAST_STEP = 1.0
 """Grey levels added to the mean step, relative to which steps count."""
 
 
-class Strips:
+class ContourVerifier:
     """The network, and the part whose outlines it looks along."""
 
     def __init__(self, part: PartView) -> None:
         self._part = part
-        self._network = ScoreNetwork("contour_verifier.onnx")
+        self._network = ScoreNet("contour_verifier.onnx")
 
-    def scores(self, picture: Picture, poses: Array) -> Array:
+    def scores(self, picture: ImagePyramid, poses: Array) -> Array:
         """What strips say (N,) for refined poses (N,4,4) ``cam_from_body`` beyond all else, as log odds."""
         picture.gradients(picture_step(picture))
         radii_px = picture.radii_px(self._part.views.diameter_mm, poses)
 
-        def look(pose: Array, radius_px: float) -> Look:
-            return shown(raw_strips(picture, self._part, pose), radius_px)
+        def look(pose: Array, radius_px: float) -> NetworkInput:
+            return shown(contour_profiles(picture, self._part, pose), radius_px)
 
         return self._network.scores(list(pool().map(look, poses, radii_px.tolist())))
 
 
-def picture_step(picture: Picture) -> int:
+def picture_step(picture: ImagePyramid) -> int:
     """Scale step at which strips are cut: the picture's own, unless the line network sees it shrunk."""
     return int(steps_to(float(LONGEST_SIDE_PX), np.array([float(max(picture.image.shape[:2]))]))[0])
 
 
-def raw_strips(picture: Picture, part: PartView, pose: Array) -> NDArray[np.uint8]:
+def contour_profiles(picture: ImagePyramid, part: PartView, pose: Array) -> NDArray[np.uint8]:
     """Samples (RAW, ROWS, COLUMNS) across the lines of a part at a pose (4,4) ``cam_from_body``: see RAW."""
     gradients = picture.gradients(picture_step(picture))
     strips = np.zeros((RAW, ROWS, COLUMNS), dtype=np.uint8)
@@ -81,11 +79,11 @@ def raw_strips(picture: Picture, part: PartView, pose: Array) -> NDArray[np.uint
 
 @kernel(fastmath=True)
 def _cut(colours, answers, part, pose, intrinsics, step_mm, strips):  # type: ignore[no-untyped-def]
-    """Write the samples of `raw_strips`."""
+    """Write the samples of `contour_profiles`."""
     height, width = colours.shape[:2]
     rows, columns = answers.shape[1:]
     shrunk = columns / width
-    points, directions, runs, outline, inner, _ = chosen_lines(part, pose, OUTLINE_ROWS, INNER_ROWS)
+    points, directions, runs, outline, inner, _ = sample_lines(part, pose, OUTLINE_ROWS, INNER_ROWS)
     px, normals, depths = project_lines(points[:outline], directions[:outline], False, pose, intrinsics, step_mm)
     inner_px, inner_normals, inner_depths = project_lines(
         points[OUTLINE_ROWS : OUTLINE_ROWS + inner], directions[OUTLINE_ROWS : OUTLINE_ROWS + inner], True, pose,
@@ -129,7 +127,7 @@ def _cut(colours, answers, part, pose, intrinsics, step_mm, strips):  # type: ig
 def _shown(strips):  # type: ignore[no-untyped-def]
     """What the network is shown (CHANNELS, ROWS, COLUMNS) float32, the contrast, and the share of rows seen."""
     out = np.zeros((CHANNELS, ROWS, COLUMNS), dtype=np.float32)
-    contrast = relative_colours(strips[:4].transpose(1, 2, 0), out)
+    contrast = write_relative_colours(strips[:4].transpose(1, 2, 0), out)
     count, seen, total = 1, 0, 0.0
     for row in range(ROWS):
         seen += 1 if strips[3, row, COLUMNS // 2] > 0 else 0
@@ -153,7 +151,7 @@ def _shown(strips):  # type: ignore[no-untyped-def]
     return out, contrast, seen / ROWS
 
 
-def shown(strips: NDArray[np.uint8], radius_px: float) -> Look:
+def shown(strips: NDArray[np.uint8], radius_px: float) -> NetworkInput:
     """What the network is shown of raw strips, and told: see CHANNELS and GLOBALS."""
     seen, contrast, share = _shown(strips)
     return seen, np.array([*size_and_contrast(radius_px / TYPICAL_RADIUS_PX, contrast), share], dtype=np.float32)

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.parallel import pool
-from arview.detection.features.image_pyramid import Picture
+from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pose_verifier import (
     CHANNELS,
     LINES,
-    Window,
-    contrasted,
-    with_gradients,
-    with_lines,
+    CropWindow,
+    append_edge_responses,
+    append_gradients,
+    normalise_colours,
 )
 from arview.geometry import Array
 from arview.refinement.view_model import PartView
@@ -35,21 +35,21 @@ SHOWN = CHANNELS + LINES
 """Channels of a pose, as the verifier's."""
 
 
-class TwinNetwork:
+class PairComparator:
     """The network, and the part that it looks for."""
 
     def __init__(self, part: PartView) -> None:
         self._part = part
         self._network = load_network("pair_comparator.onnx")
 
-    def leads(self, picture: Picture, poses: Sequence[Array]) -> Array:
+    def log_odds(self, picture: ImagePyramid, poses: Sequence[Array]) -> Array:
         """Log odds (N,N) that each of some poses is right rather than each other, if one of them is.
 
         Args:
             picture: where the part is.
             poses: (4,4) ``cam_from_body``, at about the same place.
         """
-        pixels, drawn, lines = raw_looks(picture, self._part, poses)
+        pixels, drawn, lines = pair_crops(picture, self._part, poses)
         seen = np.stack(list(pool().map(lambda k: shown(pixels, drawn[k], lines[k]), range(len(poses)))))
         one, other = (side.astype(np.int64) for side in np.triu_indices(len(poses), 1))
         leads = np.zeros((len(poses), len(poses)))
@@ -57,16 +57,16 @@ class TwinNetwork:
         return leads - leads.T
 
 
-def raw_looks(
-    picture: Picture, part: PartView, poses: Sequence[Array]
+def pair_crops(
+    picture: ImagePyramid, part: PartView, poses: Sequence[Array]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
     """The picture (S,S,4) around the first of some poses, the part (N,6,S,S) and the lines (N,3,S,S) at each."""
     radius_px = float(picture.radii_px(part.views.diameter_mm, poses[0][None])[0])
-    window = Window(picture, part, poses[0], radius_px, SIDE_PX, RADIUS_PX)
+    window = CropWindow(picture, part, poses[0], radius_px, SIDE_PX, RADIUS_PX)
     drawn, lines = zip(*pool().map(window.look, poses), strict=True)
     return window.pixels, np.stack(drawn), np.stack(lines)
 
 
 def shown(pixels: NDArray[np.uint8], drawn: NDArray[np.float32], lines: NDArray[np.uint8]) -> NDArray[np.float32]:
     """What the network is shown (SHOWN,S,S) of a pose."""
-    return with_lines(with_gradients(contrasted(pixels, drawn)[0])[0], lines)
+    return append_edge_responses(append_gradients(normalise_colours(pixels, drawn)[0])[0], lines)

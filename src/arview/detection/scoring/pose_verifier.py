@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.detection.features.edge_net import INSIDE
-from arview.detection.features.image_pyramid import Picture, steps_to
-from arview.detection.scoring.score_net import Look, ScoreNetwork, size_and_contrast
+from arview.detection.features.image_pyramid import ImagePyramid, steps_to
+from arview.detection.scoring.score_net import NetworkInput, ScoreNet, size_and_contrast
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.guideviews.surface import draw_surface
@@ -60,7 +60,7 @@ LEAST_CONTRAST = 6.0
 LEAST_GRADIENT = 0.02
 """In such deviations per pixel: added to the mean gradient."""
 BESIDE = 0.6
-"""Gradients count as the outline's within such a distance of it, in BAND_PX."""
+"""PyramidLevel count as the outline's within such a distance of it, in BAND_PX."""
 TYPICAL_RADIUS_PX = 80.0
 """Half diameters count relative to this."""
 MEANS, DEVIATIONS = np.array([2.0, 1.0, 0.5]), np.array([4.0, 3.0, 1.0 / 3.0])
@@ -68,14 +68,14 @@ MEANS, DEVIATIONS = np.array([2.0, 1.0, 0.5]), np.array([4.0, 3.0, 1.0 / 3.0])
 _ORIGIN, _ANY_DIRECTION = np.zeros((1, 3), np.float32), np.array([[1.0, 0.0, 0.0]], np.float32)
 
 
-class Verifier:
+class PoseVerifier:
     """The network, and the part that it looks for."""
 
     def __init__(self, part: PartView) -> None:
         self._part = part
-        self._network = ScoreNetwork("pose_verifier.onnx")
+        self._network = ScoreNet("pose_verifier.onnx")
 
-    def scores(self, picture: Picture, poses: Array, known: Array) -> Array:
+    def scores(self, picture: ImagePyramid, poses: Array, known: Array) -> Array:
         """Log odds that refined poses are right, but for how often that is so.
 
         Args:
@@ -89,22 +89,22 @@ class Verifier:
         radii_px = picture.radii_px(self._part.views.diameter_mm, poses)
         list(pool().map(picture.gradients, set(steps_to(RADIUS_PX, radii_px).tolist())))
 
-        def look(pose: Array, radius_px: float, of_it: Array) -> Look:
-            pixels, drawn, lines = raw_look(picture, self._part, pose, radius_px)
-            plain, contrast = contrasted(pixels, drawn)
-            shown, explained = with_gradients(plain)
-            return with_lines(shown, lines), overall(radius_px, contrast, of_it, explained)
+        def look(pose: Array, radius_px: float, of_it: Array) -> NetworkInput:
+            pixels, drawn, lines = pose_crop(picture, self._part, pose, radius_px)
+            plain, contrast = normalise_colours(pixels, drawn)
+            shown, explained = append_gradients(plain)
+            return append_edge_responses(shown, lines), overall(radius_px, contrast, of_it, explained)
 
         return self._network.scores(list(pool().map(look, poses, radii_px.tolist(), known)))
 
 
-class Window:
+class CropWindow:
     """A square of a picture around a pose, and what the CAD says is in it there and at poses nearby.
 
     Args:
         picture, part: what is looked for, and where.
         pose: (4,4) ``cam_from_body`` that it is around.
-        radius_px: half the part's diameter in the picture there, see `Picture.radii_px`.
+        radius_px: half the part's diameter in the picture there, see `ImagePyramid.radii_px`.
         side_px: of the square.
         drawn_px: half the part's diameter in it.
 
@@ -114,7 +114,7 @@ class Window:
 
     def __init__(
         self,
-        picture: Picture,
+        picture: ImagePyramid,
         part: PartView,
         pose: Array,
         radius_px: float,
@@ -140,7 +140,7 @@ class Window:
         intrinsics, side = self._gradients.intrinsics, self._side_px
         diameter_mm = self._part.views.diameter_mm
         drawn = np.empty((DRAWN, side, side), dtype=np.float32)
-        draw_lines(self._part.arrays, pose, intrinsics, 0.01 * diameter_mm, self._zoom, self._shift_px, drawn[:2])
+        draw_edges(self._part.arrays, pose, intrinsics, 0.01 * diameter_mm, self._zoom, self._shift_px, drawn[:2])
         face_ids = np.empty((side, side), dtype=np.int32)
         center_px = self._zoom * self._center_px(pose) + self._shift_px
         draw_surface(self._part.surface, pose, self._zoom * intrinsics[:2], center_px, diameter_mm, drawn[2:], face_ids)
@@ -148,32 +148,32 @@ class Window:
         drawn[0][is_far] = np.where(face_ids[is_far] >= 0, -1.0, 1.0)
         seen = self._gradients.lines
         shrunk = seen.shape[2] / self._gradients.colours.shape[1]
-        return drawn, lines_around(seen, shrunk, self._zoom, self._shift_px, drawn[0])
+        return drawn, crop_edge_responses(seen, shrunk, self._zoom, self._shift_px, drawn[0])
 
     def _center_px(self, pose: Array) -> Array:
         intrinsics = self._gradients.intrinsics
         return np.asarray(project_lines(_ORIGIN, _ANY_DIRECTION, True, pose, intrinsics, 1.0)[0][0])
 
 
-def raw_look(
-    picture: Picture, part: PartView, pose: Array, radius_px: float
+def pose_crop(
+    picture: ImagePyramid, part: PartView, pose: Array, radius_px: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
-    """The picture around a pose (4,4) ``cam_from_body``, and what is drawn and seen there: see `Window`."""
-    window = Window(picture, part, pose, radius_px)
+    """The picture around a pose (4,4) ``cam_from_body``, and what is drawn and seen there: see `CropWindow`."""
+    window = CropWindow(picture, part, pose, radius_px)
     return window.pixels, *window.look(pose)
 
 
-def with_lines(shown: NDArray[np.float32], lines: NDArray[np.uint8]) -> NDArray[np.float32]:
+def append_edge_responses(shown: NDArray[np.float32], lines: NDArray[np.uint8]) -> NDArray[np.float32]:
     """All that the verifier is shown (CHANNELS + LINES,S,S)."""
     return np.concatenate([shown, lines.astype(np.float32) / np.float32(255.0)])
 
 
 @kernel
-def lines_around(answers, shrunk, zoom, shift, outline):  # type: ignore[no-untyped-def]
+def crop_edge_responses(answers, shrunk, zoom, shift, outline):  # type: ignore[no-untyped-def]
     """What the line network sees around a pose (3,S,S) uint8: see LINES.
 
     Args:
-        answers: (9,h,w) uint8, see `LineNetwork.lines`; shrunk: their size against the picture's.
+        answers: (9,h,w) uint8, see `EdgeNet.predict`; shrunk: their size against the picture's.
         zoom, shift: (2,) what brings the picture's pixels to those of the look.
         outline: (S,S) float32, distance to the outline as drawn.
     """
@@ -198,15 +198,15 @@ def lines_around(answers, shrunk, zoom, shift, outline):  # type: ignore[no-unty
 
 
 @kernel(fastmath=True)
-def contrasted(pixels, drawn):  # type: ignore[no-untyped-def]
+def normalise_colours(pixels, drawn):  # type: ignore[no-untyped-def]
     """A raw look with colours less their mean, in units of their deviation (PLAIN,S,S), and that deviation."""
     plain = np.zeros((PLAIN, *pixels.shape[:2]), dtype=np.float32)
     plain[4:] = drawn
-    return plain, relative_colours(pixels, plain)
+    return plain, write_relative_colours(pixels, plain)
 
 
 @kernel(fastmath=True)
-def relative_colours(pixels, plain):  # type: ignore[no-untyped-def]
+def write_relative_colours(pixels, plain):  # type: ignore[no-untyped-def]
     """Write colours (H,W,4) less their mean in units of their deviation, which it returns; 1 where the 4th is not 0.
 
     ``plain`` (4 or more,H,W) float32 is 0 there before.
@@ -235,10 +235,10 @@ def relative_colours(pixels, plain):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def with_gradients(plain):  # type: ignore[no-untyped-def]
+def append_gradients(plain):  # type: ignore[no-untyped-def]
     """All that the network is shown (CHANNELS,S,S) from what is plain, and the share of brightness that is explained.
 
-    Gradients are relative to their mean.
+    PyramidLevel are relative to their mean.
     """
     rows, columns = plain.shape[1:]
     shown = np.zeros((CHANNELS, rows, columns), dtype=np.float32)
@@ -343,7 +343,7 @@ def overall(radius_px: float, contrast: float, known: Array, explained: float) -
 
 
 @kernel(fastmath=True)
-def draw_lines(part, pose, intrinsics, step_mm, zoom, shift, drawn):  # type: ignore[no-untyped-def]
+def draw_edges(part, pose, intrinsics, step_mm, zoom, shift, drawn):  # type: ignore[no-untyped-def]
     """Draw the lines of the part at a pose: see DRAWN.
 
     Args:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.detection.features.edge_net import INSIDE
-from arview.detection.features.image_pyramid import Picture, steps_to
+from arview.detection.features.image_pyramid import ImagePyramid, steps_to
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
@@ -57,7 +57,7 @@ MOST = np.float32(1e30)
 SIDE_PX = 2
 """The sides of a line begin so far from it."""
 LONGEST, LINES_WEIGHT = 400, 0.3
-"""Outlines of more points count as such of so many; what brings the logarithm of the lines to the others' size."""
+"""ViewOutlines of more points count as such of so many; what brings the logarithm of the lines to the others' size."""
 
 
 class Network(NamedTuple):
@@ -81,7 +81,7 @@ def network(name: str) -> Network:
 
 
 def judge(
-    picture: Picture, part: PartView, poses: Array, view_lines: Array, networks: tuple[str, ...] = ROUGH
+    picture: ImagePyramid, part: PartView, poses: Array, view_lines: Array, networks: tuple[str, ...] = ROUGH
 ) -> Array:
     """How much likelier than others each of a picture's poses is: differences are log odds.
 
@@ -100,7 +100,7 @@ def judge(
     def score(look: tuple[str, int, NDArray[np.intp]]) -> Array:
         name, step, some = look
         return np.asarray(
-            judge_poses(
+            score_profiles(
                 picture.gradients(step), part.distinct, poses[some], np.log(view_lines[some]), part.views.diameter_mm,
                 network(name),
             )
@@ -112,22 +112,22 @@ def judge(
     return total
 
 
-def describe(
-    picture: Picture, part: PartView, poses: Array, view_lines: Array, radius_px: float
+def describe_poses(
+    picture: ImagePyramid, part: PartView, poses: Array, view_lines: Array, radius_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What a network is shown of poses, to fit it: (N, lines, FEATURES) and (N, GLOBALS); see `judge`."""
     lines = np.empty((len(poses), OUTLINE_LINES + INNER_LINES, FEATURES), dtype=np.float32)
     both = np.empty((len(poses), GLOBALS), dtype=np.float32)
     for step, some in _looks(picture, part, poses, radius_px):
         for k in some:
-            describe_pose(
+            describe_profiles(
                 picture.gradients(step), part.distinct, poses[k], np.log(view_lines[k]), part.views.diameter_mm,
                 lines[k], both[k],
             )  # fmt: skip
     return lines, both
 
 
-def _looks(picture: Picture, part: PartView, poses: Array, radius_px: float) -> list[tuple[int, NDArray[np.intp]]]:
+def _looks(picture: ImagePyramid, part: PartView, poses: Array, radius_px: float) -> list[tuple[int, NDArray[np.intp]]]:
     """Scale steps with the poses to be looked at there, in halves."""
     steps = steps_to(radius_px, picture.radii_px(part.views.diameter_mm, poses))
     halves = [
@@ -137,7 +137,7 @@ def _looks(picture: Picture, part: PartView, poses: Array, radius_px: float) -> 
 
 
 @kernel(fastmath=True)
-def judge_poses(gradients, part, poses, log_lines, diameter_mm, weights):  # type: ignore[no-untyped-def]
+def score_profiles(gradients, part, poses, log_lines, diameter_mm, weights):  # type: ignore[no-untyped-def]
     """Scores (N,), see `judge`; ``part`` as in `PartView.arrays`, ``weights`` a `Network`."""
     first, first_bias, second, second_bias, third, third_bias, last, last_bias = weights
     zero = np.float32(0.0)
@@ -147,7 +147,7 @@ def judge_poses(gradients, part, poses, log_lines, diameter_mm, weights):  # typ
     stretch = np.empty(width, dtype=np.float32)
     scores = np.empty(poses.shape[0])
     for n in range(poses.shape[0]):
-        describe_pose(gradients, part, poses[n], log_lines[n], diameter_mm, lines, pooled[3 * width :])
+        describe_profiles(gradients, part, poses[n], log_lines[n], diameter_mm, lines, pooled[3 * width :])
         hidden = np.maximum(np.dot(lines, first) + first_bias, zero)
         hidden = np.maximum(np.dot(hidden, second) + second_bias, zero)
         pooled[: 2 * width] = zero
@@ -175,7 +175,7 @@ def judge_poses(gradients, part, poses, log_lines, diameter_mm, weights):  # typ
 
 
 @kernel(fastmath=True)
-def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  # type: ignore[no-untyped-def]
+def describe_profiles(gradients, part, pose, log_lines, diameter_mm, lines, both):  # type: ignore[no-untyped-def]
     """Write what the network is shown of a pose to ``lines`` (L, FEATURES) and ``both`` (GLOBALS,), float32.
 
     Lines outside the picture are all zero.
@@ -186,7 +186,7 @@ def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  
     shrunk = columns / width
     along = 2 * PLACES
     answered = SEEN + 2
-    points, directions, runs, outline, inner, length = chosen_lines(part, pose, OUTLINE_LINES, INNER_LINES)
+    points, directions, runs, outline, inner, length = sample_lines(part, pose, OUTLINE_LINES, INNER_LINES)
     step_mm = 0.01 * diameter_mm
     outline_px, outline_normals, outline_depths = project_lines(
         points[:outline], directions[:outline], False, pose, intrinsics, step_mm
@@ -272,7 +272,7 @@ def describe_pose(gradients, part, pose, log_lines, diameter_mm, lines, both):  
 
 
 @kernel
-def chosen_lines(part, pose, most_outline, most_inner):  # type: ignore[no-untyped-def]
+def sample_lines(part, pose, most_outline, most_inner):  # type: ignore[no-untyped-def]
     """Evenly spread lines of the nearest view: points and directions (L,3), runs (L,2), how many are of the outline.
 
     The last two: how many are design edges, which begin at ``most_outline``; how many points the outline has in all.

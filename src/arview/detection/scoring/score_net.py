@@ -22,11 +22,11 @@ MOST_AT_ONCE = 8
 TYPICAL_CONTRAST = 40.0
 """Contrasts count relative to this."""
 
-Look = tuple[NDArray[np.float32], NDArray[np.float32]]
+NetworkInput = tuple[NDArray[np.float32], NDArray[np.float32]]
 """What a network is shown (C,H,W), and what else it is told (G,)."""
 
 
-class ScoreNetwork:
+class ScoreNet:
     """A network of the package.
 
     Args:
@@ -38,7 +38,7 @@ class ScoreNetwork:
         self._network = load_network(name)
         self._mirrors = mirrors
 
-    def scores(self, looks: Sequence[Look], in_mirrors: bool = True) -> Array:
+    def scores(self, looks: Sequence[NetworkInput], in_mirrors: bool = True) -> Array:
         """Scores (N,) of some looks, means over their forms or of the first form alone."""
         mirrors = self._mirrors if in_mirrors else self._mirrors[:1]
         scores = np.empty(len(looks))

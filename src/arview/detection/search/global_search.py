@@ -2,7 +2,7 @@
 
 Templates (`templates`) give thousands of rough matches. In clutter the right one is seldom among the first hundred of
 them, but often among the first five thousand; and once each is improved as an outline in the picture
-(`climb_outlines`, some 30 µs), on maps of a finer and finer scale, it comes to the front: the larger the part in the
+(`search_outlines`, some 30 µs), on maps of a finer and finer scale, it comes to the front: the larger the part in the
 picture, the fewer wrong poses fit by chance. This is what makes clutter tractable on a CPU; own here, measured on
 semi-synthetic sequences. What their responses leave open, the `judge` decides.
 """
@@ -21,26 +21,26 @@ from arview.camera import Camera
 from arview.core.parallel import pool
 from arview.detection.features.image_pyramid import (
     STEPS_PER_OCTAVE,
-    Picture,
+    ImagePyramid,
     step_for,
 )
 from arview.detection.scoring.profile_ranker import judge
-from arview.detection.search.pattern_search import climb_outlines
+from arview.detection.search.pattern_search import search_outlines
 from arview.detection.search.template_bank import (
     GROUPS,
-    choose_apart,
     decimate,
     make_bank,
     make_outlines,
     match_templates,
     outlines_around,
+    select_distinct,
 )
 from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
 from arview.refinement.view_model import PartView
 
 POINTS = 64
-"""Points of an outline, a multiple of `FIRST_POINTS`, see `by_sector`."""
+"""Points of an outline, a multiple of `FIRST_POINTS`, see `sector_order`."""
 GRID_PX = 4
 """Places that templates are matched at are so far apart."""
 LARGEST_SCALE = 1.5
@@ -54,7 +54,7 @@ NEARER, FARTHER = 0.85, 1.18
 """Poses are looked for so far beyond the declared distances, as shares of them."""
 CELL_PX, CELL_ROLL = 4.0, 0.33
 """Of matches whose place and roll (rad) fall in one cell, of one scale and group of views, the best is enough."""
-WANTED_SIDE = np.array([0.36, 0.48, 0.8])
+DOMAIN_DIRECTION = np.array([0.36, 0.48, 0.8])
 """On no axis or plane that a part's symmetries are likely to have."""
 WANTED_MARGIN_DEG = 14.0
 """Near the border the templates on both sides matter: 192 of 200 frames of the recorded cube, 189 with 9 (193 with all
@@ -64,7 +64,7 @@ ALIKE = 5
 
 
 @dataclass(frozen=True)
-class Growth:
+class RefinementStep:
     """A round in which matches are improved as outlines on larger maps.
 
     Attributes:
@@ -79,14 +79,18 @@ class Growth:
     is_fine: bool
 
 
-GROWTHS = (Growth(2, 0.16, 0.07, False), Growth(2, 0.16, 0.07, False), Growth(2, 0.08, 0.04, True))
+REFINEMENT_STEPS = (
+    RefinementStep(2, 0.16, 0.07, False),
+    RefinementStep(2, 0.16, 0.07, False),
+    RefinementStep(2, 0.08, 0.04, True),
+)
 """From half diameters of 20 px by 28 and 40 to 57."""
 GROWTH_ROUNDS, SHIFT_PX = 2, 2
 """Over all steps; places are tried so far away."""
 
 
 @dataclass(frozen=True)
-class Effort:
+class SearchBudget:
     """How far a search goes.
 
     Attributes:
@@ -96,8 +100,8 @@ class Effort:
         starts: of these, how many poses are searched around.
         kept: hypotheses left after each level of that search.
         scale_step: templates are matched at one of so many scales.
-        is_sparing: a quarter of the outline does not count, that of which the least is seen.
-        with_lines: what the line network sees counts until poses are judged, as much as gradients do.
+        is_trimmed: a quarter of the outline does not count, that of which the least is seen.
+        use_edge_net: what the line network sees counts until poses are judged, as much as gradients do.
     """
 
     matches: int
@@ -106,23 +110,23 @@ class Effort:
     starts: int
     kept: tuple[int, ...]
     scale_step: int
-    is_sparing: bool
-    with_lines: bool = True
+    is_trimmed: bool
+    use_edge_net: bool = True
 
 
-QUICK = Effort(400, 200, 100, 16, (6, 4), 2, False)
-WIDE = Effort(2500, 1400, 700, 160, (60, 20), 1, True)
+QUICK = SearchBudget(400, 200, 100, 16, (6, 4), 2, False)
+WIDE = SearchBudget(2500, 1400, 700, 160, (60, 20), 1, True)
 """For clutter, in which thousands of wrong matches come before the right one, and for what is partly hidden: of three
 parts behind things, 75 frames, a right pose is among the likely ones in 64 if a quarter is spared, in 55 if not."""
-BY_GRADIENTS = replace(WIDE, is_sparing=False, with_lines=False)
-WHOLE = replace(WIDE, is_sparing=False)
+GRADIENTS_ONLY = replace(WIDE, is_trimmed=False, use_edge_net=False)
+UNTRIMMED = replace(WIDE, is_trimmed=False)
 """For what these miss: what is in plain sight but of little contrast, and what the line network does not know. Of the
 52 of 600 semi-synthetic frames in which the two before find nothing, the part is found in 10 with these, and in none at
 a wrong pose; of 1,001 pictures without the part 3 instead of 4 are taken for it, for a wrong pose has more rivals."""
 
 
 @dataclass(frozen=True)
-class Candidate:
+class PoseCandidate:
     """A hypothesis: score for comparing, and the pose it stands for, about the model's centre."""
 
     score: float
@@ -130,8 +134,8 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Matches:
-    """Matches of outlines in the picture.
+class TemplateMatches:
+    """TemplateMatches of outlines in the picture.
 
     Attributes:
         keys: (M,) by which they compare.
@@ -147,16 +151,16 @@ class Matches:
     radii_px: Array
     places: Array
 
-    def best(self, most: int) -> Matches:
+    def best(self, most: int) -> TemplateMatches:
         """The best, best first."""
         return self.of(np.argsort(-self.keys, kind="stable")[:most])
 
-    def of(self, index: NDArray[np.intp]) -> Matches:
+    def of(self, index: NDArray[np.intp]) -> TemplateMatches:
         """Some of them."""
-        return Matches(*(getattr(self, field.name)[index] for field in fields(self)))
+        return TemplateMatches(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
-class Likely(NamedTuple):
+class CandidatePoses(NamedTuple):
     """Poses (N,4,4) about the model's centre, best first by ``responses`` (N,) 0–1 and the ``lines`` (N,) they show."""
 
     poses: Array
@@ -164,14 +168,16 @@ class Likely(NamedTuple):
     responses: Array
 
 
-NOTHING_LIKELY = Likely(np.empty((0, 4, 4)), np.empty(0), np.empty(0))
+NO_CANDIDATES = CandidatePoses(np.empty((0, 4, 4)), np.empty(0), np.empty(0))
 
 
-def _joined(parts: list[Matches]) -> Matches:
-    return Matches(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Matches)))
+def _joined(parts: list[TemplateMatches]) -> TemplateMatches:
+    return TemplateMatches(
+        *(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(TemplateMatches))
+    )
 
 
-def are_wanted(directions: Array, turns: Array, view_range: ViewRange) -> NDArray[np.bool_]:
+def in_fundamental_domain(directions: Array, turns: Array, view_range: ViewRange) -> NDArray[np.bool_]:
     """Which of the directions (V,3) to the camera to look for: of those that turns make the same, one and a margin.
 
     The part of the sphere nearer to one fixed direction than to its images under the turns; images outside the
@@ -182,7 +188,7 @@ def are_wanted(directions: Array, turns: Array, view_range: ViewRange) -> NDArra
     if high - low < 360.0:
         return wanted
     for turn in turns:
-        across = turn @ WANTED_SIDE - WANTED_SIDE
+        across = turn @ DOMAIN_DIRECTION - DOMAIN_DIRECTION
         is_farther = directions @ across > np.sin(np.deg2rad(WANTED_MARGIN_DEG)) * np.linalg.norm(across)
         wanted &= ~(is_farther & view_range.contains_direction(directions @ turn))
     return wanted
@@ -199,7 +205,7 @@ def weighed(scores: Array, lines: Array) -> Array:
     return np.asarray(scores * lines**0.25)
 
 
-class FirstSearch:
+class GlobalSearch:
     """The first search for one part with one camera.
 
     Args:
@@ -238,7 +244,7 @@ class FirstSearch:
         top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
         chosen = outlines_around(views, self.outlines, subdivisions)
-        chosen = chosen[are_wanted(-self.outlines.rotations[chosen, 2], turns, views.view_range)]
+        chosen = chosen[in_fundamental_domain(-self.outlines.rotations[chosen, 2], turns, views.view_range)]
         self._groups = len(np.unique(self.outlines.groups[chosen]))
         rolls = np.deg2rad(views.view_range.rolls_deg(roll_step_deg))
         focals_px = {step: self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE) for step in self._steps}
@@ -251,25 +257,25 @@ class FirstSearch:
         """Scale step at which the part at a distance has the size of the templates."""
         return step_for(self._focal_px * 0.5 * self._diameter_mm / distance_mm, self._radius_px)
 
-    def starts(self, picture: Picture, effort: Effort = QUICK) -> list[Candidate]:
+    def starts(self, picture: ImagePyramid, effort: SearchBudget = QUICK) -> list[PoseCandidate]:
         """Poses for the best matches over the whole range, apart from each other, best first."""
-        return self.judged(picture, self.likely(picture, effort), effort)
+        return self.rank(picture, self.candidates(picture, effort), effort)
 
     def _are_in_reach(self, distances_mm: Array) -> NDArray[np.bool_]:
         low, high = self._reach_mm
         return np.asarray((low <= distances_mm) & (distances_mm <= high))
 
-    def judged(self, picture: Picture, likely: Likely, effort: Effort = QUICK) -> list[Candidate]:
+    def rank(self, picture: ImagePyramid, likely: CandidatePoses, effort: SearchBudget = QUICK) -> list[PoseCandidate]:
         """The starts among likely poses, best first."""
         scores = judge(picture, self._part, likely.poses, likely.lines) + RESPONSE_WORTH * likely.responses
         best = np.argsort(-scores, kind="stable")[: effort.starts]
-        return [Candidate(float(scores[k]), likely.poses[k]) for k in best]
+        return [PoseCandidate(float(scores[k]), likely.poses[k]) for k in best]
 
-    def likely(self, picture: Picture, effort: Effort = QUICK) -> Likely:
+    def candidates(self, picture: ImagePyramid, effort: SearchBudget = QUICK) -> CandidatePoses:
         """Poses for the best matches by their responses."""
         scales = self._steps[:: effort.scale_step]
-        if not effort.with_lines:
-            picture = picture.without_lines
+        if not effort.use_edge_net:
+            picture = picture.without_edge_net
         picture.make(scales)
         phases = list(pool().map(lambda step: decimate(picture.maps(step)[0], GRID_PX), scales))
         count = len(next(iter(self.banks.values())).bins)
@@ -279,48 +285,48 @@ class FirstSearch:
         kept = ALIKE * -(-effort.matches // (self._groups * len(scales)))
         levels = list(zip(scales, phases, strict=True))
         jobs = [(*level, first, last) for level in levels for first, last in pairwise(halves)]
-        found = pool().map(lambda job: self._match(votes[job[0]], kept, effort.is_sparing, picture, *job), jobs)
+        found = pool().map(lambda job: self._match(votes[job[0]], kept, effort.is_trimmed, picture, *job), jobs)
         raw = [m for m in found if m is not None]
         if not raw:
-            return NOTHING_LIKELY
+            return NO_CANDIDATES
         matches = self._distinct(_joined(raw), effort.matches)
         if not len(matches.keys):
-            return NOTHING_LIKELY
-        for growth in GROWTHS[:-1]:
-            matches = self._improved(picture, matches, growth, effort.is_sparing)
-        matches = self._improved(picture, matches.best(effort.improved), GROWTHS[-1], effort.is_sparing)
+            return NO_CANDIDATES
+        for growth in REFINEMENT_STEPS[:-1]:
+            matches = self._improved(picture, matches, growth, effort.is_trimmed)
+        matches = self._improved(picture, matches.best(effort.improved), REFINEMENT_STEPS[-1], effort.is_trimmed)
         if not len(matches.keys):
-            return NOTHING_LIKELY
+            return NO_CANDIDATES
         matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.looked_at)
         poses = np.stack([rigid(r, p) for r, p in zip(*self._posed(matches), strict=True)])
         lines = self.outlines.lines[matches.views]
-        return Likely(poses, lines, matches.keys / weighed(np.ones(len(lines)), lines))
+        return CandidatePoses(poses, lines, matches.keys / weighed(np.ones(len(lines)), lines))
 
     def _match(
         self,
         votes: NDArray[np.int64],
         kept: int,
-        is_sparing: bool,
-        picture: Picture,
+        is_trimmed: bool,
+        picture: ImagePyramid,
         step: int,
         phases: NDArray[np.uint8],
         first: int,
         last: int,
-    ) -> Matches | None:
+    ) -> TemplateMatches | None:
         """The matches of some templates at one scale."""
         bank = self.banks[step]
         maps, _ = picture.maps(step)
         if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
             return None
         keys, templates, places = match_templates(
-            phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, LOWEST_SCORE, votes, is_sparing
+            phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, LOWEST_SCORE, votes, is_trimmed
         )
-        return Matches(
+        return TemplateMatches(
             keys, np.full(len(keys), step), bank.views[templates], bank.rolls[templates],
             np.full(len(keys), self._radius_px), places + bank.origins[templates] - picture.pad_px,
         )  # fmt: skip
 
-    def _posed(self, matches: Matches) -> tuple[Array, Array]:
+    def _posed(self, matches: TemplateMatches) -> tuple[Array, Array]:
         """Rotations (M,3,3) and positions (M,3) mm of the part's centre."""
         scales = 2.0 ** (matches.steps / STEPS_PER_OCTAVE)
         rays = self.camera.unproject((matches.places + 0.5) / scales[:, None] - 0.5)
@@ -331,20 +337,24 @@ class FirstSearch:
         rotations = turns @ self.outlines.rotations[matches.views]
         return turns_to_rays(rays) @ rotations, rays * distances_mm[:, None]
 
-    def _distances_mm(self, matches: Matches) -> Array:
+    def _distances_mm(self, matches: TemplateMatches) -> Array:
         """(M,) of the part's centre."""
         scales = 2.0 ** (matches.steps / STEPS_PER_OCTAVE)
         return np.asarray(self._focal_px * 0.5 * self._diameter_mm * scales / matches.radii_px)
 
-    def _best_apart(self, matches: Matches, reach_px: float, angle_rad: float, ratio: float, most: int) -> Matches:
+    def _best_apart(
+        self, matches: TemplateMatches, reach_px: float, angle_rad: float, ratio: float, most: int
+    ) -> TemplateMatches:
         """The best, none near a better one."""
         matches = matches.of(np.argsort(-matches.keys, kind="stable"))
         rotations, positions = self._posed(matches)
         # Pixels of the templates' scale: as many times further off as the part is larger than there.
         reach = np.full(len(positions), reach_px / self._radius_px) * 0.5 * self._diameter_mm
-        return matches.of(choose_apart(rotations, positions, reach / positions[:, 2], np.cos(angle_rad), ratio, most))
+        return matches.of(
+            select_distinct(rotations, positions, reach / positions[:, 2], np.cos(angle_rad), ratio, most)
+        )
 
-    def _distinct(self, matches: Matches, most: int) -> Matches:
+    def _distinct(self, matches: TemplateMatches, most: int) -> TemplateMatches:
         """The best, one for each cell of places, scales and rotations.
 
         The best of each group of views at each scale come first, then all second best, and so on.
@@ -361,7 +371,9 @@ class FirstSearch:
         rank[by_group] = np.arange(len(first)) - np.repeat(starts, counts)
         return matches.of(first[np.argsort(rank, kind="stable")[:most]])
 
-    def _improved(self, picture: Picture, matches: Matches, growth: Growth, is_sparing: bool) -> Matches:
+    def _improved(
+        self, picture: ImagePyramid, matches: TemplateMatches, growth: RefinementStep, is_trimmed: bool
+    ) -> TemplateMatches:
         """The matches improved each by itself, on larger maps; those that leave the declared distances are dropped."""
         if not len(matches.keys):
             return matches
@@ -373,20 +385,20 @@ class FirstSearch:
             jobs += [(min(0, step + growth.steps_up), part) for part in np.array_split(group, 2)]
         picture.make([step for step, _ in jobs])
 
-        def improve(job: tuple[int, NDArray[np.intp]]) -> Matches:
+        def improve(job: tuple[int, NDArray[np.intp]]) -> TemplateMatches:
             step, index = job
             some = matches.of(index)
             focal_px = self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE)
             scale = 2.0 ** ((step - some.steps) / STEPS_PER_OCTAVE)
             maps, _ = picture.maps(step)
             places = (some.places + 0.5) * scale[:, None] - 0.5 + picture.pad_px
-            scores, views, rolls, radii, places = climb_outlines(
+            scores, views, rolls, radii, places = search_outlines(
                 maps, shapes.points, shapes.angles, around.views, around.turns, some.views, some.rolls,
                 some.radii_px * scale, places, focal_px, growth.roll_step_rad, growth.stretch_step, GROWTH_ROUNDS,
-                SHIFT_PX, SHIFT_PX, is_sparing,
+                SHIFT_PX, SHIFT_PX, is_trimmed,
             )  # fmt: skip
             keys = weighed(scores, shapes.lines[views])
-            improved = Matches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
+            improved = TemplateMatches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
             return improved.of(np.flatnonzero(self._are_in_reach(self._distances_mm(improved))))
 
         return _joined(list(pool().map(improve, jobs)))

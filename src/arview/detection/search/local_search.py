@@ -1,6 +1,6 @@
 """Local search: what becomes of rough poses of a part in one picture, and how much speaks for each.
 
-Coarse to fine: pattern search around them on response maps of growing resolution (`climb`), the tracker's edges and
+Coarse to fine: pattern search around them on response maps of growing resolution, the tracker's edges and
 colours from the best of those, and the same evidence as for a tracked pose. At each level fewer hypotheses are left
 and each costs more; which ones, the `judge` says, and of the last ones the `verifier`.
 """
@@ -25,17 +25,17 @@ from arview.detection.confidence import (
     VERIFIED_JUDGEMENT,
     VERIFIED_LINES,
     VERIFIED_STRIPS,
-    found_logit,
+    evidence_logit,
 )
 from arview.detection.features.denoiser import Denoiser
-from arview.detection.features.edge_net import LineNetwork, line_support
-from arview.detection.features.image_pyramid import Picture, step_for
-from arview.detection.scoring.contour_verifier import Strips
-from arview.detection.scoring.pose_verifier import Verifier
+from arview.detection.features.edge_net import EdgeNet, mean_edge_response
+from arview.detection.features.image_pyramid import ImagePyramid, step_for
+from arview.detection.scoring.contour_verifier import ContourVerifier
+from arview.detection.scoring.pose_verifier import PoseVerifier
 from arview.detection.scoring.profile_ranker import FINE, judge
-from arview.detection.search.global_search import QUICK, Candidate, weighed
-from arview.detection.search.pattern_search import climb
-from arview.detection.search.template_bank import ShownLines, choose_apart
+from arview.detection.search.global_search import QUICK, PoseCandidate, weighed
+from arview.detection.search.pattern_search import search_poses
+from arview.detection.search.template_bank import ViewLineCounts, select_distinct
 from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.refinement.evidence import DECISION_SCORE, PoseEvidence
@@ -81,7 +81,7 @@ class Level:
     Attributes:
         magnification: the part's size against that of the templates.
         turn_step_deg, stretch_step: first steps of rotations and of the distance as a share.
-        rounds, halvings: see `climb`.
+        rounds, halvings: see `search_poses`.
         apart_deg: no two hypotheses nearer than this are left.
         points: of outline and, as many, of design edges that are looked at.
     """
@@ -108,49 +108,49 @@ class Hypothesis:
     Attributes:
         cam_from_body: (4,4).
         evidence: of it.
-        judgement: of the networks for refined poses, see `judge`.
+        profile_score: of the networks for refined poses, see `judge`.
         verification: of the `verifier`, once it has looked at it.
-        line_support: what the line network sees along its lines, see there; once verified.
-        strips: what the picture right across its outline says, see `Strips`; once verified.
-        lines: distinct lines that its view shows.
+        edge_response: what the line network sees along its lines, see there; once verified.
+        contour_score: what the picture right across its outline says, see `ContourVerifier`; once verified.
+        view_lines: distinct lines that its view shows.
         radius_px: half the part's diameter in the picture.
     """
 
     cam_from_body: Array
     evidence: PoseEvidence
-    judgement: float
-    lines: float
+    profile_score: float
+    view_lines: float
     radius_px: float
-    verification: float | None = None
-    line_support: float = 0.0
-    strips: float = 0.0
+    verifier_score: float | None = None
+    edge_response: float = 0.0
+    contour_score: float = 0.0
 
     @property
-    def own_logit(self) -> float:
-        """By the evidence alone, see `found_logit`."""
-        return found_logit(self.evidence, self.lines, self.radius_px)
+    def evidence_logit(self) -> float:
+        """By the evidence alone, see `evidence_logit`."""
+        return evidence_logit(self.evidence, self.view_lines, self.radius_px)
 
     @property
-    def seen(self) -> float:
-        """What verifier and line network say of it, once verified: for `found_probability`."""
-        return max(self.verification or 0.0, LEAST_VERIFIED) + FOUND_LINES * self.line_support
+    def appearance_score(self) -> float:
+        """What verifier and line network say of it, once verified: for `pose_probability`."""
+        return max(self.verifier_score or 0.0, LEAST_VERIFIED) + FOUND_LINES * self.edge_response
 
     @property
     def logit(self) -> float:
         """For comparing the hypotheses of one picture, either all verified or none."""
-        if self.verification is not None:
-            return self.logit_without_strips + VERIFIED_STRIPS * self.strips
-        return EVIDENCE_WEIGHT * self.own_logit + self.judgement
+        if self.verifier_score is not None:
+            return self.logit_without_contour + VERIFIED_STRIPS * self.contour_score
+        return EVIDENCE_WEIGHT * self.evidence_logit + self.profile_score
 
     @property
-    def logit_without_strips(self) -> float:
+    def logit_without_contour(self) -> float:
         """The same of a verified one, for comparing twins: their outlines are the same, what differs is chance."""
-        others = VERIFIED_EVIDENCE * self.own_logit + VERIFIED_JUDGEMENT * self.judgement
-        return (self.verification or 0.0) + others + VERIFIED_LINES * self.line_support
+        others = VERIFIED_EVIDENCE * self.evidence_logit + VERIFIED_JUDGEMENT * self.profile_score
+        return (self.verifier_score or 0.0) + others + VERIFIED_LINES * self.edge_response
 
 
 @dataclass(frozen=True)
-class LocalOptions:
+class LocalSearchOptions:
     """Options of the local search.
 
     Attributes:
@@ -179,7 +179,7 @@ class LocalSearch:
     Args:
         views: of the part.
         camera: of the pictures.
-        options: see `LocalOptions`.
+        options: see `LocalSearchOptions`.
         reach_mm: poses nearer or farther are left out.
     """
 
@@ -187,46 +187,50 @@ class LocalSearch:
         self,
         views: GuideViewSet,
         camera: Camera,
-        options: LocalOptions | None = None,
+        options: LocalSearchOptions | None = None,
         reach_mm: tuple[float, float] = (0.0, math.inf),
     ) -> None:
         self.views = views
         self.camera = camera
-        self.options = options or LocalOptions()
+        self.options = options or LocalSearchOptions()
         self.refiner = PoseRefiner(PartView(views), camera)
         self._reach_mm = reach_mm
-        self._line_network = LineNetwork()
+        self._line_network = EdgeNet()
         self._denoiser = Denoiser()
-        self._verifier = Verifier(self.refiner.part)
-        self._strips = Strips(self.refiner.part)
-        self._shown_lines = ShownLines(views)
+        self._verifier = PoseVerifier(self.refiner.part)
+        self._strips = ContourVerifier(self.refiner.part)
+        self._shown_lines = ViewLineCounts(views)
 
-    def picture(self, image: NDArray[np.uint8]) -> Picture:
+    def pyramid(self, image: NDArray[np.uint8]) -> ImagePyramid:
         """A frame (H,W,3) as the searches take it: without the grain of noisy ones."""
-        clean = self._denoiser.cleaned(image)
-        return Picture(clean, self.camera, round(0.6 * self.options.radius_px), self._line_network)
+        clean = self._denoiser.denoise(image)
+        return ImagePyramid(clean, self.camera, round(0.6 * self.options.radius_px), self._line_network)
 
-    def with_options(self, options: LocalOptions) -> LocalSearch:
-        """The same with other options and at any distance, beside which this one can be used: see `seen_by`."""
+    def with_options(self, options: LocalSearchOptions) -> LocalSearch:
+        """The same with other options and at any distance, beside which this one can be used: see `with_camera`."""
         other = copy.copy(self)
         other.options, other._reach_mm = options, (0.0, math.inf)
         return other
 
-    def seen_by(self, camera: Camera) -> LocalSearch:
+    def with_camera(self, camera: Camera) -> LocalSearch:
         """The same for pictures of another camera, such as that of a window."""
         other = copy.copy(self)
         other.camera, other.refiner = camera, self.refiner.with_camera(camera)
         return other
 
-    def climbed(self, picture: Picture, starts: list[Candidate], kept: tuple[int, ...] = QUICK.kept) -> list[Candidate]:
+    def pattern_search(
+        self, picture: ImagePyramid, starts: list[PoseCandidate], kept: tuple[int, ...] = QUICK.kept
+    ) -> list[PoseCandidate]:
         """The likeliest hypotheses after all levels of the search from some starts, best first; so many of each."""
         for level, most in zip(self.options.levels, kept, strict=True):
             starts = self._climb(picture, starts, level, most)
         return starts
 
-    def _climb(self, picture: Picture, candidates: list[Candidate], level: Level, kept: int) -> list[Candidate]:
+    def _climb(
+        self, picture: ImagePyramid, candidates: list[PoseCandidate], level: Level, kept: int
+    ) -> list[PoseCandidate]:
         """The hypotheses after a pattern search around each, apart from each other, best first."""
-        by_step: dict[int, list[Candidate]] = {}
+        by_step: dict[int, list[PoseCandidate]] = {}
         for candidate in candidates:
             radius_px = float(picture.radii_px(self.views.diameter_mm, candidate.cam_from_body[None])[0])
             step = min(0, round(step_for(radius_px, level.magnification * self.options.radius_px)))
@@ -240,7 +244,7 @@ class LocalSearch:
 
         def search(job: tuple[int, Array]) -> tuple[Array, Array]:
             maps, intrinsics = picture.maps(job[0])
-            found: tuple[Array, Array] = climb(
+            found: tuple[Array, Array] = search_poses(
                 maps, self.refiner.part.distinct, job[1], intrinsics, 0.01 * self.views.diameter_mm,
                 np.deg2rad(level.turn_step_deg), level.stretch_step, level.rounds, level.halvings, 2, 2,
                 level.points, level.points,
@@ -260,49 +264,49 @@ class LocalSearch:
         order = np.argsort(-scores, kind="stable")
         scores, poses = scores[order], poses[order]
         reach = np.full(len(poses), 0.01 * level.apart_deg * self.views.diameter_mm) / poses[:, 2, 3]
-        chosen = choose_apart(
+        chosen = select_distinct(
             np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), reach,
             np.cos(np.deg2rad(level.apart_deg)), 1.0 + 0.01 * level.apart_deg, kept,
         )  # fmt: skip
-        return [Candidate(float(scores[i]), poses[i]) for i in chosen]
+        return [PoseCandidate(float(scores[i]), poses[i]) for i in chosen]
 
-    def settled(self, picture: Picture, starts: list[Candidate]) -> list[Hypothesis]:
+    def refine_and_verify(self, picture: ImagePyramid, starts: list[PoseCandidate]) -> list[Hypothesis]:
         """Refine starts, keep the best, search around them; apart from each other, best first."""
-        return sorted(self.verified(picture, self.refined_around(picture, starts)), key=lambda h: -h.logit)
+        return sorted(self.verify(picture, self.refine_starts(picture, starts)), key=lambda h: -h.logit)
 
-    def refined_around(self, picture: Picture, starts: list[Candidate]) -> list[Hypothesis]:
+    def refine_starts(self, picture: ImagePyramid, starts: list[PoseCandidate]) -> list[Hypothesis]:
         """What starts lead to, apart from each other, best first, before the verifier has looked at it."""
         o = self.options
         as_found = self._tried(picture, [start.cam_from_body for start in starts], ())
         likely = [h.cam_from_body for h in sorted(as_found, key=lambda h: -h.logit)[: o.tried]]
         tried = [h for stages in COARSE_STAGES for h in self._tried(picture, likely, stages)]
-        refined = self.ordered([*as_found, *tried], 3.0)
+        refined = self.deduplicate([*as_found, *tried], 3.0)
         # Besides the best, some for quite other poses: the lead over these says whether the best stands out.
         others = [h for h in refined[o.finalists :] if not self._same(h.cam_from_body, refined[0].cam_from_body, 25.0)]
-        coarse = refined[: o.finalists] + self.ordered(others, 15.0, o.rivals)
-        finished = self.finished(picture, [found.cam_from_body for found in coarse])
+        coarse = refined[: o.finalists] + self.deduplicate(others, 15.0, o.rivals)
+        finished = self.refine_fine(picture, [found.cam_from_body for found in coarse])
         if finished and HOPELESS_SCORE <= finished[0].evidence.score < DECISION_SCORE:
-            finished += self.finished(picture, _around(finished[0].cam_from_body, 0.05))
-        return self.ordered(finished, 5.0, o.verified)
+            finished += self.refine_fine(picture, _around(finished[0].cam_from_body, 0.05))
+        return self.deduplicate(finished, 5.0, o.verified)
 
-    def verified(self, picture: Picture, found: list[Hypothesis]) -> list[Hypothesis]:
+    def verify(self, picture: ImagePyramid, found: list[Hypothesis]) -> list[Hypothesis]:
         """Refined poses, in the same order, after shading was heard and verifier and strips have looked at them."""
         if not found:
             return []
         if self.refiner.part.is_curved:
             found = self._shaded(picture, found)
-        known = np.array([(h.own_logit, h.judgement, h.evidence.scatter_px) for h in found])
+        known = np.array([(h.evidence_logit, h.profile_score, h.evidence.scatter_px) for h in found])
         poses = np.stack([h.cam_from_body for h in found])
         scores = self._verifier.scores(picture, poses, known).tolist()
         strips = self._strips.scores(picture, poses).tolist()
-        seen, part, step_mm = picture.lines(), self.refiner.part.distinct, 0.01 * self.views.diameter_mm
-        supports = [line_support(seen.answers, part, pose, seen.intrinsics, step_mm) for pose in poses]
+        seen, part, step_mm = picture.edge_responses(), self.refiner.part.distinct, 0.01 * self.views.diameter_mm
+        supports = [mean_edge_response(seen.maps, part, pose, seen.intrinsics, step_mm) for pose in poses]
         return [
-            replace(h, verification=score, line_support=float(support), strips=across)
+            replace(h, verifier_score=score, edge_response=float(support), contour_score=across)
             for h, score, support, across in zip(found, scores, supports, strips, strict=True)
         ]
 
-    def _shaded(self, picture: Picture, found: list[Hypothesis]) -> list[Hypothesis]:
+    def _shaded(self, picture: ImagePyramid, found: list[Hypothesis]) -> list[Hypothesis]:
         """Refined poses after the shading of the surface was heard, too, unless the outline says no to it."""
 
         def shaded(h: Hypothesis) -> tuple[Array, tuple[Stage, ...]]:
@@ -311,23 +315,25 @@ class LocalSearch:
             pose, information = refiner.refine(picture.image, picture.gray, h.cam_from_body, LAST_STAGE, look)
             return refiner.refine_shading(picture.gray, pose, information)[0], ()
 
-        after = self.refined(picture, list(pool().map(shaded, found)), FINE_TOLERANCE_PX)
+        after = self.refine_starts_through(picture, list(pool().map(shaded, found)), FINE_TOLERANCE_PX)
         return [new if new.logit > old.logit - LARGEST_LOSS else old for old, new in zip(found, after, strict=True)]
 
-    def _tried(self, picture: Picture, starts: Sequence[Array], stages: tuple[Stage, ...]) -> list[Hypothesis]:
+    def _tried(self, picture: ImagePyramid, starts: Sequence[Array], stages: tuple[Stage, ...]) -> list[Hypothesis]:
         """Poses after some coarse stages from each start."""
-        return self.refined(picture, [(start, stages) for start in starts], COARSE_TOLERANCE_PX)
+        return self.refine_starts_through(picture, [(start, stages) for start in starts], COARSE_TOLERANCE_PX)
 
-    def finished(self, picture: Picture, starts: Sequence[Array]) -> list[Hypothesis]:
+    def refine_fine(self, picture: ImagePyramid, starts: Sequence[Array]) -> list[Hypothesis]:
         """Poses refined to the end, best first; those of which too little is in the picture are left out."""
-        found = self.refined(picture, [(s, stages) for s in starts for stages in FINE_STAGES], FINE_TOLERANCE_PX)
+        found = self.refine_starts_through(
+            picture, [(s, stages) for s in starts for stages in FINE_STAGES], FINE_TOLERANCE_PX
+        )
         is_in_range = self._are_in_reach(np.array([h.cam_from_body for h in found]).reshape(-1, 4, 4))
         low = self.options.min_in_picture
         kept = [h for h, is_ok in zip(found, is_in_range, strict=True) if is_ok and h.evidence.points_in_picture >= low]
-        return self.ordered(kept, 0.0)
+        return self.deduplicate(kept, 0.0)
 
-    def refined(
-        self, picture: Picture, ways: Sequence[tuple[Array, tuple[Stage, ...]]], tolerance_px: float
+    def refine_starts_through(
+        self, picture: ImagePyramid, ways: Sequence[tuple[Array, tuple[Stage, ...]]], tolerance_px: float
     ) -> list[Hypothesis]:
         """Where some stages lead from each of some starts."""
 
@@ -341,11 +347,11 @@ class LocalSearch:
         lines = np.array([self.view_lines(pose) for pose in poses])
         judgements = judge(picture, self.refiner.part, poses, lines, FINE)
         return [
-            Hypothesis(pose, evidence, float(judgement), float(shown), self.refiner.radius_px(pose))
-            for (pose, evidence), judgement, shown in zip(refined, judgements, lines, strict=True)
+            Hypothesis(pose, evidence, float(profile_score), float(shown), self.refiner.radius_px(pose))
+            for (pose, evidence), profile_score, shown in zip(refined, judgements, lines, strict=True)
         ]
 
-    def ordered(self, found: Iterable[Hypothesis], apart_deg: float, most: int = 1000) -> list[Hypothesis]:
+    def deduplicate(self, found: Iterable[Hypothesis], apart_deg: float, most: int = 1000) -> list[Hypothesis]:
         """Best first, without those near a better one; of copies of one pose the evidence says which stays."""
         copies: list[list[Hypothesis]] = []
         for hypothesis in sorted(found, key=lambda h: -h.logit):
@@ -356,7 +362,7 @@ class LocalSearch:
                 copies.append([hypothesis])
         if apart_deg > COPY_DEG:
             return [some[0] for some in copies]
-        chosen = [max(some, key=lambda h: h.own_logit) for some in copies]
+        chosen = [max(some, key=lambda h: h.evidence_logit) for some in copies]
         return sorted(chosen, key=lambda h: -h.logit)
 
     def view_lines(self, cam_from_body: Array) -> float:
@@ -364,7 +370,7 @@ class LocalSearch:
         return self._shown_lines.towards(-cam_from_body[:3, :3].T @ cam_from_body[:3, 3])
 
     @property
-    def usual_lines(self) -> float:
+    def mean_view_lines(self) -> float:
         """Distinct lines that the views show in the (geometric) mean."""
         return self._shown_lines.usual
 

@@ -13,8 +13,8 @@ from arview.core.kernel import kernel
 from arview.detection.features.response_maps import best_shift, collect_points
 from arview.detection.search.template_bank import (
     SECTORS,
-    SPARED_SHARE,
-    least_pair,
+    TRIMMED_SHARE,
+    min_adjacent_pair,
     sector_of,
 )
 from arview.refinement.kernels import nearest_view
@@ -58,7 +58,7 @@ def _stepped(pose, axis, amount):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def climb(  # type: ignore[no-untyped-def]
+def search_poses(  # type: ignore[no-untyped-def]
     maps, part, poses, intrinsics, step_mm, turn_step_rad, stretch_step, rounds, halvings, shift_px, shift_step,
     contour_count, edge_count
 ):  # fmt: skip
@@ -114,11 +114,11 @@ def climb(  # type: ignore[no-untyped-def]
 
 @kernel
 def outline_score(  # type: ignore[no-untyped-def]
-    maps, points, angles, roll, radius_px, nearness, x0, y0, shift_px, shift_step, is_sparing, room, sums, sectors
+    maps, points, angles, roll, radius_px, nearness, x0, y0, shift_px, shift_step, is_trimmed, room, sums, sectors
 ):  # fmt: skip
     """Mean response 0–1 of an outline (N,3), (N,) at a roll, size and place, and the best shift dx, dy in px.
 
-    ``is_sparing`` as in `match_templates`.
+    ``is_trimmed`` as in `match_templates`.
     """
     a, b = np.float32(radius_px * np.cos(roll)), np.float32(radius_px * np.sin(roll))
     turn = int(np.round(roll * (256.0 / np.pi))) + 16
@@ -131,9 +131,9 @@ def outline_score(  # type: ignore[no-untyped-def]
         room[2, i] = ((angles[i] + turn) >> 5) & 7
     count = points.shape[0]
     best, dx, dy = best_shift(maps, room, count, shift_px, shift_step, sums)
-    if not is_sparing:
+    if not is_trimmed:
         return best / (255.0 * count), dx, dy
-    return _sum_but_a_pair(maps, room, count, dx, dy, sectors) / (255.0 * count * (1.0 - SPARED_SHARE)), dx, dy
+    return _sum_but_a_pair(maps, room, count, dx, dy, sectors) / (255.0 * count * (1.0 - TRIMMED_SHARE)), dx, dy
 
 
 @kernel
@@ -145,27 +145,27 @@ def _sum_but_a_pair(maps, room, count, dx, dy, sums):  # type: ignore[no-untyped
         x, y = room[0, i] + dx, room[1, i] + dy
         if 0 <= x < width and 0 <= y < height:
             sums[sector_of(i)] += np.int64(maps[room[2, i], y, x])
-    return np.sum(sums) - least_pair(sums)
+    return np.sum(sums) - min_adjacent_pair(sums)
 
 
 @kernel
-def climb_outlines(  # type: ignore[no-untyped-def]
+def search_outlines(  # type: ignore[no-untyped-def]
     maps, points, angles, neighbours, turns, views, rolls, radii_px, places, focal_px, roll_step_rad, stretch_step,
-    rounds, shift_px, shift_step, is_sparing
+    rounds, shift_px, shift_step, is_trimmed
 ):  # fmt: skip
     """Improve matches of outlines, each by itself, in the picture: view, roll, size and place.
 
-    Quicker than `climb`: nothing is projected. For matches that are still rough.
+    Quicker than `search_poses`: nothing is projected. For matches that are still rough.
 
     Args:
         maps: (8,H,W) from `response_maps`, padded.
-        points, angles: see `Outlines`; neighbours, turns: see `Neighbours`.
+        points, angles: see `ViewOutlines`; neighbours, turns: see `NeighbourViews`.
         views (M,), rolls (M,) rad, radii_px (M,), places (M,2) px of the maps: the matches.
         focal_px: of the maps.
         roll_step_rad, stretch_step: steps of the roll and, as a share, of the size.
         rounds: over all steps.
         shift_px, shift_step: shifts of ± shift_px are tried.
-        is_sparing: see `match_templates`.
+        is_trimmed: see `match_templates`.
 
     Returns:
         scores (M,) 0–1, views (M,), rolls (M,), radii_px (M,), places (M,2).
@@ -181,7 +181,7 @@ def climb_outlines(  # type: ignore[no-untyped-def]
         view, roll, radius = views[n], rolls[n], radii_px[n]
         best, dx, dy = outline_score(
             maps, points[view], angles[view], roll, radius, radius / focal_px, places[n, 0], places[n, 1],
-            shift_px, shift_step, is_sparing, room, sums, sectors,
+            shift_px, shift_step, is_trimmed, room, sums, sectors,
         )  # fmt: skip
         x, y = places[n, 0] + dx, places[n, 1] + dy
         for _ in range(rounds):
@@ -196,7 +196,7 @@ def climb_outlines(  # type: ignore[no-untyped-def]
                     v = neighbours[view, step - 4]
                     r += turns[view, step - 4]
                 score, dx, dy = outline_score(
-                    maps, points[v], angles[v], r, s, s / focal_px, x, y, shift_px, shift_step, is_sparing, room, sums,
+                    maps, points[v], angles[v], r, s, s / focal_px, x, y, shift_px, shift_step, is_trimmed, room, sums,
                     sectors,
                 )  # fmt: skip
                 if score > best:

@@ -33,7 +33,7 @@ FIRST_POINTS = 32
 """So many points of a template are looked at everywhere, the others only where these bode well."""
 SECTORS = 8
 """Of an outline, about its middle, equally many points in each. Two side by side may be spared."""
-SPARED_SHARE = 2.0 / SECTORS
+TRIMMED_SHARE = 2.0 / SECTORS
 FIRST_MARGIN = 0.035
 """The mean of the first points may be so much lower than the score asked for."""
 TILE = 1024
@@ -57,7 +57,7 @@ FAR_DEG = 8.5
 
 
 @dataclass(frozen=True)
-class Neighbours:
+class NeighbourViews:
     """Directions around each of some: their indices (V,6), and (V,6) rad, the roll that brings each closest."""
 
     views: NDArray[np.int32]
@@ -65,12 +65,12 @@ class Neighbours:
 
 
 @dataclass(frozen=True)
-class Outlines:
+class ViewOutlines:
     """What the part shows from directions spread over the declared range, seen along the optical axis.
 
     Attributes:
         points: (V,N,3) float32 of outline and design edges, in halves of the part's diameter about its centre, in
-            the axes of the camera; in the order `by_sector`.
+            the axes of the camera; in the order `sector_order`.
         angles: (V,N) uint8 of their normals, 256 to the half turn.
         rotations: (V,3,3) of ``cam_from_body``.
         lines: (V,) distinct lines shown.
@@ -83,8 +83,8 @@ class Outlines:
     rotations: Array
     lines: Array
     groups: NDArray[np.int32]
-    near: Neighbours
-    far: Neighbours
+    near: NeighbourViews
+    far: NeighbourViews
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class TemplateBank:
     gains: Array
 
 
-def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> Outlines:
-    """Outlines over the directions of the declared range.
+def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> ViewOutlines:
+    """ViewOutlines over the directions of the declared range.
 
     Args:
         views: of the part; the nearest to each direction of an icosphere is taken.
@@ -135,25 +135,25 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, points: int) -> O
         body[depths <= 0], normals[depths <= 0] = body[depths > 0][0], normals[depths > 0][0]
         shown = body @ cam_from_body[:3, :3].T / (0.5 * views.diameter_mm)
         angles = np.arctan2(normals[:, 1], normals[:, 0]) / np.pi
-        order = by_sector(shown)
+        order = sector_order(shown)
         rows.append((shown[order], angles[order], cam_from_body[:3, :3], views.directions[index]))
     if not rows:
         raise InputError("guide views: no view shows an outline; check the model and the declared distances")
     shown, angles, rotations, seen_from = (np.stack([row[k] for row in rows]) for k in range(4))
     near, far = _around(seen_from, 6)
-    shown_lines = ShownLines(views)
-    return Outlines(
+    shown_lines = ViewLineCounts(views)
+    return ViewOutlines(
         points=shown.astype(np.float32),
         angles=(np.round(angles * 256.0).astype(np.int64) % 256).astype(np.uint8),
         rotations=rotations,
         lines=np.array([shown_lines.towards(direction) for direction in seen_from]),
         groups=np.argmax(seen_from @ icosphere_directions(GROUP_SUBDIVISIONS).T, axis=1).astype(np.int32),
-        near=Neighbours(near, rolls_between(rotations[near], rotations[:, None])),
-        far=Neighbours(far, rolls_between(rotations[far], rotations[:, None])),
+        near=NeighbourViews(near, rolls_between(rotations[near], rotations[:, None])),
+        far=NeighbourViews(far, rolls_between(rotations[far], rotations[:, None])),
     )
 
 
-def by_sector(shown: Array) -> NDArray[np.intp]:
+def sector_order(shown: Array) -> NDArray[np.intp]:
     """An order of points (N,2+), N a multiple of `FIRST_POINTS`: of each so many, some of one sector after another.
 
     Sectors lie about the middle; a point's is `sector_of` its place in the order.
@@ -172,7 +172,7 @@ def sector_of(place):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def least_pair(sums):  # type: ignore[no-untyped-def]
+def min_adjacent_pair(sums):  # type: ignore[no-untyped-def]
     """The least that two sectors side by side have of the sums (SECTORS,) of all."""
     least = sums[SECTORS - 1] + sums[0]
     for sector in range(1, SECTORS):
@@ -180,7 +180,7 @@ def least_pair(sums):  # type: ignore[no-untyped-def]
     return least
 
 
-class ShownLines:
+class ViewLineCounts:
     """Distinct lines that a part shows to each direction, counted when first asked for."""
 
     def __init__(self, views: GuideViewSet) -> None:
@@ -229,14 +229,14 @@ def _nearest_views(views: GuideViewSet, subdivisions: int) -> NDArray[np.intp]:
     return np.unique(np.argmax(wanted[inside] @ views.directions.T, axis=1))
 
 
-def outlines_around(views: GuideViewSet, outlines: Outlines, subdivisions: int) -> NDArray[np.intp]:
+def outlines_around(views: GuideViewSet, outlines: ViewOutlines, subdivisions: int) -> NDArray[np.intp]:
     """Indices of the outlines nearest to the directions of an icosphere; 2 gives 162 directions, about 17° apart."""
     wanted = np.stack([views.view(int(i)).cam_from_model[2, :3] for i in _nearest_views(views, subdivisions)])
     return np.unique(np.argmax(wanted @ outlines.rotations[:, 2].T, axis=1))
 
 
 def make_bank(
-    outlines: Outlines, chosen: NDArray[np.intp], rolls: Array, radius_px: float, nearness: float
+    outlines: ViewOutlines, chosen: NDArray[np.intp], rolls: Array, radius_px: float, nearness: float
 ) -> TemplateBank:
     """Templates of chosen outlines at all of some rolls.
 
@@ -351,7 +351,7 @@ def _still_in(keys, groups, found, votes, kept):  # type: ignore[no-untyped-def]
 
 @kernel
 def match_templates(  # type: ignore[no-untyped-def]
-    phases, offsets, bins, gains, groups, first_template, last_template, kept, lowest, votes, is_sparing
+    phases, offsets, bins, gains, groups, first_template, last_template, kept, lowest, votes, is_trimmed
 ):
     """The matches that stand out most, of each group of templates.
 
@@ -363,7 +363,7 @@ def match_templates(  # type: ignore[no-untyped-def]
         lowest: mean response below which a match is noise.
         votes: (GROUPS, 1024) int64, how many matches of a group have a key of so many `KEY_STEP`, over all calls that
             share it.
-        is_sparing: the two sectors side by side with the least do not count: something may hide them.
+        is_trimmed: the two sectors side by side with the least do not count: something may hide them.
 
     Returns:
         keys (M,) by which matches compare, templates (M,), places (M,2) of the offsets' origin in full pixels.
@@ -383,7 +383,7 @@ def match_templates(  # type: ignore[no-untyped-def]
     own = np.empty((SECTORS, TILE), dtype=np.uint16)
     least = np.empty(TILE, dtype=np.uint16)
     sums = np.empty(SECTORS, dtype=np.int64)
-    counted = 1.0 - SPARED_SHARE if is_sparing else 1.0
+    counted = 1.0 - TRIMMED_SHARE if is_trimmed else 1.0
     full = 63.0 * points * counted
     first_full = 63.0 * FIRST_POINTS * counted
     for t in range(first_template, last_template):
@@ -403,7 +403,7 @@ def match_templates(  # type: ignore[no-untyped-def]
         for start in range(0, span, TILE):
             size = min(TILE, span - start)
             total[start : start + size] = 0
-            if is_sparing:
+            if is_trimmed:
                 _add_but_a_pair(total[start : start + size], own, least, flat, source, shift, start, size)
             else:
                 _add_points(total[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
@@ -439,11 +439,11 @@ def match_templates(  # type: ignore[no-untyped-def]
                     k + columns < span and total[k + columns] >= value
                 ):
                     continue
-                if is_sparing:
+                if is_trimmed:
                     sums[:] = 0
                     for i in range(points):
                         sums[sector_of(i)] += np.int64(flat[source[i], shift[i] + k])
-                    sum_all = np.sum(sums) - least_pair(sums)
+                    sum_all = np.sum(sums) - min_adjacent_pair(sums)
                 else:
                     sum_all = np.int64(value)
                     for i in range(FIRST_POINTS, points):
@@ -472,7 +472,7 @@ def match_templates(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def choose_apart(rotations, positions, reach, cosine, distance_ratio, most):  # type: ignore[no-untyped-def]
+def select_distinct(rotations, positions, reach, cosine, distance_ratio, most):  # type: ignore[no-untyped-def]
     """Indices of at most ``most`` poses, best first as given, none near a better one.
 
     Args:
