@@ -107,7 +107,7 @@ def test_the_window_sees_what_the_picture_shows() -> None:
     left, top, camera = 120, 60, CAMERA.cropped(120, 60, 416, 352)
     windowed = local().with_camera(camera)
     crop = np.ascontiguousarray(image[top : top + camera.height, left : left + camera.width])
-    found = windowed.refine_and_verify(windowed.picture(crop), [start])[0]
+    found = windowed.refine_and_verify(windowed.pyramid(crop), [start])[0]
     for one in (whole, found):
         mm, _, deg = error(in_model(one.cam_from_body), truth)
         assert mm < 2.0 and deg < 0.5
