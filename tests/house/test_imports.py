@@ -1,0 +1,104 @@
+"""The table of rooms: who may import whom, lazy imports and imports for type checking counted."""
+
+from __future__ import annotations
+
+from helpers.open_entries import open_entries
+from helpers.source_tree import imports, modules
+
+ROOMS = (
+    ("errors",),
+    ("geometry",),
+    ("pose",),
+    ("core",),
+    ("camera",),
+    ("cad",),
+    ("rendering", "fiducials", "weights", "web"),
+    ("guideviews",),
+    ("refinement",),
+    ("detection",),
+    ("assembly",),
+    ("tracking",),
+    ("video", "inspection"),
+    ("overlay",),
+    ("annotation",),
+    ("reconstruction",),
+    ("measurement",),
+    ("report", "history", "calibration", "acceptance", "evaluation"),
+    ("live",),
+    ("workflow",),
+    ("cli",),
+)
+"""From the bottom up. A room imports only rooms of lines above its own; rooms on one line do not import each other."""
+LEVEL = {room: level for level, line in enumerate(ROOMS) for room in line}
+FORBIDDEN = {
+    "measurement": {"detection", "refinement", "tracking"},
+    "detection": {"assembly"},
+}
+FRONT = {"arview", "arview.__main__"}
+"""The front door, which is of no room and may name all of them."""
+
+
+def room(name: str) -> str:
+    return name.split(".")[1]
+
+
+def test_every_module_is_in_a_room_of_the_table() -> None:
+    found = {room(name) for name in modules() if name not in FRONT}
+    assert found == set(LEVEL) - open_entries("rooms")
+
+
+def test_no_room_imports_one_that_is_not_above_it() -> None:
+    crossings = [
+        (name, other)
+        for name in modules()
+        if name not in FRONT
+        for other in imports(name)
+        if other not in FRONT and room(other) != room(name)
+    ]
+    assert len(crossings) > 300
+    upwards = {f"{name} imports {other}" for name, other in crossings if LEVEL[room(other)] >= LEVEL[room(name)]}
+    assert upwards == open_entries("imports")
+
+
+def test_no_room_imports_the_front() -> None:
+    assert [name for name in modules() if name not in FRONT and imports(name) & FRONT] == []
+
+
+def test_rooms_that_know_nothing_of_each_other() -> None:
+    for name in modules():
+        if name not in FRONT:
+            assert not {room(other) for other in imports(name)} & FORBIDDEN.get(room(name), set()), name
+
+
+def test_there_is_no_circle() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [["b", "c"]]
+    found = circles({name: set(imports(name)) - FRONT for name in modules() if name not in FRONT})
+    assert {" ".join(circle) for circle in found} == open_entries("circles")
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Strongly connected components of more than one module, each sorted (Tarjan 1972)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in sorted(graph[node]):
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            component = stack[stack.index(node) :]
+            del stack[stack.index(node) :]
+            if len(component) > 1:
+                found.append(sorted(component))
+
+    for node in sorted(graph):
+        if node not in index:
+            visit(node)
+    return found
