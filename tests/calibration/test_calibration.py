@@ -20,7 +20,7 @@ from arview.calibration.choose import ChoiceOptions, choose_views
 from arview.calibration.plot import draw
 from arview.calibration.run import calibrate, record_of
 from arview.calibration.solve import Solution, picture_grid, pixel_difference, pixel_uncertainty, solve
-from arview.calibration.verdict import Grade, judge
+from arview.calibration.verdict import Grade, assess
 from arview.calibration.views import BoardFinder, BoardView
 from arview.camera import Camera
 from arview.camera.exif import PhotoExif, read_exif
@@ -200,7 +200,7 @@ def assert_near_truth(solution: Solution, focal: float, centre_px: float, pixel_
 
 def test_a_folder_of_photos(photos: Path) -> None:
     result = calibrate([photos], BOARD)
-    solution, judged = result.solution, result.judgement
+    solution, judged = result.solution, result.verdict
     assert len(solution.views) == 22
     assert set(result.rejected) == {"x_cat.jpg", "x_bent.jpg", "x_wide.jpg", "x_cut.jpg"}
     assert "no marker" in result.rejected["x_cat.jpg"]
@@ -295,7 +295,7 @@ def test_straight_views_are_not_enough_and_say_so() -> None:
     for seed in range(3):
         views = views_of(np.random.default_rng(seed), 20, tilt_deg=(0.0, 1.0))
         try:
-            judged = judge(solve(views, 640, 480))
+            judged = assess(solve(views, 640, 480))
         except InputError as error:
             assert "tilt it" in str(error)
             continue
@@ -311,7 +311,7 @@ def test_views_in_the_middle_are_not_enough_and_say_so() -> None:
         keep = np.max(np.abs(view.pixels - [320, 240]), axis=1) < 110
         small.append(replace(view, ids=view.ids[keep], points_in_board=view.points_in_board[keep],
                              pixels=view.pixels[keep]))  # fmt: skip
-    judged = judge(solve(small, 640, 480))
+    judged = assess(solve(small, 640, 480))
     assert judged.grade is Grade.NOT_ENOUGH
     assert judged.coverage < 0.4
     assert any("upper left, upper right, lower left, lower right" in advice for advice in judged.advice)

@@ -15,9 +15,9 @@ from arview.cli import main
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, load_inspection
-from arview.measurement.cloud.global_registration import GlobalOptions, find_model
-from arview.measurement.cloud.surface import Surface
-from arview.measurement.datums.cloud_datums import measure_datums_in_cloud
+from arview.measurement.cloud.global_registration import GlobalRegistrationOptions, find_model_in_cloud
+from arview.measurement.cloud.mesh_surface import MeshSurface
+from arview.measurement.datums.in_cloud import measure_datums_in_cloud
 from arview.measurement.folder import in_model_frame, read_cloud
 from arview.measurement.run import measure
 from arview.reconstruction.dense import write_ply
@@ -29,13 +29,13 @@ from helpers.plate_scene import part as plate_part
 NOISE_MM = 0.04
 PLACE = rigid(exp_so3(np.array([0.9, -1.4, 0.6])), [120.0, -300.0, 800.0])
 """scan_from_model."""
-QUICK = GlobalOptions(points=2000, voxels=28, step_deg=8.0)
+QUICK = GlobalRegistrationOptions(points=2000, voxels=28, step_deg=8.0)
 
 
 def scan(model: Model, place: Array = PLACE, count: int = 60_000, seed: int = 0, scale: float = 1.0) -> DenseCloud:
     """Points of all that does not look down, with noise."""
     vertices, faces, _ = model.mesh
-    surface = Surface(vertices, faces)
+    surface = MeshSurface(vertices, faces)
     points, of_face = surface.spread(count, seed)
     normals = surface.face_normals[of_face]
     seen = normals[:, 2] > -0.5
@@ -60,14 +60,14 @@ def test_the_part_is_found_and_not_half_a_turn_round(has_normals: bool) -> None:
     """The plate is symmetric, the blocks differ by millimetres, one is missing, and two stand elsewhere."""
     cloud = scan(as_built())
     cloud = cloud if has_normals else replace(cloud, normals=np.zeros_like(cloud.normals))
-    found = find_model(cloud, nominal(), options=QUICK)
+    found = find_model_in_cloud(cloud, nominal(), options=QUICK)
     assert found.scale == 1.0
     assert off_mm(found.model_from_scan) < 0.3
 
 
 def test_the_scale_is_found_too() -> None:
     cloud = scan(as_built(), scale=37.0)
-    found = find_model(cloud, nominal(), None, replace(QUICK, scale_range=(0.85, 1.2)))
+    found = find_model_in_cloud(cloud, nominal(), None, replace(QUICK, scale_range=(0.85, 1.2)))
     assert found.scale == pytest.approx(37.0, rel=1e-3)
     assert off_mm(found.model_from_scan, found.scale, 37.0) < 0.4
 
@@ -76,13 +76,13 @@ def test_clouds_of_nothing_that_is_known() -> None:
     cloud = scan(as_built())
     mirror = np.array([-1.0, 1.0, 1.0])
     with pytest.raises(InputError, match="20 points are too few"):
-        find_model(DenseCloud(*(a[:20] for a in vars(cloud).values())), nominal(), options=QUICK)
+        find_model_in_cloud(DenseCloud(*(a[:20] for a in vars(cloud).values())), nominal(), options=QUICK)
     rng = np.random.default_rng(3)
     ball = rng.normal(size=(20_000, 3))
     ball = 90.0 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     other = replace(cloud, points=ball, normals=(ball / 90.0).astype(np.float32))
     with pytest.raises(InputError, match=r"cloud: the part (is not found|fits in two ways)"):
-        find_model(other, nominal(), options=QUICK)
+        find_model_in_cloud(other, nominal(), options=QUICK)
     # A lug at one end of a block tells left from right.
     parts = (*nominal().components, Component("lug", *with_faces(box((-20, 70, 0), (30, 85, 35)))))
     handed = make_model("handed", parts)
@@ -229,7 +229,7 @@ def test_cylinder_and_edge_in_a_cloud() -> None:
 
 
 def test_cylinder_and_edge_in_photos(tmp_path: Path) -> None:
-    from arview.measurement.datums.photo_datums import measure_datums
+    from arview.measurement.datums.in_photos import measure_datums_in_photos
     from arview.measurement.photo.views import views_of
     from helpers.photo_scene import CAMERA, photograph, ring
 
@@ -239,7 +239,7 @@ def test_cylinder_and_edge_in_photos(tmp_path: Path) -> None:
     placed = np.stack([pose @ invert(moved) for pose in poses])
     views = views_of(grays, (CAMERA,) * 12, placed, posted(), tuple(str(i) for i in range(12)))
     datums = (AXIS, TOP, EDGE)
-    locked, found = solved(datums, list(measure_datums(datums, views, {})))
+    locked, found = solved(datums, list(measure_datums_in_photos(datums, views, {})))
     assert locked == ["rx ry tx ty", "tz", "rz"]
     for point in ([0.0, 0.0, 0.0], [80.0, 60.0, 0.0], [0.0, 0.0, 45.0]):  # a pixel is 0.46 mm
         assert np.abs(apply(found, [point]) - apply(moved, [point])).max() < 0.08

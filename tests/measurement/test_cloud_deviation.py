@@ -25,10 +25,10 @@ from arview.measurement.cloud.distance_map import (
     write_distance_ply,
 )
 from arview.measurement.cloud.foreign_objects import find_foreign
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, grid_average, prepare_cloud
 from arview.measurement.cloud.registration import move_about
-from arview.measurement.cloud.surface import Surface
-from arview.measurement.cloud.visibility import Views
+from arview.measurement.cloud.visibility import SurfaceVisibility
 from arview.measurement.types import Move, NotMeasured
 from arview.reconstruction.types import DenseCloud, PosedPhoto
 from helpers.paths import SHARED
@@ -89,10 +89,10 @@ def make_cloud(model, photos, moves=None, without=(), seed=0, spacing_mm=0.45, e
         for c in (*model.components, *(extra or ())) if c.name not in without
     ))  # fmt: skip
     vertices, faces, _ = built.mesh
-    surface = Surface(vertices, faces)
+    surface = MeshSurface(vertices, faces)
     points, of_face = surface.sample(spacing_mm, seed)
     normals = surface.face_normals[of_face]
-    seen = Views(built, photos).count(points, normals) >= 3
+    seen = SurfaceVisibility(built, photos).count(points, normals) >= 3
     points = points[seen] + normals[seen] * rng.normal(0.0, noise_mm, (int(seen.sum()), 1))
     count = len(points)
     return DenseCloud(
@@ -313,6 +313,6 @@ def test_a_cloud_too_large_for_one_piece_gives_the_same(cloud, model, monkeypatc
     pieces = prepare_cloud(cloud, box, 0.5, 60)
     assert len(pieces) == pytest.approx(len(whole), rel=0.1)
     vertices, faces, _ = model.mesh
-    surface = Surface(vertices, faces)
+    surface = MeshSurface(vertices, faces)
     spread = [np.nanmedian(np.abs(surface.closest(p.points, 0.5).distances)) for p in (whole, pieces)]
     assert spread[1] == pytest.approx(spread[0], rel=0.2)

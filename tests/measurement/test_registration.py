@@ -6,11 +6,12 @@ import trimesh
 
 from arview.errors import InputError
 from arview.geometry import apply, invert
-from arview.measurement.cloud.point_registration import (
-    CloudRegistrationOptions,
-    TargetCloud,
+from arview.measurement.cloud.icp import (
+    IcpOptions,
+    IcpTarget,
     register_clouds,
 )
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.registration import (
     RegistrationOptions,
     degrees_of_freedom,
@@ -20,7 +21,6 @@ from arview.measurement.cloud.registration import (
     twist_about,
 )
 from arview.measurement.cloud.shape_fits import fit_circle, fit_cylinder, fit_plane
-from arview.measurement.cloud.surface import Surface
 from arview.measurement.studies.common import post
 
 SHIFT = np.array([0.8, -0.6, 0.0])
@@ -31,7 +31,7 @@ QUICK = RegistrationOptions(noise_points=0)
 def bracket():
     """An angle of two plates, 60 × 40 × 30 mm: every move is determined."""
     profile = np.array([[0, 0], [60, 0], [60, 6], [8, 6], [8, 30], [0, 30]], dtype=float)
-    return Surface(*_prism(profile, 40.0))
+    return MeshSurface(*_prism(profile, 40.0))
 
 
 def _prism(profile, height):
@@ -110,7 +110,7 @@ def test_only_free_moves_are_made(bracket):
 
 def test_a_plane_leaves_three_moves_open():
     vertices = np.array([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], dtype=float)
-    surface = Surface(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+    surface = MeshSurface(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
     points, _ = surface.spread(2000)
     points = points * [0.8, 0.8, 1.0] + [0.0, 0.0, 0.7]
     found = register_to_surface(points, surface, center=np.zeros(3), options=QUICK)
@@ -124,8 +124,8 @@ def test_a_second_minimum_is_told():
     """Two equal fins 3 mm apart: half a step away every start falls onto the wrong one or the right one."""
     fins = [trimesh.creation.box((0.8, 20.0, 10.0)).apply_translation((x, 0.0, 0.0)) for x in (0.0, 3.0, 6.0, 9.0)]
     mesh = trimesh.util.concatenate(fins)
-    surface = Surface(mesh.vertices, mesh.faces)
-    one = Surface(fins[1].vertices, fins[1].faces)
+    surface = MeshSurface(mesh.vertices, mesh.faces)
+    one = MeshSurface(fins[1].vertices, fins[1].faces)
     points, faces = one.spread(3000)
     starts = [move_about(np.zeros(3), np.array([0, 0, 0, x, 0, 0])) for x in (0.0, -2.8, 3.1)]
     free = degrees_of_freedom("tx ty tz")
@@ -203,11 +203,11 @@ def test_icp_between_clouds(bracket, method, limit_um):
     target, target_faces = bracket.spread(20_000, 2)
     center = np.array([30.0, 15.0, 20.0])
     moved = move_about(center, np.array([0.01, 0.0, -0.01, 0.4, -0.3, 0.2]))
-    cloud = TargetCloud(target, bracket.face_normals[target_faces])
-    found = register_clouds(apply(moved, points), cloud, options=CloudRegistrationOptions(method=method))
+    cloud = IcpTarget(target, bracket.face_normals[target_faces])
+    found = register_clouds(apply(moved, points), cloud, options=IcpOptions(method=method))
     assert found.converged
     assert 1e3 * np.linalg.norm(twist_about(center, found.target_from_source @ moved)[3:]) < limit_um
-    estimated = TargetCloud(target)
+    estimated = IcpTarget(target)
     assert np.median(np.abs(np.sum(estimated.normals * cloud.normals, axis=1))) > 0.9999
     with pytest.raises(InputError, match="have a partner"):
         register_clouds(points + 1000.0, cloud)

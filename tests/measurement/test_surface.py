@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from arview.errors import InputError
-from arview.measurement.cloud.surface import Surface
+from arview.measurement.cloud.mesh_surface import MeshSurface
 
 
 @pytest.fixture(scope="module")
@@ -13,7 +13,7 @@ def lumpy():
     """A closed body of 20,480 triangles with hollows."""
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=30.0)
     wave = 1.0 + 0.2 * np.sin(0.2 * mesh.vertices[:, 0]) * np.cos(0.15 * mesh.vertices[:, 1])
-    return Surface(mesh.vertices * wave[:, None], mesh.faces)
+    return MeshSurface(mesh.vertices * wave[:, None], mesh.faces)
 
 
 def test_closest_is_that_of_trying_every_triangle(lumpy):
@@ -42,7 +42,7 @@ def test_hints_and_reach_change_nothing_but_what_is_too_far(lumpy):
 
 def test_sign_near_edges_and_corners_of_a_box():
     box = trimesh.creation.box((20.0, 30.0, 40.0))
-    surface = Surface(box.vertices, box.faces)
+    surface = MeshSurface(box.vertices, box.faces)
     points = np.random.default_rng(2).uniform(-25, 25, (5000, 3))
     inside = (np.abs(points) < [10.0, 15.0, 20.0]).all(axis=1)
     found = surface.closest(points)
@@ -57,7 +57,7 @@ def test_sign_near_edges_and_corners_of_a_box():
 
 def test_normals_of_a_coarse_cylinder_are_those_of_the_round_one():
     mesh = trimesh.creation.cylinder(8.0, 40.0, sections=36)
-    surface = Surface(mesh.vertices, mesh.faces)
+    surface = MeshSurface(mesh.vertices, mesh.faces)
     angle = np.random.default_rng(3).uniform(0, 2 * np.pi, 500)
     radial = np.stack([np.cos(angle), np.sin(angle), np.zeros(500)], axis=1)
     found = surface.closest(8.1 * radial + [0.0, 0.0, 5.0])
@@ -70,13 +70,15 @@ def test_faces_without_area_and_doubled_vertices_are_no_matter():
     box = trimesh.creation.box((10.0, 10.0, 10.0))
     soup = box.triangles.reshape(-1, 3)
     faces = np.concatenate([np.arange(len(soup)).reshape(-1, 3), [[0, 0, 1], [2, 2, 2]]])
-    surface = Surface(soup, faces)
+    surface = MeshSurface(soup, faces)
     points = np.random.default_rng(4).uniform(-8, 8, (500, 3))
-    assert np.allclose(surface.closest(points).distances, Surface(box.vertices, box.faces).closest(points).distances)
+    assert np.allclose(
+        surface.closest(points).distances, MeshSurface(box.vertices, box.faces).closest(points).distances
+    )
     with pytest.raises(InputError, match="no triangle has an area"):
-        Surface(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+        MeshSurface(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     with pytest.raises(InputError, match="NaN"):
-        Surface(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
+        MeshSurface(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
 
 
 def test_samples_lie_on_the_surface_evenly(lumpy):

@@ -39,7 +39,7 @@ from helpers.photo_scene import CAMERA, bench, ring
 
 RADIUS_MM = 22.0
 CENTER = np.array([60.0, -40.0, 20.0])
-BARE = UncertaintyOptions(form_mm=1e-6, least_poses_mm=1e-6)
+BARE = UncertaintyOptions(form_mm=1e-6, min_poses_mm=1e-6)
 
 
 def move(

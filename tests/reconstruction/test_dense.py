@@ -136,7 +136,7 @@ def test_cloud_lies_on_what_was_built(cloud: DenseCloud, scene: SparseModel) -> 
     assert score.far < 0.02  # the rim before a plain background
     assert score.complete > 0.85
     assert len(cloud.points) == len(cloud.normals) == len(cloud.colors) == len(cloud.sigma) == len(cloud.views)
-    assert cloud.views.min() >= TINY.least_views
+    assert cloud.views.min() >= TINY.min_views
 
 
 def test_normals_colors_and_deviations_are_right(cloud: DenseCloud) -> None:
@@ -193,7 +193,7 @@ def test_a_photo_of_another_size_is_named(scene: SparseModel, nominal: Cad) -> N
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("max_region_px", 10), ("best_sources", 9), ("least_views", 1), ("band_mm", 0.0), ("grazing_deg", 90.0)],
+    [("max_region_px", 10), ("best_sources", 9), ("min_views", 1), ("band_mm", 0.0), ("grazing_deg", 90.0)],
 )
 def test_options_out_of_range_are_refused(field: str, value: float) -> None:
     with pytest.raises(InputError, match=field):

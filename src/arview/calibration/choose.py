@@ -31,8 +31,8 @@ class ChoiceOptions:
     first: int = 25  # views of the first camera, by which the information of the others is told
 
     def __post_init__(self) -> None:
-        if self.most < SolveOptions.least_views or self.candidates < self.most or not self.worse > 1:
-            raise InputError(f"choice of views: expected at least {SolveOptions.least_views} views and worse above 1")
+        if self.most < SolveOptions.min_views or self.candidates < self.most or not self.worse > 1:
+            raise InputError(f"choice of views: expected at least {SolveOptions.min_views} views and worse above 1")
 
 
 def choose_views(
@@ -63,13 +63,13 @@ def choose_views(
         else:
             rejected[name] = "there are better views"
     if len(kept) > options.most:
-        chosen = _most_telling([views[i] for i in kept], [outlines[i] for i in kept], width, height, options)
+        chosen = _max_information([views[i] for i in kept], [outlines[i] for i in kept], width, height, options)
         rejected |= {views[i].name: "adds little to the others" for k, i in enumerate(kept) if k not in chosen}
         kept = [kept[k] for k in chosen]
     return [views[i] for i in sorted(kept)], rejected
 
 
-def _most_telling(
+def _max_information(
     views: list[BoardView], outlines: list[Array], width: int, height: int, options: ChoiceOptions
 ) -> list[int]:
     camera = solve([views[k] for k in _spread(outlines, options.first)], width, height).camera

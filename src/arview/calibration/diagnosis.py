@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,30 +12,33 @@ from numpy.typing import NDArray
 from arview.fiducials.board import Board, cv_board
 from arview.geometry import Array
 
-if TYPE_CHECKING:
-    from arview.calibration.views import BoardFinder, Sightings
-
 _DICTIONARIES = (
     "DICT_4X4_250", "DICT_5X5_250", "DICT_6X6_250", "DICT_7X7_250", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
     "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9",
 )  # fmt: skip
 """Of each family one that the others are parts of, but for boards of more than 250 markers."""
-_LEAST_MARKERS = 4
+_MIN_MARKERS = 4
 _FIT = 0.1
 """Share of a marker's side that corners may lie off a homography: lens distortion bends boards by less."""
 
 
-def why_no_board(finder: BoardFinder, sightings: Sightings, pictures: Iterable[NDArray[np.uint8]]) -> str:
-    """In words, why none of the pictures shows the board, and what to do.
+MarkerDetections = tuple[Array, NDArray[np.int64]]
+"""Markers found in one picture: corners (N,4,2) px and ids (N,)."""
+
+
+def diagnose_missing_board(
+    board: Board, detections: Sequence[MarkerDetections], picture_count: int, pictures: Iterable[NDArray[np.uint8]]
+) -> str:
+    """Explain why no picture shows the board, and say what to do.
 
     Args:
-        finder: it has kept the markers that were seen.
-        sightings: of all pictures.
-        pictures: some of them, gray.
+        board: the board that was searched for.
+        detections: markers of pictures in which too few of the board's corners were found.
+        picture_count: number of pictures searched.
+        pictures: some of them, grey (H,W) uint8, in which markers of other dictionaries are searched for.
     """
-    board = finder.board
-    if any(len(ids) >= _LEAST_MARKERS for _, ids in finder.markers_seen):
-        columns = _columns_that_fit(board, finder.markers_seen)
+    if any(len(ids) >= _MIN_MARKERS for _, ids in detections):
+        columns = _columns_that_fit(board, detections)
         if columns is not None and columns != board.columns:
             return (
                 f"markers of {board.dictionary} are seen, but they lie as on a board of {columns} columns, not of"
@@ -54,16 +56,13 @@ def why_no_board(finder: BoardFinder, sightings: Sightings, pictures: Iterable[N
     other = _other_dictionary(pictures)
     if other is not None:
         return f"no marker of {board.dictionary} is seen, but such of {other}; give the board that is in the pictures"
-    count = sightings.looked_at
-    return (
-        f"no marker of the board in any of {count} picture{'s' if count > 1 else ''}; it must be whole, in focus and"
-        " fill about half of the picture"
-    )
+    count = f"{picture_count} picture{'s' if picture_count > 1 else ''}"
+    return f"no marker of the board in any of {count}; it must be whole, in focus and fill about half of the picture"
 
 
-def _columns_that_fit(board: Board, seen: list[tuple[Array, NDArray[np.int64]]]) -> int | None:
+def _columns_that_fit(board: Board, detections: Sequence[MarkerDetections]) -> int | None:
     """The number of columns with which the ids of the markers make a plane board in most pictures."""
-    pictures = sorted((one for one in seen if len(one[1]) >= _LEAST_MARKERS), key=lambda one: -len(one[1]))[:3]
+    pictures = sorted((one for one in detections if len(one[1]) >= _MIN_MARKERS), key=lambda one: -len(one[1]))[:3]
     votes: Counter[int] = Counter()
     for quads, ids in pictures:
         fits = [columns for columns in range(3, 31) if _fits(board, columns, quads, ids)]
@@ -87,7 +86,7 @@ def _fits(board: Board, columns: int, quads: Array, ids: NDArray[np.int64]) -> b
             int(i): np.asarray(c)[:, :2] for i, c in zip(drawn.getIds().ravel(), drawn.getObjPoints(), strict=True)
         }
         known = [k for k, index in enumerate(ids) if int(index) in place]
-        if len(known) < max(_LEAST_MARKERS, 0.8 * len(ids)):
+        if len(known) < max(_MIN_MARKERS, 0.8 * len(ids)):
             continue
         on_board = np.concatenate([place[int(ids[k])] for k in known]).astype(np.float64)
         pixels = np.concatenate([quads[k] for k in known])
@@ -112,4 +111,4 @@ def _other_dictionary(pictures: Iterable[NDArray[np.uint8]]) -> str | None:
             _, ids, _ = detector.detectMarkers(gray)
             counts[name] += 0 if ids is None else len(ids)
     name, count = counts.most_common(1)[0] if counts else ("", 0)
-    return name if count >= _LEAST_MARKERS else None
+    return name if count >= _MIN_MARKERS else None

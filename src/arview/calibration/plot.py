@@ -20,7 +20,7 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
     """Corners with their residuals, and U of a ray's place, as a picture of a kind of FORMATS. Raises InputError."""
     if kind not in FORMATS:
         raise InputError(f"plot: {kind!r}: expected one of {', '.join(FORMATS)}")
-    solution, judged = calibration.solution, calibration.judgement
+    solution, judged = calibration.solution, calibration.verdict
     camera = solution.camera
     pixels = np.concatenate([view.pixels for view in solution.views])
     residuals = np.concatenate(solution.residuals)

@@ -13,8 +13,8 @@ import numpy as np
 from arview import __version__
 from arview.calibration.choose import ChoiceOptions, choose_views
 from arview.calibration.solve import PARAMETERS, K, Solution, SolveOptions, solve
-from arview.calibration.verdict import Judgement, VerdictOptions, judge
-from arview.calibration.views import Sightings, find_views
+from arview.calibration.verdict import CalibrationVerdict, VerdictOptions, assess
+from arview.calibration.views import BoardSightings, find_views
 from arview.camera import Camera
 from arview.camera.profiles import lens_record
 from arview.core.progress import StepProgress
@@ -27,9 +27,9 @@ class Calibration:
     """A calibration with all that is known of it: what was seen, the camera, and the verdict."""
 
     board: Board
-    sightings: Sightings
+    sightings: BoardSightings
     solution: Solution
-    judgement: Judgement
+    verdict: CalibrationVerdict
     rejected: dict[str, str]
 
     @property
@@ -65,7 +65,7 @@ def calibrate(
         InputError: nothing readable, no board, too few views, or views that no camera explains.
     """
     sightings = find_views(sources, board, progress)
-    least = (solving or SolveOptions()).least_views
+    least = (solving or SolveOptions()).min_views
     if len(sightings.views) < least:
         why = "; ".join(f"{name} {reason}" for name, reason in list(sightings.rejected.items())[:3])
         raise InputError(
@@ -78,12 +78,12 @@ def calibrate(
     except InputError as error:
         raise InputError(f"{sightings.label}: {error}") from error
     rejected = sightings.rejected | left_out | solution.rejected
-    return Calibration(board, sightings, solution, judge(solution, limits), rejected)
+    return Calibration(board, sightings, solution, assess(solution, limits), rejected)
 
 
 def record_of(calibration: Calibration) -> dict[str, Any]:
     """What goes into the camera file beside the numbers: ``calibration`` and ``lens``. Infinite values are null."""
-    solution, judged, seen = calibration.solution, calibration.judgement, calibration.sightings
+    solution, judged, seen = calibration.solution, calibration.verdict, calibration.sightings
 
     def plain(value: float) -> float | None:
         return float(value) if np.isfinite(value) else None

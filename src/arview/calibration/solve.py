@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from arview.calibration.views import LEAST_CORNERS, BoardView
+from arview.calibration.views import MIN_CORNERS, BoardView
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, rigid
@@ -27,14 +27,14 @@ K = 2.0
 class SolveOptions:
     """What is left out."""
 
-    least_views: int = 5  # poses and nine intrinsics from less are hardly checked by anything
+    min_views: int = 5  # poses and nine intrinsics from less are hardly checked by anything
     view_outlier: float = 2.5  # times the median view's rms: a blurred or bent view
     view_floor_px: float = 0.15  # views that fit this well are kept, however well the others do
     corner_outlier: float = 4.5  # robust standard deviations: 1 corner of 25,000 of normal errors
     rounds: int = 12  # of solving and leaving out; wrong corners go a few at a time
 
     def __post_init__(self) -> None:
-        if self.least_views < 3 or not (self.view_outlier > 1 and self.corner_outlier > 2 and self.rounds > 0):
+        if self.min_views < 3 or not (self.view_outlier > 1 and self.corner_outlier > 2 and self.rounds > 0):
             raise InputError("calibration: expected at least 3 views, and outliers beyond 1 (views) and 2 (corners)")
 
 
@@ -79,9 +79,9 @@ def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOpt
     before = sum(len(view.ids) for view in kept)
     solution: Solution | None = None
     for _ in range(options.rounds):
-        if len(kept) < options.least_views:
+        if len(kept) < options.min_views:
             raise InputError(
-                f"only {len(kept)} of {len(views)} views of the board fit together; {options.least_views} are the"
+                f"only {len(kept)} of {len(views)} views of the board fit together; {options.min_views} are the"
                 " least, 20 are good: hold the board flat and still, in focus, and take it from many sides"
             )
         solution = _adjust(kept, width, height, None if solution is None else solution.camera)
@@ -92,7 +92,7 @@ def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOpt
         rejected |= bad
         if not bad and len(settled) == len(kept):
             break
-        kept = [view for view in trimmed if view.name not in bad and len(view.ids) >= LEAST_CORNERS]
+        kept = [view for view in trimmed if view.name not in bad and len(view.ids) >= MIN_CORNERS]
     if solution is None:
         raise InputError("no views of the board")
     gone = {view.name for view in views} - {view.name for view in solution.views} - set(rejected)

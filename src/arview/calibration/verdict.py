@@ -31,12 +31,12 @@ class VerdictOptions:
     good_coverage: float = 0.7  # share of the picture's cells with a corner of the board
     usable_coverage: float = 0.4
     tilted_deg: float = 20.0  # a view tilted by more tells the focal length
-    least_tilted: int = 4  # such views, to at least two sides
+    min_tilted: int = 4  # such views, to at least two sides
     good_range: float = 1.3  # farthest over nearest board
 
 
 @dataclass(frozen=True)
-class Judgement:
+class CalibrationVerdict:
     """A calibration judged.
 
     Attributes:
@@ -64,7 +64,7 @@ class Judgement:
     advice: tuple[str, ...]
 
 
-def judge(solution: Solution, options: VerdictOptions | None = None) -> Judgement:
+def assess(solution: Solution, options: VerdictOptions | None = None) -> CalibrationVerdict:
     """The calibration against the limits, with what to do when it is not good."""
     options = options or VerdictOptions()
     camera = solution.camera
@@ -100,7 +100,7 @@ def judge(solution: Solution, options: VerdictOptions | None = None) -> Judgemen
     if grade is not Grade.GOOD:
         tilted = int(np.sum(tilts >= options.tilted_deg))
         focal_is_poor = grades[0] is not Grade.GOOD
-        if focal_is_poor and (tilted < options.least_tilted or sides < 2):
+        if focal_is_poor and (tilted < options.min_tilted or sides < 2):
             advice.append("tilt the board more, by 30° to 45°, to the left, the right, upwards and downwards")
         if grades[3] is not Grade.GOOD or (grades[1] is not Grade.GOOD and not focal_is_poor):
             missing = _empty_corners(cells)
@@ -116,7 +116,7 @@ def judge(solution: Solution, options: VerdictOptions | None = None) -> Judgemen
             )
         if not advice:
             advice.append("take more views, tilted to all sides, with the board filling the picture")
-    return Judgement(
+    return CalibrationVerdict(
         grade, focal_u, centre_u, (float(np.median(pixel_u)), worst), coverage, cells,
         (float(tilts.min()), float(np.median(tilts)), float(tilts.max())), ratio, tuple(why), tuple(advice),
     )  # fmt: skip

@@ -16,17 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.calibration.diagnosis import diagnose_missing_board
 from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
 from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.fiducials.board import Board, cv_board
 from arview.geometry import Array
 
-LEAST_CORNERS = 8
+MIN_CORNERS = 8
 """A picture with fewer says little and is easily wrong."""
 _LOOKS_PER_S = 5.0
 """Frames of a video that are looked at; a hand-held camera hardly moves in between."""
-_MOST_LOOKS = 400
+_MAX_LOOKS = 400
 _SHUTTER_S = 0.02
 """How long a phone takes to read a picture out: it bends what moves."""
 
@@ -59,7 +60,7 @@ class BoardView:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class BoardSightings:
     """What the pictures show.
 
     Attributes:
@@ -108,7 +109,7 @@ class BoardFinder:
         """The view of a picture (H,W) uint8, or in words why there is none."""
         for detector in list(self._detectors):
             corners, ids, quads, marker_ids = detector.detectBoard(gray)
-            if ids is not None and len(ids) >= LEAST_CORNERS:
+            if ids is not None and len(ids) >= MIN_CORNERS:
                 self._detectors = [detector]
                 points = np.asarray(detector.getBoard().getChessboardCorners(), dtype=np.float64)
                 number = np.asarray(ids).ravel().astype(np.int64)
@@ -123,7 +124,7 @@ class BoardFinder:
             (np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2), np.asarray(marker_ids).ravel().astype(np.int64))
         )
         count = 0 if ids is None else len(ids)
-        return f"shows {found} markers and {count} corners of the board; {LEAST_CORNERS} are needed"
+        return f"shows {found} markers and {count} corners of the board; {MIN_CORNERS} are needed"
 
     def _detector(self, is_legacy: bool) -> Any:
         import cv2
@@ -136,7 +137,7 @@ class BoardFinder:
         return cv2.aruco.CharucoDetector(drawn, details, self._parameters)
 
 
-def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgress | None = None) -> Sightings:
+def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgress | None = None) -> BoardSightings:
     """Look for the board in photos, or in one video.
 
     Args:
@@ -156,16 +157,17 @@ def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgre
     else:
         sightings = _look_at_photos(sources, finder, progress)
     if not sightings.views:
-        from arview.calibration.diagnosis import why_no_board
-
-        raise InputError(f"{sightings.label}: {why_no_board(finder, sightings, _some_pictures(sources))}")
+        reason = diagnose_missing_board(board, finder.markers_seen, sightings.looked_at, _some_pictures(sources))
+        raise InputError(f"{sightings.label}: {reason}")
     return sightings
 
 
 # --- photos ------------------------------------------------------------------------------------------------
 
 
-def _look_at_photos(sources: Sequence[str | Path], finder: BoardFinder, progress: StepProgress | None) -> Sightings:
+def _look_at_photos(
+    sources: Sequence[str | Path], finder: BoardFinder, progress: StepProgress | None
+) -> BoardSightings:
     from arview.reconstruction.intake.reading import photo_paths
 
     paths: list[Path] = []
@@ -198,7 +200,7 @@ def _look_at_photos(sources: Sequence[str | Path], finder: BoardFinder, progress
             f"{len(others)} of {len(paths)} photos are of another camera, zoom or size and are left out: "
             f"{', '.join(list(others)[:4])}; calibrate each by itself"
         )
-    return Sightings(label, width, height, tuple(views), rejected, len(paths), first, turns, tuple(warnings))
+    return BoardSightings(label, width, height, tuple(views), rejected, len(paths), first, turns, tuple(warnings))
 
 
 def _exif_of_all(paths: Sequence[Path], names: Sequence[str]) -> tuple[dict[str, PhotoExif], dict[str, str]]:
@@ -261,7 +263,7 @@ def _is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES
 
 
-def _look_at_video(path: Path, finder: BoardFinder, progress: StepProgress | None) -> Sightings:
+def _look_at_video(path: Path, finder: BoardFinder, progress: StepProgress | None) -> BoardSightings:
     import cv2
 
     from arview.camera.profiles import exif_of_video
@@ -269,7 +271,7 @@ def _look_at_video(path: Path, finder: BoardFinder, progress: StepProgress | Non
 
     with open_source(path) as source:
         fps, count = source.fps or 30.0, source.frame_count
-    stride = max(1, round(fps / _LOOKS_PER_S), -(-(count or 0) // _MOST_LOOKS))
+    stride = max(1, round(fps / _LOOKS_PER_S), -(-(count or 0) // _MAX_LOOKS))
     views: list[BoardView] = []
     rejected: dict[str, str] = {}
     looked_at = 0
@@ -296,7 +298,7 @@ def _look_at_video(path: Path, finder: BoardFinder, progress: StepProgress | Non
         raise InputError(f"{path}: no frame could be read; record or copy the video again")
     warnings = (ended,) if ended else ()
     exif = exif_of_video(path, *size)
-    return Sightings(str(path), *size, tuple(views), rejected, looked_at, exif, turns, warnings)
+    return BoardSightings(str(path), *size, tuple(views), rejected, looked_at, exif, turns, warnings)
 
 
 def _speed_px_s(before: BoardView | None, now: BoardView, seconds: float) -> float:

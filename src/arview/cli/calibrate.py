@@ -152,8 +152,8 @@ def lens(
 
         write_bytes(picture, draw(result, picture.suffix.lower().removeprefix(".")))
         click.echo(f"wrote {picture}")
-    not_enough = result.judgement.grade.value == "not enough"
-    if not_enough and not (anyway and math.isfinite(result.judgement.focal_u)):
+    not_enough = result.verdict.grade.value == "not enough"
+    if not_enough and not (anyway and math.isfinite(result.verdict.focal_u)):
         say("no camera was written; do as advised" + ("" if anyway else ", or take it --anyway"))
         click.get_current_context().exit(EXIT_NOT_ENOUGH)
     extra = record_of(result)
@@ -208,7 +208,7 @@ def _parse_squares(text: str | None) -> tuple[int | None, int | None]:
 
 def _print(result: Calibration) -> None:
     """What was seen, the camera with U, the verdict and what to do; doubts go to stderr."""
-    seen, solution, judged = result.sightings, result.solution, result.judgement
+    seen, solution, judged = result.sightings, result.solution, result.verdict
     for warning in seen.warnings:
         say(f"warning: {warning}")
     reasons: dict[str, list[str]] = {}
@@ -237,7 +237,7 @@ def _print(result: Calibration) -> None:
 
 
 def _camera_lines(result: Calibration) -> list[str]:
-    camera, judged = result.camera, result.judgement
+    camera, judged = result.camera, result.verdict
     values: Any = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist]
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     cells = [

@@ -119,7 +119,7 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
     Raises:
         InputError: the part is not found in the cloud; the scale is unknown, and no two datums have a distance.
     """
-    from arview.measurement.cloud.global_registration import find_model
+    from arview.measurement.cloud.global_registration import find_model_in_cloud
 
     scale, cloud = reconstruction.scale, reconstruction.cloud
     if scale.model_from_scan is not None or cloud is None:
@@ -129,7 +129,7 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
             "cloud: lengths are in an arbitrary unit, and the part file has no two datums whose distance says the "
             "scale; reconstruct with a board, a tag or a scale bar"
         )
-    found = find_model(cloud, part.model, None if scale.scale is None else 1.0)
+    found = find_model_in_cloud(cloud, part.model, None if scale.scale is None else 1.0)
     normals = np.asarray(cloud.normals @ found.model_from_scan[:3, :3].T, dtype=np.float32)
     moved = replace(
         cloud, points=found.points_in_model(np.asarray(cloud.points, dtype=np.float64)), normals=normals,

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from arview.errors import InputError
 from arview.measurement.datums.alignment import AlignmentOptions
-from arview.measurement.datums.photo_datums import DatumOptions
+from arview.measurement.datums.in_photos import DatumOptions
 from arview.measurement.photo import PhotoOptions
 from arview.measurement.types import Method, Move, NotMeasured
 from arview.measurement.uncertainty.budget import UncertaintyOptions
-from arview.measurement.uncertainty.combine import Combined, combine
+from arview.measurement.uncertainty.combine import CombinedMove, combine
 from arview.measurement.uncertainty.decision import DecisionOptions
 
 METHODS: tuple[Method, ...] = ("sweep", "edges", "cloud")
@@ -41,14 +41,14 @@ class MeasureOptions:
 
 
 @dataclass(frozen=True)
-class Measured:
+class ComponentMeasurement:
     """A component's results by all methods, before the datum frame."""
 
     moves: tuple[Move, ...]
     failures: tuple[NotMeasured, ...]
 
 
-def combined_of(measured: Measured) -> Combined | None:
+def combined_of(measured: ComponentMeasurement) -> CombinedMove | None:
     """The move that counts: sweep and edges together; the cloud's alone where neither could."""
     direct = [move for move in measured.moves if move.method != "cloud"]
     moves = direct or list(measured.moves)

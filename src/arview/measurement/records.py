@@ -28,7 +28,7 @@ from arview.inspection import (
 )
 from arview.measurement.datums.alignment import Alignment
 from arview.measurement.folder import MetricReconstruction
-from arview.measurement.options import Measured, MeasureOptions, combined_of
+from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.types import Move
 from arview.measurement.uncertainty.budget import (
     Placement,
@@ -36,14 +36,14 @@ from arview.measurement.uncertainty.budget import (
     place,
     relative_twists,
 )
-from arview.measurement.uncertainty.combine import Agreement, Combined, agreements
+from arview.measurement.uncertainty.combine import Agreement, CombinedMove, agreements
 from arview.measurement.uncertainty.decision import decide, worst, zone_diameter_mm
 
 _SOFTWARE = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "numba")
 
 
 def component_record(
-    name: str, measured: Measured, alignment: Alignment, poses: PosePropagation | None, part: Part,
+    name: str, measured: ComponentMeasurement, alignment: Alignment, poses: PosePropagation | None, part: Part,
     options: MeasureOptions,
 ) -> ComponentDeviation:  # fmt: skip
     """Where a component stands in the datum frame, and the verdict."""
@@ -119,7 +119,7 @@ def _verdict(
     return verdict if verdicts else Verdict.UNDECIDED
 
 
-def _details(placed: Placement, together: Combined, settings: ComponentSettings) -> Details:
+def _details(placed: Placement, together: CombinedMove, settings: ComponentSettings) -> Details:
     rotation = exp_so3(placed.twist[:3])
     center, distance, angle = together.center_in_model, placed.distance, placed.angle
     return Details(
@@ -141,7 +141,7 @@ def _details(placed: Placement, together: Combined, settings: ComponentSettings)
 
 def _method_result(move: Move, alignment: Alignment) -> MethodResult:
     """A method's own result in the datum frame."""
-    alone = Combined(move.twist, {}, np.zeros((6, 6)), move.undetermined, move.radius_mm, move.center_in_model)
+    alone = CombinedMove(move.twist, {}, np.zeros((6, 6)), move.undetermined, move.radius_mm, move.center_in_model)
     twist = relative_twists(move.twist[None], alignment.move[None], alone, alignment)[0]
     std = np.sqrt(np.maximum(np.diag(move.covariance), 0.0))
 

@@ -17,6 +17,7 @@ from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import DistanceReport, ForeignReport, Inspection
+from arview.measurement.cloud_report import inspect_cloud
 from arview.measurement.datums.alignment import (
     Alignment,
     Equations,
@@ -24,11 +25,10 @@ from arview.measurement.datums.alignment import (
     check_covered,
     move_equations,
 )
-from arview.measurement.datums.cloud_datums import measure_datums_in_cloud
-from arview.measurement.datums.photo_datums import base_plane, measure_datums
-from arview.measurement.findings import look_at_cloud
+from arview.measurement.datums.in_cloud import measure_datums_in_cloud
+from arview.measurement.datums.in_photos import base_plane, measure_datums_in_photos
 from arview.measurement.folder import MetricReconstruction, in_model_frame
-from arview.measurement.options import Measured, MeasureOptions, combined_of
+from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.photo import PhotoViews, load_views, measure_components_in_photos
 from arview.measurement.records import (
     component_record,
@@ -38,7 +38,7 @@ from arview.measurement.records import (
 )
 from arview.measurement.types import Move, NotMeasured
 from arview.measurement.uncertainty.budget import PosePropagation
-from arview.measurement.uncertainty.combine import Combined
+from arview.measurement.uncertainty.combine import CombinedMove
 from arview.reconstruction.scale.cad import base_names
 
 
@@ -102,7 +102,7 @@ def _measure(
     distances: DistanceReport | None = None
     if reconstruction.cloud is not None and "cloud" in options.methods:
         tell("distance map", 0, 1)
-        foreign, distances = look_at_cloud(reconstruction.cloud, part.model, alignment, deviations, options.maps_folder)
+        foreign, distances = inspect_cloud(reconstruction.cloud, part.model, alignment, deviations, options.maps_folder)
     return Inspection(
         part=part.name,
         serial=part.serial or "",
@@ -120,7 +120,7 @@ def _measure(
 def measure_all(
     reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, names: Sequence[str],
     options: MeasureOptions, tell: Progress,
-) -> dict[str, Measured]:  # fmt: skip
+) -> dict[str, ComponentMeasurement]:  # fmt: skip
     """Every component by every method asked for, in the rough frame."""
     found: dict[str, list[Move | NotMeasured]] = {name: [] for name in names}
     if views is not None and {"sweep", "edges"} & set(options.methods):
@@ -151,7 +151,7 @@ def measure_all(
             if one.component in found:
                 found[one.component].append(one)
     return {
-        name: Measured(
+        name: ComponentMeasurement(
             tuple(one for one in all_of if isinstance(one, Move)),
             tuple(one for one in all_of if isinstance(one, NotMeasured)),
         )
@@ -161,7 +161,7 @@ def measure_all(
 
 def align_to_datums(
     reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, base: Sequence[str],
-    results: Mapping[str, Measured], options: MeasureOptions,
+    results: Mapping[str, ComponentMeasurement], options: MeasureOptions,
 ) -> Alignment:  # fmt: skip
     """The datum frame of the part file; where it leaves something free, or without datums, the base's best fit."""
     fitted = {}
@@ -173,7 +173,7 @@ def align_to_datums(
         assert reconstruction.cloud is not None
         equations = measure_datums_in_cloud(part.datums, part.model, reconstruction.cloud, fitted, options.datums)
     else:
-        equations = measure_datums(part.datums, views, fitted, options.datums)
+        equations = measure_datums_in_photos(part.datums, views, fitted, options.datums)
     if not part.datums and views is not None:
         equations = _plane_of_base(views, part.model, base, options)
     rest = next((_rest_of_base(results[name], fitted[name], equations) for name in base if name in fitted), None)
@@ -199,21 +199,21 @@ def _plane_of_base(views: PhotoViews, model: Model, base: Sequence[str], options
     if plane is None:
         return []
     try:
-        equations = measure_datums((plane,), views, {}, options.datums)
+        equations = measure_datums_in_photos((plane,), views, {}, options.datums)
         check_covered(equations[0], options.alignment)
     except InputError:
         return []
     return equations
 
 
-def _rest_of_base(measured: Measured, fitted: Move, datums: Sequence[Equations]) -> Equations:
+def _rest_of_base(measured: ComponentMeasurement, fitted: Move, datums: Sequence[Equations]) -> Equations:
     """The base's best fit; within a plane that is already known by its edges, as its narrow sides tell little."""
     edges = [move for move in measured.moves if move.method == "edges"]
     is_flat = any(datum.feature == "plane" for datum in datums)
     return move_equations(fitted.component, edges[0] if edges and is_flat else fitted)[0]
 
 
-def _as_move(name: str, together: Combined) -> Move:
+def _as_move(name: str, together: CombinedMove) -> Move:
     covariance = np.sum([*together.covariances.values(), together.disagreement], axis=0)
     return Move(
         name, "sweep", together.center_in_model, together.twist, covariance, together.undetermined,

@@ -20,9 +20,9 @@ from arview.rendering.renderers import ZBufferRenderer
 class CoverageOptions:
     """When a component counts as seen, and from how many places it should be."""
 
-    longest_px: int = 400  # of the pictures rendered; a component of 1 % of the width still has 16 px
-    least_px: int = 12  # visible pixels at that size, below which nothing can be matched on it
-    least_share: float = 0.3  # visible share of the component's own outline; less is a glimpse past others
+    max_side_px: int = 400  # of the pictures rendered; a component of 1 % of the width still has 16 px
+    min_px: int = 12  # visible pixels at that size, below which nothing can be matched on it
+    min_share: float = 0.3  # visible share of the component's own outline; less is a glimpse past others
     direction_deg: float = 15.0  # views that differ by less count as one direction
     photos_wanted: int = 4  # one more than the least that can contradict each other
     directions_wanted: int = 3  # two give a distance, the third confirms it
@@ -105,19 +105,19 @@ def coverage(
 
 def _seen(model: Model, camera: Camera, cam_from_model: Array, options: CoverageOptions) -> list[bool]:
     """For each component whether the photo shows enough of it."""
-    scale = min(1.0, options.longest_px / max(camera.width, camera.height))
+    scale = min(1.0, options.max_side_px / max(camera.width, camera.height))
     small = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     ids = ZBufferRenderer(model, small).render(cam_from_model).component_ids
     visible = np.bincount(ids[ids >= 0], minlength=len(model.components))
     result = []
     for component, pixels in zip(model.components, visible, strict=True):
-        enough = bool(pixels >= options.least_px)
+        enough = bool(pixels >= options.min_px)
         if enough:
             points = apply(cam_from_model, component.vertices_in_model)
             _, faces = rasterise(
                 points, component.faces, small.fx, small.fy, small.cx, small.cy, small.width, small.height
             )
-            enough = bool(pixels >= options.least_share * np.count_nonzero(faces >= 0))
+            enough = bool(pixels >= options.min_share * np.count_nonzero(faces >= 0))
         result.append(enough)
     return result
 

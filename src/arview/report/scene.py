@@ -14,7 +14,7 @@ from arview.cad.model import Model
 from arview.geometry import Array
 from arview.inspection import Inspection
 from arview.measurement.cloud.distance_map import COLOR_STOPS, DistanceMap
-from arview.measurement.cloud.surface import Surface
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.overlay.labels import arrow_scale
 from arview.overlay.options import OverlayOptions
 from arview.reconstruction.types import DenseCloud
@@ -126,7 +126,7 @@ def _points(
 
 def _distances_um(points: Array, model: Model) -> NDArray[np.int16]:
     """Signed distances of the points in micrometres, −32768 for those that are far from the CAD."""
-    closest = Surface(*model.mesh).closest(points, _REACH_MM)
+    closest = MeshSurface(*model.mesh).closest(points, _REACH_MM)
     um = np.where(closest.faces >= 0, np.round(1000.0 * closest.distances).clip(-32767, 32767), -32768)
     return np.asarray(um.astype("<i2"))
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import apply
-from arview.measurement.cloud.point_registration import (
-    CloudRegistrationOptions,
-    TargetCloud,
+from arview.measurement.cloud.icp import (
+    IcpOptions,
+    IcpTarget,
     register_clouds,
 )
 from arview.measurement.cloud.registration import register_to_surface
@@ -33,11 +33,11 @@ def registrations() -> Iterator[tuple[str, float, float]]:
         return register_to_surface(points, surface, center=center, options=EXACT).surface_from_points
 
     def plane(points: Array, reference: Array, normals: Array) -> Array:
-        return register_clouds(points, TargetCloud(reference, normals)).target_from_source
+        return register_clouds(points, IcpTarget(reference, normals)).target_from_source
 
     def point(points: Array, reference: Array, normals: Array) -> Array:
-        options = CloudRegistrationOptions(method="point")
-        return register_clouds(points, TargetCloud(reference, normals), options=options).target_from_source
+        options = IcpOptions(method="point")
+        return register_clouds(points, IcpTarget(reference, normals), options=options).target_from_source
 
     methods: dict[str, Callable[[Array, Array, Array], Array]] = {
         "exact surface": exact, "point to plane": plane, "point to point": point, **_of_open3d(), **_of_small_gicp(),

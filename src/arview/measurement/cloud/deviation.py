@@ -20,6 +20,7 @@ from arview.cad.model import Component, Model
 from arview.cad.part import Part
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
 from arview.measurement.cloud.registration import (
     Registration,
@@ -29,8 +30,7 @@ from arview.measurement.cloud.registration import (
     register_to_surface,
     twist_about,
 )
-from arview.measurement.cloud.surface import Surface
-from arview.measurement.cloud.visibility import Views
+from arview.measurement.cloud.visibility import SurfaceVisibility
 from arview.measurement.types import Move, NotMeasured
 from arview.reconstruction.types import DenseCloud, PosedPhoto
 
@@ -45,14 +45,14 @@ class CloudDeviationOptions:
         grid_mm: cell of the grid that the cloud is averaged on: neighbouring points hold no more information.
         joint_mm: points nearer to another component are left out: weld beads, and what belongs to that component.
             Of a flat component at most a quarter of its height.
-        least_photos: a piece of surface counts as visible when so many photos see it; two make a point.
-        least_support: with less of its visible surface covered by points that fit, a component is not measured.
-        least_fitting: share of the points near it that must fit, or it is something else.
-        largest_noise_mm: with a larger spread of the residuals the points are no surface of this component.
+        min_photos: a piece of surface counts as visible when so many photos see it; two make a point.
+        min_support: with less of its visible surface covered by points that fit, a component is not measured.
+        min_fitting: share of the points near it that must fit, or it is something else.
+        max_noise_mm: with a larger spread of the residuals the points are no surface of this component.
         doubt_width_mm: width of the kernel in a second fit; what it changes is added to the covariance.
-        largest_std_mm: moves known less well than this are undetermined.
+        max_std_mm: moves known less well than this are undetermined.
         missing_share: with less of the visible surface within the band of any point, there is no component.
-        least_points: of a component.
+        min_points: of a component.
         rival_cost: a second minimum whose cost is less than so many times the best one's is told in the notes.
         registration: of the solver.
     """
@@ -60,17 +60,17 @@ class CloudDeviationOptions:
     band_mm: float = 5.0
     grid_mm: float = 0.5
     joint_mm: float = 2.0
-    least_photos: int = 2
-    least_support: float = 0.45
-    least_fitting: float = 0.7
-    largest_noise_mm: float = 0.7
+    min_photos: int = 2
+    min_support: float = 0.45
+    min_fitting: float = 0.7
+    max_noise_mm: float = 0.7
     doubt_width_mm: float = 0.4
-    largest_std_mm: float = 0.5
+    max_std_mm: float = 0.5
     missing_share: float = 0.2
-    least_points: int = 60
+    min_points: int = 60
     rival_cost: float = 1.5
     registration: RegistrationOptions = field(
-        default_factory=lambda: RegistrationOptions(least_width_mm=0.1, threshold_mm=1e-3, threshold_deg=1e-3)
+        default_factory=lambda: RegistrationOptions(min_width_mm=0.1, threshold_mm=1e-3, threshold_deg=1e-3)
     )
 
     def __post_init__(self) -> None:
@@ -79,7 +79,7 @@ class CloudDeviationOptions:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class CloudComponent:
     """A component, what of it can be seen, and what is around it.
 
     Attributes:
@@ -92,8 +92,8 @@ class Candidate:
     """
 
     component: Component
-    surface: Surface
-    others: Surface | None
+    surface: MeshSurface
+    others: MeshSurface | None
     samples: Array
     contact: Array
     usable_faces: NDArray[np.bool_]
@@ -134,30 +134,32 @@ def measure_components_in_cloud(
     """
     o = options or CloudDeviationOptions()
     box = model.bounds_in_model + np.array([[-o.band_mm], [o.band_mm]])
-    points = prepare_cloud(cloud, box, o.grid_mm, o.least_points)
+    points = prepare_cloud(cloud, box, o.grid_mm, o.min_points)
     check_belongs(points, model, o.band_mm)
-    views = Views(model, photos) if photos else None
+    views = SurfaceVisibility(model, photos) if photos else None
     # Threads of BLAS would wait for each other on matrices as small as these.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
-        candidates = list(threads.map(lambda name: _candidate(name, model, part, views, o), names or part.inspected))
-        first = list(threads.map(lambda c: _measure(c, points, None, o), candidates))
+        components = list(
+            threads.map(lambda name: _cloud_component(name, model, part, views, o), names or part.inspected)
+        )
+        first = list(threads.map(lambda c: _measure(c, points, None, o), components))
         places = {m.component: m.measured_from_nominal for m in first if isinstance(m, Move)}
 
         def again(index: int) -> Move | NotMeasured:
-            c, found = candidates[index], first[index]
+            c, found = components[index], first[index]
             if not isinstance(found, Move) or not _is_crowded(c, model, first, o):
                 return found
             moved = replace(c, others=_around(c.component, model, places, o))
             return _measure(moved, points, found.nominal_from_measured, o)
 
-        second = list(threads.map(again, range(len(candidates))))
-        return list(threads.map(lambda i: _named(second[i], candidates[i], candidates, points, o), range(len(second))))
+        second = list(threads.map(again, range(len(components))))
+        return list(threads.map(lambda i: _named(second[i], components[i], components, points, o), range(len(second))))
 
 
 def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:
     """Raises InputError when few points are near the CAD, or many more when the cloud is mirrored."""
     vertices, faces, _ = model.mesh
-    surface = Surface(vertices, faces)
+    surface = MeshSurface(vertices, faces)
     few = points.points[:: max(1, len(points) // 6000)]
     near = 0.2 * band_mm
 
@@ -181,7 +183,7 @@ def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:
         )
 
 
-def spin_moves(component: Component, surface: Surface, part: Part | None, least_information: float = 1e-4) -> Array:
+def spin_moves(component: Component, surface: MeshSurface, part: Part | None, min_information: float = 1e-4) -> Array:
     """(K,6) orthonormal moves about the middle of a component's box that leave its shape as it is.
 
     Moves along which the whole surface slides in itself (Gelfand & Guibas, SGP 2004), and the continuous symmetry of
@@ -193,7 +195,7 @@ def spin_moves(component: Component, surface: Surface, part: Part | None, least_
     normals = surface.closest(samples).normals
     rows = np.hstack([np.cross(samples - center, normals) / radius_mm, normals])
     values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    moves = vectors[:, values < least_information].T
+    moves = vectors[:, values < min_information].T
     known = part.component_settings(component.name).symmetry if part is not None else None
     if known is not None and known.order is None:
         axis = np.array(known.axis_in_model)
@@ -205,11 +207,11 @@ def spin_moves(component: Component, surface: Surface, part: Part | None, least_
     return vectors[values > 0.1]
 
 
-def _candidate(
-    name: str, model: Model, part: Part | None, views: Views | None, o: CloudDeviationOptions
-) -> Candidate:  # fmt: skip
+def _cloud_component(
+    name: str, model: Model, part: Part | None, views: SurfaceVisibility | None, o: CloudDeviationOptions
+) -> CloudComponent:  # fmt: skip
     component = model.component(name)
-    surface = Surface(component.vertices_in_model, component.faces)
+    surface = MeshSurface(component.vertices_in_model, component.faces)
     others = _around(component, model, {}, o)
     spacing = max(o.grid_mm, 0.3, float(np.sqrt(surface.areas.sum() / 4000.0)))
     spread, of_face = surface.sample(spacing)
@@ -222,19 +224,21 @@ def _candidate(
     touches = to_others < 0.2
     seen = ~touches
     if views is not None:
-        seen &= views.count(tried, surface.face_normals[faces]) >= o.least_photos
+        seen &= views.count(tried, surface.face_normals[faces]) >= o.min_photos
     height = float(np.max(to_others[np.isfinite(to_others)], initial=0.0)) if others is not None else np.inf
     joint = min(o.joint_mm, 0.25 * height)
     usable = np.zeros(len(surface.faces), dtype=bool)
     usable[faces[seen]] = True
     is_spread = np.arange(len(tried)) < len(spread)
-    return Candidate(
+    return CloudComponent(
         component, surface, others, tried[is_spread & seen & (to_others > joint)], tried[is_spread & touches], usable,
         spin_moves(component, surface, part), joint,
     )  # fmt: skip
 
 
-def _around(component: Component, model: Model, places: dict[str, Array], o: CloudDeviationOptions) -> Surface | None:
+def _around(
+    component: Component, model: Model, places: dict[str, Array], o: CloudDeviationOptions
+) -> MeshSurface | None:
     """The surface of the components near one, each at its place or nominal."""
     reach = 2.0 * o.band_mm + o.joint_mm
     low, high = component.bounds_in_model[0] - reach, component.bounds_in_model[1] + reach
@@ -252,10 +256,10 @@ def _around(component: Component, model: Model, places: dict[str, Array], o: Clo
         offset += len(at)
     if not vertices:
         return None
-    return Surface(np.concatenate(vertices), np.concatenate(faces), np.concatenate(groups))
+    return MeshSurface(np.concatenate(vertices), np.concatenate(faces), np.concatenate(groups))
 
 
-def _is_crowded(c: Candidate, model: Model, found: Sequence[Move | NotMeasured], o: CloudDeviationOptions) -> bool:
+def _is_crowded(c: CloudComponent, model: Model, found: Sequence[Move | NotMeasured], o: CloudDeviationOptions) -> bool:
     """Whether a neighbour stands so far from nominal that other points are left out on its account."""
     low, high = c.component.bounds_in_model
     for one in found:
@@ -269,7 +273,9 @@ def _is_crowded(c: Candidate, model: Model, found: Sequence[Move | NotMeasured],
     return False
 
 
-def _measure(c: Candidate, cloud: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Move | NotMeasured:
+def _measure(
+    c: CloudComponent, cloud: CloudPoints, start: Array | None, o: CloudDeviationOptions
+) -> Move | NotMeasured:
     """Move of one component, or why there is none; ``start`` is nominal_from_measured (4,4), None tries several."""
     name = c.component.name
     if len(c.samples) == 0:
@@ -278,8 +284,8 @@ def _measure(c: Candidate, cloud: CloudPoints, start: Array | None, o: CloudDevi
     missing = _missing(c, near, own, o)
     if missing is not None:
         return missing
-    if len(own) < o.least_points:
-        return NotMeasured(name, "cloud", f"only {len(own)} points of it in the cloud; {o.least_points} are needed")
+    if len(own) < o.min_points:
+        return NotMeasured(name, "cloud", f"only {len(own)} points of it in the cloud; {o.min_points} are needed")
     try:
         fit = _register(c, own, start, o)
     except InputError as error:
@@ -287,17 +293,17 @@ def _measure(c: Candidate, cloud: CloudPoints, start: Array | None, o: CloudDevi
     support = _covered(apply(invert(fit.surface_from_points), c.samples), own.points, max(1.0, 2.0 * o.grid_mm), fit)
     fitting = float(np.mean(fit.weights > 0.1))
     found = f"{100 * support:.0f} % of its visible surface found, {100 * fitting:.0f} % of the points there fit it"
-    if fit.sigma_mm > o.largest_noise_mm or (support < o.least_support and fitting < o.least_fitting):
+    if fit.sigma_mm > o.max_noise_mm or (support < o.min_support and fitting < o.min_fitting):
         reason = (
             "what stands there does not have its shape: fallen over, bent, another component, or badly reconstructed"
         )
         return NotMeasured(name, "cloud", f"{reason} ({found}, residuals {fit.sigma_mm:.2f} mm)")
-    if support < o.least_support:
+    if support < o.min_support:
         return NotMeasured(name, "cloud", f"too little of it is where it should be: fallen over, or hidden ({found})")
     return _move(c, fit, support, o)
 
 
-def _crop(c: Candidate, cloud: CloudPoints, o: CloudDeviationOptions) -> tuple[CloudPoints, CloudPoints]:
+def _crop(c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions) -> tuple[CloudPoints, CloudPoints]:
     """Points in the component's surroundings, and those that may be its own."""
     low, high = c.component.bounds_in_model[0] - o.band_mm, c.component.bounds_in_model[1] + o.band_mm
     near = cloud.only(np.all((cloud.points >= low) & (cloud.points <= high), axis=1))
@@ -307,9 +313,9 @@ def _crop(c: Candidate, cloud: CloudPoints, o: CloudDeviationOptions) -> tuple[C
     return near, near.only(is_own)
 
 
-def _missing(c: Candidate, near: CloudPoints, own: CloudPoints, o: CloudDeviationOptions) -> NotMeasured | None:
+def _missing(c: CloudComponent, near: CloudPoints, own: CloudPoints, o: CloudDeviationOptions) -> NotMeasured | None:
     """The verdict missing, or not covered, when hardly any point is where the component should be."""
-    if _covered(c.samples, own.points, o.band_mm) >= o.missing_share and len(own) >= o.least_points // 3:
+    if _covered(c.samples, own.points, o.band_mm) >= o.missing_share and len(own) >= o.min_points // 3:
         return None
     name = c.component.name
     # Where it stands on others, those can only be seen when it is not there.
@@ -334,10 +340,10 @@ def _covered(samples: Array, points: Array, reach_mm: float, fit: Registration |
     return float(np.mean(np.isfinite(distance)))
 
 
-def _register(c: Candidate, own: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Registration:
+def _register(c: CloudComponent, own: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Registration:
     """The component's points on its surface: undetermined moves are left out one after the other."""
     radius, scales = c.radius_mm, np.array([c.radius_mm] * 3 + [1.0] * 3)
-    options = replace(o.registration, first_distance_mm=o.band_mm, least_points=min(o.least_points, 50))
+    options = replace(o.registration, first_distance_mm=o.band_mm, min_points=min(o.min_points, 50))
     given: dict[str, Any] = {"center": c.center, "radius_mm": radius, "usable_faces": c.usable_faces}
     fixed = c.spins
     starts = _starts(c.center, radius, o.band_mm) if start is None else [start]
@@ -348,7 +354,7 @@ def _register(c: Candidate, own: CloudPoints, start: Array | None, o: CloudDevia
             free=free, **given,
         )  # fmt: skip
         values, vectors = np.linalg.eigh(fit.covariance * np.outer(scales, scales))
-        loose = vectors[:, values > o.largest_std_mm**2].T
+        loose = vectors[:, values > o.max_std_mm**2].T
         unknown = np.concatenate([fit.undetermined, loose])
         if len(unknown) == 0:
             break
@@ -356,7 +362,7 @@ def _register(c: Candidate, own: CloudPoints, start: Array | None, o: CloudDevia
         if len(fixed) >= 6:
             raise InputError("registration: the points determine no move of it")
     # What the choice of the kernel does to the result is part of what is not known.
-    wide = replace(options, least_width_mm=o.doubt_width_mm, noise_points=0)
+    wide = replace(options, min_width_mm=o.doubt_width_mm, noise_points=0)
     other = register_to_surface(
         own.points, c.surface, fit.surface_from_points, normals=own.normals, point_weights=1.0 / own.sigma**2,
         options=wide, free=free, **given,
@@ -384,7 +390,7 @@ def _rest(fixed: Array) -> Array:
     return vectors[int(np.count_nonzero(values > 1e-6)) :]
 
 
-def _move(c: Candidate, fit: Registration, support: float, o: CloudDeviationOptions) -> Move:
+def _move(c: CloudComponent, fit: Registration, support: float, o: CloudDeviationOptions) -> Move:
     """The registration as a move, with what speaks against it."""
     scales = np.array([c.radius_mm] * 3 + [1.0] * 3)
     undetermined = _rest(fit.free)
@@ -412,7 +418,7 @@ def _move(c: Candidate, fit: Registration, support: float, o: CloudDeviationOpti
 
 
 def _named(
-    found: Move | NotMeasured, c: Candidate, all_of_them: Sequence[Candidate], cloud: CloudPoints,
+    found: Move | NotMeasured, c: CloudComponent, all_of_them: Sequence[CloudComponent], cloud: CloudPoints,
     o: CloudDeviationOptions,
 ) -> Move | NotMeasured:  # fmt: skip
     """A component that did not fit, with the name of another whose shape does: the two were swapped."""
@@ -428,7 +434,7 @@ def _named(
         vertices = apply(there, other.component.vertices_in_model)
         trial = replace(
             other, component=Component(c.component.name, vertices, other.component.faces), others=c.others,
-            surface=Surface(vertices, other.component.faces), samples=apply(there, other.samples),
+            surface=MeshSurface(vertices, other.component.faces), samples=apply(there, other.samples),
             contact=apply(there, other.contact),
         )  # fmt: skip
         if isinstance(_measure(trial, cloud, np.eye(4), o), Move):
@@ -436,7 +442,7 @@ def _named(
     return found
 
 
-def _same_shape(a: Candidate, b: Candidate) -> bool:
+def _same_shape(a: CloudComponent, b: CloudComponent) -> bool:
     sizes = [np.sort(np.ptp(c.component.bounds_in_model, axis=0)) for c in (a, b)]
     return (
         bool(np.allclose(sizes[0], sizes[1], atol=0.1))

@@ -15,7 +15,7 @@ from arview.core.atomic import replacing
 from arview.errors import InputError, OutputError
 from arview.geometry import Array, apply, look_at
 from arview.inspection import DistanceStatistics
-from arview.measurement.cloud.surface import Surface
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.plot import Chart, Picture
 from arview.reconstruction.types import DenseCloud
 
@@ -58,7 +58,7 @@ def distance_map(
     places = places or {}
     vertices = [apply(places.get(c.name, np.eye(4)), c.vertices_in_model) for c in model.components]
     _, faces, groups = model.mesh
-    surface = Surface(np.concatenate(vertices), faces, groups)
+    surface = MeshSurface(np.concatenate(vertices), faces, groups)
     points = np.asarray(cloud.points, dtype=np.float64)
     points = points[np.isfinite(points).all(axis=1)]
     closest = surface.closest(points, reach_mm)

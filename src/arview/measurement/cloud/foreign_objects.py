@@ -9,8 +9,8 @@ import numpy as np
 
 from arview.cad.model import Model
 from arview.geometry import Array, apply
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import prepare_cloud
-from arview.measurement.cloud.surface import Surface
 from arview.reconstruction.types import DenseCloud
 
 
@@ -75,7 +75,7 @@ def find_foreign(
     places = places or {}
     _, faces, groups = model.mesh
     parts = [apply(places.get(c.name, np.eye(4)), c.vertices_in_model) for c in model.components]
-    surface = Surface(np.concatenate(parts), faces, groups)
+    surface = MeshSurface(np.concatenate(parts), faces, groups)
     far = points[surface.closest(points, o.far_mm).faces < 0]
     for name in unknown:
         low, high = model.component(name).bounds_in_model

@@ -17,14 +17,14 @@ from arview.cad.model import Model
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.registration import TUKEY_SIGMAS
-from arview.measurement.cloud.surface import Surface
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.types import DenseCloud
 
 
 @dataclass(frozen=True)
-class GlobalOptions:
+class GlobalRegistrationOptions:
     """Options of the search. ``diameter`` is the model's."""
 
     points: int = 4000  # of cloud and CAD each; a few to each voxel
@@ -34,12 +34,12 @@ class GlobalOptions:
     scale_step: float = 1.08  # between scales that are tried when it is unknown
     scale_range: tuple[float, float] = (0.7, 2.5)  # the part's size over the cloud's; more than 1: part of it is seen
     limit_share: float = 0.015  # distances count up to this share of the diameter: displaced, or not the part
-    least_lead: float = 1.08  # cost of the next best place over the best one's, or it is ambiguous
+    min_lead: float = 1.08  # cost of the next best place over the best one's, or it is ambiguous
     seed: int = 0
 
 
-def find_model(
-    cloud: DenseCloud, model: Model, scale: float | None = 1.0, options: GlobalOptions | None = None
+def find_model_in_cloud(
+    cloud: DenseCloud, model: Model, scale: float | None = 1.0, options: GlobalRegistrationOptions | None = None
 ) -> Similarity:
     """The scale and rigid place ``model_from_scan`` of a cloud anywhere.
 
@@ -47,15 +47,15 @@ def find_model(
         cloud: of the part and little else.
         model: nominal.
         scale: mm per unit of the cloud, None when it is unknown.
-        options: see GlobalOptions.
+        options: see GlobalRegistrationOptions.
 
     Raises:
         InputError: too few points; two places that are no symmetry of the part fit alike; none fits.
     """
-    o = options or GlobalOptions()
+    o = options or GlobalRegistrationOptions()
     points, normals, is_oriented = _some_points(cloud, o)
     vertices, faces, groups = model.mesh
-    surface = Surface(vertices, faces, groups)
+    surface = MeshSurface(vertices, faces, groups)
     samples, of_face = surface.spread(o.points, o.seed)
     extent = float(np.linalg.norm(np.diff(np.quantile(points, [0.01, 0.99], axis=0), axis=0)))
     scales = [scale] if scale else list(_ladder(model.diameter_mm / extent, o))
@@ -79,7 +79,7 @@ def find_model(
     if around > 0.7 or cost > 0.6 * limit_mm * (1.0 - around):
         raise InputError("cloud: the part is not found in it: another part, or too little of it")
     for rival_cost, _, rival in fits[1:]:
-        if rival_cost - around * limit_mm > o.least_lead * cost + 1e-3 * limit_mm:
+        if rival_cost - around * limit_mm > o.min_lead * cost + 1e-3 * limit_mm:
             break
         moved = apply(rival @ invert(pose), samples)
         other_mm = np.abs(surface.closest(moved).distances)
@@ -91,7 +91,7 @@ def find_model(
     return Similarity(found_scale, pose)
 
 
-def _some_points(cloud: DenseCloud, o: GlobalOptions) -> tuple[Array, Array, bool]:
+def _some_points(cloud: DenseCloud, o: GlobalRegistrationOptions) -> tuple[Array, Array, bool]:
     """Points (N,3) spread evenly over a cloud, normals, and whether their side is known: else they are estimated."""
     points, own = np.asarray(cloud.points, dtype=np.float64), np.asarray(cloud.normals, dtype=np.float64)
     sound = np.isfinite(points).all(axis=1)
@@ -121,7 +121,7 @@ def _some_points(cloud: DenseCloud, o: GlobalOptions) -> tuple[Array, Array, boo
     return chosen, vectors[:, :, 0], False
 
 
-def _ladder(middle: float, o: GlobalOptions) -> Array:
+def _ladder(middle: float, o: GlobalRegistrationOptions) -> Array:
     low, high = o.scale_range
     return np.asarray(middle * np.geomspace(low, high, int(np.log(high / low) / np.log(o.scale_step)) + 2))
 
@@ -143,7 +143,7 @@ def _main_axes(normals: Array, most: int) -> list[Array]:
     return found or [np.array([0.0, 0.0, 1.0])]
 
 
-def _turns(of_cloud: Array, of_model: Array, o: GlobalOptions) -> list[Array]:
+def _turns(of_cloud: Array, of_model: Array, o: GlobalRegistrationOptions) -> list[Array]:
     """Rotations (3,3) that turn the cloud's main direction onto one of the model's, either side, all around it."""
     turns = []
     angles = np.arange(0.0, 360.0, o.step_deg)
@@ -164,7 +164,7 @@ def _between(a: Array, b: Array) -> Array:
 
 
 def _shifted(
-    points: Array, samples: Array, turn: Array, model: Model, scale: float, o: GlobalOptions
+    points: Array, samples: Array, turn: Array, model: Model, scale: float, o: GlobalRegistrationOptions
 ) -> tuple[float, float, Array]:
     """How well turned points fit at their best shift: score, scale, pose (4,4) of the scaled points."""
     from scipy import fft
@@ -194,7 +194,9 @@ def _voxels(points: Array, cell: float) -> tuple[Array, Array]:
     return gaussian_filter(grid, 0.8), low
 
 
-def _distinct(places: list[tuple[float, float, Array]], o: GlobalOptions) -> list[tuple[float, float, Array]]:
+def _distinct(
+    places: list[tuple[float, float, Array]], o: GlobalRegistrationOptions
+) -> list[tuple[float, float, Array]]:
     """The best places that are not nearly one that is better."""
     kept: list[tuple[float, float, Array]] = []
     for score, scale, pose in places:
@@ -207,7 +209,7 @@ def _distinct(places: list[tuple[float, float, Array]], o: GlobalOptions) -> lis
 
 
 def _refined(
-    points: Array, normals: Array | None, surface: Surface, samples: Array, start: tuple[float, Array],
+    points: Array, normals: Array | None, surface: MeshSurface, samples: Array, start: tuple[float, Array],
     with_scale: bool, limit_mm: float,
 ) -> tuple[float, float, Array]:  # fmt: skip
     """Cost, scale and pose (4,4) on the exact surface: Gauss–Newton on seven numbers with Tukey's weights."""

@@ -26,7 +26,7 @@ _SUM_POINTS = 1000
 
 
 @dataclass(frozen=True)
-class Noise:
+class NoiseModel:
     """Of the residuals of a fit.
 
     Attributes:
@@ -42,14 +42,14 @@ class Noise:
     effective_points: float
 
 
-def estimate_noise(points: Array, normals: Array, residuals: Array, rows: Array, count: int, seed: int) -> Noise:
+def estimate_noise(points: Array, normals: Array, residuals: Array, rows: Array, count: int, seed: int) -> NoiseModel:
     """Noise of residuals (N,) at points (N,3) with surface normals (N,3), after a fit with Jacobian rows (N,K).
 
     ``count`` points are looked at; 0 takes the residuals to be independent.
     """
     total = float(np.sqrt(np.mean(residuals**2)))
     if count == 0 or len(points) < 60 or total < 1e-7:
-        return Noise(total, 0.0, 0.0, float(len(points)))
+        return NoiseModel(total, 0.0, 0.0, float(len(points)))
     chosen = _sample(points, count, seed)
     x, n, r, jacobian = points[chosen], normals[chosen], residuals[chosen] / total, rows[chosen]
     rest = np.linalg.qr(jacobian, mode="complete")[0][:, jacobian.shape[1] :]
@@ -57,7 +57,7 @@ def estimate_noise(points: Array, normals: Array, residuals: Array, rows: Array,
     apart = _apart(x, x)
     facing = n @ n.T
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    best, likelihood = Noise(total, 0.0, 0.0, float(len(points))), -np.inf
+    best, likelihood = NoiseModel(total, 0.0, 0.0, float(len(points))), -np.inf
     for length in np.geomspace(0.02 * size, 0.5 * size, _LENGTHS):
         values, vectors = np.linalg.eigh(rest.T @ (np.exp(-apart / length) * facing) @ rest)
         variances = _SHARES * values[:, None] + (1.0 - _SHARES)
@@ -67,13 +67,13 @@ def estimate_noise(points: Array, normals: Array, residuals: Array, rows: Array,
         k = int(np.argmax(likelihoods))
         if likelihoods[k] > likelihood:
             likelihood = float(likelihoods[k])
-            best = Noise(total * float(np.sqrt(scales[k])), float(_SHARES[k]), float(length), 0.0)
+            best = NoiseModel(total * float(np.sqrt(scales[k])), float(_SHARES[k]), float(length), 0.0)
     mean_correlation = best.shared * float(np.mean(np.exp(-apart / max(best.length_mm, 1e-9)) * np.abs(facing)))
     effective = 1.0 / ((1.0 - best.shared) / len(points) + mean_correlation) if best.shared else float(len(points))
-    return Noise(best.sigma_mm, best.shared, best.length_mm, min(effective, float(len(points))))
+    return NoiseModel(best.sigma_mm, best.shared, best.length_mm, min(effective, float(len(points))))
 
 
-def spread_of_sum(points: Array, normals: Array, pull: Array, noise: Noise, seed: int) -> Array:
+def spread_of_sum(points: Array, normals: Array, pull: Array, noise: NoiseModel, seed: int) -> Array:
     """(K,K) covariance of Σ pull[:, i] rᵢ over residuals r with this noise; ``pull`` is (K,N).
 
     The shared part is summed over pairs of some points that stand for all.

@@ -31,7 +31,7 @@ class CloudPoints:
         return CloudPoints(self.points[chosen], self.normals[chosen], self.sigma[chosen])
 
 
-def prepare_cloud(cloud: DenseCloud, box: Array, grid_mm: float, least_points: int) -> CloudPoints:
+def prepare_cloud(cloud: DenseCloud, box: Array, grid_mm: float, min_points: int) -> CloudPoints:
     """Points of a cloud inside a box (2,3), averaged on a grid; NaN, infinite ones and repeats do no harm.
 
     Raises:
@@ -52,10 +52,10 @@ def prepare_cloud(cloud: DenseCloud, box: Array, grid_mm: float, least_points: i
         if len(parts) > 1:
             parts = [grid_average(join(parts), grid_mm)]
     kept = join(parts)
-    if len(kept) < least_points:
+    if len(kept) < min_points:
         raise InputError(
             f"cloud: {len(kept)} of {len(cloud.points)} points lie at the part ({broken} are NaN); at least "
-            f"{least_points} are needed: is it in mm and in the frame of the CAD?"
+            f"{min_points} are needed: is it in mm and in the frame of the CAD?"
         )
     typical = float(np.nanmedian(kept.sigma)) if np.isfinite(kept.sigma).any() else 0.05
     filled = CloudPoints(kept.points, kept.normals, np.where(np.isfinite(kept.sigma), kept.sigma, typical))

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
-from arview.measurement.cloud.noise import Noise, estimate_noise, spread_of_sum
-from arview.measurement.cloud.surface import Surface
+from arview.measurement.cloud.mesh_surface import MeshSurface
+from arview.measurement.cloud.noise import NoiseModel, estimate_noise, spread_of_sum
 
 NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 TUKEY_SIGMAS, HUBER_SIGMAS = 4.685, 1.345
@@ -39,13 +39,13 @@ class RegistrationOptions:
         distance_sigmas: the limit in widths of the kernel.
         shrink: of that width from one iteration to the next, until it is that of the noise.
         threshold_mm, threshold_deg: converged when the centre moves and the points turn less than this in a step.
-        most_iterations: the solver needs 4 to 15.
+        max_iterations: the solver needs 4 to 15.
         skips_edges: leaves out points whose closest point lies on an edge: with noise they pull to its outside.
-        least_normal_cosine: points with a normal that leans more against the surface's belong to another face.
-        least_information: moves with less information per point, in the unit of the best one's possible, are not
+        min_normal_cosine: points with a normal that leans more against the surface's belong to another face.
+        min_information: moves with less information per point, in the unit of the best one's possible, are not
             determined; turns are weighed with the size of the points' cloud.
-        least_points: fewer cannot tell a place from noise.
-        least_width_mm: of the kernel: a surface that is off by less is never left out as an outlier, however well the
+        min_points: fewer cannot tell a place from noise.
+        min_width_mm: of the kernel: a surface that is off by less is never left out as an outlier, however well the
             rest fits.
         noise_points: points that the noise is estimated from; 0 takes the points to err independently, which makes
             the covariance far too small on real clouds.
@@ -60,12 +60,12 @@ class RegistrationOptions:
     shrink: float = 1.0 / 3.0
     threshold_mm: float = 1e-4
     threshold_deg: float = 1e-4
-    most_iterations: int = 60
+    max_iterations: int = 60
     skips_edges: bool = True
-    least_normal_cosine: float = 0.5
-    least_information: float = 1e-4
-    least_points: int = 50
-    least_width_mm: float = 0.0
+    min_normal_cosine: float = 0.5
+    min_information: float = 1e-4
+    min_points: int = 50
+    min_width_mm: float = 0.0
     noise_points: int = 240
     seed: int = 0
 
@@ -114,7 +114,7 @@ class Registration:
     undetermined: Array
     information: Array
     covariance: Array
-    noise: Noise
+    noise: NoiseModel
     residuals: Array
     weights: Array
     rms_mm: float
@@ -164,7 +164,7 @@ def twist_about(center: Array, b_from_a: Array) -> Array:
 
 def register_to_surface(
     points: Array,
-    surface: Surface,
+    surface: MeshSurface,
     start: Array | None = None,
     center: Array | None = None,
     free: Array | None = None,
@@ -194,8 +194,8 @@ def register_to_surface(
     """
     o = options or RegistrationOptions()
     points = np.ascontiguousarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < o.least_points:
-        raise InputError(f"registration: {len(points)} points are too few to place a surface; {o.least_points} needed")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < o.min_points:
+        raise InputError(f"registration: {len(points)} points are too few to place a surface; {o.min_points} needed")
     if not np.isfinite(points).all():
         bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
         raise InputError(f"registration: {bad} of {len(points)} points are NaN or infinite; leave them out first")
@@ -209,7 +209,7 @@ def register_to_surface(
     basis = np.eye(6) if free is None else _orthonormal(free / scales)
     width, hint, converged = o.first_distance_mm / o.distance_sigmas, None, False
     iterations = 0
-    while iterations < o.most_iterations:
+    while iterations < o.max_iterations:
         iterations += 1
         system = _measure(points, normals, base, surface, usable_faces, pose, center, radius, basis, width, hint, o)
         step = -(system.vectors / system.values) @ (system.vectors.T @ (basis @ system.gradient))
@@ -217,18 +217,18 @@ def register_to_surface(
         pose = move_about(center, twist) @ pose
         hint = system.faces
         turned_deg = float(np.rad2deg(np.linalg.norm(twist[:3])))
-        is_narrow = width <= max(system.sigma, o.least_width_mm, o.last_distance_mm / o.distance_sigmas)
+        is_narrow = width <= max(system.sigma, o.min_width_mm, o.last_distance_mm / o.distance_sigmas)
         if is_narrow and np.linalg.norm(twist[3:]) < o.threshold_mm and turned_deg < o.threshold_deg:
             converged = True
             break
-        width = max(system.sigma, o.least_width_mm, o.shrink * width)
+        width = max(system.sigma, o.min_width_mm, o.shrink * width)
     system = _measure(points, normals, base, surface, usable_faces, pose, center, radius, basis, width, hint, o)
     return _result(system, pose, center, radius, basis, base, iterations, converged, o)
 
 
 def register_from_starts(
     points: Array,
-    surface: Surface,
+    surface: MeshSurface,
     starts: Sequence[Array],
     coarse_points: int = 800,
     apart_mm: float = 0.2,
@@ -252,7 +252,7 @@ def register_from_starts(
     few = slice(None, None, -(-len(points) // coarse_points))
     some = {"normals": normals[few] if normals is not None else None,
             "point_weights": point_weights[few] if point_weights is not None else None}  # fmt: skip
-    quick = replace(o, noise_points=0, threshold_mm=0.01, threshold_deg=0.01, most_iterations=15)
+    quick = replace(o, noise_points=0, threshold_mm=0.01, threshold_deg=0.01, max_iterations=15)
     found: list[Registration] = []
     failure: InputError | None = None
     for start in starts:
@@ -282,7 +282,7 @@ def register_from_starts(
 
 
 @dataclass(frozen=True)
-class _System:
+class _LinearSystem:
     """The linear system of one iteration; ``values`` and ``vectors`` are of the determined part of ``basis``."""
 
     residuals: Array
@@ -299,10 +299,10 @@ class _System:
 
 
 def _measure(
-    points: Array, point_normals: Array | None, base: Array, surface: Surface,
+    points: Array, point_normals: Array | None, base: Array, surface: MeshSurface,
     usable_faces: NDArray[np.bool_] | None, pose: Array, center: Array, radius: float, basis: Array, width: float,
     hint: NDArray[np.int64] | None, o: RegistrationOptions,
-) -> _System:  # fmt: skip
+) -> _LinearSystem:  # fmt: skip
     """Residuals, weights and normal equations at a pose; turns are scaled to mm at ``radius``."""
     moved = apply(pose, points)
     reach = min(max(o.distance_sigmas * width, o.last_distance_mm), o.first_distance_mm)
@@ -315,8 +315,8 @@ def _measure(
         counts &= ~closest.is_edge
     if point_normals is not None:
         cosine = np.sum((point_normals @ pose[:3, :3].T) * np.nan_to_num(closest.normals), axis=1)
-        counts &= (cosine >= o.least_normal_cosine) | ~point_normals.any(axis=1)
-    if np.count_nonzero(counts) < max(6, o.least_points // 4):
+        counts &= (cosine >= o.min_normal_cosine) | ~point_normals.any(axis=1)
+    if np.count_nonzero(counts) < max(6, o.min_points // 4):
         raise InputError(
             f"registration: {np.count_nonzero(counts)} of {len(points)} points are within {reach:.2f} mm of the surface"
         )
@@ -324,15 +324,15 @@ def _measure(
     if o.trim > 0.0:
         counts &= size <= np.quantile(size[counts], 1.0 - o.trim)
     sigma = max(1.4826 * float(np.median(size[counts])), 1e-9)
-    weights = np.where(counts, _kernel(size / max(sigma, width, o.least_width_mm), o.kernel), 0.0) * base
+    weights = np.where(counts, _kernel(size / max(sigma, width, o.min_width_mm), o.kernel), 0.0) * base
     normals = np.where(counts[:, None], closest.normals, 0.0)
     rows = np.hstack([np.cross(moved - center, normals) / radius, normals])
     weighted = rows * weights[:, None]
     hessian = weighted.T @ rows
     values, vectors = np.linalg.eigh(basis @ hessian @ basis.T)
-    kept = values > o.least_information * weights.sum()
+    kept = values > o.min_information * weights.sum()
     gradient = weighted.T @ np.where(counts, residuals, 0.0)
-    return _System(
+    return _LinearSystem(
         residuals, weights, rows, normals, moved, hessian, gradient, values[kept], vectors[:, kept], sigma,
         closest.faces,
     )  # fmt: skip
@@ -348,7 +348,7 @@ def _kernel(size: Array, kernel: str) -> Array:
 
 
 def _result(
-    system: _System, pose: Array, center: Array, radius: float, basis: Array, base: Array, iterations: int,
+    system: _LinearSystem, pose: Array, center: Array, radius: float, basis: Array, base: Array, iterations: int,
     converged: bool, o: RegistrationOptions,
 ) -> Registration:  # fmt: skip
     determined = system.vectors.T @ basis

@@ -16,11 +16,11 @@ from arview.rendering.rasterizer import rasterise
 
 _SIDE_PX = 800
 """Longer side of the depth pictures: a pixel is under a millimetre where a photo resolves a tenth of one."""
-_LEAST_COSINE = 0.15
+_MIN_COSINE = 0.15
 """Surfaces that lean away more are seen too flat to be reconstructed."""
 
 
-class Views:
+class SurfaceVisibility:
     """What photos see of a model at nominal, by z-buffers that are drawn once.
 
     ``cam_from_scan`` of the photos is taken for ``cam_from_model``.
@@ -48,7 +48,7 @@ class Views:
         for photo, (camera, nearness) in zip(self._photos, self._drawn, strict=True):
             in_cam = apply(photo.cam_from_scan, points)
             towards = photo.centre_in_scan - points
-            facing = np.sum(normals * towards, axis=1) > _LEAST_COSINE * np.linalg.norm(towards, axis=1)
+            facing = np.sum(normals * towards, axis=1) > _MIN_COSINE * np.linalg.norm(towards, axis=1)
             pixels = np.nan_to_num(camera.project(in_cam), nan=-1.0)
             inside = facing & np.all((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1]), axis=1)
             u, v = np.round(pixels[inside]).astype(int).T

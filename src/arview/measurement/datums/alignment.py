@@ -25,7 +25,7 @@ from arview.measurement.types import Move
 
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 _TUKEY = 4.685
-_LEAST_SHARE_OF_SIZE = 0.02
+_MIN_SHARE_OF_SIZE = 0.02
 """A direction is determined by a datum when its points would move by this share of the part's size."""
 
 
@@ -33,10 +33,10 @@ _LEAST_SHARE_OF_SIZE = 0.02
 class AlignmentOptions:
     """When a datum counts as measured, and what is unknown about its form."""
 
-    least_points: int = 12  # offsets that agree; fewer cannot tell outliers
-    least_share: float = 0.3  # of what should be seen of the datum; a rim seen on one side only is no circle
+    min_points: int = 12  # offsets that agree; fewer cannot tell outliers
+    min_share: float = 0.3  # of what should be seen of the datum; a rim seen on one side only is no circle
     form_mm: float = 0.005  # standard uncertainty of a feature's place by its form (flatness, chamfer): fine machining
-    largest_std_mm: float = 0.2  # of any direction that a datum locks; worse is not measured at all
+    max_std_mm: float = 0.2  # of any direction that a datum locks; worse is not measured at all
 
 
 @dataclass(frozen=True)
@@ -414,8 +414,8 @@ def _check_covered(one: Equations, fit: _Fit, options: AlignmentOptions) -> None
     used, name = int(fit.inliers.sum()), f"datum {one.label} ({one.feature})"
     if one.feature == "fit":
         return
-    least = {"point": 1, "edge": 4}.get(one.feature, options.least_points)
-    if used < max(least, round(options.least_share * one.of)):
+    least = {"point": 1, "edge": 4}.get(one.feature, options.min_points)
+    if used < max(least, round(options.min_share * one.of)):
         raise InputError(
             f"{name}: only {used} of {one.of} points on it could be measured; photograph it from more sides, in better"
             " light, or name another feature in the part file"
@@ -432,7 +432,7 @@ def _check_covered(one: Equations, fit: _Fit, options: AlignmentOptions) -> None
     values, vectors = np.linalg.eigh(information)
     kept = values > 1e-9 * values[-1]
     worst = float(np.sqrt((((watched @ vectors[:, kept]) ** 2) / values[kept]).sum(axis=1).max()))
-    if worst > options.largest_std_mm:
+    if worst > options.max_std_mm:
         raise InputError(
             f"{name}: its place is known to {worst:.2f} mm only; photograph it from more sides, or in better light"
         )
@@ -474,7 +474,7 @@ def _determined(rows: Array, allowed: Array, weights: Array) -> Array:
     projected = (rows * np.sqrt(share)[:, None]) @ allowed
     _, values, right = np.linalg.svd(projected, full_matrices=False)
     size = np.sqrt((share[:, None] * rows**2).sum())
-    return allowed @ right[values > _LEAST_SHARE_OF_SIZE * size].T
+    return allowed @ right[values > _MIN_SHARE_OF_SIZE * size].T
 
 
 def _common(a: Array, b: Array) -> Array:

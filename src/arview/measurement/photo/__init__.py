@@ -4,17 +4,17 @@ from arview.measurement.photo.edges import EdgeOffsets, EdgePoints, edge_offsets
 from arview.measurement.photo.measure import measure_components_in_photos
 from arview.measurement.photo.options import EdgeOptions, PhotoOptions, SweepOptions
 from arview.measurement.photo.rims import RimFit, fit_rim
-from arview.measurement.photo.sweep import Offsets, sweep_offsets
+from arview.measurement.photo.sweep import SweepOffsets, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
 
 __all__ = [
     "EdgeOffsets",
     "EdgeOptions",
     "EdgePoints",
-    "Offsets",
     "PhotoOptions",
     "PhotoViews",
     "RimFit",
+    "SweepOffsets",
     "SweepOptions",
     "edge_offsets",
     "fit_rim",

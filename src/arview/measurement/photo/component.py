@@ -8,7 +8,7 @@ from arview.cad.part import Part
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
 from arview.measurement.photo.fit import RigidFit
 from arview.measurement.photo.options import PhotoOptions
-from arview.measurement.photo.surface import free_directions
+from arview.measurement.photo.patches import free_directions
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Method, Move
 

@@ -21,7 +21,7 @@ from arview.guideviews.mesh_edges import EDGE_CREASE, EDGE_SILHOUETTE, mesh_edge
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.options import EdgeOptions
-from arview.measurement.photo.surface import near_others
+from arview.measurement.photo.patches import near_others
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
 
@@ -159,7 +159,7 @@ class ComponentEdges:
         o = self.options.edges
         place = np.eye(4) if start is None else start
         edges = self.predicted(place)
-        if len(edges.points) < o.least_points or len(np.unique(edges.view)) < 3:
+        if len(edges.points) < o.min_points or len(np.unique(edges.view)) < 3:
             return self._not("fewer than 3 photos show enough of its edges; take more of it")
         # Coarse pictures first where a pixel is much finer than what is looked for.
         levels = [k for k in (2, 1) if self.body.px_mm * 2.0**k < 0.6]
@@ -171,7 +171,7 @@ class ComponentEdges:
             edges = self.predicted(place)
             found = edge_offsets(edges, apply(place, self.body.center), self.views, reach_px, o, level)
             ok = found.seen & (found.slopes != 0.0)
-            if np.count_nonzero(ok) < o.least_points:
+            if np.count_nonzero(ok) < o.min_points:
                 return self._not(f"only {np.count_nonzero(ok)} of {len(ok)} points of its edges are seen in the photos")
             before, dark_before_mm = place, dark_mm
             fit, dark_mm = self._fit(edges, found, ok, place, dark_mm, is_last=False)
@@ -183,7 +183,7 @@ class ComponentEdges:
         place = self.body.moved(before, fit.twist)
         support = self._support(edges, place)
         used = int(np.count_nonzero(fit.weights > 0.1))
-        if support < o.least_support or used < o.least_points or len(fit.undetermined) == 6:
+        if support < o.min_support or used < o.min_points or len(fit.undetermined) == 6:
             return self._not(f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance")
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
         return self.body.move("edges", fit, by_poses, place, o.systematic_px * self.body.px_mm, support)
@@ -220,8 +220,8 @@ class ComponentEdges:
         all_points = np.concatenate(points)
         apart = ~near_others(all_points, self.views.model, self.body.index, self.options.joint_mm)
         kept = np.flatnonzero(apart)
-        if len(kept) > o.most_points:
-            kept = kept[:: int(np.ceil(len(kept) / o.most_points))]
+        if len(kept) > o.max_points:
+            kept = kept[:: int(np.ceil(len(kept) / o.max_points))]
         edges = EdgePoints(
             apply(place, all_points[kept]),
             np.concatenate(tangents)[kept] @ place[:3, :3].T,
@@ -259,12 +259,12 @@ class ComponentEdges:
         dark = np.sign(slope)
         fit = fit_rigid(
             rows, found.offsets_mm[ok] - dark * dark_mm, sigmas, self.body.free_at(place), self.body.radius_mm,
-            self.options.undetermined_mm, edges.points[ok] / (4.0 * self.body.px_mm), o.least_sigma_px / _SIGMA_PX,
-            move_rows(edges.points[found.seen], found.directions[found.seen], center), o.least_direction,
-            most_pairs=len(ok) if is_last else _FEW_PAIRS,
+            self.options.undetermined_mm, edges.points[ok] / (4.0 * self.body.px_mm), o.min_sigma_px / _SIGMA_PX,
+            move_rows(edges.points[found.seen], found.directions[found.seen], center), o.min_direction,
+            max_pairs=len(ok) if is_last else _FEW_PAIRS,
         )  # fmt: skip
         left = found.offsets_mm[ok] - rows @ fit.twist
-        limit = o.most_dark_shift_px * self.body.px_mm
+        limit = o.max_dark_shift_px * self.body.px_mm
         shift = float(np.sum(fit.weights * dark * left) / (1.05 * np.sum(fit.weights) + 1.0))  # a little held at none
         return fit, float(np.clip(shift, -limit, limit))
 

@@ -46,10 +46,10 @@ def fit_rigid(
     radius_mm: float,
     undetermined_mm: float,
     places: Array,
-    least_sigma: float,
+    min_sigma: float,
     looked_rows: Array | None = None,
-    least_support: float = 0.0,
-    most_pairs: int = 1_000_000,
+    min_support: float = 0.0,
+    max_pairs: int = 1_000_000,
 ) -> RigidFit:
     """Weighted least squares with Tukey's biweight (Holland & Welsch 1977) on ``offsets ≈ rows @ twist``.
 
@@ -64,11 +64,11 @@ def fit_rigid(
         radius_mm: length that rotations are weighed with.
         undetermined_mm: limit of a direction's standard deviation.
         places: (N,D) coordinates in which neighbours are near each other, in correlation lengths or so.
-        least_sigma: robust standard deviation of normalised residuals is not taken to be less.
+        min_sigma: robust standard deviation of normalised residuals is not taken to be less.
         looked_rows: (L,6) of all that was looked at, whether it gave an offset or not; default ``rows``.
-        least_support: share of the information of ``looked_rows`` that must agree for a direction to be stated; below
+        min_support: share of the information of ``looked_rows`` that must agree for a direction to be stated; below
             twice as much its uncertainty grows.
-        most_pairs: points whose pairs say how alike residuals are; fewer take the covariance from every so manieth.
+        max_pairs: points whose pairs say how alike residuals are; fewer take the covariance from every so manieth.
     """
     scale = np.repeat([1.0 / radius_mm, 1.0], 3)
     scaled = rows * scale
@@ -88,7 +88,7 @@ def fit_rigid(
         normal = weighted.T @ (white @ basis)
         solution, last = basis @ np.linalg.pinv(normal, hermitian=True) @ (weighted.T @ target), solution
         left = target - white @ solution
-        spread = max(least_sigma, 1.4826 * float(np.median(np.abs(left))))
+        spread = max(min_sigma, 1.4826 * float(np.median(np.abs(left))))
         weights = np.clip(1.0 - (left / (TUKEY * spread)) ** 2, 0.0, None) ** 2
         if np.abs(solution - last).max() < 1e-6:
             break
@@ -97,19 +97,19 @@ def fit_rigid(
     gain = (basis @ inverse @ weighted.T) / sigmas  # scaled twist by offset
     is_in = weights > 0.0
     some = np.flatnonzero(is_in)
-    stride = max(1, -(-len(some) // most_pairs))
+    stride = max(1, -(-len(some) // max_pairs))
     some = some[::stride]
     middle = stride * _correlated(np.ascontiguousarray(weighted[some]), left[some], places[some], stride)
     covariance = basis @ inverse @ middle @ inverse @ basis.T
     shares, modes = _support(scaled, weights, scaled if looked_rows is None else looked_rows * scale, basis)
     # Few of many agreeing is a sign of a wrong place among them: worse than their scatter shows.
-    grown = np.maximum(2.0 * least_support / np.maximum(shares, 1e-9), 1.0)
+    grown = np.maximum(2.0 * min_support / np.maximum(shares, 1e-9), 1.0)
     own = np.linalg.pinv(modes)
     inner = own @ covariance @ own.T
     covariance = covariance + modes @ np.diag(np.diag(inner) * (grown**2 - 1.0)) @ modes.T
     # What the covariance shows to be too poor to state is open as well.
     values, vectors = np.linalg.eigh(basis.T @ covariance @ basis)
-    is_open = np.concatenate([(basis @ vectors[:, values > undetermined_mm**2]).T, modes[:, shares < least_support].T])
+    is_open = np.concatenate([(basis @ vectors[:, values > undetermined_mm**2]).T, modes[:, shares < min_support].T])
     held = basis @ _across(is_open @ basis)
     project = held @ held.T
     return RigidFit(

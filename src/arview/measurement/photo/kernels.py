@@ -11,7 +11,7 @@ _FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 
 @kernel(fastmath=_FAST, numpy_errors=True)
-def sweep_scores(patches, is_on, shades, normals, steps, views, stack, least_contrast):  # type: ignore[no-untyped-def]
+def sweep_scores(patches, is_on, shades, normals, steps, views, stack, min_contrast):  # type: ignore[no-untyped-def]
     """Mean correlation (ZNCC) over all pairs of views of patches moved along their normals.
 
     Args:
@@ -21,8 +21,8 @@ def sweep_scores(patches, is_on, shades, normals, steps, views, stack, least_con
         normals: (N,3).
         steps: (S,) mm.
         views: (N,V) indices of photos, -1 for none.
-        stack: the photos (`Stack`).
-        least_contrast: standard deviation in grey levels; a view with less takes no part.
+        stack: the photos (`PhotoStack`).
+        min_contrast: standard deviation in grey levels; a view with less takes no part.
 
     Returns:
         scores (N,S), -1 where fewer than two views take part; count (N,S) of views that do; alike (N,S,V) correlation
@@ -111,7 +111,7 @@ def sweep_scores(patches, is_on, shades, normals, steps, views, stack, least_con
                 for p in range(used):
                     values[v, p] -= mean * shade[0, p] + slope_a * shade[1, p] + slope_b * shade[2, p]
                     square += values[v, p] * values[v, p]
-                if square < used * least_contrast * least_contrast:
+                if square < used * min_contrast * min_contrast:
                     continue
                 scale = 1.0 / np.sqrt(square)
                 for p in range(used):

@@ -13,13 +13,13 @@ from arview.core.parallel import pool
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.edges import ComponentEdges
 from arview.measurement.photo.options import PhotoOptions
-from arview.measurement.photo.surface import near_others
+from arview.measurement.photo.patches import near_others
 from arview.measurement.photo.sweep import ComponentSweep, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
 from arview.measurement.types import Method, Move, NotMeasured
 from arview.reconstruction.types import SparseModel
 
-Result = dict[Method, Move | NotMeasured]
+MethodResults = dict[Method, Move | NotMeasured]
 
 
 def measure_components_in_photos(
@@ -29,7 +29,7 @@ def measure_components_in_photos(
     options: PhotoOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
     names: Sequence[str] | None = None,
-) -> dict[str, Result]:
+) -> dict[str, MethodResults]:
     """Where components stand, by each of the two ways.
 
     Both look around the nominal place by themselves, and where the other found the component. The frame is that of
@@ -53,7 +53,7 @@ def measure_components_in_photos(
         names = [component.name for component in model.components if part is None]
         names = names or [name for name in part.inspected if name in known] if part is not None else names
     indices = [model.index(name) for name in names]
-    results: dict[str, Result] = {}
+    results: dict[str, MethodResults] = {}
     jobs = [(index, pool().submit(measure_component, views, index, part, options)) for index in indices]
     for done, (index, job) in enumerate(jobs, 1):
         name = model.components[index].name
@@ -63,7 +63,7 @@ def measure_components_in_photos(
     return results
 
 
-def measure_component(views: PhotoViews, index: int, part: Part | None, options: PhotoOptions) -> Result:
+def measure_component(views: PhotoViews, index: int, part: Part | None, options: PhotoOptions) -> MethodResults:
     """One component by both ways; when a way fails, whether the component is there at all is looked at."""
     body = MeasuredComponent(views, index, part, options)
     edges = ComponentEdges(body).measure()
@@ -90,7 +90,7 @@ def is_gone(body: MeasuredComponent) -> bool:
     # Seen from the other side: the surface below faces against the component's own.
     below = Samples(contact.points, -contact.normals)
     found = sweep_offsets(below.points, below.normals, body.views, 3.0 * body.px_mm, o, removed=body.index)
-    looked = np.count_nonzero(found.views >= 0, axis=1) >= o.least_views
+    looked = np.count_nonzero(found.views >= 0, axis=1) >= o.min_views
     agree = looked & found.is_ok & (np.abs(found.offsets_mm) < 1.5 * body.px_mm)
     return bool(
         np.count_nonzero(looked) >= 10 and np.count_nonzero(agree) > body.options.gone_share * np.count_nonzero(looked)

@@ -15,19 +15,19 @@ class SweepOptions:
     edge_px: float = 4.0  # what is nearer a sharp edge is left out: blur mixes it with what lies beyond
     sample_spacing_px: float = 5.0  # about half a patch: each point of the surface is in four of them
     max_views: int = 7  # photos that a sample is compared in
-    least_views: int = 3  # two agree by chance
-    least_cosine: float = 0.35  # flattest view of a surface, 70° off its normal
+    min_views: int = 3  # two agree by chance
+    min_cosine: float = 0.35  # flattest view of a surface, 70° off its normal
     capture_mm: float = 5.0  # displacement that the coarse round finds
     fine_range_px: float = 3.0  # of the first fine round; narrows from round to round
     rounds: int = 5  # at most; patches are cut anew at the moved place
     settled_mm: float = 0.003  # a smaller step ends the rounds
-    least_score: float = 0.55  # mean correlation of a sample's views below which it says nothing
-    least_contrast: float = 1.5  # grey levels, standard deviation in a patch; less is noise
-    largest_sigma_mm: float = 0.3  # of one sample
-    least_sigma_mm: float = 0.015  # samples are never taken to be better: form, lens, tessellation
-    least_samples: int = 25  # fewer that agree are no measurement
-    least_support: float = 0.15  # share of the visible samples that must agree
-    least_direction: float = 0.2  # share of what is seen of a direction that must agree, or it is undetermined
+    min_score: float = 0.55  # mean correlation of a sample's views below which it says nothing
+    min_contrast: float = 1.5  # grey levels, standard deviation in a patch; less is noise
+    max_sigma_mm: float = 0.3  # of one sample
+    min_sigma_mm: float = 0.015  # samples are never taken to be better: form, lens, tessellation
+    min_samples: int = 25  # fewer that agree are no measurement
+    min_support: float = 0.15  # share of the visible samples that must agree
+    min_direction: float = 0.2  # share of what is seen of a direction that must agree, or it is undetermined
     systematic_mm: float = 0.004  # of the whole component, any direction: what residuals do not show
     systematic_share: float = 0.25  # of the residuals that is alike all over: reflections, shadows, blur at edges
 
@@ -39,15 +39,15 @@ class EdgeOptions:
     capture_mm: float = 5.0  # displacement that the first round finds
     reaches_px: tuple[float, ...] = (6.0, 4.5, 3.5, 3.0, 3.0, 3.0)  # how far steps are looked for, by round
     spacing_px: float = 3.0  # between samples along an edge
-    most_points: int = 3000  # edge points of one component in all photos; more say the same
+    max_points: int = 3000  # edge points of one component in all photos; more say the same
     half_width_px: float = 2.0  # profiles are averaged so far along the edge
     threshold: float = 1.0  # weakest step, grey levels of 255 per px in linear light
     half_slope: float = 6.0  # a step of this slope counts half
-    least_sigma_px: float = 0.05  # residuals are never taken to be better: lens, tessellation, pixel response
-    most_dark_shift_px: float = 0.2  # how far all edges may be shifted towards the dark side: tone curve, glare
-    least_points: int = 40  # fewer are no measurement
-    least_direction: float = 0.2  # share of what is seen of a direction that must agree, or it is undetermined
-    least_support: float = 0.25  # share of predicted points with a step where the fit says, above chance
+    min_sigma_px: float = 0.05  # residuals are never taken to be better: lens, tessellation, pixel response
+    max_dark_shift_px: float = 0.2  # how far all edges may be shifted towards the dark side: tone curve, glare
+    min_points: int = 40  # fewer are no measurement
+    min_direction: float = 0.2  # share of what is seen of a direction that must agree, or it is undetermined
+    min_support: float = 0.25  # share of predicted points with a step where the fit says, above chance
     systematic_px: float = 0.03  # what all edges of a component may be off together: chamfers, light
 
 

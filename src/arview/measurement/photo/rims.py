@@ -11,7 +11,7 @@ from arview.geometry import Array
 from arview.measurement.photo.edges import EdgeOffsets, EdgePoints, edge_offsets, pose_gain
 from arview.measurement.photo.fit import fit_rigid
 from arview.measurement.photo.options import EdgeOptions
-from arview.measurement.photo.surface import tangents_of
+from arview.measurement.photo.patches import tangents_of
 from arview.measurement.photo.views import PhotoViews
 
 
@@ -71,14 +71,14 @@ def fit_rim(
         # More than a radius away is the other side.
         found = edge_offsets(edges, center + shift, views, min(reach_px, 0.8 * radius_mm / px_mm), o)
         ok = found.seen & (found.slopes != 0.0)
-        if np.count_nonzero(ok) < o.least_points or len(np.unique(edges.view[ok])) < 3:
+        if np.count_nonzero(ok) < o.min_points or len(np.unique(edges.view[ok])) < 3:
             raise InputError(
                 f"rim of ⌀{diameter_mm:g} mm at ({', '.join(f'{x:.1f}' for x in center)}): its edge is found in "
                 f"{len(np.unique(edges.view[ok]))} photos at {np.count_nonzero(ok)} points; take photos that show it"
             )
         fit = fit_rigid(
             _rows(found, outward)[ok], found.offsets_mm[ok], 0.3 * found.mm_per_px[ok], np.array(locked), 1.0,
-            reach_mm, edges.points[ok] / (4.0 * px_mm), o.least_sigma_px / 0.3,
+            reach_mm, edges.points[ok] / (4.0 * px_mm), o.min_sigma_px / 0.3,
         )  # fmt: skip
         shift = shift + fit.twist[3:]
         radius_mm += float(fit.twist[0])

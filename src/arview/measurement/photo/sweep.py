@@ -19,7 +19,7 @@ from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.kernels import choose_views, sweep_scores, vote_shifts
 from arview.measurement.photo.options import SweepOptions
-from arview.measurement.photo.surface import (
+from arview.measurement.photo.patches import (
     cut_patches,
     face_normals,
     near_edges,
@@ -35,7 +35,7 @@ Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Offsets:
+class SweepOffsets:
     """What a sweep says of each sample.
 
     Attributes:
@@ -61,7 +61,7 @@ def sweep_offsets(
     options: SweepOptions | None = None,
     component: int | None = None,
     removed: int | None = None,
-) -> Offsets:
+) -> SweepOffsets:
     """Distance along the normal of any samples of nearly flat surfaces, e.g. of a datum plane.
 
     Args:
@@ -114,7 +114,7 @@ def pick_views(
     visible = np.zeros(cosines.shape, dtype=bool)
     scene = component if removed is None else -1 - removed
     for view in range(len(views.cameras)):
-        facing = np.flatnonzero(cosines[:, view] > o.least_cosine)
+        facing = np.flatnonzero(cosines[:, view] > o.min_cosine)
         if len(facing):
             window = views.window(view, scene, np.eye(4) if place is None else place, groups[facing].reshape(-1, 3))
             # The middle must show the component itself; the corners must not be hidden.
@@ -139,15 +139,15 @@ def without_outliers(chosen: Indices, scores: Array, alike: Array, least: float 
 
 def agreeing_scores(
     patches: Array, is_on: NDArray[np.bool_], shades: Array, normals: Array, steps: Array, chosen: Indices,
-    views: PhotoViews, least_contrast: float,
+    views: PhotoViews, min_contrast: float,
 ) -> tuple[Array, Array, Indices]:  # fmt: skip
     """Scores (N,S) and numbers of views (N,S) of `sweep_scores` without the views unlike the others; those left."""
     stack = views.levels[0]
-    scores, count, alike = sweep_scores(patches, is_on, shades, normals, steps, chosen, stack, least_contrast)
+    scores, count, alike = sweep_scores(patches, is_on, shades, normals, steps, chosen, stack, min_contrast)
     kept = without_outliers(chosen, scores, alike)
     less = np.flatnonzero((kept != chosen).any(axis=1))
     scores[less], count[less], _ = sweep_scores(
-        patches[less], is_on[less], shades[less], normals[less], steps, kept[less], stack, least_contrast
+        patches[less], is_on[less], shades[less], normals[less], steps, kept[less], stack, min_contrast
     )
     return scores, count, kept
 
@@ -157,7 +157,7 @@ def _steps(reach_mm: float, step_mm: float) -> Array:
     return np.asarray(np.arange(-count, count + 1) * step_mm, dtype=np.float64)
 
 
-def _peaks(scores: Array, count: Array, steps: Array, on: Array, chosen: Indices, o: SweepOptions) -> Offsets:
+def _peaks(scores: Array, count: Array, steps: Array, on: Array, chosen: Indices, o: SweepOptions) -> SweepOffsets:
     """Sub-pixel place of the best score by a parabola, its variance by the curvature and what is left of the views.
 
     The sum of squared differences of m views from their mean is (m - 1)(1 - score); its second derivative and the
@@ -174,9 +174,9 @@ def _peaks(scores: Array, count: Array, steps: Array, on: Array, chosen: Indices
     views = count[rows, best].astype(np.float64)
     freedom = np.maximum(views - 1.0, 1.0) * np.maximum(on - 4.0, 1.0)  # pixels of a patch share what they saw
     variances = 2.0 * (1.0 - np.minimum(b, 0.999)) / freedom / (-bend / pitch**2)
-    is_ok = is_peak & (b > o.least_score) & (views >= o.least_views) & (variances < o.largest_sigma_mm**2)
+    is_ok = is_peak & (b > o.min_score) & (views >= o.min_views) & (variances < o.max_sigma_mm**2)
     is_ok &= on >= 0.4 * o.patch_points**2
-    return Offsets(np.where(is_peak, offsets, 0.0), variances, is_ok, b, chosen)
+    return SweepOffsets(np.where(is_peak, offsets, 0.0), variances, is_ok, b, chosen)
 
 
 def pose_rows(views: PhotoViews, samples: Samples, chosen: Indices) -> Array:
@@ -228,9 +228,9 @@ class ComponentSweep:
         """The component's move; ``starts`` (4,4, places) are tried beside what the coarse round finds."""
         o = self.options.sweep
         chosen = self._pick(np.eye(4))
-        seen = np.count_nonzero(chosen >= 0, axis=1) >= o.least_views
-        if np.count_nonzero(seen) < o.least_samples:
-            return self._not(f"seen in fewer than {o.least_views} photos from near enough; take more of it")
+        seen = np.count_nonzero(chosen >= 0, axis=1) >= o.min_views
+        if np.count_nonzero(seen) < o.min_samples:
+            return self._not(f"seen in fewer than {o.min_views} photos from near enough; take more of it")
         patches, is_on = self._cut(o.patch_points, o.patch_px / o.patch_points * self.body.px_mm)
         shades = shades_of(is_on)
         places = [self._coarse(chosen, seen), *starts]
@@ -243,12 +243,12 @@ class ComponentSweep:
             moved = Samples(apply(place, self.samples.points), self.samples.normals @ place[:3, :3].T)
             shaped = apply(place, patches)
             scores, count, chosen = agreeing_scores(
-                shaped, is_on, shades, moved.normals, steps, chosen, self.views, o.least_contrast
+                shaped, is_on, shades, moved.normals, steps, chosen, self.views, o.min_contrast
             )
             found = _peaks(scores, count, steps, is_on.sum(axis=1), chosen, o)
             ok = found.is_ok
-            seen = np.count_nonzero(chosen >= 0, axis=1) >= o.least_views
-            if np.count_nonzero(ok) < o.least_samples:
+            seen = np.count_nonzero(chosen >= 0, axis=1) >= o.min_views
+            if np.count_nonzero(ok) < o.min_samples:
                 return self._not(
                     f"weak texture: only {np.count_nonzero(ok)} of {np.count_nonzero(seen)} samples of its surface "
                     "look alike in the photos"
@@ -262,7 +262,7 @@ class ComponentSweep:
         assert fit is not None
         used = int(np.count_nonzero(fit.weights > 0.1))
         support = used / max(1, int(np.count_nonzero(seen)))
-        if support < o.least_support or used < o.least_samples:
+        if support < o.min_support or used < o.min_samples:
             return self._not(f"weak texture or not there: {100 * support:.0f} % of its surface agrees on a place")
         if len(fit.undetermined) == 6:
             return self._not("weak texture: in no direction does enough of its surface agree on a place")
@@ -319,7 +319,7 @@ class ComponentSweep:
             near = np.where(np.abs(steps[None] - (rows @ twist)[:, None]) < reach_mm, scores, -1.0)
             found = _peaks(near, np.full(near.shape, 3), steps, is_on.sum(axis=1), chosen, o)
             ok = seen & (found.scores > 0.5) & (found.variances_mm2 < 1.0)
-            if np.count_nonzero(ok) < o.least_samples:
+            if np.count_nonzero(ok) < o.min_samples:
                 break
             sigmas = np.full(np.count_nonzero(ok), 0.3 * coarse_mm)
             twist = fit_rigid(
@@ -328,13 +328,13 @@ class ComponentSweep:
             ).twist  # fmt: skip
         return self.body.moved(np.eye(4), twist)
 
-    def _fit(self, moved: Samples, found: Offsets, seen: NDArray[np.bool_], place: Array) -> RigidFit:
+    def _fit(self, moved: Samples, found: SweepOffsets, seen: NDArray[np.bool_], place: Array) -> RigidFit:
         o, ok = self.options.sweep, found.is_ok
         rows = move_rows(moved.points, moved.normals, apply(place, self.body.center))
         return fit_rigid(
-            rows[ok], found.offsets_mm[ok], np.sqrt(found.variances_mm2[ok] + o.least_sigma_mm**2),
+            rows[ok], found.offsets_mm[ok], np.sqrt(found.variances_mm2[ok] + o.min_sigma_mm**2),
             self.body.free_at(place), self.body.radius_mm, self.options.undetermined_mm, self._places(moved.of(ok)),
-            0.3, rows[seen], o.least_direction,
+            0.3, rows[seen], o.min_direction,
         )  # fmt: skip
 
     def _places(self, samples: Samples) -> Array:

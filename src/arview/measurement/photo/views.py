@@ -19,7 +19,7 @@ from arview.reconstruction.types import SparseModel
 from arview.rendering.rasterizer import rasterise
 
 
-class Stack(NamedTuple):
+class PhotoStack(NamedTuple):
     """All photos at one size, for the kernels.
 
     Attributes:
@@ -37,7 +37,7 @@ class Stack(NamedTuple):
     poses: Array
 
 
-class Window(NamedTuple):
+class RenderedWindow(NamedTuple):
     """What an ideal camera sees of the model in part of a photo: 1/depth (0 = nothing) and component (-1)."""
 
     lens: tuple[float, float, float, float]
@@ -63,7 +63,7 @@ class PhotoViews:
     names: tuple[str, ...]
     cameras: tuple[Camera, ...]
     cam_from_model: Array
-    levels: tuple[Stack, ...]
+    levels: tuple[PhotoStack, ...]
     pose_covariance: Array | None = None
 
     @property
@@ -85,7 +85,9 @@ class PhotoViews:
             raise InputError("photos: no camera looks at the part; the poses are not in the frame of the CAD")
         return float(np.median(depths[ahead] / np.array([camera.fx for camera in self.cameras])[ahead]))
 
-    def window(self, view: int, component: int | None, place: Array, around: Array, margin_px: int = 12) -> Window:
+    def window(
+        self, view: int, component: int | None, place: Array, around: Array, margin_px: int = 12
+    ) -> RenderedWindow:
         """The model around some points (N,3) as a photo without distortion shows it.
 
         ``component`` stands at ``place`` (4,4, measured_from_nominal); None leaves all at nominal. A component of
@@ -101,7 +103,7 @@ class PhotoViews:
             faces, owner = faces[owner != -1 - component], owner[owner != -1 - component]
         pixels = camera.without_distortion().project(apply(pose, around))
         if not np.isfinite(pixels).all():
-            return Window((1.0, 1.0, 0.0, 0.0), (0, 0), np.zeros((1, 1)), np.full((1, 1), -1, dtype=np.int32))
+            return RenderedWindow((1.0, 1.0, 0.0, 0.0), (0, 0), np.zeros((1, 1)), np.full((1, 1), -1, dtype=np.int32))
         spare = 0.15 * max(camera.width, camera.height)  # lenses may see beyond the ideal picture
         largest = np.array([camera.width, camera.height]) + spare
         low = np.floor(np.clip(pixels.min(axis=0) - margin_px, -spare, largest)).astype(int)
@@ -110,9 +112,9 @@ class PhotoViews:
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
         origin = (int(low[0]), int(low[1]))
         inverse_depth, face = rasterise(apply(pose, vertices), faces, *lens, width, height, origin=origin)
-        return Window(lens, origin, inverse_depth, np.where(face >= 0, owner[np.maximum(face, 0)], -1))
+        return RenderedWindow(lens, origin, inverse_depth, np.where(face >= 0, owner[np.maximum(face, 0)], -1))
 
-    def visible(self, view: int, window: Window, groups: Array, component: int = -1) -> NDArray[np.bool_]:
+    def visible(self, view: int, window: RenderedWindow, groups: Array, component: int = -1) -> NDArray[np.bool_]:
         """(N,) whether all points of each group (N,Q,3) are inside the photo and not hidden in the window.
 
         With ``component`` the window must show that component there.
@@ -172,7 +174,7 @@ def views_of(
         small = [c.scaled(int(w), int(h)) for c, (w, h) in zip(cameras, sizes, strict=True)]
         lenses = np.array([[c.fx, c.fy, c.cx, c.cy, *c.dist] for c in small], dtype=np.float64)
         pixels = np.concatenate([g.ravel() for g in grays])
-        levels.append(Stack(pixels, starts, sizes, lenses, np.ascontiguousarray(cam_from_model[:, :3])))
+        levels.append(PhotoStack(pixels, starts, sizes, lenses, np.ascontiguousarray(cam_from_model[:, :3])))
     return PhotoViews(model, names, cameras, cam_from_model, tuple(levels), pose_covariance)
 
 

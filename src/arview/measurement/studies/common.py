@@ -16,8 +16,8 @@ import numpy as np
 from arview.core.atomic import replacing
 from arview.errors import OutputError
 from arview.geometry import Array
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.registration import RegistrationOptions
-from arview.measurement.cloud.surface import Surface
 from arview.measurement.plot import Picture, save_picture
 
 T = TypeVar("T")
@@ -41,7 +41,7 @@ class Study:
     summary: tuple[str, ...]
 
 
-def post(size_mm: tuple[float, float] = POST_MM) -> tuple[Surface, Array]:
+def post(size_mm: tuple[float, float] = POST_MM) -> tuple[MeshSurface, Array]:
     """An upright closed post on z = 0, and the (3,) middle of it."""
     radius, height = 0.5 * size_mm[0], size_mm[1]
     angles = np.arange(SECTIONS) * 2.0 * np.pi / SECTIONS
@@ -53,7 +53,7 @@ def post(size_mm: tuple[float, float] = POST_MM) -> tuple[Surface, Array]:
         np.stack([i, j, j + n], axis=1), np.stack([i, j + n, i + n], axis=1),
         np.stack([j, i, np.full(n, 2 * n)], axis=1), np.stack([i + n, j + n, np.full(n, 2 * n + 1)], axis=1),
     ])  # fmt: skip
-    return Surface(vertices, faces), np.array([0.0, 0.0, 0.5 * height])
+    return MeshSurface(vertices, faces), np.array([0.0, 0.0, 0.5 * height])
 
 
 def sideways(angle_rad: float, length_mm: float) -> Array:

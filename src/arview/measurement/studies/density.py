@@ -7,10 +7,10 @@ import time
 import numpy as np
 
 from arview.geometry import Array, apply
-from arview.measurement.cloud.point_registration import (
-    CloudRegistrationOptions,
+from arview.measurement.cloud.icp import (
+    IcpOptions,
+    IcpTarget,
     Method,
-    TargetCloud,
     register_clouds,
 )
 from arview.measurement.cloud.registration import register_to_surface
@@ -70,8 +70,8 @@ def density_study(
                 else:
                     target, faces = surface.spread(job[2], int(rng.integers(1 << 31)))
                     start = time.process_time()
-                    options = CloudRegistrationOptions(method="plane" if method == "plane" else "point")
-                    cloud = TargetCloud(target, surface.face_normals[faces])
+                    options = IcpOptions(method="plane" if method == "plane" else "point")
+                    cloud = IcpTarget(target, surface.face_normals[faces])
                     pose = register_clouds(points, cloud, options=options).target_from_source
                 spent = time.process_time() - start
                 return turn @ (center - apply(pose, center + shift)), spent

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from arview.geometry import Array
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.registration import register_to_surface
-from arview.measurement.cloud.surface import Surface
 from arview.measurement.plot import Chart, stack
 from arview.measurement.studies.common import EXACT, POST_MM, SECOND_POST_MM, Study, over_cores, post, sideways
 
@@ -56,7 +56,7 @@ def cost_curve(count: int, seed: int) -> tuple[Array, Array]:
     return shifts, np.array(cost)
 
 
-def _run(job: tuple[Surface, Array, int, float, list[int]]) -> float:
+def _run(job: tuple[MeshSurface, Array, int, float, list[int]]) -> float:
     """Estimated length of one displacement."""
     surface, center, count, true_mm, seeds = job
     rng = np.random.default_rng([*seeds, round(true_mm * 1000)])

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from arview.geometry import Array, apply
-from arview.measurement.cloud.point_registration import (
-    CloudRegistrationOptions,
-    TargetCloud,
+from arview.measurement.cloud.icp import (
+    IcpOptions,
+    IcpTarget,
     register_clouds,
 )
 from arview.measurement.cloud.registration import register_to_surface
@@ -46,10 +46,10 @@ def threshold_study(is_quick: bool = False, seed: int = 0, runs: int = 20) -> St
             if method != METHODS[3]:
                 target, target_faces = surface.spread(count, int(rng.integers(1 << 31)))
             cloud = register_clouds(
-                points + shift, TargetCloud(target, surface.face_normals[target_faces]),
-                options=CloudRegistrationOptions(
+                points + shift, IcpTarget(target, surface.face_normals[target_faces]),
+                options=IcpOptions(
                     method="plane" if method == METHODS[1] else "point", threshold_mm=threshold,
-                    threshold_deg=threshold, most_iterations=500,
+                    threshold_deg=threshold, max_iterations=500,
                 ),
             )  # fmt: skip
             pose, iterations = cloud.target_from_source, cloud.iterations

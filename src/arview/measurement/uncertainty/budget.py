@@ -17,7 +17,7 @@ from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.measurement.datums.alignment import Alignment, point_from_move
-from arview.measurement.uncertainty.combine import Combined, quantile_of_length
+from arview.measurement.uncertainty.combine import CombinedMove, quantile_of_length
 from arview.measurement.uncertainty.rice import rice_estimate
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from arview.rendering.renderers import ZBufferRenderer
@@ -32,7 +32,7 @@ class UncertaintyOptions:
     """What is not in any covariance, and how the numbers are made."""
 
     form_mm: float = 0.005  # standard uncertainty of a component's place by its own form; as machined, not cast
-    least_poses_mm: float = 0.004  # of what bundle adjustment does not know of itself: lens model, tracks
+    min_poses_mm: float = 0.004  # of what bundle adjustment does not know of itself: lens model, tracks
     k: float = 2.0  # coverage factor of a single direction; 2 is 95 % of a normal distribution
     probability: float = 0.95  # coverage of intervals
     draws: int = 20_000  # JCGM 101 asks for 1e4 / (1 - p) for two digits of the ends; U is stated with 0.7 % noise
@@ -111,7 +111,7 @@ class Placement:
 
 
 def place(
-    combined: Combined, alignment: Alignment, poses: Array | None = None, options: UncertaintyOptions | None = None
+    combined: CombinedMove, alignment: Alignment, poses: Array | None = None, options: UncertaintyOptions | None = None
 ) -> Placement:
     """A component's move relative to the datum frame, with every contribution.
 
@@ -129,7 +129,7 @@ def place(
     own = [Contribution(f"noise of {method}", share) for method, share in combined.covariances.items()]
     own.append(Contribution("methods disagree", combined.disagreement))
     own.append(Contribution("form", np.diag((options.form_mm / unit) ** 2), is_bounded=True))
-    least = np.diag((options.least_poses_mm / unit) ** 2)
+    least = np.diag((options.min_poses_mm / unit) ** 2)
     own.append(Contribution("camera poses", least if poses is None else poses + least))
     frame = [Contribution(f"datum {one.label}", one.covariance) for one in alignment.datums]
     frame.append(Contribution("scale", alignment.scale_covariance))
@@ -157,7 +157,7 @@ def place(
     return Placement(twist, covariance, contributions, combined.undetermined, observable, lengths[0], lengths[1])
 
 
-def relative_twists(moves: Array, frames: Array, combined: Combined, alignment: Alignment) -> Array:
+def relative_twists(moves: Array, frames: Array, combined: CombinedMove, alignment: Alignment) -> Array:
     """(D,6) twists of a component in the datum frame, of its (D,6) and the frame's moves (D,7) in the rough frame."""
     center, origin = combined.center_in_model, alignment.origin_in_model
     arm = center - origin

@@ -37,7 +37,7 @@ class Agreement:
 
 
 @dataclass(frozen=True)
-class Combined:
+class CombinedMove:
     """The move that methods give together.
 
     Attributes:
@@ -57,7 +57,7 @@ class Combined:
     center_in_model: Array
 
 
-def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> Combined:
+def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove:
     """Weighted mean of moves of one component by independent methods.
 
     Methods that differ by more than their covariances allow have an error that neither knows. Rotations and shifts for
@@ -97,7 +97,7 @@ def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> Combined:
                 twists[i] - twists[j], noise[i] + noise[j], gains[i], gains[j], inverse, axes
             )
     shares = [gain @ one @ gain.T / scaled for gain, one in zip(gains, noise, strict=True)]
-    return Combined(
+    return CombinedMove(
         twist / unit, {move.method: share for move, share in zip(moves, shares, strict=True)},
         disagreement / scaled, vectors[:, ~known].T, radius, moves[0].center_in_model,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from arview.reconstruction.dense.depth import depth_maps
 from arview.reconstruction.dense.files import read_map, read_ply, write_map, write_maps, write_ply
 from arview.reconstruction.dense.fusion import fuse
 from arview.reconstruction.dense.options import DenseOptions
-from arview.reconstruction.dense.views import Cad, View, choose_sources, make_view
+from arview.reconstruction.dense.views import Cad, DenseView, choose_sources, make_view
 from arview.reconstruction.types import DenseCloud, SparseModel
 
 __all__ = [
@@ -52,7 +52,7 @@ def reconstruct_dense(
         The cloud; with no points where the photos show no texture. Same input and seed, same cloud.
 
     Raises:
-        InputError: fewer than ``options.least_views`` photos have others to compare with, or a photo cannot be read.
+        InputError: fewer than ``options.min_views`` photos have others to compare with, or a photo cannot be read.
         OutputError: the folder cannot be written to.
     """
     from arview.reconstruction.intake import read_photo
@@ -67,10 +67,10 @@ def reconstruct_dense(
             [i for i in range(len(sparse.photos)) if sources[i]],
         )
         views = _linked([view for view in made if view is not None])
-    if len(views) < options.least_views:
+    if len(views) < options.min_views:
         raise InputError(
             f"dense: only {len(views)} photos see enough of the same surface from useful angles, "
-            f"expected {options.least_views}; take more photos all around, 10 to 20 degrees apart"
+            f"expected {options.min_views}; take more photos all around, 10 to 20 degrees apart"
         )
     maps = depth_maps(views, sparse, cad, options, threads, progress)
     if folder is not None:
@@ -79,7 +79,7 @@ def reconstruct_dense(
     return fuse(maps, [view.color for view in views], options, threads, progress)
 
 
-def _linked(views: list[View]) -> list[View]:
+def _linked(views: list[DenseView]) -> list[DenseView]:
     """The views that have sources among themselves, with these as indices into the list."""
     while True:
         place = {view.index: i for i, view in enumerate(views)}

@@ -22,7 +22,7 @@ from arview.reconstruction.dense.options import DenseOptions
 from arview.reconstruction.dense.patchmatch import NEIGHBOURS, sweep, try_hypotheses
 from arview.reconstruction.dense.polish import polish
 from arview.reconstruction.dense.torch_search import search_torch, torch_device
-from arview.reconstruction.dense.views import Cad, Floats, Planes, View, cad_planes, relative_pose, sparse_planes
+from arview.reconstruction.dense.views import Cad, DenseView, Floats, Planes, cad_planes, relative_pose, sparse_planes
 from arview.reconstruction.types import SparseModel
 
 STEPS = (4, 2)
@@ -54,7 +54,12 @@ class DepthMap:
 
 
 def depth_maps(
-    views: list[View], sparse: SparseModel, cad: Cad | None, options: DenseOptions, threads: int, progress: Progress
+    views: list[DenseView],
+    sparse: SparseModel,
+    cad: Cad | None,
+    options: DenseOptions,
+    threads: int,
+    progress: Progress,
 ) -> list[DepthMap]:
     """Depth maps of all views, whose sources are indices into the list."""
     greys = [cv2.cvtColor(view.color, cv2.COLOR_RGB2GRAY).astype(np.float32) for view in views]
@@ -95,7 +100,7 @@ def _grown(planes: Planes, factor: int) -> Planes:
 
 
 def _problem(
-    views: list[View], index: int, greys: list[Floats], maps: list[Planes], step: int, options: DenseOptions
+    views: list[DenseView], index: int, greys: list[Floats], maps: list[Planes], step: int, options: DenseOptions
 ) -> Problem:
     view = views[index]
     camera = view.camera.scaled(greys[index].shape[1], greys[index].shape[0])
@@ -141,7 +146,7 @@ def _layout(images: list[NDArray[np.float32]]) -> NDArray[np.int32]:
 
 
 def _search(
-    views: list[View], greys: list[Floats], maps: list[Planes], sparse: SparseModel, cad: Cad | None,
+    views: list[DenseView], greys: list[Floats], maps: list[Planes], sparse: SparseModel, cad: Cad | None,
     options: DenseOptions, stage: int, device: str | None, index: int,
 ) -> Planes:  # fmt: skip
     """PatchMatch of one view at one level; ``maps`` are those of the level before, or empty."""
@@ -177,7 +182,7 @@ def _search(
 
 
 def _polished(
-    views: list[View], greys: list[Floats], maps: list[Planes], options: DenseOptions, index: int
+    views: list[DenseView], greys: list[Floats], maps: list[Planes], options: DenseOptions, index: int
 ) -> DepthMap:
     planes = maps[index].copy()
     height, width = planes.shape[:2]

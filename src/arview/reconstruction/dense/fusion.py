@@ -61,7 +61,7 @@ def fuse(
     maps: Sequence[DepthMap], images: Sequence[Image], options: DenseOptions, threads: int,
     progress: Progress,
 ) -> DenseCloud:  # fmt: skip
-    """The cloud of all points that ``options.least_views`` maps agree on; empty when there are none.
+    """The cloud of all points that ``options.min_views`` maps agree on; empty when there are none.
 
     Args:
         maps: depth maps of the views.
@@ -76,8 +76,8 @@ def fuse(
             options.agreement_px,
             _RELATIVE_DEPTH,
             np.cos(np.deg2rad(options.normal_angle_deg)),
-            options.least_views,
-            options.largest_spread_px,
+            options.min_views,
+            options.max_spread_px,
         ]
     )
     fellows = [_fellows(maps, i) for i in range(len(maps))]
@@ -141,8 +141,8 @@ def _stacked(maps: Sequence[DepthMap], options: DenseOptions) -> _Stack:
         a, b, w = planes[..., 1] * camera.fx, planes[..., 2] * camera.fy, planes[..., 0]
         c = w - a * x - b * y
         cosine = w / np.maximum(np.sqrt((a * a + b * b + c * c) * (x * x + y * y + 1.0)), 1e-30)
-        is_known = (w > 0) & (m.scores > 0) & (m.sigmas <= options.largest_sigma_px * m.unit_w)
-        is_good = is_known & (m.scores >= options.least_zncc) & (cosine >= np.cos(np.deg2rad(options.grazing_deg)))
+        is_known = (w > 0) & (m.scores > 0) & (m.sigmas <= options.max_sigma_px * m.unit_w)
+        is_good = is_known & (m.scores >= options.min_zncc) & (cosine >= np.cos(np.deg2rad(options.grazing_deg)))
         element = np.stack([a, b, c, m.sigmas**2, np.where(is_known, w, 0.0), is_good], axis=-1)
         elements.append(element.reshape(-1, 6).astype(np.float32))
     sizes = np.array([(m.camera.width, m.camera.height) for m in maps])
@@ -183,7 +183,7 @@ def _seen_at(j, p0, p1, p2, layout, cameras, poses):  # type: ignore[no-untyped-
 def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # type: ignore[no-untyped-def]
     """Merged depth, its standard deviation and the number of views of each pixel of view i that enough agree on."""
     first, width, height = layout[i]
-    agreement, relative, least_cosine, least_views, spread_px = limits
+    agreement, relative, min_cosine, min_views, spread_px = limits
     fx, fy, cx, cy = cameras[i]
     count = fellows.shape[0]
     depths, weights = np.empty(count + 1), np.empty(count + 1)
@@ -228,7 +228,7 @@ def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # typ
             m1 = poses[j, 0, 1] * e0 + poses[j, 1, 1] * e1 + poses[j, 2, 1] * e2
             m2 = poses[j, 0, 2] * e0 + poses[j, 1, 2] * e1 + poses[j, 2, 2] * e2
             cosine = (m0 * n0 + m1 * n1 + m2 * n2) / (length * np.sqrt(m0 * m0 + m1 * m1 + m2 * m2))
-            if cosine < least_cosine:
+            if cosine < min_cosine:
                 continue
             # Moved along the other's ray onto its plane, the point moves in this view by so many pixels.
             stretch = 1.0 + shift / depth
@@ -248,7 +248,7 @@ def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # typ
                 continue
             depths[views], weights[views] = here, 1.0 / max(elements[q, 3] * here**4, 1e-18 * z * z)
             views += 1
-        if views < least_views or against >= views:
+        if views < min_views or against >= views:
             continue
         total, mean = 0.0, 0.0
         for k in range(views):

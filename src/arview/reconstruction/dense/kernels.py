@@ -30,7 +30,7 @@ PARALLAX = 12
 NOISE, GEOMETRIC, MAP_STEP, BEST, FX, FY, CX, CY = range(8)
 
 MAX_ERROR_PX = float32(3.0)
-LEAST_SQUARED_COSINE = float32(0.025)
+MIN_SQUARED_COSINE = float32(0.025)
 """Of the angle at which an element is seen: 81°."""
 _WORST = float32(2.0)
 _ZERO, _HALF, _ONE = float32(0.0), float32(0.5), float32(1.0)
@@ -200,7 +200,7 @@ def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
     xn, yn = (x - numbers[CX]) / numbers[FX], (y - numbers[CY]) / numbers[FY]
     a, b = du * numbers[FX], dv * numbers[FY]
     c = w - a * xn - b * yn
-    return w * w > LEAST_SQUARED_COSINE * (a * a + b * b + c * c) * (xn * xn + yn * yn + _ONE)
+    return w * w > MIN_SQUARED_COSINE * (a * a + b * b + c * c) * (xn * xn + yn * yn + _ONE)
 
 
 @kernel(fastmath=True, numpy_errors=True)

@@ -25,9 +25,9 @@ from arview.reconstruction.dense.kernels import (
     FX,
     FY,
     GEOMETRIC,
-    LEAST_SQUARED_COSINE,
     MAP_STEP,
     MAX_ERROR_PX,
+    MIN_SQUARED_COSINE,
     NOISE,
     PARALLAX,
     RADIUS,
@@ -153,7 +153,7 @@ class _Search:
         xn, yn = (u - numbers[CX]) / numbers[FX], (v - numbers[CY]) / numbers[FY]
         a, b = du * numbers[FX], dv * numbers[FY]
         c = w - a * xn - b * yn
-        facing = (w > 0) & (w * w > LEAST_SQUARED_COSINE * (a * a + b * b + c * c) * (xn * xn + yn * yn + 1.0))
+        facing = (w > 0) & (w * w > MIN_SQUARED_COSINE * (a * a + b * b + c * c) * (xn * xn + yn * yn + 1.0))
         costs = torch.stack([self._source_cost(k, u, v, plane, window) for k in range(len(self.sizes))])
         best = min(int(numbers[BEST]), len(self.sizes))
         mean = costs.sort(dim=0).values[:best].mean(dim=0)

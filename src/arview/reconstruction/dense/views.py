@@ -1,7 +1,7 @@
 """The photos as the dense reconstruction needs them: ideal, cropped to the part, with the views to compare with.
 
-A `View` is an undistorted window of a photo, scaled to the working size. Inverse depth w = 1/z of a plane is linear
-in its pixels, so a surface element is (w, dw/du, dw/dv) everywhere in this package.
+A `DenseView` is an undistorted window of a photo, scaled to the working size. The inverse depth w = 1/z of a plane is
+linear in its pixels, so a surface element is (w, dw/du, dw/dv) everywhere in this package.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Cad:
 
 
 @dataclass(frozen=True)
-class View:
+class DenseView:
     """One photo, undistorted and cropped.
 
     Attributes:
@@ -87,7 +87,7 @@ def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int
             cosine = np.sum(a * b, axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
             angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
             worth = np.clip(angle / low, 0.0, 1.0) ** 2
-            worth *= np.clip((options.widest_angle_deg - angle) / (options.widest_angle_deg - high), 0.0, 1.0)
+            worth *= np.clip((options.max_angle_deg - angle) / (options.max_angle_deg - high), 0.0, 1.0)
             score[i, j] = score[j, i] = worth.sum()
             apart[i, j] = apart[j, i] = np.median(angle)
     chosen: list[tuple[int, ...]] = []
@@ -110,7 +110,7 @@ def make_view(
     cad: Cad | None,
     options: DenseOptions,
     read: Callable[[PosedPhoto], Image],
-) -> View | None:
+) -> DenseView | None:
     """The window of one photo around the region to reconstruct; None where the photo does not show it.
 
     The region is the CAD's silhouette widened by the band, else the hull of the sparse points that were seen.
@@ -141,7 +141,9 @@ def make_view(
     part = region[max(v0, 0) : v0 + height, max(u0, 0) : u0 + width]
     inside[max(-v0, 0) :, max(-u0, 0) :][: part.shape[0], : part.shape[1]] = part
     color, is_seen = _undistorted(image, photo.camera, camera)
-    return View(index, photo.name, camera, photo.cam_from_scan, color, inside & is_seen, nearest, farthest, sources)
+    return DenseView(
+        index, photo.name, camera, photo.cam_from_scan, color, inside & is_seen, nearest, farthest, sources
+    )
 
 
 def _window(region: NDArray[np.bool_]) -> tuple[int, int, int, int]:
@@ -256,6 +258,6 @@ def sparse_planes(sparse: SparseModel, index: int, camera: Camera) -> Planes:
     return planes
 
 
-def relative_pose(view: View, source: View) -> Array:
+def relative_pose(view: DenseView, source: DenseView) -> Array:
     """(4,4) ``source_from_view``."""
     return source.cam_from_scan @ invert(view.cam_from_scan)

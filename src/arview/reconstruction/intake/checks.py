@@ -14,7 +14,7 @@ from arview.reconstruction.intake.reading import Pixels
 _FINE, _COARSE = 1.0, 2.0  # px, the two scales whose gradients are compared
 _DIRECTIONS = 6  # bins of edge direction: motion blurs the edges across it only
 _MIN_EDGES = 60  # edge points that a direction needs to have a say
-_MIN_GRADIENT, _MOST_GRADIENT = 4.0, 12.0  # grey levels per px that an edge needs, without noise and at most
+_MIN_GRADIENT, _MAX_GRADIENT = 4.0, 12.0  # grey levels per px that an edge needs, without noise and at most
 _TILES = (12, 16)  # rows and columns in which texture is looked for
 _TILE_EDGES = 0.002  # share of a tile's pixels: an edge across a quarter of it
 _THUMB = (24, 18)  # px, for finding candidates of equal pictures
@@ -28,15 +28,15 @@ class CheckOptions:
 
     blurred_px: float = 2.0  # edge spread (Gaussian sigma); sharp photos have 0.3 to 1.2
     blurred_ratio: float = 1.8  # of the median photo's spread, so that one shaken photo among sharp ones is named
-    blurred_least_px: float = 1.3  # below, a photo that is worse than the others is still sharp enough
+    blurred_min_px: float = 1.3  # below, a photo that is worse than the others is still sharp enough
     useless_px: float = 3.5  # features cannot be placed any more
     useless_ratio: float = 3.0  # and the others are so much better that it is not missed
-    least_textured: float = 0.02  # share of the picture's tiles with edges; an outline of a plain part gives 0.1
+    min_textured: float = 0.02  # share of the picture's tiles with edges; an outline of a plain part gives 0.1
     clipped: float = 0.4  # share of white pixels: a white background gives 0.3
     clipped_more: float = 0.2  # above the median photo's share: overexposed against the others
     dark_level: float = 50.0  # grey level that 95 % of the pixels stay below
-    least_side_px: int = 320  # shorter side; below are thumbnails and icons
-    longest_aspect: float = 2.6  # above are panoramas, which no pinhole camera made
+    min_side_px: int = 320  # shorter side; below are thumbnails and icons
+    max_aspect: float = 2.6  # above are panoramas, which no pinhole camera made
     same_thumbs: float = 0.95  # correlation above which two pictures are compared in detail
     same_shift: float = 0.00125  # of the longer side: pictures that differ by less than such a shift are the same view
 
@@ -79,7 +79,7 @@ def blur_and_texture(gray: Pixels) -> tuple[float, float]:
     coarse = cv2.GaussianBlur(fine, (0, 0), float(np.sqrt(_COARSE**2 - _FINE**2)))
     # White noise of sigma n leaves gradients of 0.2 n at the fine scale; its sigma shows in what that scale took away.
     noise = float(np.percentile(np.abs(gray[::4, ::4] - fine[::4, ::4]), 20)) / 0.22
-    floor = min(max(_MIN_GRADIENT, 1.2 * noise), _MOST_GRADIENT)
+    floor = min(max(_MIN_GRADIENT, 1.2 * noise), _MAX_GRADIENT)
     rows, columns, direction, strength, spread = _edge_points(fine, coarse, floor)
     tile = rows * _TILES[0] // gray.shape[0] * _TILES[1] + columns * _TILES[1] // gray.shape[1]
     enough = max(3.0, _TILE_EDGES * gray.size / (_TILES[0] * _TILES[1]))

@@ -18,7 +18,7 @@ from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.intake.reading import RAW_SUFFIXES, Pixels, glance, photo_paths
 from arview.reconstruction.types import Photo
 
-LEAST_PHOTOS = 3  # a third photo is the first that can contradict the other two
+MIN_PHOTOS = 3  # a third photo is the first that can contradict the other two
 GOOD_NUMBER = "20 to 40 photos from all around the part, each sharing more than half of what it shows with the next"
 _FEW_PHOTOS = 8
 _NAMES_SHOWN = 5
@@ -152,11 +152,11 @@ def _unusable(photo: Seen, options: CheckOptions) -> str:
     """Why this photo is of no use whatever the others are like, else empty."""
     width, height = photo.exif.upright_size
     check = photo.check
-    if min(width, height) < options.least_side_px:
+    if min(width, height) < options.min_side_px:
         return f"has only {width}×{height} px; give the photo itself, not a thumbnail"
-    if max(width, height) > options.longest_aspect * min(width, height):
+    if max(width, height) > options.max_aspect * min(width, height):
         return f"is a panorama ({width}×{height} px), which no single camera position shows; give plain photos"
-    if check.textured >= options.least_textured:
+    if check.textured >= options.min_textured:
         return ""
     if check.level_95 < options.dark_level:
         return "is black or nearly so; take it again with more light"
@@ -166,7 +166,7 @@ def _unusable(photo: Seen, options: CheckOptions) -> str:
 
 
 def _check_texture(label: str, seen: Sequence[Seen], options: CheckOptions) -> None:
-    plain = [photo.name for photo in seen if photo.check.textured < options.least_textured]
+    plain = [photo.name for photo in seen if photo.check.textured < options.min_textured]
     if plain and 2 * len(plain) > len(seen):
         raise InputError(
             f"{label}: {len(plain)} of {len(seen)} photos show no texture at all ({_listed(plain)}), so that there is "
@@ -197,7 +197,7 @@ def _blurred_beyond_use(photos: Sequence[Seen], options: CheckOptions) -> dict[s
 
 
 def _judge_blur(photos: Sequence[Seen], options: CheckOptions) -> list[str]:
-    worse = max(options.blurred_ratio * _usual_blur(photos), options.blurred_least_px)
+    worse = max(options.blurred_ratio * _usual_blur(photos), options.blurred_min_px)
     least = min(worse, options.blurred_px)
     # Where a photo is white, its edges end in white and look soft.
     blurred = [p.name for p in photos if p.check.blur_px > least and p.check.clipped <= options.clipped]
@@ -227,14 +227,14 @@ def _judge_exposure(photos: Sequence[Seen], options: CheckOptions) -> list[str]:
 
 
 def _check_number(label: str, photos: Sequence[Photo], rejected: dict[str, str], total: int) -> None:
-    if len(photos) >= LEAST_PHOTOS:
+    if len(photos) >= MIN_PHOTOS:
         return
     usable = f"only {len(photos)}" if photos else "none"
     reasons = "; ".join(f"{name} {reason}" for name, reason in list(rejected.items())[:_NAMES_SHOWN])
     more = f"; and {len(rejected) - _NAMES_SHOWN} more" if len(rejected) > _NAMES_SHOWN else ""
     why = f" ({reasons}{more})" if rejected else ""
     raise InputError(
-        f"{label}: {usable} of {total} photos can be used{why}; take at least {LEAST_PHOTOS}, better {GOOD_NUMBER}"
+        f"{label}: {usable} of {total} photos can be used{why}; take at least {MIN_PHOTOS}, better {GOOD_NUMBER}"
     )
 
 
@@ -243,7 +243,7 @@ def _judge_numbers(photos: Sequence[Photo], counts: dict[str, int]) -> list[str]
     if len(photos) < _FEW_PHOTOS:
         warnings.append(f"only {len(photos)} photos: the result will have gaps; take {GOOD_NUMBER}")
     for key, count in counts.items():
-        if count < LEAST_PHOTOS and count < len(photos):
+        if count < MIN_PHOTOS and count < len(photos):
             names = _listed([photo.name for photo in photos if photo.lens == key])
             warnings.append(
                 f"{names} differs from the other photos in camera, zoom or size ({key}): with so few photos of it its "

@@ -14,7 +14,7 @@ from arview.core.atomic import replacing
 from arview.core.progress import StepProgress
 from arview.errors import InputError, OutputError
 from arview.reconstruction.intake.checks import CheckOptions, check_photo, thumbnail
-from arview.reconstruction.intake.photos import LEAST_PHOTOS, Intake, Seen, assess, look_at
+from arview.reconstruction.intake.photos import MIN_PHOTOS, Intake, Seen, assess, look_at
 from arview.reconstruction.intake.reading import GLANCE_PX, Pixels
 from arview.video import Frame, FrameSource, open_source
 
@@ -35,10 +35,10 @@ class VideoIntakeOptions:
     checks: CheckOptions = field(default_factory=CheckOptions)
 
     def __post_init__(self) -> None:
-        if self.max_frames < LEAST_PHOTOS or not self.min_step > 0 or not self.looks_per_s > 0:
+        if self.max_frames < MIN_PHOTOS or not self.min_step > 0 or not self.looks_per_s > 0:
             raise InputError(
                 f"max_frames {self.max_frames}, min_step {self.min_step}, looks_per_s {self.looks_per_s}: expected at "
-                f"least {LEAST_PHOTOS} frames and positive numbers"
+                f"least {MIN_PHOTOS} frames and positive numbers"
             )
 
 
@@ -75,7 +75,7 @@ def intake_video(
         total = 2 * (source.frame_count or 0)
         indices, travel, sharpness = _look_through(source, options, progress, total)
         chosen = {indices[k] for k in choose_frames(travel, sharpness, options)}
-        if len(chosen) < LEAST_PHOTOS:
+        if len(chosen) < MIN_PHOTOS:
             raise InputError(
                 f"{path}: the camera hardly moves (the picture shifts by {100 * travel[-1]:.1f} % of its diagonal in "
                 "all); walk around the part while recording"
@@ -199,8 +199,8 @@ class _Motion:
         self._found = len(corners) if enough else 0
 
 
-def _shrunk(gray: Pixels, longest_px: int) -> Pixels:
-    scale = longest_px / max(gray.shape)
+def _shrunk(gray: Pixels, max_side_px: int) -> Pixels:
+    scale = max_side_px / max(gray.shape)
     if scale >= 1:
         return gray
     size = round(gray.shape[1] * scale), round(gray.shape[0] * scale)

@@ -20,7 +20,7 @@ from arview.detection import Detector
 from arview.geometry import Array, invert, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
-from arview.reconstruction.scale.refine import Fit, JointRefiner, RefineOptions, Support, View
+from arview.reconstruction.scale.refine import Fit, JointRefiner, RefineOptions, ScaleView, Support
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.vote import Sighting, Vote, vote
 from arview.reconstruction.types import PosedPhoto
@@ -38,32 +38,32 @@ class CadOptions:
 
     Attributes:
         detect_width_px: longer side of the pictures that the part is searched in.
-        most_detections: photos searched at most; while no two agree, at most ``first_detections``.
+        max_detections: photos searched at most; while no two agree, at most ``first_detections``.
         agreeing: so many photos end the search.
-        least_quality: detections that would not be believed alone vote too: with others they may agree.
+        min_quality: detections that would not be believed alone vote too: with others they may agree.
         sightings: detections taken of a photo.
         subdivisions: of the guide views' directions: 3 is about 8° apart, enough to start from.
         spans: smallest and largest part of the longer side that the part is expected to span.
         max_side_px: photos are refined at this size at most: memory.
         max_views: photos refined at most, spread: time.
         rival_views: photos in which rivals of the best vote are judged.
-        least_support: a similarity borne out by less is no find, see `Support`.
+        min_support: a similarity borne out by less is no find, see `Support`.
         clear_lead: a rival with so little less support makes the frame ambiguous.
         refine: of the joint refinement.
     """
 
     detect_width_px: int = 800
-    most_detections: int = 12
+    max_detections: int = 12
     first_detections: int = 6
     agreeing: int = 3
-    least_quality: float = 0.1
+    min_quality: float = 0.1
     sightings: int = 5
     subdivisions: int = 3
     spans: tuple[float, float] = (0.2, 1.2)
     max_side_px: int = 2000
     max_views: int = 30
     rival_views: int = 6
-    least_support: float = 0.25
+    min_support: float = 0.25
     clear_lead: float = 0.08
     refine: RefineOptions = field(default_factory=RefineOptions)
 
@@ -112,10 +112,10 @@ def spread_order(photos: Sequence[PosedPhoto]) -> list[int]:
     return order
 
 
-def make_view(photo: PosedPhoto, image: Pixels, max_side_px: int) -> View:
+def make_view(photo: PosedPhoto, image: Pixels, max_side_px: int) -> ScaleView:
     """A photo in linear light, no larger than ``max_side_px``."""
     camera, gray = shrunk(photo.camera, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), max_side_px)
-    return View(photo.name, camera, linear_light(gray), photo.cam_from_scan)
+    return ScaleView(photo.name, camera, linear_light(gray), photo.cam_from_scan)
 
 
 def shrunk(camera: Camera, image: Pixels, max_side_px: int) -> tuple[Camera, Pixels]:
@@ -198,16 +198,16 @@ def _search(
     reasons: list[str] = []
     sure = 0
     enough = min(options.agreeing, len(photos))
-    for count, index in enumerate(order[: options.most_detections]):
+    for count, index in enumerate(order[: options.max_detections]):
         if count >= options.first_detections and not votes:
             break
         if progress:
-            progress("finding the part", count, min(len(order), options.most_detections))
+            progress("finding the part", count, min(len(order), options.max_detections))
         camera, image = shrunk(photos[index].camera, read(photos[index]), options.detect_width_px)
         key = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist)
         detector = detectors.get(key)
         if detector is None:
-            unsure = replace(options_for(views), min_quality=options.least_quality)
+            unsure = replace(options_for(views), min_quality=options.min_quality)
             detector = detectors[key] = Detector(views, camera, unsure)
         found = detector.detect(image, options.sightings)
         if found and found[0].quality >= FOUND_QUALITY:
@@ -240,7 +240,7 @@ def _refined(
 ) -> CadFind | NotFound:
     """The vote, or a twin of it, that the edges of several photos bear out best, refined in all; or why none is."""
     chosen = list(order[: options.max_views])
-    views: list[View] = []
+    views: list[ScaleView] = []
     for view in pool().map(lambda i: make_view(photos[i], read(photos[i]), options.max_side_px), chosen):
         views.append(view)
         if progress:
@@ -263,7 +263,7 @@ def _refined(
     refiner = JointRefiner(model, base, views, options.refine)
     fit = refiner.refine(judged[0][1])
     support = refiner.support(fit.similarity, fit.samples)
-    if max(support.score, support.base_score) < options.least_support:
+    if max(support.score, support.base_score) < options.min_support:
         reason = (
             f"the part was found in {len(votes[0].sightings)} photos, but with the photos' poses only "
             f"{100 * support.share:.0f} % of its edges are where they should be "

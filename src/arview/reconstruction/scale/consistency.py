@@ -21,11 +21,11 @@ RIM_PX = 3
 """Points this near to an outline, in px drawn, may belong to what is behind it."""
 MIN_PHOTOS = 3
 """Points seen by fewer photos are often wrong matches."""
-LEAST_POINTS = 60
-LEAST_NEAR, MOST_BEHIND = 0.6, 0.15
-LEAST_EDGES, LEAST_OF_OTHERS = 0.25, 0.45
+MIN_POINTS = 60
+MIN_NEAR, MAX_BEHIND = 0.6, 0.15
+MIN_EDGES, MIN_OF_OTHERS = 0.25, 0.45
 """Share of edges found beyond chance in all; in a photo, of what the others show."""
-MOST_MISFITS = 0.1
+MAX_MISFITS = 0.1
 """Share of photos that may not fit."""
 
 
@@ -40,22 +40,22 @@ def check_consistency(sparse: SparseModel, model: Model, found: CadFind, similar
     """
     support = found.refiner.support(similarity)
     usual = float(np.nanmedian(support.by_view))
-    is_misfit = support.by_view < LEAST_OF_OTHERS * usual
+    is_misfit = support.by_view < MIN_OF_OTHERS * usual
     misfits = tuple(v.name for v, bad in zip(found.refiner.views, is_misfit, strict=True) if bad)
     ahead = points_before_surface(sparse, model, similarity)
     tolerance_mm = NEAR_SHARE * model.diameter_mm
-    near = float(np.mean(np.abs(ahead) < tolerance_mm)) if len(ahead) >= LEAST_POINTS else None
-    behind = float(np.mean(ahead < -tolerance_mm)) if len(ahead) >= LEAST_POINTS else None
+    near = float(np.mean(np.abs(ahead) < tolerance_mm)) if len(ahead) >= MIN_POINTS else None
+    behind = float(np.mean(ahead < -tolerance_mm)) if len(ahead) >= MIN_POINTS else None
     against = []
-    if usual < LEAST_EDGES:
+    if usual < MIN_EDGES:
         against.append(
             f"only {100 * support.share:.0f} % of the CAD's edges are where they should be "
             f"({100 * support.chance:.0f} % would be by chance)"
         )
-    if len(misfits) > MOST_MISFITS * len(is_misfit):
+    if len(misfits) > MAX_MISFITS * len(is_misfit):
         names = ", ".join(misfits[:5]) + (" …" if len(misfits) > 5 else "")
         against.append(f"{len(misfits)} of {len(is_misfit)} photos do not fit the CAD where the others do: {names}")
-    if near is not None and behind is not None and (near < LEAST_NEAR or behind > MOST_BEHIND):
+    if near is not None and behind is not None and (near < MIN_NEAR or behind > MAX_BEHIND):
         against.append(
             f"of the points on the part only {100 * near:.0f} % lie within {tolerance_mm:.1f} mm of the CAD's surface, "
             f"{100 * behind:.0f} % lie behind it"

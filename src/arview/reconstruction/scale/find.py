@@ -25,7 +25,7 @@ NO_CHECK = Consistency(True, "not checked against the CAD")
 
 
 @dataclass(frozen=True)
-class Combined:
+class CombinedScale:
     """The scale that the evidence agrees on, its relative standard deviation, the evidence, and disagreements."""
 
     scale: float
@@ -101,7 +101,7 @@ def find_scale(
     )  # fmt: skip
 
 
-def combine(evidence: Sequence[ScaleEvidence]) -> Combined | None:
+def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:
     """The mean of the evidence by inverse variance, in order of trust; None without any.
 
     What disagrees with the more trusted (by more than DISAGREE standard deviations) is set aside, with a warning that
@@ -130,7 +130,7 @@ def combine(evidence: Sequence[ScaleEvidence]) -> Combined | None:
     mean = float(weights @ logs / weights.sum())
     excess = float(weights @ (logs - mean) ** 2) / max(1, len(used) - 1)
     std = float(np.sqrt(max(1.0, excess) / weights.sum()))
-    return Combined(float(np.exp(mean)), std, tuple(judged), tuple(warnings))
+    return CombinedScale(float(np.exp(mean)), std, tuple(judged), tuple(warnings))
 
 
 def _positive(covariance: Array) -> Array:

@@ -25,7 +25,7 @@ from arview.rendering.renderers import ZBufferRenderer
 
 
 @dataclass(frozen=True)
-class View:
+class ScaleView:
     """A photo as the refinement sees it.
 
     Attributes:
@@ -53,10 +53,10 @@ class RefineOptions:
         threshold: weakest step, grey levels of 255 per px in linear light.
         half_slope: a step of this slope counts half.
         contact_px: an edge this near to a surface of another component, in px drawn, is a joint (and often a weld).
-        least_sigma_px: residuals are never taken to be better than this: lens, tessellation, pixel response.
+        min_sigma_px: residuals are never taken to be better than this: lens, tessellation, pixel response.
         near_px, beside_px: a step so near bears an edge out; chance is counted so far beside it.
         dark_shift_px: how far all edges may be shifted towards the dark side (1 σ): tone curve, glare.
-        least_displacement_mm: width of the prior on displacements of components, at least.
+        min_displacement_mm: width of the prior on displacements of components, at least.
         base_sigma_mm: how far the edges of the base may mislead (shadows below, a bench of the same colour).
         systematic_px: what all edges may be off together (chamfers, tone curve), for the uncertainty.
     """
@@ -69,11 +69,11 @@ class RefineOptions:
     threshold: float = 1.0
     half_slope: float = 6.0
     contact_px: float = 3.0
-    least_sigma_px: float = 0.1
+    min_sigma_px: float = 0.1
     near_px: float = 1.5
     beside_px: float = 9.0
     dark_shift_px: float = 0.1
-    least_displacement_mm: float = 0.05
+    min_displacement_mm: float = 0.05
     base_sigma_mm: float = 0.05
     systematic_px: float = 0.05
 
@@ -95,7 +95,7 @@ class Fit:
     covariance: Array
     sigma_px: float
     displacements_mm: Array
-    samples: list[Samples]
+    samples: list[EdgeSamples]
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Support:
 
 
 @dataclass(frozen=True)
-class Samples:
+class EdgeSamples:
     """Visible CAD edge points of one view: (N,3) points and unit tangents in the model, component, feature (N,)."""
 
     points: Array
@@ -137,7 +137,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Measured:
+class EdgeResiduals:
     """What one view says.
 
     Attributes:
@@ -158,7 +158,7 @@ class Measured:
 class JointRefiner:
     """Refines similarities of one model and some views; what it needs of the model is made once."""
 
-    def __init__(self, model: Model, base: Sequence[str], views: Sequence[View], options: RefineOptions) -> None:
+    def __init__(self, model: Model, base: Sequence[str], views: Sequence[ScaleView], options: RefineOptions) -> None:
         self.model = model
         self.views = tuple(views)
         self.options = options
@@ -166,7 +166,7 @@ class JointRefiner:
         self._edges = mesh_edges(model)
         self._is_base = np.array([component.name in base for component in model.components])
 
-    def samples(self, view: View, cam_from_model: Array) -> Samples:
+    def samples(self, view: ScaleView, cam_from_model: Array) -> EdgeSamples:
         """Edge points that the view shows, without joints of components and folds of curved surfaces."""
         o = self.options
         shrink = min(1.0, o.drawn_width_px / max(view.camera.width, view.camera.height))
@@ -188,7 +188,7 @@ class JointRefiner:
         points, tangents, component = (
             found.points_in_model[is_good], found.tangents_in_model[is_good], found.component[is_good]
         )  # fmt: skip
-        return Samples(points, tangents, component, self._features(points, tangents, component))
+        return EdgeSamples(points, tangents, component, self._features(points, tangents, component))
 
     def rough(self, start: Similarity) -> tuple[Similarity, Support]:
         """A similarity refined from far, by all components or by the base alone, whichever finds the base better."""
@@ -215,13 +215,13 @@ class JointRefiner:
             if index == len(reaches) - 2:
                 samples = self.sample_all(similarity, components)
             measured = self.measure_all(similarity, samples, reach_px)
-            system = _System(measured, displacements, self._is_base, o)
+            system = _JointSystem(measured, displacements, self._is_base, o)
             step, displacements = system.solve()
             similarity = similarity.moved(step, self.center)
         covariance = system.covariance() + self._systematic(similarity, samples)
         return Fit(similarity, covariance, system.sigma_px, displacements, samples)
 
-    def _systematic(self, similarity: Similarity, samples: Sequence[Samples]) -> Array:
+    def _systematic(self, similarity: Similarity, samples: Sequence[EdgeSamples]) -> Array:
         """(7,7) covariance of what residuals do not show: that all edges lie a little off, outwards or to one side."""
         points = np.concatenate([s.points for s in samples]) - self.center
         if not len(points):
@@ -234,7 +234,7 @@ class JointRefiner:
         shift_mm = float(np.hypot(sigma_mm, self.options.base_sigma_mm))
         return np.diag(np.repeat([sigma_mm / radius_mm, shift_mm, sigma_mm / radius_mm], [3, 3, 1]) ** 2)
 
-    def support(self, similarity: Similarity, samples: Sequence[Samples] | None = None) -> Support:
+    def support(self, similarity: Similarity, samples: Sequence[EdgeSamples] | None = None) -> Support:
         """How many predicted edges the views show, against how many they show beside them."""
         o = self.options
         samples = samples or self.sample_all(similarity)
@@ -256,8 +256,8 @@ class JointRefiner:
         )
 
     def measure(
-        self, view: View, samples: Samples, cam_from_model: Array, reach_px: float, shift_px: float = 0.0
-    ) -> Measured:
+        self, view: ScaleView, samples: EdgeSamples, cam_from_model: Array, reach_px: float, shift_px: float = 0.0
+    ) -> EdgeResiduals:
         """Steps of brightness near the predicted edges, and how these move with a step of the similarity.
 
         With ``shift_px`` it is looked beside the edges: what is found there is chance.
@@ -283,31 +283,31 @@ class JointRefiner:
             (by_cam @ apply(cam_from_model, self.center))[:, None], np.sign(slopes)[:, None],
         ], axis=1)  # fmt: skip
         count = len(self._is_base)
-        return Measured(
+        return EdgeResiduals(
             rows[is_found], offsets[is_found], samples.component[is_found], samples.feature[is_found],
             np.bincount(samples.component[seen], minlength=count),
             np.bincount(samples.component[is_found & (np.abs(offsets) < 0.5 * reach_px)], minlength=count),
         )  # fmt: skip
 
     def measure_all(
-        self, start: Similarity, samples: Sequence[Samples], reach_px: float, shift_px: float = 0.0
-    ) -> list[Measured]:
+        self, start: Similarity, samples: Sequence[EdgeSamples], reach_px: float, shift_px: float = 0.0
+    ) -> list[EdgeResiduals]:
         """`measure` of every view."""
 
-        def one(pair: tuple[View, Samples]) -> Measured:
+        def one(pair: tuple[ScaleView, EdgeSamples]) -> EdgeResiduals:
             return self.measure(pair[0], pair[1], start.cam_from_model(pair[0].cam_from_scan), reach_px, shift_px)
 
         return list(pool().map(one, zip(self.views, samples, strict=True)))
 
-    def sample_all(self, start: Similarity, components: NDArray[np.bool_] | None = None) -> list[Samples]:
+    def sample_all(self, start: Similarity, components: NDArray[np.bool_] | None = None) -> list[EdgeSamples]:
         """`samples` of every view, of some ``components`` (C,) only."""
 
-        def one(view: View) -> Samples:
+        def one(view: ScaleView) -> EdgeSamples:
             found = self.samples(view, start.cam_from_model(view.cam_from_scan))
             if components is None:
                 return found
             of = components[found.component]
-            return Samples(found.points[of], found.tangents[of], found.component[of], found.feature[of])
+            return EdgeSamples(found.points[of], found.tangents[of], found.component[of], found.feature[of])
 
         return list(pool().map(one, self.views))
 
@@ -336,11 +336,11 @@ def _mean(values: Array) -> float:
     return float(np.nanmean(values)) if np.isfinite(values).any() else 0.0
 
 
-class _System:
+class _JointSystem:
     """The equations of one round: 8 common unknowns, 3 more for each component that may be displaced."""
 
     def __init__(
-        self, measured: Sequence[Measured], displacements: Array, is_base: NDArray[np.bool_], o: RefineOptions
+        self, measured: Sequence[EdgeResiduals], displacements: Array, is_base: NDArray[np.bool_], o: RefineOptions
     ) -> None:
         self.rows = np.concatenate([m.rows for m in measured])
         self.offsets = np.concatenate([m.offsets for m in measured])
@@ -350,10 +350,10 @@ class _System:
         self.is_base = is_base
         # What is left over when each component is where it was last seen to be.
         left = self.offsets - np.sum(self.rows[:, 3:6] * displacements[self.component], axis=1)
-        self.sigma_px = max(o.least_sigma_px, 1.4826 * float(np.median(np.abs(left))) if len(left) else np.inf)
+        self.sigma_px = max(o.min_sigma_px, 1.4826 * float(np.median(np.abs(left))) if len(left) else np.inf)
         self.weights = np.clip(1.0 - (left / (4.685 * self.sigma_px)) ** 2, 0.0, None) ** 2 / self.sigma_px**2
         moving = np.linalg.norm(displacements[~is_base], axis=1)
-        width_mm = max(o.least_displacement_mm, 0.6 * float(np.median(moving)) if len(moving) else 0.0)
+        width_mm = max(o.min_displacement_mm, 0.6 * float(np.median(moving)) if len(moving) else 0.0)
         # Student's t with one degree of freedom in three dimensions.
         self.prior = np.where(is_base, 1.0 / o.base_sigma_mm**2, 4.0 / (width_mm**2 + np.sum(displacements**2, axis=1)))
         self.dark_prior = 1.0 / o.dark_shift_px**2

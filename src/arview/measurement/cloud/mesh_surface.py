@@ -30,7 +30,7 @@ _SHARP_DEG = 30.0
 
 
 @dataclass(frozen=True)
-class Closest:
+class ClosestPoints:
     """Closest points of a surface to N points.
 
     Attributes:
@@ -50,7 +50,7 @@ class Closest:
     is_edge: NDArray[np.bool_]
 
 
-class Surface:
+class MeshSurface:
     """A triangle mesh that closest points are looked up on.
 
     Args:
@@ -85,7 +85,7 @@ class Surface:
         self._place = np.full(len(self.faces), -1, dtype=np.int64)
         self._place[self._order] = np.arange(len(self._order))
 
-    def closest(self, points: Array, reach: float = np.inf, hint: NDArray[np.int64] | None = None) -> Closest:
+    def closest(self, points: Array, reach: float = np.inf, hint: NDArray[np.int64] | None = None) -> ClosestPoints:
         """Closest points of the surface to ``points`` (N,3), no farther than ``reach`` mm.
 
         ``hint`` (N,) are faces that are likely near, as those of the last time; they only save time.
@@ -93,7 +93,7 @@ class Surface:
         points = np.ascontiguousarray(points, dtype=np.float64)
         count = len(points)
         hints = np.full(count, -1, dtype=np.int64) if hint is None else np.where(hint >= 0, self._place[hint], -1)
-        out = Closest(
+        out = ClosestPoints(
             np.empty((count, 3)),
             np.empty(count, np.int64),
             np.empty(count),
@@ -179,7 +179,7 @@ def _pool() -> ThreadPoolExecutor:
 
 
 @kernel
-def _smooth(corner, normals, angles, faces_around, ends, least_cosine):  # type: ignore[no-untyped-def]
+def _smooth(corner, normals, angles, faces_around, ends, min_cosine):  # type: ignore[no-untyped-def]
     """(F,3,3) normals at the corners of faces, of the faces around that meet them at a small angle."""
     out = np.zeros((len(corner), 3, 3))
     for face in range(len(corner)):
@@ -187,7 +187,7 @@ def _smooth(corner, normals, angles, faces_around, ends, least_cosine):  # type:
             total = np.zeros(3)
             for j in range(ends[corner[face, k]], ends[corner[face, k] + 1]):
                 other = faces_around[j]
-                if np.dot(normals[face], normals[other]) > least_cosine:
+                if np.dot(normals[face], normals[other]) > min_cosine:
                     for m in range(3):
                         if corner[other, m] == corner[face, k]:
                             total += angles[other, m] * normals[other]

@@ -19,10 +19,10 @@ from arview.measurement.datums.alignment import (
     robust_weights,
     surface_equations,
 )
-from arview.measurement.datums.features import edge_line, round_faces
+from arview.measurement.datums.cad_features import edge_line, round_faces
 from arview.measurement.photo.edges import EdgePoints, edge_offsets
 from arview.measurement.photo.options import EdgeOptions, SweepOptions
-from arview.measurement.photo.surface import near_edges, near_others, tangents_of
+from arview.measurement.photo.patches import near_edges, near_others, tangents_of
 from arview.measurement.photo.sweep import sweep_offsets
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move
@@ -34,7 +34,7 @@ class DatumOptions:
 
     samples: int = 500  # on a plane; more are nearer to each other than their errors are alike
     clear_mm: float = 8.0  # of other components: weld beads and spatter lie within a leg's length of the joint
-    least_clear_mm: float = 2.0  # where a plane has no room for that
+    min_clear_mm: float = 2.0  # where a plane has no room for that
     point_radius_mm: float = 4.0  # of the disc that stands for a datum point; some patches
     reach_mm: float = 1.0  # how far a feature may be from its rough place
     rim_points: int = 120  # around a hole; about a px apart on small ones
@@ -45,7 +45,7 @@ class DatumOptions:
     edges: EdgeOptions = field(default_factory=EdgeOptions)
 
 
-def measure_datums(
+def measure_datums_in_photos(
     datums: tuple[Datum, ...],
     views: PhotoViews,
     moves: Mapping[str, Move],
@@ -86,8 +86,8 @@ def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move], o: Datu
     normals = np.tile(np.array(datum.direction_in_model), (len(points), 1))
     index = views.model.index(datum.component)
     found = sweep_offsets(points, normals, views, o.reach_mm, o.sweep, index)
-    ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= o.sweep.least_views))
-    variances = found.variances_mm2[ok] + o.sweep.least_sigma_mm**2
+    ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= o.sweep.min_views))
+    variances = found.variances_mm2[ok] + o.sweep.min_sigma_mm**2
     return surface_equations(
         datum.label, datum.feature, points[ok], normals[ok], found.offsets_mm[ok], variances, seen, locks=datum.locks
     )
@@ -163,7 +163,7 @@ def _clear(points: Array, views: PhotoViews, component: Component, datum: Datum,
     """Those away from other components, and from what ends the face, as far as there is room."""
     index = views.model.index(datum.component)
     patch_mm = 0.5 * o.sweep.patch_px * views.mm_per_px(points.mean(axis=0))
-    for clear_mm in (o.clear_mm, o.least_clear_mm):
+    for clear_mm in (o.clear_mm, o.min_clear_mm):
         kept = points[~near_others(points, views.model, index, clear_mm)]
         if len(kept) >= min(100, 0.3 * len(points)):
             break
@@ -310,7 +310,7 @@ def _find_steps(
         edges, inside = edges_at(place)
         found = edge_offsets(edges, inside, views, reach_px, o.edges)
         ok = found.seen & (found.slopes != 0.0)
-        if np.count_nonzero(ok) < o.edges.least_points:
+        if np.count_nonzero(ok) < o.edges.min_points:
             raise InputError(
                 f"datum {datum.label} ({datum.feature}): its edge is seen at {np.count_nonzero(ok)} of"
                 f" {len(ok)} places only; is it filled, or covered?"
@@ -352,17 +352,17 @@ def _measure_cylinder(datum: Datum, views: PhotoViews, o: DatumOptions) -> Equat
     faces, side = round_faces(component, datum)
     px_mm = views.mm_per_px(np.array(datum.point_in_model))
     samples = sample_surface(replace(component, faces=component.faces[faces]), 3.0 * px_mm, o.samples)
-    apart = ~near_others(samples.points, views.model, index, o.least_clear_mm)
+    apart = ~near_others(samples.points, views.model, index, o.min_clear_mm)
     samples = samples.of(apart & ~near_edges(samples.points, component, o.sweep.edge_px * px_mm))
-    if len(samples.points) < o.sweep.least_samples:
+    if len(samples.points) < o.sweep.min_samples:
         raise InputError(f"datum {datum.label} (cylinder): too little of it is clear of edges and other components")
     found = sweep_offsets(samples.points, samples.normals, views, o.reach_mm, o.sweep, index)
-    ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= o.sweep.least_views))
+    ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= o.sweep.min_views))
     axis = np.array(datum.direction_in_model)
     radial = samples.points - np.array(datum.point_in_model)
     radial = side * (radial - (radial @ axis)[:, None] * axis)
     radial /= np.linalg.norm(radial, axis=1, keepdims=True)
-    variances = found.variances_mm2 + o.sweep.least_sigma_mm**2
+    variances = found.variances_mm2 + o.sweep.min_sigma_mm**2
     return surface_equations(
         datum.label, "cylinder", samples.points[ok], radial[ok], found.offsets_mm[ok], variances[ok], seen,
         np.full(np.count_nonzero(ok), side), datum.locks,
@@ -374,7 +374,7 @@ def _measure_edge(datum: Datum, views: PhotoViews, o: DatumOptions) -> Equations
     line = edge_line(views.model.component(datum.component), datum)
     px_mm = views.mm_per_px(0.5 * (line.start + line.end))
     points = line.points(o.rim_points, 6.0 * px_mm)
-    points = points[~near_others(points, views.model, views.model.index(datum.component), o.least_clear_mm)]
+    points = points[~near_others(points, views.model, views.model.index(datum.component), o.min_clear_mm)]
     groups = (points + 0.05 * line.normals.sum(axis=0))[:, None]
     seen = np.zeros((len(points), len(views.cameras)), dtype=bool)
     for index in range(len(views.cameras)):

@@ -12,17 +12,17 @@ from arview.cad.model import Model
 from arview.cad.part import Datum
 from arview.errors import InputError
 from arview.geometry import Array
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
-from arview.measurement.cloud.surface import Surface
 from arview.measurement.datums.alignment import (
     Equations,
     move_equations,
     robust_weights,
     surface_equations,
 )
-from arview.measurement.datums.features import edge_line, flat_faces, round_faces
-from arview.measurement.datums.photo_datums import DatumOptions
-from arview.measurement.photo.surface import near_others
+from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces
+from arview.measurement.datums.in_photos import DatumOptions
+from arview.measurement.photo.patches import near_others
 from arview.measurement.types import Move
 from arview.reconstruction.types import DenseCloud
 
@@ -92,7 +92,7 @@ def _offsets(
 ) -> tuple[CloudPoints, Array, Array]:
     """Points near some faces of the datum's component, their signed distances and the faces' normals there."""
     component = model.component(datum.component)
-    surface = Surface(component.vertices_in_model, component.faces)
+    surface = MeshSurface(component.vertices_in_model, component.faces)
     low, high = component.bounds_in_model[0] - o.reach_mm, component.bounds_in_model[1] + o.reach_mm
     near = cloud.only(np.all((cloud.points > low) & (cloud.points < high), axis=1))
     closest = surface.closest(near.points, o.reach_mm)
@@ -102,7 +102,7 @@ def _offsets(
     mine &= (facing > 0.5) | ~near.normals.any(axis=1)
     chosen = np.flatnonzero(mine)
     index = model.index(datum.component)
-    for clear_mm in (o.clear_mm, o.least_clear_mm):
+    for clear_mm in (o.clear_mm, o.min_clear_mm):
         clear = chosen[~near_others(near.points[chosen], model, index, clear_mm)] if len(chosen) else chosen
         if len(clear) >= min(300, 0.3 * len(chosen)):
             break

@@ -19,14 +19,14 @@ Method = Literal["point", "plane", "generalized"]
 
 
 @dataclass(frozen=True)
-class CloudRegistrationOptions:
+class IcpOptions:
     """Options of ICP between clouds.
 
     Attributes:
         method: distance that is minimised: to the point, to the plane at the point, or between planes at both.
         threshold_mm, threshold_deg: converged when the centre moves and the points turn less in a step: the
             dissertation's values.
-        most_iterations: point to point needs tens where surfaces slide.
+        max_iterations: point to point needs tens where surfaces slide.
         first_distance_mm, last_distance_mm: pairs farther apart do not count; the limit halves every iteration.
         trim: share of the pairs, the farthest, that is left out.
         neighbours: points that a normal is estimated from.
@@ -36,7 +36,7 @@ class CloudRegistrationOptions:
     method: Method = "plane"
     threshold_mm: float = 1e-4
     threshold_deg: float = 1e-4
-    most_iterations: int = 200
+    max_iterations: int = 200
     first_distance_mm: float = 10.0
     last_distance_mm: float = 5.0
     trim: float = 0.0
@@ -45,7 +45,7 @@ class CloudRegistrationOptions:
 
 
 @dataclass(frozen=True)
-class CloudRegistration:
+class IcpResult:
     """``target_from_source`` (4,4), root mean square distance of the pairs, their share, and how it ended."""
 
     target_from_source: Array
@@ -55,7 +55,7 @@ class CloudRegistration:
     converged: bool
 
 
-class TargetCloud:
+class IcpTarget:
     """A cloud (N,3) that others are registered to, its search tree and normals (N,3) (estimated when not given)."""
 
     def __init__(self, points: Array, normals: Array | None = None, neighbours: int = 12) -> None:
@@ -80,21 +80,21 @@ def estimate_normals(points: Array, tree: Any = None, neighbours: int = 12) -> A
 
 
 def register_clouds(
-    source: Array, target: TargetCloud, start: Array | None = None, options: CloudRegistrationOptions | None = None
-) -> CloudRegistration:
+    source: Array, target: IcpTarget, start: Array | None = None, options: IcpOptions | None = None
+) -> IcpResult:
     """Move points (N,3) onto a cloud.
 
     Raises:
         InputError: fewer than 6 pairs within the distance.
     """
-    o = options or CloudRegistrationOptions()
+    o = options or IcpOptions()
     source = np.asarray(source, dtype=np.float64)
     pose = np.eye(4) if start is None else start
     center = apply(pose, source).mean(axis=0)
     own_normals = estimate_normals(source, None, o.neighbours) if o.method == "generalized" else source
     limit, converged = o.first_distance_mm, False
     iterations = 0
-    while iterations < o.most_iterations:
+    while iterations < o.max_iterations:
         iterations += 1
         moved = apply(pose, source)
         distance, index = target.tree.query(moved, distance_upper_bound=limit)
@@ -119,7 +119,7 @@ def register_clouds(
             break
         limit = max(o.last_distance_mm, 0.5 * limit)
     rms = float(np.sqrt(np.mean(distance[pairs] ** 2)))
-    return CloudRegistration(pose, rms, len(pairs) / len(source), iterations, converged)
+    return IcpResult(pose, rms, len(pairs) / len(source), iterations, converged)
 
 
 def _best_rigid(x: Array, y: Array) -> Array:

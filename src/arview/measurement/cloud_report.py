@@ -25,7 +25,7 @@ from arview.measurement.plot import save_picture
 from arview.reconstruction.types import DenseCloud
 
 
-def look_at_cloud(
+def inspect_cloud(
     cloud: DenseCloud, model: Model, alignment: Alignment, deviations: Sequence[ComponentDeviation],
     folder: Path | None = None,
 ) -> tuple[tuple[ForeignReport, ...], DistanceReport | None]:  # fmt: skip
