@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image as PilImage
 
-from arview.live.stream.stamp import Stamp, strip
+from arview.live.stream.stamp import Stamp, stamp_strip
 from arview.overlay.guide import GUIDE_RGB
 from arview.video import VideoSink
 from helpers import live_browser
@@ -31,7 +31,7 @@ TIMEOUT_S = 120.0
 """Chromium without a GPU, the tracker and the tests share two cores."""
 VIEWPORT = {"width": 680, "height": 640}
 """Here the picture is shown a little larger than it is."""
-MEDIAN_PX, MOST_PX = 1.5, 4.0
+MEDIAN_PX, MAX_PX = 1.5, 4.0
 """Of the ghost's outline; of the part itself nothing may be further off in nineteen of twenty places."""
 
 
@@ -111,10 +111,10 @@ document.addEventListener("arview:drawn", (event) => { window.drawn = event.deta
 """
 
 
-def choose(page: Any, transport: str, link: str, way: str) -> None:
+def choose(page: Any, transport: str, link: str, mode: str) -> None:
     """Choose how the page is connected and wait until it is and the part is tracked."""
     page.locator(f"#transports input[value={transport}]").evaluate("input => input.click()")
-    until(page, f"document.querySelector('#link-state').textContent.startsWith('Connected by {link}, {way}')")
+    until(page, f"document.querySelector('#link-state').textContent.startsWith('Connected by {link}, {mode}')")
     until(page, "window.drawn?.pose?.state === 'tracked'")
 
 
@@ -137,7 +137,7 @@ def check_outline(found: np.ndarray, number: int, gap_px: int = 1) -> None:
     found = closed(found, gap_px)
     errors_px = {n: outline_errors_px(found, closed(true_mask(found.shape, n), gap_px)) for n in near}
     assert np.median(errors_px[number]) < MEDIAN_PX
-    assert np.quantile(errors_px[number], 0.95) < MOST_PX
+    assert np.quantile(errors_px[number], 0.95) < MAX_PX
     assert min(near, key=lambda n: np.mean(errors_px[n])) == number, "the ghost belongs to another frame"
 
 
@@ -372,7 +372,7 @@ def test_modules_agree_with_the_server(chromium: Any, server: Running) -> None:
                     return [data.filter((_, i) => i % 4 === 0).join(), readStamp(canvas, width, canvas.height)]; }""",
                 [stamp.frame_id, stamp.width, stamp.height, stamp.quarter_turns_clockwise],
             )
-            assert np.array_equal(np.array(drawn[0].split(","), dtype=int).reshape(-1, stamp.width), strip(stamp))
+            assert np.array_equal(np.array(drawn[0].split(","), dtype=int).reshape(-1, stamp.width), stamp_strip(stamp))
             assert drawn[1]["id"] == stamp.frame_id
             assert drawn[1]["turns"] == stamp.quarter_turns_clockwise
         pixels = page.evaluate(

@@ -21,10 +21,10 @@ from av.video.frame import VideoFrame
 from arview.live.options import LiveOptions
 from arview.live.security.addresses import LOOPBACK
 from arview.live.server.hub import Hub
-from arview.live.server.live_server import LiveServer, take_place
+from arview.live.server.live_server import LiveServer, open_endpoint
 from arview.live.stream.stamp import read_stamp, stamped
 from arview.live.stream.subject import Subject
-from arview.live.transport.receiving import bind_to, make_prompt
+from arview.live.transport.receiving import reduce_latency, restrict_candidates
 from arview.video import Image
 
 
@@ -37,7 +37,7 @@ class Running:
 
     @property
     def port(self) -> int:
-        return self.server.place.port
+        return self.server.endpoint.port
 
     @property
     def token(self) -> str:
@@ -50,7 +50,7 @@ class Running:
 @contextmanager
 def running(options: LiveOptions, load: Callable[[], Subject], until_ready: bool = True) -> Iterator[Running]:
     """A server at a free port of the loopback interface; ends with the block."""
-    server = LiveServer(options, take_place(None, 0, is_plain=True))
+    server = LiveServer(options, open_endpoint(None, 0, is_plain=True))
     ready = threading.Event()
     hubs: list[Hub] = []
     failures: list[BaseException] = []
@@ -113,9 +113,9 @@ class Http:
         status, _, answer = self.ask(method, path, body, **headers)
         return status, json.loads(answer) if answer else None
 
-    def join(self, **wish: Any) -> str:
+    def join(self, **wanted: Any) -> str:
         """Take part; the client's name."""
-        status, answer = self.json("POST", "/api/clients", {"transport": "jpeg", "way": "poses", **wish})
+        status, answer = self.json("POST", "/api/clients", {"transport": "jpeg", "mode": "poses", **wanted})
         assert status == 201, answer
         return str(answer["client"])
 
@@ -161,7 +161,7 @@ class Phone:
 
     http: Http
     camera: Camera | None
-    way: str = "poses"
+    mode: str = "poses"
     pause_s: float = 0.0  # taken after each video frame: a slow screen
     answers: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
     statuses: list[dict[str, Any]] = field(default_factory=list)
@@ -182,11 +182,11 @@ class Phone:
         peer.on("track", self._watch)
         opened = asyncio.Event()
         channel.on("open", opened.set)
-        bind_to(peer, [LOOPBACK])
+        restrict_candidates(peer, [LOOPBACK])
         await peer.setLocalDescription(await peer.createOffer())
         offer = {"type": "offer", "sdp": self.change_offer(peer.localDescription.sdp)}
-        wish = {"transport": "webrtc", "way": self.way, "offer": offer}
-        status, answer = await asyncio.to_thread(self.http.json, "POST", "/api/clients", wish)
+        wanted = {"transport": "webrtc", "mode": self.mode, "offer": offer}
+        status, answer = await asyncio.to_thread(self.http.json, "POST", "/api/clients", wanted)
         if status != 201:
             await peer.close()
             raise RuntimeError(f"{status} {answer}")
@@ -225,7 +225,7 @@ class Phone:
 
     def _watch(self, track: Any) -> None:
         for transceiver in self._peer.getTransceivers():
-            make_prompt(transceiver.receiver)
+            reduce_latency(transceiver.receiver)
 
         async def watch() -> None:
             with suppress(Exception):
@@ -234,7 +234,7 @@ class Phone:
                     image = await asyncio.to_thread(frame.to_ndarray, format="rgb24")
                     stamp = read_stamp(np.ascontiguousarray(image[:, :, 1]))
                     self.shown.append((time.monotonic(), stamp.frame_id if stamp else None))
-                    self.picture = image
+                    self.frame = image
                     await asyncio.sleep(self.pause_s)
 
         self._tasks.append(asyncio.ensure_future(watch()))

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from arview.geometry import Array
-from arview.live.options import LiveOptions
+from arview.live.options import LiveOptions, RequestLimits, WebrtcOptions
 from arview.live.server.loading import load_subject
 from arview.live.stream.subject import Subject
 from arview.video import Image, open_source
@@ -45,11 +45,11 @@ def there_and_back() -> list[int]:
 
 
 def options(**more: Any) -> LiveOptions:
-    """Of a server for phones that show the sample."""
+    """Options of a server that shows the sample to phones, without rate limits and with long timeouts."""
     usual: dict[str, Any] = {
         "camera": str(CAMERA), "inspection": INSPECTION, "width": WIDTH, "height": HEIGHT,
-        "requests_per_s": 1e6, "requests_burst": 1e6, "joins_per_s": 1e6, "joins_burst": 1e6,
-        "jpeg_silence_s": 120.0, "connect_timeout_s": 60.0,  # tests share their cores
+        "requests": RequestLimits(per_s=1e6, burst=1e6, joins_per_s=1e6, joins_burst=1e6),
+        "jpeg_silence_s": 120.0, "webrtc": WebrtcOptions(connect_timeout_s=60.0),  # tests share their cores
     }  # fmt: skip
     return LiveOptions(**{**usual, **more})
 

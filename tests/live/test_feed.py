@@ -22,16 +22,17 @@ from arview.camera import Camera
 from arview.camera.read import guess_camera
 from arview.errors import InputError, MismatchError
 from arview.inspection import load_inspection, save_inspection
+from arview.live.options import RecordingOptions
 from arview.live.protocol import NOTICE_CODES
+from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.documents import _source_name, pose_document
-from arview.live.stream.drawing import KEPT_LOOKS, Drawing
-from arview.live.stream.feed import KEPT_FRAMES, Feed, Tracked
-from arview.live.stream.frames import Incoming, Picture
+from arview.live.stream.feed import Feed, TrackedFrame
+from arview.live.stream.frames import DecodedFrame, IncomingFrame
 from arview.live.stream.inspection_file import InspectionFile
-from arview.live.stream.newest import Inbox, NewestSlot
+from arview.live.stream.newest import AsyncNewestSlot, NewestSlot
 from arview.live.stream.notices import Notice
 from arview.live.stream.recording import Recorder, Recordings, _fitted
-from arview.live.stream.subject import Look
+from arview.live.stream.subject import OverlayStyle
 from arview.pose import Pose, TrackingState
 from arview.video import Image, open_source
 from helpers.live_client import wait
@@ -83,7 +84,7 @@ class Scripted:
         self.sessions += 1
         return Session(self)
 
-    def overlay(self, camera: Camera, look: Look) -> Overlay:
+    def overlay(self, camera: Camera, style: OverlayStyle) -> Overlay:
         self.overlays += 1
         return Overlay()
 
@@ -92,9 +93,9 @@ def feed_of(subject: Any, kind: str = "phone") -> Feed:
     return Feed(subject, kind)
 
 
-def frame(number: int, shape: tuple[int, int] = (120, 160)) -> Incoming:
-    picture = Picture(number, np.full((*shape, 3), number % 256, dtype=np.uint8))
-    return Incoming(lambda: picture, time.monotonic())
+def frame(number: int, shape: tuple[int, int] = (120, 160)) -> IncomingFrame:
+    picture = DecodedFrame(number, np.full((*shape, 3), number % 256, dtype=np.uint8))
+    return IncomingFrame(lambda: picture, time.monotonic())
 
 
 @pytest.fixture
@@ -108,17 +109,17 @@ def closing() -> Iterator[Callable[[Feed], Feed]]:
 def test_a_slow_tracker_takes_the_newest_frame_and_counts_the_others(closing: Callable[[Feed], Feed]) -> None:
     """30 frames a second into a tracker that manages 5: no answer is older than one frame's wait and two trackings."""
     feed = closing(feed_of(Scripted(pause_s=0.2)))
-    tracked: list[Tracked] = []
+    tracked: list[TrackedFrame] = []
     feed.listen(tracked.append)
     for number in range(60):
         feed.put(frame(number))
         time.sleep(1 / 30)
-    wait(lambda: tracked and tracked[-1].picture.frame_id == 59)
+    wait(lambda: tracked and tracked[-1].frame.frame_id == 59)
     ages_s = [one.done_s - one.arrived_s for one in tracked]
     assert max(ages_s) < 0.2 + 0.2 + 0.1
     assert 7 <= len(tracked) <= 14
     assert feed.received == 60 and feed.dropped == 60 - len(tracked) == tracked[-1].dropped
-    ids = [one.picture.frame_id for one in tracked]
+    ids = [one.frame.frame_id for one in tracked]
     assert ids == sorted(set(ids))
 
 
@@ -126,9 +127,10 @@ def test_memory_of_a_feed_is_bounded(closing: Callable[[Feed], Feed]) -> None:
     feed = closing(feed_of(Scripted()))
     for number in range(200):
         feed.put(frame(number))
-        wait(lambda number=number: feed.newest is not None and feed.newest.picture.frame_id == number)
-    assert len(feed._kept) == KEPT_FRAMES
-    assert feed.find(199 - KEPT_FRAMES) is None and feed.find(199 - KEPT_FRAMES + 1) is not None
+        wait(lambda number=number: feed.newest is not None and feed.newest.frame.frame_id == number)
+    kept = feed.options.kept_frames
+    assert len(feed._kept) == kept
+    assert feed.find(199 - kept) is None and feed.find(199 - kept + 1) is not None
 
 
 def test_an_error_inside_the_tracker_is_told_and_tracking_begins_anew(closing: Callable[[Feed], Feed]) -> None:
@@ -137,7 +139,7 @@ def test_an_error_inside_the_tracker_is_told_and_tracking_begins_anew(closing: C
     for number in range(5):
         feed.put(frame(number))
         time.sleep(0.05)
-    wait(lambda: feed.newest is not None and feed.newest.picture.frame_id == 4)
+    wait(lambda: feed.newest is not None and feed.newest.frame.frame_id == 4)
     assert subject.sessions == 2 and feed.failures == 1
     assert [notice.code for notice in feed.notices()] == ["tracking_failed"]
 
@@ -147,7 +149,7 @@ def test_a_phone_that_is_turned_gets_another_session_and_a_misfit_none(closing: 
     feed = closing(feed_of(subject))
     for number, shape in enumerate([(120, 160), (120, 160), (160, 120), (160, 160), (120, 160)]):
         feed.put(frame(number, shape))
-        wait(lambda number=number: feed.newest is not None and feed.newest.picture.frame_id == number)
+        wait(lambda number=number: feed.newest is not None and feed.newest.frame.frame_id == number)
         assert feed.newest is not None
         is_misfit = shape == (160, 160)
         assert (feed.newest.pose.cam_from_model is None) == is_misfit
@@ -158,7 +160,7 @@ def test_a_phone_that_is_turned_gets_another_session_and_a_misfit_none(closing: 
 def test_frames_that_cannot_be_read_are_counted_and_told(closing: Callable[[Feed], Feed]) -> None:
     feed = closing(feed_of(Scripted()))
     for number in range(15):
-        feed.put(Incoming(lambda: None, time.monotonic()))
+        feed.put(IncomingFrame(lambda: None, time.monotonic()))
         wait(lambda number=number: feed.unreadable == number + 1)
     assert [notice.code for notice in feed.notices()] == ["stamp_unreadable"]
     feed.put(frame(1))
@@ -182,7 +184,7 @@ def test_slots_hold_one_value() -> None:
 
 def test_inbox_brings_the_newest_from_threads_to_a_task() -> None:
     async def go() -> list[int]:
-        inbox: Inbox[int] = Inbox(asyncio.get_running_loop())
+        inbox: AsyncNewestSlot[int] = AsyncNewestSlot(asyncio.get_running_loop())
 
         def write() -> None:
             for value in range(2000):
@@ -202,26 +204,26 @@ def test_inbox_brings_the_newest_from_threads_to_a_task() -> None:
     assert got == sorted(set(got)) and got[-1] == 1999
 
 
-def tracked_frame(number: int = 0, shape: tuple[int, int] = (120, 160)) -> Tracked:
-    picture = Picture(number, np.full((*shape, 3), 50, dtype=np.uint8))
+def tracked_frame(number: int = 0, shape: tuple[int, int] = (120, 160)) -> TrackedFrame:
+    picture = DecodedFrame(number, np.full((*shape, 3), 50, dtype=np.uint8))
     pose = Pose(None, None, 0.0, TrackingState.SEARCHING, 0.0, number, 0.0, "too dark")
-    return Tracked(picture, pose, guess_camera(shape[1], shape[0]), 1.0, 1.01, 1.03, 3, 1, number)
+    return TrackedFrame(picture, pose, guess_camera(shape[1], shape[0]), 1.0, 1.01, 1.03, 3, 1, number)
 
 
-def test_a_frame_is_drawn_once_for_each_look() -> None:
+def test_a_frame_is_drawn_once_for_each_style() -> None:
     subject: Any = Scripted()
-    drawing = Drawing(subject)
+    annotator = FrameAnnotator(subject)
     one = tracked_frame()
-    assert drawing.draw(one) is drawing.draw(one)
-    assert drawing.draw(one, Look(status=False)) is not drawing.draw(one)
+    assert annotator.draw(one) is annotator.draw(one)
+    assert annotator.draw(one, OverlayStyle(status=False)) is not annotator.draw(one)
     assert subject.overlays == 2
     for opacity in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6):
-        drawing.look = replace(drawing.look, opacity=opacity)
-        drawing.draw(one)
-    assert len(drawing._pencils) == KEPT_LOOKS
+        annotator.style = replace(annotator.style, opacity=opacity)
+        annotator.draw(one)
+    assert len(annotator._renderers) == subject.options.feed.kept_styles
     overlays = subject.overlays
     subject.revision += 1  # another inspection
-    drawing.draw(tracked_frame(1))
+    annotator.draw(tracked_frame(1))
     assert subject.overlays == overlays + 1
 
 
@@ -257,7 +259,7 @@ def test_notices_are_of_the_protocol() -> None:
 def test_recording_fits_in_pictures_of_another_shape(tmp_path: Path, closing: Callable[[Feed], Feed]) -> None:
     subject: Any = Scripted()
     feed = closing(feed_of(subject))
-    recorder = Recorder(feed, Drawing(subject), tmp_path / "out.mp4")
+    recorder = Recorder(feed, FrameAnnotator(subject), tmp_path / "out.mp4")
     for number in range(8):
         feed.put(frame(200, (120, 160) if number < 4 else (160, 120)))
         time.sleep(0.06)
@@ -275,14 +277,14 @@ def test_a_recording_that_cannot_be_written_is_told_and_harms_nobody(
     subject: Any = Scripted()
     feed = closing(feed_of(subject))
     recordings = Recordings(tmp_path, "a part/../x")
-    recordings.start(feed, Drawing(subject), tmp_path / "gone" / "out.mp4")
+    recordings.start(feed, FrameAnnotator(subject), tmp_path / "gone" / "out.mp4")
     feed.put(frame(1))
     wait(lambda: recordings.notices(feed))
     (notice,) = recordings.notices(feed)
     assert notice.code == "recording_failed" and str(tmp_path) not in notice.text
     feed.put(frame(2))
-    wait(lambda: feed.newest is not None and feed.newest.picture.frame_id == 2)
-    recordings.start(feed, Drawing(subject))
+    wait(lambda: feed.newest is not None and feed.newest.frame.frame_id == 2)
+    recordings.start(feed, FrameAnnotator(subject))
     feed.put(frame(3))
     time.sleep(0.2)
     recordings.stop_all()
@@ -296,11 +298,10 @@ def test_a_recording_ends_before_the_disk_is_full(
 ) -> None:
     subject: Any = Scripted()
     feed = closing(feed_of(subject))
-    monkeypatch.setattr("arview.live.stream.recording._LOOK_EVERY_S", 0.0)
-    recorder = Recorder(feed, Drawing(subject), tmp_path / "out.mp4")
+    recorder = Recorder(feed, FrameAnnotator(subject), tmp_path / "out.mp4", RecordingOptions(check_interval_s=0.0))
     feed.put(frame(1))
     time.sleep(0.2)
-    monkeypatch.setattr("arview.live.stream.recording.FREE_BYTES", 1 << 60)
+    monkeypatch.setattr(recorder, "_options", RecordingOptions(check_interval_s=0.0, min_free_bytes=1 << 60))
     feed.put(frame(2))
     wait(lambda: not recorder.is_running)
     assert recorder.stop() and len(list(open_source(tmp_path / "out.mp4"))) == 1

@@ -24,15 +24,15 @@ from arview.errors import InputError, OutputError
 from arview.live.security import addresses
 from arview.live.security.addresses import LOOPBACK, Interface, bind, choose_host
 from arview.live.security.certificates import (
-    AUTHORITY_DAYS,
-    LEAF_DAYS,
+    CertificateOptions,
     local_certificates,
     own_certificates,
 )
 from arview.live.security.trust_page import apple_profile, fingerprint
-from arview.live.server.live_server import LiveServer, take_place
+from arview.live.server.live_server import LiveServer, open_endpoint
 from helpers.live_sample import loader, options
 
+LIFETIMES = CertificateOptions()
 NOW = datetime(2026, 11, 22, 12, 0, tzinfo=UTC)
 HERE = ["192.168.7.20", LOOPBACK, "localhost"]
 
@@ -56,7 +56,8 @@ def test_certificates_are_what_browsers_ask_for(tmp_path: Path) -> None:
     usage = server.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     assert list(usage) == [ExtendedKeyUsageOID.SERVER_AUTH]
     days = (server.not_valid_after_utc - NOW) / timedelta(days=1)
-    assert days == LEAF_DAYS and (authority.not_valid_after_utc - NOW) / timedelta(days=1) == AUTHORITY_DAYS
+    assert days == LIFETIMES.server_days
+    assert (authority.not_valid_after_utc - NOW) / timedelta(days=1) == LIFETIMES.authority_days
 
 
 def test_keys_are_for_this_user_only(tmp_path: Path) -> None:
@@ -101,12 +102,12 @@ def test_leaf_is_renewed_when_it_ends_soon_or_the_address_changes_and_the_author
     local_certificates(HERE, tmp_path, NOW + timedelta(days=70))
     renewed = leaf(tmp_path)
     assert renewed.serial_number != serial
-    assert renewed.not_valid_after_utc == NOW + timedelta(days=70 + LEAF_DAYS)
+    assert renewed.not_valid_after_utc == NOW + timedelta(days=70 + LIFETIMES.server_days)
     moved = local_certificates(["10.0.0.5"], tmp_path, NOW + timedelta(days=71))
     assert leaf(tmp_path).serial_number != renewed.serial_number
     assert moved.authority_der == first.authority_der
     # Years later the authority itself is replaced in time.
-    later = local_certificates(["10.0.0.5"], tmp_path, NOW + timedelta(days=AUTHORITY_DAYS - 60))
+    later = local_certificates(["10.0.0.5"], tmp_path, NOW + timedelta(days=LIFETIMES.authority_days - 60))
     assert later.is_authority_new and later.authority_der != first.authority_der
 
 
@@ -151,7 +152,7 @@ def test_apple_profile_holds_the_certificate(tmp_path: Path) -> None:
 
 def test_pages_come_by_https_and_the_way_to_trust_them_by_http(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ARVIEW_DATA", str(tmp_path))
-    place = take_place(LOOPBACK, 0)
+    place = open_endpoint(LOOPBACK, 0)
     assert place.certificates is not None and place.certificates.authority_der is not None
     chosen = options(max_age_s=None)
     server = LiveServer(chosen, place)
@@ -205,7 +206,7 @@ def test_ports_and_addresses_that_cannot_be_had() -> None:
     with pytest.raises(InputError, match="--host"):
         choose_host("no.such.host.invalid")
     with pytest.raises(InputError, match="--http"):
-        take_place("192.0.2.1", 0, is_plain=True)
+        open_endpoint("192.0.2.1", 0, is_plain=True)
 
 
 def test_host_is_chosen_among_the_networks_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:

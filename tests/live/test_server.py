@@ -78,11 +78,11 @@ def test_poses_by_jpeg_are_those_of_the_very_frame(page: Http) -> None:
     status = page.json("GET", f"/api/clients/{name}/status")[1]
     feed = status["feed"]
     assert (feed["kind"], feed["state"], feed["received"], feed["dropped"]) == ("phone", "live", COUNT, 0)
-    assert (status["clients"], status["most_clients"], status["way"]) == (1, 3, "poses")
+    assert (status["clients"], status["max_clients"], status["mode"]) == (1, 3, "poses")
 
 
 def test_annotated_picture_by_jpeg(page: Http) -> None:
-    name = page.join(way="video")
+    name = page.join(mode="video")
     status, headers, content = send(page, name, 0)
     answer = json.loads(headers["x-arview-answer"])
     assert (status, headers["content-type"], answer["id"], answer["state"]) == (200, "image/jpeg", 0, "tracked")
@@ -94,7 +94,7 @@ def test_annotated_picture_by_jpeg(page: Http) -> None:
     page.json(
         "POST",
         f"/api/clients/{name}/control",
-        {"look": {"ghost": False, "labels": False, "edges": "none", "status": False}},
+        {"style": {"ghost": False, "labels": False, "edges": "none", "status": False}},
     )
     plain = from_jpeg(send(page, name, 1)[2]).astype(int)
     assert (np.abs(plain - frames()[1]).max(axis=2) > 60).mean() < 0.02
@@ -103,19 +103,20 @@ def test_annotated_picture_by_jpeg(page: Http) -> None:
 def test_control_changes_what_is_asked_for_and_nothing_on_a_wrong_wish(page: Http) -> None:
     name = page.join()
     path = f"/api/clients/{name}/control"
-    status, answer = page.json("POST", path, {"way": "video", "look": {"opacity": 0.2, "only": "post_1"}})
-    assert status == 200 and answer["way"] == "video"
-    look = {"ghost": True, "edges": "visible", "labels": True, "opacity": 0.2, "only": "post_1", "status": True}
-    assert answer["look"] == look
+    status, answer = page.json("POST", path, {"mode": "video", "style": {"opacity": 0.2, "only": "post_1"}})
+    assert status == 200 and answer["mode"] == "video"
+    style = {"ghost": True, "edges": "visible", "labels": True, "opacity": 0.2, "only": "post_1", "status": True}
+    assert answer["style"] == style
     for wrong in (
-        {"way": "sideways"}, {"way": 3}, {"look": {"opacity": 7}}, {"look": {"opacity": True}}, {"unknown": 1},
-        {"look": {"edges": "x"}}, {"look": {"only": "no_such"}}, {"look": []}, {"look": {"ghost": None}},
-        {"hold": -1}, {"hold": True}, {"hold": 1 << 20}, {"way": "poses", "look": {"ghost": "yes"}}, {"record": "yes"},
+        {"mode": "sideways"}, {"mode": 3}, {"style": {"opacity": 7}}, {"style": {"opacity": True}}, {"unknown": 1},
+        {"style": {"edges": "x"}}, {"style": {"only": "no_such"}}, {"style": []}, {"style": {"ghost": None}},
+        {"hold": -1}, {"hold": True}, {"hold": 1 << 20}, {"record": "yes"},
+        {"mode": "poses", "style": {"ghost": "yes"}},
     ):  # fmt: skip
         status, refused = page.json("POST", path, wrong)
         assert (status, refused["error"]) == (400, "bad_control"), wrong
     again = page.json("GET", f"/api/clients/{name}/status")[1]
-    assert (again["way"], again["look"]) == ("video", answer["look"])
+    assert (again["mode"], again["style"]) == ("video", answer["style"])
 
 
 def test_reset_searches_again(page: Http) -> None:
@@ -255,7 +256,7 @@ def test_inspection_is_reloaded_and_garbage_keeps_the_last_good_one(page: Http, 
     after = wait(lambda: (part := page.json("GET", "/api/part")[1])["revision"] > before["revision"] and part)
     assert {c["name"]: c for c in after["components"]}["post_1"]["uncertainty_mm"] == 0.2
     assert codes(page) == ["inspection_serial"]
-    name = page.join(way="video")
+    name = page.join(mode="video")
     assert json.loads(send(page, name, 0)[1]["x-arview-answer"])["revision"] == after["revision"]
 
 
@@ -270,7 +271,7 @@ def test_part_is_aligned_with_a_guide_view_when_asked_for() -> None:
     chosen = options(guide="az-40_el30", max_age_s=None)
     with running(chosen, loader(chosen)) as server:
         page = server.session()
-        name = page.join(way="video")
+        name = page.join(mode="video")
         for index in range(3):
             _, headers, content = send(page, name, index)
             answer = json.loads(headers["x-arview-answer"])

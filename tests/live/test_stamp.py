@@ -13,7 +13,7 @@ from av.video.frame import VideoFrame
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.live.stream.frames import from_jpeg, from_stamped, to_jpeg
-from arview.live.stream.stamp import Stamp, crc16, read_stamp, stamped, strip, strip_px
+from arview.live.stream.stamp import Stamp, crc16, read_stamp, stamp_strip, stamped, strip_px
 
 SIZES = [(640, 480), (480, 640), (1280, 720), (720, 1280), (1920, 1080), (360, 640)]
 
@@ -54,7 +54,7 @@ def test_layout_is_as_the_page_draws_it() -> None:
     bits = f"{0xABCDE:020b}{640:013b}{480:013b}{3:02b}"
     payload = int(bits, 2).to_bytes(6, "big")
     bits += f"{crc16(payload):016b}"
-    drawn = strip(Stamp(0xABCDE, 640, 480, 3))
+    drawn = stamp_strip(Stamp(0xABCDE, 640, 480, 3))
     assert drawn.shape == (20, 640)
     cells = [int(drawn[5 + 10 * (k // 32), 10 + 20 * (k % 32)] > 127) for k in range(64)]
     assert "".join(map(str, cells)) == bits

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from arview.errors import InputError
-from arview.live.options import LiveOptions
+from arview.live.options import LiveOptions, StationOptions
 from arview.live.security.addresses import LOOPBACK
 from arview.live.stream import station
 from arview.live.stream.frames import from_jpeg
@@ -87,7 +87,7 @@ def newest(page: Http, name: str, after: int = -1) -> tuple[dict[str, Any], Imag
 
 def test_file_is_played_and_all_pages_see_its_poses(playing: Running) -> None:
     page, other = playing.session(), playing.session()
-    name, other_name = page.join(), other.join(way="video")
+    name, other_name = page.join(), other.join(mode="video")
     wait(lambda: (feed := playing.hub.watched()) and feed[0].newest and feed[0].newest.pose.cam_from_model is not None)
     order = there_and_back()
     last, seen = -1, 0
@@ -150,7 +150,7 @@ def test_twenty_pages_look_at_one_station(clip: Path) -> None:
 
         def look(number: int) -> list[int]:
             page = server.session()
-            name = page.join(way="video" if number % 2 else "poses")
+            name = page.join(mode="video" if number % 2 else "poses")
             ids = []
             for _ in range(4):
                 answer, picture = newest(page, name, ids[-1] if ids else -1)
@@ -168,8 +168,7 @@ def test_twenty_pages_look_at_one_station(clip: Path) -> None:
 def test_camera_that_breaks_is_told_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     cable = Cable()
     monkeypatch.setattr(station, "open_source", cable.open)
-    monkeypatch.setattr(station, "FROZEN_S", 1.2)
-    chosen = options(source="0", max_age_s=None)
+    chosen = options(source="0", max_age_s=None, station=StationOptions(frozen_s=1.2))
     with running(chosen, loader(chosen)) as server:
         page = server.session()
 

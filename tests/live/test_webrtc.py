@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from aiortc.rtp import RtpPacket
 
+from arview.live.options import WebrtcOptions
 from arview.live.stream.stamp import strip_px
 from arview.live.transport.receiving import (
-    WAITING_FRAMES,
+    MAX_WAITING_FRAMES,
+    BoundedFrameQueue,
     PromptJitterBuffer,
-    ShortQueue,
 )
-from arview.live.transport.webrtc import MOST_CANDIDATES, _checked, _faster
+from arview.live.transport.webrtc import _checked_offer, _with_bitrates
 from helpers.live_client import Camera, Phone, Running, running
 from helpers.live_sample import HEIGHT, WIDTH, errors, frames, loader, nearest, options, there_and_back, truth
 
@@ -67,16 +68,16 @@ def test_poses_are_those_of_the_very_frame_and_come_soon(phones: Running) -> Non
     ids = [answer["id"] for _, answer in phone.answers]
     assert len(set(ids)) == len(ids) and all(answer["scale"] == 1.0 for _, answer in phone.answers)
     status = phone.statuses[-1]
-    assert status["feed"]["kind"] == "phone" and status["notices"] == [] and status["way"] == "poses"
+    assert status["feed"]["kind"] == "phone" and status["notices"] == [] and status["mode"] == "poses"
     assert not phone.shown  # poses only: no picture comes back to a phone
 
 
 def test_annotated_video_comes_back_with_the_ids_of_its_frames(phones: Running) -> None:
     async def go() -> Phone:
-        async with Phone(phones.session(), camera(), way="video") as phone:
+        async with Phone(phones.session(), camera(), mode="video") as phone:
             await phone.until(lambda: len(phone.shown) >= 40 and phone.answers, 60)
             # Back to poses: the pictures stop.
-            await asyncio.to_thread(phone.http.json, "POST", f"/api/clients/{phone.name}/control", {"way": "poses"})
+            await asyncio.to_thread(phone.http.json, "POST", f"/api/clients/{phone.name}/control", {"mode": "poses"})
             await asyncio.sleep(0.5)
             count = len(phone.shown)
             await asyncio.sleep(0.7)
@@ -89,9 +90,9 @@ def test_annotated_video_comes_back_with_the_ids_of_its_frames(phones: Running) 
     assert np.mean([frame_id is not None for frame_id in ids]) > 0.7
     known = [frame_id for frame_id in ids if frame_id is not None]
     assert known == sorted(known)
-    assert phone.picture is not None and phone.picture.shape == (HEIGHT + strip_px(WIDTH), WIDTH, 3)
+    assert phone.frame is not None and phone.frame.shape == (HEIGHT + strip_px(WIDTH), WIDTH, 3)
     plain = frames()[index_of(known[-1])].astype(int)
-    drawn = np.abs(phone.picture[:HEIGHT].astype(int) - plain).max(axis=2) > 60
+    drawn = np.abs(phone.frame[:HEIGHT].astype(int) - plain).max(axis=2) > 60
     assert 0.04 < drawn.mean() < 0.6
     assert phone.camera is not None
     waited_ms = [1e3 * (moment - phone.camera.sent_s[i]) for moment, i in phone.shown[20:] if i is not None]
@@ -108,7 +109,7 @@ def test_station_sends_its_plain_picture_with_ids_and_poses(tmp_path_factory: py
     chosen = options(source=str(path), max_age_s=None)
 
     async def go(server: Running) -> tuple[Phone, Phone]:
-        async with Phone(server.session(), None) as one, Phone(server.session(), None, way="video") as two:
+        async with Phone(server.session(), None) as one, Phone(server.session(), None, mode="video") as two:
             await one.until(
                 lambda: one.states().count("tracked") >= 5 and len(one.shown) > 20 and len(two.shown) > 20, 60
             )
@@ -119,12 +120,12 @@ def test_station_sends_its_plain_picture_with_ids_and_poses(tmp_path_factory: py
     answered = {answer["id"] for _, answer in one.answers}
     shown = [frame_id for _, frame_id in one.shown[5:] if frame_id is not None]
     assert np.mean([frame_id in answered for frame_id in shown]) > 0.9
-    assert one.picture is not None and two.picture is not None
+    assert one.frame is not None and two.frame is not None
     last = next(frame_id for _, frame_id in reversed(one.shown) if frame_id is not None)
-    plain = np.abs(one.picture[:HEIGHT].astype(int) - frames()[index_of(last)]).mean()
+    plain = np.abs(one.frame[:HEIGHT].astype(int) - frames()[index_of(last)]).mean()
     assert plain < 12.0  # encoded twice, nothing drawn
     last = next(frame_id for _, frame_id in reversed(two.shown) if frame_id is not None)
-    drawn = np.abs(two.picture[:HEIGHT].astype(int) - frames()[index_of(last)]).max(axis=2) > 60
+    drawn = np.abs(two.frame[:HEIGHT].astype(int) - frames()[index_of(last)]).max(axis=2) > 60
     assert drawn.mean() > 0.04
 
 
@@ -191,7 +192,7 @@ OFFERS = {
     "no codec": "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=-\r\nt=0 0\r\nm=video 9 UDP/TLS/RTP/SAVPF 96\r\n"
     "m=application 9 UDP/DTLS/SCTP webrtc-datachannel\r\n",
     "candidates": "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=-\r\nt=0 0\r\n"
-    + (MOST_CANDIDATES + 1) * "a=candidate:1 1 udp 1 127.0.0.1 9 typ host\r\n",
+    + (WebrtcOptions().max_candidates + 1) * "a=candidate:1 1 udp 1 127.0.0.1 9 typ host\r\n",
     "binary": "\x00\xff\u2028" * 100,
 }
 
@@ -201,7 +202,7 @@ def test_malformed_offers_are_refused_and_leave_nothing(phones: Running, sdp: st
     page = phones.session()
     before = set(phones.hub.clients)
     offer = {"type": "offer", "sdp": sdp}
-    status, refused = page.json("POST", "/api/clients", {"transport": "webrtc", "way": "poses", "offer": offer})
+    status, refused = page.json("POST", "/api/clients", {"transport": "webrtc", "mode": "poses", "offer": offer})
     assert (status, refused["error"]) == (400, "bad_offer") and len(refused["message"]) < 120
     assert set(phones.hub.clients) == before
     for wrong in ({"transport": "webrtc"}, {"transport": "webrtc", "offer": 3}, {"transport": "webrtc", "offer": {}}):
@@ -229,8 +230,8 @@ def test_damaged_offers(phones: Running) -> None:
             what = trial % 3
             text[place : place + (0 if what == 2 else int(rng.integers(1, 40)))] = rng.bytes(int(rng.integers(0, 4)))
         sdp = text.decode("latin-1")
-        wish = {"transport": "webrtc", "way": "poses", "offer": {"type": "offer", "sdp": sdp}}
-        status, answer = page.json("POST", "/api/clients", wish)
+        wanted = {"transport": "webrtc", "mode": "poses", "offer": {"type": "offer", "sdp": sdp}}
+        status, answer = page.json("POST", "/api/clients", wanted)
         answers.append(status)
         assert status in (201, 400), answer
         if status == 201:
@@ -277,7 +278,7 @@ def test_clients_that_vanish_again_and_again_leave_nothing_behind(
 
 
 def test_an_offer_without_a_page_behind_it_is_forgotten() -> None:
-    chosen = options(connect_timeout_s=1.0)
+    chosen = options(webrtc=WebrtcOptions(connect_timeout_s=1.0))
 
     async def go(server: Running) -> None:
         phone = Phone(server.session(), camera())
@@ -299,8 +300,8 @@ def test_a_slow_screen_gets_fewer_pictures_not_later_ones(phones: Running) -> No
 
     async def go() -> tuple[Phone, Phone]:
         async with (
-            Phone(phones.session(), camera(), way="video", pause_s=0.3) as slow,
-            Phone(phones.session(), camera(), way="poses") as quick,
+            Phone(phones.session(), camera(), mode="video", pause_s=0.3) as slow,
+            Phone(phones.session(), camera(), mode="poses") as quick,
         ):
             await quick.until(lambda: quick.states().count("tracked") > 60 and slow.shown, 60)
             return slow, quick
@@ -340,12 +341,12 @@ def test_frames_without_a_marker_and_out_of_order() -> None:
 
 def test_a_decoder_that_cannot_keep_up_drops_all_and_asks_for_a_key_frame() -> None:
     failed = threading.Event()
-    waiting = ShortQueue(failed)
-    for number in range(WAITING_FRAMES):
+    waiting = BoundedFrameQueue(failed)
+    for number in range(MAX_WAITING_FRAMES):
         waiting.put(number)
-    assert not failed.is_set() and waiting.qsize() == WAITING_FRAMES
+    assert not failed.is_set() and waiting.qsize() == MAX_WAITING_FRAMES
     waiting.put("next")
-    assert failed.is_set() and waiting.qsize() == 1 and waiting.dropped == WAITING_FRAMES
+    assert failed.is_set() and waiting.qsize() == 1 and waiting.dropped == MAX_WAITING_FRAMES
     waiting.put(None)
     assert [waiting.get(), waiting.get()] == ["next", None]
 
@@ -363,14 +364,14 @@ def test_candidates_elsewhere_are_never_called() -> None:
     ):
         lines.append(f"a=candidate:1 1 udp 1 {address} 9 typ host")
     lines += ["a=candidate:1 1 tcp 1 192.168.1.8 9 typ host", "a=candidate:", "a=candidate:1 1 udp"]
-    kept = [line for line in _checked("\r\n".join(lines)).splitlines() if line.startswith("a=")]
+    kept = [line for line in _checked_offer("\r\n".join(lines), 32).splitlines() if line.startswith("a=")]
     assert [line.split()[4] for line in kept] == ["192.168.1.7", "127.0.0.1", "fe80::1"]
 
 
 def test_answers_ask_chromium_for_enough_bits() -> None:
     sdp = "m=video 9 x 96 97 102\r\na=rtpmap:96 VP8/90000\r\na=rtpmap:97 rtx/90000\r\na=fmtp:97 apt=96\r\n"
     sdp += "a=rtpmap:102 H264/90000\r\na=fmtp:102 packetization-mode=1\r\n"
-    lines = _faster(sdp).splitlines()
+    lines = _with_bitrates(sdp).splitlines()
     assert any(line.startswith("a=fmtp:96 x-google-min-bitrate") for line in lines)
     assert "a=fmtp:97 apt=96" in lines
     assert any(line.startswith("a=fmtp:102 packetization-mode=1;x-google") for line in lines)

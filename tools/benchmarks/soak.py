@@ -112,7 +112,7 @@ async def _soak(pid: int, port: int, token: str, seconds: float) -> list[Sample]
     seen: list[Sample] = []
     screen = Screen(port, token)
     print(f"{'s':>5} {'memory MB':>10} {'answers/s':>10} {'age p95 ms':>11} {'server p95 ms':>14} {'dropped':>8}")
-    async with Phone(Http(port, token), Camera(images, FPS), way="video") as phone:
+    async with Phone(Http(port, token), Camera(images, FPS), mode="video") as phone:
         assert phone.camera is not None
         await phone.until(lambda: phone.answers, 180)
         screen.start()

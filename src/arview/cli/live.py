@@ -21,7 +21,7 @@ from arview.errors import InputError, MissingDependencyError
 if TYPE_CHECKING:
     from arview.live.options import LiveOptions
     from arview.live.server.hub import Hub
-    from arview.live.server.live_server import LiveServer, Place
+    from arview.live.server.live_server import LiveServer
     from arview.live.stream.subject import Subject
 
 EXTRA = ("aiortc", "starlette", "uvicorn", "cryptography", "segno")
@@ -134,7 +134,7 @@ def live(
     require_extra()
     from arview.cad.part_file import find_part_file
     from arview.live.options import LiveOptions
-    from arview.live.server.live_server import LiveServer, take_place
+    from arview.live.server.live_server import LiveServer, open_endpoint
     from arview.video.sources import check_source
 
     find_part_file(part_path)
@@ -163,8 +163,7 @@ def live(
         clients=clients,
     )
     _tell_logs()
-    place = take_place(host, port, is_plain, cert, key)
-    server = LiveServer(options, place)
+    server = LiveServer(options, open_endpoint(host, port, is_plain, cert, key))
     asyncio.run(_serve(server, options, part_path, views_path, renderer, unit))
     say("ended; files are finished")
     _leave_threads()
@@ -215,7 +214,7 @@ async def _serve(
     def ready(hub: Hub) -> None:
         gc.collect()
         gc.freeze()  # what is loaded stays: the collector need not look at it again while phones wait
-        _print_welcome(server, server.place)
+        _print_welcome(server)
         if hub.subject is not None:
             for notice in hub.subject.notices():
                 say(f"{notice.level}: {notice.text}")
@@ -224,17 +223,18 @@ async def _serve(
     await server.serve(load, ready)
 
 
-def _print_welcome(server: LiveServer, place: Place) -> None:
-    certificates = place.certificates
+def _print_welcome(server: LiveServer) -> None:
+    endpoint = server.endpoint
+    certificates = endpoint.certificates
     click.echo(f"page:  {server.link}")
-    if place.trust_link is not None and certificates is not None and certificates.authority_der is not None:
+    if endpoint.trust_link is not None and certificates is not None and certificates.authority_der is not None:
         from arview.live.security.trust_page import fingerprint
 
-        click.echo(f"first time on a phone:  {place.trust_link}")
+        click.echo(f"first time on a phone:  {endpoint.trust_link}")
         click.echo(f"fingerprint:  {fingerprint(certificates.authority_der)}")
         if certificates.is_authority_new:
             _print_code(
-                "made just now: every phone has to trust this station once, so scan this first:", place.trust_link
+                "made just now: every phone has to trust this station once, so scan this first:", endpoint.trust_link
             )
     _print_code("the page, for phones that trust this station:", server.link)
     click.echo("Ctrl-C ends")

@@ -2,13 +2,73 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from arview.errors import InputError
 
 PHONE = "phone"
-LEAST_SIDE_PX, MOST_SIDE_PX = 120, 1920
+MIN_SIDE_PX, MAX_SIDE_PX = 120, 1920
+"""Range of the sides of the pictures that a phone is asked for."""
+
+
+@dataclass(frozen=True)
+class FeedOptions:
+    """How the frames of one stream are tracked and drawn."""
+
+    kept_frames: int = 12  # tracked frames kept for snapshots while the network is slow; 33 MB at 720p
+    kept_styles: int = 4  # overlay styles that keep a renderer and their last picture: pages, recording and screens
+    rate_window_s: float = 2.0  # window over which frame rates are counted
+    silence_s: float = 1.5  # a feed without a frame for longer than this is waiting
+    max_unreadable: int = 15  # consecutive frames without a readable stamp, half a second, that raise a notice
+    min_scale: float = 0.95  # a frame received at less than this share of its size raises a notice
+
+
+@dataclass(frozen=True)
+class StationOptions:
+    """How a station camera is opened, and opened again after it broke."""
+
+    first_pause_s: float = 0.5  # pause before the first reconnection; it doubles with each further one
+    max_pause_s: float = 8.0
+    open_timeout_s: float = 10.0
+    read_timeout_s: float = 3.0
+    frozen_s: float = 2.0  # pictures that stay equal, pixel for pixel, for so long: sensors have noise
+    sample_step_px: int = 7  # distance of the pixels that are compared
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """When a recording ends by itself."""
+
+    min_free_bytes: int = 500_000_000  # free disk space that is left to other programs
+    max_duration_s: float = 3600.0
+    check_interval_s: float = 5.0  # time between two looks at the free disk space
+
+
+@dataclass(frozen=True)
+class RequestLimits:
+    """Bounds on the requests of a client."""
+
+    jpeg_bytes: int = 4_000_000  # size of an uploaded frame
+    offer_bytes: int = 64_000  # size of a join request with its WebRTC offer
+    control_bytes: int = 4_000
+    body_timeout_s: float = 10.0  # time in which a body must arrive
+    per_s: float = 80.0  # requests of one address; a page that sends JPEGs needs about 35
+    burst: float = 240.0
+    joins_per_s: float = 1.0  # of one address; each join costs a tracker and a handshake
+    joins_burst: float = 12.0
+    snapshots_per_s: float = 2.0  # of one page; drawing and packing a PNG takes 50 ms of a core
+    snapshots_burst: float = 6.0
+
+
+@dataclass(frozen=True)
+class WebrtcOptions:
+    """Bounds and bitrates of the WebRTC connections."""
+
+    offer_timeout_s: float = 10.0  # time to answer an offer
+    connect_timeout_s: float = 20.0  # time from the offer to a connection
+    max_candidates: int = 32  # ICE candidates in an offer
+    max_buffered_bytes: int = 32_768  # messages waiting on the data channel, about fifteen; later ones are dropped
 
 
 @dataclass(frozen=True)
@@ -19,38 +79,49 @@ class LiveOptions:
         InputError: a value is outside its range.
     """
 
-    source: str = PHONE  # "phone": each page sends its own camera; else a spec of arview.video.open_source
-    camera: str | None = None  # spec of arview.camera.read.load_camera; None: guessed, and said so on the page
+    source: str = PHONE  # "phone": each page sends its own camera; else a source of arview.video.open_source
+    camera: str | None = None  # camera of arview.camera.read.load_camera; None: guessed, and the page says so
     inspection: Path | None = None  # inspection.json, read again whenever it changes
-    serial: str | None = None  # of the specimen at the station; None: what the part file says, if anything
-    max_age_s: float | None = 86400.0  # an older inspection is called old on the page; None: never. A day: one shift
+    serial: str | None = None  # serial number of the part at the station; None: that of the part file, if any
+    max_age_s: float | None = 86400.0  # age above which the page calls an inspection old; None: never
     guide: str | None = None  # name of a guide view to align with; None: the part is searched for
-    record: Path | None = None  # video of what is shown, from the start; None: only when the page asks
-    record_folder: Path = Path()  # where recordings that a page asks for are put
-    width: int = 1280  # of the phone's pictures, px, held sideways; phones and trackers manage this at 30 fps
+    record: Path | None = None  # video recorded from the start; None: only when the page asks for one
+    record_folder: Path = Path()  # folder of the recordings that pages ask for
+    width: int = 1280  # size of the phone's pictures in landscape, px; phones and tracker manage it at 30 fps
     height: int = 720
     fps: float = 30.0
-    clients: int | None = None  # pages at once; None: 2 phones (one tracker each), or 8 that look at a station
+    clients: int | None = None  # pages at once; None: 2 phones (one tracker each), or 8 that watch a station
     watchers: int = 4  # screens that only watch, as motion JPEG
-    watch_fps: float = 15.0  # of them: enough to watch, half the encoding
-    requests_per_s: float = 80.0  # by one address; a page that sends JPEGs needs about 35
-    requests_burst: float = 240.0
-    joins_per_s: float = 1.0  # by one address; each join costs a tracker and a handshake
-    joins_burst: float = 12.0
-    jpeg_silence_s: float = 15.0  # a page without WebRTC that is silent for so long has gone
-    connect_timeout_s: float = 20.0  # from the offer to a connection
+    watch_fps: float = 15.0  # frame rate of these: enough to watch, at half the encoding work
+    watch_timeout_s: float = 10.0  # a screen that takes no picture for so long is disconnected
+    watch_repeat_s: float = 2.0  # without a new picture the last one is sent again, to notice closed connections
+    jpeg_silence_s: float = 15.0  # a page without WebRTC that sends no request for so long is removed
+    tracking_timeout_s: float = 10.0  # time in which an uploaded frame must be tracked
+    frame_wait_s: float = 5.0  # time that a request for a station's next frame waits
+    tick_s: float = 0.25  # interval of the regular work: clients that are gone, changed inspections, status messages
+    status_interval_s: float = 1.0  # a status is sent at least this often
+    reload_interval_s: float = 1.0  # time between two looks at the inspection file
+    renewal_interval_s: float = 12 * 3600.0  # time between two looks at the age of the certificate
+    workers: int = 16  # threads for drawing, JPEG and files; most of them wait for a renderer
+    feed: FeedOptions = field(default_factory=FeedOptions)
+    station: StationOptions = field(default_factory=StationOptions)
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
+    requests: RequestLimits = field(default_factory=RequestLimits)
+    webrtc: WebrtcOptions = field(default_factory=WebrtcOptions)
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if not LEAST_SIDE_PX <= value <= MOST_SIDE_PX or value % 2:
-                raise InputError(f"live: {name} is {value} px, expected an even number {LEAST_SIDE_PX}–{MOST_SIDE_PX}")
+            if not MIN_SIDE_PX <= value <= MAX_SIDE_PX or value % 2:
+                raise InputError(
+                    f"live: {name} is {value} px, expected an even number from {MIN_SIDE_PX} to {MAX_SIDE_PX}"
+                )
         if not 1.0 <= self.fps <= 120.0:
             raise InputError(f"live: {self.fps:g} frames per second, expected 1 to 120")
         if self.clients is not None and not 1 <= self.clients <= 64:
             raise InputError(f"live: {self.clients} clients, expected 1 to 64")
         if self.max_age_s is not None and not self.max_age_s > 0:
-            raise InputError(f"live: an age of {self.max_age_s:g} s, expected a positive one")
+            raise InputError(f"live: a maximum age of {self.max_age_s:g} s, expected a positive number")
 
     @property
     def is_phone(self) -> bool:
@@ -58,6 +129,6 @@ class LiveOptions:
         return self.source == PHONE
 
     @property
-    def most_clients(self) -> int:
-        """Pages that may take part at once."""
+    def max_clients(self) -> int:
+        """Number of pages that may take part at once."""
         return self.clients if self.clients is not None else 2 if self.is_phone else 8

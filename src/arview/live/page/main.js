@@ -8,13 +8,13 @@ import { Player } from "./player.js";
 import { Stage } from "./scene/stage.js";
 import { Message, Notices, StatusBar, Toast } from "./status.js";
 
-const FIGURES_EVERY_MS = 500, LOOK_DELAY_MS = 150;
+const FIGURES_EVERY_MS = 500, STYLE_DELAY_MS = 150;
 const find = (id) => document.getElementById(id);
 
 history.replaceState(null, "", location.pathname); // the token stays out of bookmarks and shared links
 for (const sign of document.querySelectorAll("[data-icon]")) sign.append(icon(sign.dataset.icon));
 
-const look = { ghost: true, edges: "visible", labels: true, opacity: 0.42, only: null, status: false };
+const style = { ghost: true, edges: "visible", labels: true, opacity: 0.42, only: null, status: false };
 const state = { phase: { name: "loading", text: "" }, part: null, status: null, trouble: "", latencies: [], isRecording: false };
 
 let player = null, isDrawAsked = false;
@@ -31,7 +31,7 @@ const parts = new Parts(
 const stage = new Stage({
   stage: find("stage"), canvas: find("picture"), leaders: find("leaders"), labels: find("labels"),
   obstacles: [find("bar"), find("notices"), find("actions"), find("card"), find("side")],
-}, look, isolate, () => requestDraw());
+}, style, isolate, () => requestDraw());
 const camera = new Camera(find("camera"), takeCameraFrame, (trouble) => {
   state.trouble = trouble;
   refresh();
@@ -57,7 +57,7 @@ const connection = new Connection(find("remote"), {
       find("open-parts").append(badge);
     }
     stage.setPart(part);
-    if (look.only && !part.components.some((one) => one.name === look.only)) isolate(null);
+    if (style.only && !part.components.some((one) => one.name === style.only)) isolate(null);
     if (part.source === "phone" && !camera.isOn && !state.trouble) camera.start(part.wanted);
     requestDraw();
   },
@@ -65,8 +65,8 @@ const connection = new Connection(find("remote"), {
     await stage.setModel(buffer, part);
   },
   onOpen() {
-    player.way = connection.way;
-    sendLook();
+    player.mode = connection.mode;
+    sendStyle();
     if (connection.hasFallenBack) toast.say("This network blocks WebRTC: pictures go one by one");
   },
   onPose(pose) {
@@ -76,7 +76,7 @@ const connection = new Connection(find("remote"), {
   onStatus(status) {
     const before = state.status?.recording.finished ?? status.recording.finished;
     state.status = status;
-    if (status.way) player.way = status.way;
+    if (status.mode) player.mode = status.mode;
     const finished = status.recording.finished.filter((number) => !before.includes(number));
     if (finished.length && state.isRecording) offerRecording(finished.at(-1));
     if (!status.recording.is_on && finished.length) state.isRecording = false;
@@ -180,7 +180,7 @@ function refresh() {
   setPressed("record", Boolean(recording?.is_on), recording?.is_on ? "stop" : "record", recording?.is_on ? clock(recording.seconds) : "Record");
   const link = connection.link;
   find("link-state").textContent = link
-    ? [`Connected by ${link.kind === "jpeg" ? "JPEG over HTTP" : "WebRTC"}, ${player.way === "video" ? "annotated video" : "poses"}`,
+    ? [`Connected by ${link.kind === "jpeg" ? "JPEG over HTTP" : "WebRTC"}, ${player.mode === "video" ? "annotated video" : "poses"}`,
       status?.feed ? `${status.feed.tracked_fps.toFixed(0)} of ${status.feed.received_fps.toFixed(0)} pictures a second tracked` : "",
       link.rttMs === null ? "" : `network ${link.rttMs.toFixed(0)} ms`].filter(Boolean).join("; ")
     : "Not connected";
@@ -221,23 +221,23 @@ setInterval(() => {
 // --- controls ---------------------------------------------------------------------------------------
 
 function isolate(name) {
-  look.only = name;
+  style.only = name;
   parts.show(name);
-  changeLook();
+  changeStyle();
 }
 
-let lookTimer = 0;
+let styleTimer = 0;
 
-function changeLook() {
-  stage.setLook(look);
+function changeStyle() {
+  stage.setStyle(style);
   requestDraw();
-  clearTimeout(lookTimer);
-  lookTimer = setTimeout(sendLook, LOOK_DELAY_MS);
+  clearTimeout(styleTimer);
+  styleTimer = setTimeout(sendStyle, STYLE_DELAY_MS);
 }
 
 /** Have the server draw the same way: for annotated video, snapshots and recordings. */
-async function sendLook() {
-  if (connection.link) await connection.ask({ look });
+async function sendStyle() {
+  if (connection.link) await connection.ask({ style });
 }
 
 function setPressed(id, isPressed, sign, text) {
@@ -265,8 +265,8 @@ async function snapshot() {
   const { link } = connection, frame = player?.shown?.frame;
   if (!link || !frame) return toast.say("There is no picture to keep yet");
   try {
-    clearTimeout(lookTimer);
-    await connection.ask({ hold: frame.id, look });
+    clearTimeout(styleTimer);
+    await connection.ask({ hold: frame.id, style });
     const answer = await fetch(`/api/clients/${link.client}/snapshot.png?id=${frame.id}`, { cache: "no-store" });
     if (!answer.ok) throw new Error((await answer.json()).message);
     const { name, serial } = state.part.part;
@@ -311,24 +311,24 @@ function openSide(section) {
 }
 
 function toggle(key) {
-  if (key === "edges") look.edges = look.edges === "none" ? "visible" : "none";
-  else look[key] = !look[key];
-  find(`show-${key}`).setAttribute("aria-checked", String(key === "edges" ? look.edges !== "none" : look[key]));
-  changeLook();
+  if (key === "edges") style.edges = style.edges === "none" ? "visible" : "none";
+  else style[key] = !style[key];
+  find(`show-${key}`).setAttribute("aria-checked", String(key === "edges" ? style.edges !== "none" : style[key]));
+  changeStyle();
 }
 
 for (const key of ["ghost", "edges", "labels"]) find(`show-${key}`).addEventListener("click", () => toggle(key));
 find("opacity").addEventListener("input", (event) => {
-  look.opacity = Number(event.target.value);
-  find("opacity-text").textContent = `${Math.round(100 * look.opacity)} %`;
-  changeLook();
+  style.opacity = Number(event.target.value);
+  find("opacity-text").textContent = `${Math.round(100 * style.opacity)} %`;
+  changeStyle();
 });
 find("search-again").addEventListener("click", async () => {
   toast.say((await connection.ask({ reset: true })) || "Searching for the part anew");
 });
 find("transports").addEventListener("change", (event) => {
   connection.choose(event.target.value);
-  if (player) player.way = connection.way;
+  if (player) player.mode = connection.mode;
 });
 find("freeze").addEventListener("click", freeze);
 find("snapshot").addEventListener("click", snapshot);

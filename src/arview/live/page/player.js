@@ -13,7 +13,7 @@ export class Player {
     this.isPhone = isPhone;
     this.own = new FrameRing(KEPT_FRAMES); // of this page's camera
     this.sent = new FrameRing(isPhone ? 4 : KEPT_FRAMES); // by the server
-    this.way = "poses";
+    this.mode = "poses";
     this.shown = null;
     this.isFrozen = false;
     this.reset();
@@ -81,7 +81,7 @@ export class Player {
       isAnnotated: false,
     };
     if (!answer?.cam_from_model) return plain;
-    if (this.way === "video") {
+    if (this.mode === "video") {
       const frame = this.sent.newest;
       if (!frame || nowMs - frame.takenMs > 4 * STALE_MS) return plain;
       return { frame, pose: this.poses.get(frame.id) ?? null, guide: null, isAnnotated: true };

@@ -19,7 +19,7 @@ function begin() {
 film.addEventListener("error", () => { isOn = false; });
 film.addEventListener("load", () => message.show(null));
 
-async function look() {
+async function refresh() {
   try {
     const part = await getPart();
     if (part.state !== "ready") {
@@ -45,5 +45,5 @@ async function look() {
   }
 }
 
-look();
-setInterval(look, EVERY_MS);
+refresh();
+setInterval(refresh, EVERY_MS);

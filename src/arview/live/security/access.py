@@ -1,4 +1,4 @@
-"""Access: who may ask. The token of the run, the host asked for, the page that asks, and how often."""
+"""Access control: the token of the run, the host name, the origin of the request and its rate."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from arview.live.security.limits import RateLimit
 from arview.live.security.refusals import Refusal
 
 PAGES = ("/", "/watch")
-"""Where a link may bring the token."""
+"""Paths whose query may carry the token."""
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "media-src 'self' blob: mediastream:; worker-src 'self' blob:; font-src 'self'; manifest-src 'self'; "
@@ -35,18 +35,18 @@ HEADERS = {
 NO_TOKEN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>arview</title>
 <h1>This link is not valid</h1>
-<p>Scan the code at the station again: a new one is made each time that arview starts.</p></html>"""
+<p>Scan the code at the station again: arview makes a new one each time it starts.</p></html>"""
 
 
 @dataclass(frozen=True)
 class Access:
-    """What a request must bring.
+    """What a request must present to be served.
 
     Attributes:
-        hosts: ``Host`` headers under which the server is known, in lower case, with the port.
-        port: of the server; cookies are shared by all ports of a host, so it goes into the name of ours.
-        is_secure: whether it is reached by HTTPS.
-        token: of this run.
+        hosts: accepted ``Host`` headers, in lower case, with the port.
+        port: port of the server. It is part of the cookie's name because all ports of a host share their cookies.
+        is_secure: whether the server is reached by HTTPS.
+        token: secret of this run.
     """
 
     hosts: frozenset[str]
@@ -56,7 +56,7 @@ class Access:
 
     @staticmethod
     def to(names: Collection[str], port: int, is_secure: bool) -> Access:
-        """Access to a server known by these names and addresses."""
+        """Access to a server that is reached by these names and addresses."""
         written = [f"[{name}]" if ":" in name else name for name in names]
         usual = 443 if is_secure else 80
         hosts = {f"{name}:{port}".lower() for name in written} | {n.lower() for n in written if port == usual}
@@ -64,11 +64,11 @@ class Access:
 
     @property
     def scheme(self) -> str:
-        """Of the addresses of the pages."""
+        """URL scheme of the pages."""
         return "https" if self.is_secure else "http"
 
     def is_token(self, text: str) -> bool:
-        """Whether a text is the token, found out in constant time."""
+        """Whether a text is the token, compared in constant time."""
         return hmac.compare_digest(text.encode("utf-8", "replace"), self.token.encode())
 
     @property
@@ -78,26 +78,26 @@ class Access:
 
     @property
     def cookie(self) -> str:
-        """``Set-Cookie`` with the token."""
+        """Value of the ``Set-Cookie`` header that holds the token."""
         secure = "; Secure" if self.is_secure else ""
         return f"{self.cookie_name}={self.token}; Path=/; HttpOnly; SameSite=Strict{secure}"
 
 
 class Gate:
-    """ASGI middleware that lets through what `Access` and the rate limit allow, and adds the security headers."""
+    """ASGI middleware that serves what `Access` and the rate limit allow, and adds the security headers."""
 
     def __init__(self, app: ASGIApp, access: Access, rate: RateLimit) -> None:
         self._app, self._access, self._rate = app, access, rate
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve or refuse one request."""
+        """Serve or refuse a request."""
         if scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1008})
             return
         if scope["type"] != "http":
             return
         headers = Headers(scope=scope)
-        brings_token = False
+        carries_token = False
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -105,14 +105,14 @@ class Gate:
                 for name, value in HEADERS.items():
                     answer.setdefault(name, value)
                 answer.setdefault("Cache-Control", "no-store")
-                if brings_token:
+                if carries_token:
                     answer.append("Set-Cookie", self._access.cookie)
             await send(message)
 
         try:
             self._check_host(headers)
             self._rate.check(str((scope.get("client") or ("?",))[0]))
-            brings_token = self._check_token(scope, headers)
+            carries_token = self._check_token(scope, headers)
             self._check_origin(scope, headers)
         except Refusal as refusal:
             await self._refused(scope, refusal)(scope, receive, send_with_headers)
@@ -120,12 +120,12 @@ class Gate:
         await self._app(scope, receive, send_with_headers)
 
     def _check_host(self, headers: Headers) -> None:
-        """A name of somebody else's that resolves to this address must not reach it (DNS rebinding)."""
+        """Refuse foreign host names that resolve to this address (DNS rebinding)."""
         if headers.get("host", "").lower() not in self._access.hosts:
-            raise Refusal(421, "other_host", "this server is not known by that name")
+            raise Refusal(421, "other_host", "this server does not have that name")
 
     def _check_token(self, scope: Scope, headers: Headers) -> bool:
-        """Whether the address itself brings a valid token, which then goes into the cookie."""
+        """Whether the URL itself carries a valid token, which then goes into the cookie."""
         is_page = scope["path"] in PAGES and scope["method"] in ("GET", "HEAD")
         if is_page and self._access.is_token(_query_token(scope["query_string"])):
             return True
@@ -135,13 +135,13 @@ class Gate:
         return False
 
     def _check_origin(self, scope: Scope, headers: Headers) -> None:
-        """What changes something must come from a page of this server."""
+        """Refuse requests from pages of other sites."""
         if scope["method"] in ("GET", "HEAD"):
             if headers.get("sec-fetch-site") in ("cross-site", "same-site") and scope["path"] not in PAGES:
-                raise Refusal(403, "other_origin", "asked by a page of another site")
+                raise Refusal(403, "other_origin", "the request comes from a page of another site")
             return
         if headers.get("origin", "").lower() != f"{self._access.scheme}://{headers.get('host', '').lower()}":
-            raise Refusal(403, "other_origin", "asked by a page of another site")
+            raise Refusal(403, "other_origin", "the request comes from a page of another site")
 
     def _refused(self, scope: Scope, refusal: Refusal) -> Response:
         if refusal.code == "no_token" and scope["path"] in PAGES:
@@ -150,8 +150,8 @@ class Gate:
 
 
 def _query_token(query: bytes) -> str:
-    """The token in the query of an address, or an empty text."""
+    """The token in the query of a URL, or an empty text."""
     try:
         return parse_qs(query.decode("latin-1"), max_num_fields=20).get("token", [""])[0]
-    except ValueError:  # more fields than any page sends
+    except ValueError:  # more fields than a page sends
         return ""

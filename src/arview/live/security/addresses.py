@@ -1,4 +1,4 @@
-"""Addresses of this machine at which a phone can reach it."""
+"""Network addresses of this machine at which phones can reach it."""
 
 from __future__ import annotations
 
@@ -10,45 +10,46 @@ from arview.errors import InputError
 
 LOOPBACK = "127.0.0.1"
 _VIRTUAL = ("docker", "br-", "veth", "virbr", "vmnet", "vboxnet", "tun", "tap", "zt", "tailscale", "wg")
-"""Interfaces of containers, machines inside this one and tunnels: no phone is there."""
+"""Prefixes of the interfaces of containers, virtual machines and tunnels, which phones cannot reach."""
 
 
 @dataclass(frozen=True)
 class Interface:
-    """One address of this machine."""
+    """A network interface of this machine and its IPv4 address."""
 
     name: str
     address: str
 
 
 def lan_interfaces() -> list[Interface]:
-    """IPv4 addresses of this machine on networks that a phone may be in, private ones first."""
+    """Interfaces of this machine on networks that a phone can be in, private addresses first."""
     import ifaddr
 
-    found = []
+    found: list[Interface] = []
     for adapter in ifaddr.get_adapters():
         if adapter.nice_name.lower().startswith(_VIRTUAL):
             continue
         for entry in adapter.ips:
-            if isinstance(entry.ip, str) and not _is_unfit(entry.ip):
+            if isinstance(entry.ip, str) and not _is_unreachable(entry.ip):
                 found.append(Interface(adapter.nice_name, entry.ip))
     return sorted(found, key=lambda one: not ipaddress.ip_address(one.address).is_private)
 
 
 def choose_host(host: str | None) -> tuple[str, list[str]]:
-    """Address to bind to, and the addresses under which the server is reached then.
+    """The address to bind to, and the addresses at which the server is then reached.
 
     Args:
-        host: an address of this machine, ``0.0.0.0`` for all, a name of it, or None for the first of the local network.
+        host: an address or name of this machine, ``0.0.0.0`` for all addresses, or None for the first one of the local
+            network.
 
     Raises:
-        InputError: no such address here, or this machine is in no network.
+        InputError: the address does not exist, or this machine is not connected to a network.
     """
     interfaces = lan_interfaces()
     if host is None:
         if not interfaces:
             raise InputError(
-                "this machine is in no network that a phone could be in; connect it, or use --http for its own browser"
+                "this machine is not connected to a network; connect it, or use --http for a browser on this machine"
             )
         return interfaces[0].address, [interfaces[0].address]
     if host == "0.0.0.0":
@@ -61,12 +62,12 @@ def choose_host(host: str | None) -> tuple[str, list[str]]:
 
 
 def bind(address: str, port: int) -> socket.socket:
-    """A listening TCP socket; port 0 takes any free one.
+    """A listening TCP socket; port 0 stands for any free port.
 
     Raises:
-        InputError: the port is taken, forbidden, or the address is not of this machine.
+        InputError: the port is in use or forbidden, or the address is not one of this machine.
     """
-    # Named as TCP, because asyncio switches Nagle's 40 ms off only for sockets that are.
+    # The protocol is given because asyncio disables Nagle's algorithm, which delays by 40 ms, only for TCP sockets.
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -83,6 +84,6 @@ def bind(address: str, port: int) -> socket.socket:
     return listener
 
 
-def _is_unfit(address: str) -> bool:
+def _is_unreachable(address: str) -> bool:
     parsed = ipaddress.ip_address(address)
     return parsed.is_loopback or parsed.is_link_local or parsed.is_multicast or parsed.is_unspecified

@@ -1,9 +1,8 @@
-"""HTTPS on a local network: a certificate authority of this user's own, and the server's certificate signed by it.
+"""HTTPS on a local network: a certificate authority of this user, and the server certificate that it signs.
 
-Browsers give the camera to HTTPS pages only, and no public authority signs for addresses of a local network. The
-authority is made on the first run and is to be trusted once on each phone. It may sign for private addresses and
-local names only (name constraints, RFC 5280 4.2.1.10), so that its key, if it were stolen, opens nothing on the
-internet.
+Browsers allow the camera on HTTPS pages only, and public authorities do not sign certificates for addresses of a local
+network. The authority is created in the first run, and each phone has to trust it once. It can only sign for private
+addresses and local names (name constraints, RFC 5280 4.2.1.10), so that a stolen key cannot be used on the internet.
 """
 
 from __future__ import annotations
@@ -24,9 +23,6 @@ if TYPE_CHECKING:
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
-AUTHORITY_DAYS, AUTHORITY_LEFT_DAYS = 3650, 120
-LEAF_DAYS, LEAF_LEFT_DAYS = 90, 30
-"""A leaf is renewed with a month left. Apple refuses leaves of more than 825 days."""
 PRIVATE_NETWORKS = ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16", "127.0.0.0/8", "100.64.0.0/10")
 LOCAL_NAMES = ("local", "lan", "localhost", "internal", "home.arpa")
 _AUTHORITY, _AUTHORITY_KEY = "authority.pem", "authority.key"
@@ -34,14 +30,24 @@ _LEAF, _LEAF_KEY = "server.pem", "server.key"
 
 
 @dataclass(frozen=True)
+class CertificateOptions:
+    """Lifetimes of the certificates."""
+
+    authority_days: int = 3650
+    authority_renewal_days: int = 120  # the authority is replaced when fewer days are left
+    server_days: int = 90  # Apple refuses server certificates that are valid for more than 825 days
+    server_renewal_days: int = 30  # the server certificate is renewed when fewer days are left
+
+
+@dataclass(frozen=True)
 class Certificates:
-    """What HTTPS needs.
+    """The files that HTTPS needs.
 
     Attributes:
-        chain, key: files of the server's certificate and its key.
-        authority_der: the authority's certificate to be trusted by phones; None when the certificate is the user's own.
-        authority_name: as phones show it.
-        is_authority_new: made just now: phones have to trust it.
+        chain, key: files of the server certificate with its chain, and of its private key.
+        authority_der: certificate of the authority, DER, for phones to trust; None when the user gave a certificate.
+        authority_name: name of the authority as phones show it.
+        is_authority_new: whether the authority was created in this run, so that phones have to trust it.
     """
 
     chain: Path
@@ -52,7 +58,7 @@ class Certificates:
 
 
 def data_folder() -> Path:
-    """``$ARVIEW_DATA``, or ``arview`` in ``$XDG_DATA_HOME`` or ``~/.local/share``."""
+    """The folder ``$ARVIEW_DATA``, else ``arview`` in ``$XDG_DATA_HOME`` or ``~/.local/share``."""
     own = os.environ.get("ARVIEW_DATA")
     if own:
         return Path(own)
@@ -61,7 +67,7 @@ def data_folder() -> Path:
 
 
 def own_certificates(chain: Path, key: Path) -> Certificates:
-    """A certificate that the user has.
+    """A certificate that the user provides.
 
     Raises:
         InputError: the files cannot be read or do not belong together.
@@ -71,46 +77,52 @@ def own_certificates(chain: Path, key: Path) -> Certificates:
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(chain, key, password=_no_password)
     except (OSError, ValueError) as error:
-        raise InputError(f"--cert {chain} --key {key}: cannot be used ({error})") from error
+        raise InputError(f"--cert {chain} --key {key}: these files cannot be used ({error})") from error
     return Certificates(chain, key)
 
 
 def local_certificates(
-    addresses: Collection[str], folder: Path | None = None, now: datetime | None = None
+    addresses: Collection[str],
+    folder: Path | None = None,
+    now: datetime | None = None,
+    options: CertificateOptions | None = None,
 ) -> Certificates:
-    """Certificates for a server at these addresses, made or renewed where needed.
+    """Certificates for a server at these addresses, created or renewed where needed.
 
     Args:
         addresses: IP addresses and names at which the server is reached.
-        folder: where they are kept, for this user's eyes only; default `data_folder` / ``tls``.
-        now: moment to judge ages by; default: this moment.
+        folder: where they are stored, readable by this user only; default `data_folder` / ``tls``.
+        now: time at which their age is computed; default: the present.
+        options: lifetimes.
 
     Raises:
-        OutputError: the folder cannot be written to.
-        InputError: an address that is not of a private network.
+        OutputError: the folder is not writable.
+        InputError: an address does not belong to a private network.
     """
     folder = folder or data_folder() / "tls"
     now = now or datetime.now(UTC)
+    options = options or CertificateOptions()
     public = sorted(address for address in addresses if not _is_permitted(address))
     if public:
         raise InputError(
-            f"{', '.join(public)}: not of a private network, for which arview's own authority may not sign; "
+            f"{', '.join(public)}: arview's own authority can only sign for private networks; "
             "give a certificate with --cert and --key"
         )
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         folder.chmod(0o700)
         authority = _load(folder / _AUTHORITY, folder / _AUTHORITY_KEY)
-        is_new = authority is None or _days_left(authority[0], now) < AUTHORITY_LEFT_DAYS
+        is_new = authority is None or _days_left(authority[0], now) < options.authority_renewal_days
         if authority is None or is_new:
-            authority = _make_authority(now)
+            authority = _make_authority(now, options.authority_days)
             _save(folder / _AUTHORITY, folder / _AUTHORITY_KEY, [authority[0]], authority[1])
         leaf = _load(folder / _LEAF, folder / _LEAF_KEY)
-        if leaf is None or not _is_good(leaf[0], authority[0], addresses, now):
-            leaf = _make_leaf(authority, addresses, now)
+        is_good = leaf is not None and _is_good(leaf[0], authority[0], addresses, now, options.server_renewal_days)
+        if leaf is None or not is_good:
+            leaf = _make_leaf(authority, addresses, now, options.server_days)
             _save(folder / _LEAF, folder / _LEAF_KEY, [leaf[0], authority[0]], leaf[1])
     except OSError as error:
-        raise OutputError(f"{folder}: certificates cannot be kept there ({error.strerror or error})") from error
+        raise OutputError(f"{folder}: cannot store the certificates there ({error.strerror or error})") from error
     from cryptography.hazmat.primitives.serialization import Encoding
 
     return Certificates(
@@ -122,6 +134,7 @@ _Pair = tuple["x509.Certificate", "EllipticCurvePrivateKey"]
 
 
 def _is_permitted(address: str) -> bool:
+    """Whether the authority can sign for an address or name."""
     try:
         parsed = ipaddress.ip_address(address)
     except ValueError:
@@ -139,7 +152,8 @@ def _common_name(certificate: x509.Certificate) -> str:
     return str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
 
 
-def _make_authority(now: datetime) -> _Pair:
+def _make_authority(now: datetime, days: int) -> _Pair:
+    """A new authority: its self-signed certificate and its key."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -165,7 +179,7 @@ def _make_authority(now: datetime) -> _Pair:
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - timedelta(days=1))
-        .not_valid_after(now + timedelta(days=AUTHORITY_DAYS))
+        .not_valid_after(now + timedelta(days=days))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
@@ -175,7 +189,8 @@ def _make_authority(now: datetime) -> _Pair:
     return certificate, key
 
 
-def _make_leaf(authority: _Pair, addresses: Collection[str], now: datetime) -> _Pair:
+def _make_leaf(authority: _Pair, addresses: Collection[str], now: datetime, days: int) -> _Pair:
+    """A new server certificate, signed by the authority, and its key."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -194,7 +209,7 @@ def _make_leaf(authority: _Pair, addresses: Collection[str], now: datetime) -> _
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - timedelta(days=1))
-        .not_valid_after(min(now + timedelta(days=LEAF_DAYS), issuer.not_valid_after_utc))
+        .not_valid_after(min(now + timedelta(days=days), issuer.not_valid_after_utc))
         .add_extension(x509.SubjectAlternativeName([_general_name(a) for a in sorted(addresses)]), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(usage, critical=True)
@@ -215,8 +230,10 @@ def _general_name(address: str) -> x509.GeneralName:
         return x509.DNSName(address)
 
 
-def _is_good(leaf: x509.Certificate, authority: x509.Certificate, addresses: Collection[str], now: datetime) -> bool:
-    """Whether a leaf is of this authority, for these addresses, and lasts."""
+def _is_good(
+    leaf: x509.Certificate, authority: x509.Certificate, addresses: Collection[str], now: datetime, min_days: int
+) -> bool:
+    """Whether a server certificate is signed by this authority, covers the addresses, and is valid for long enough."""
     from cryptography import x509
     from cryptography.exceptions import InvalidSignature
 
@@ -226,11 +243,11 @@ def _is_good(leaf: x509.Certificate, authority: x509.Certificate, addresses: Col
     except (InvalidSignature, ValueError, TypeError, x509.ExtensionNotFound):
         return False
     covered = all(_general_name(address) in list(names) for address in addresses)
-    return covered and leaf.not_valid_before_utc <= now and _days_left(leaf, now) >= LEAF_LEFT_DAYS
+    return covered and leaf.not_valid_before_utc <= now and _days_left(leaf, now) >= min_days
 
 
 def _load(certificate_path: Path, key_path: Path) -> _Pair | None:
-    """A certificate and its key; None when they are missing, damaged or not for each other."""
+    """A certificate and its key; None when they are missing, damaged or do not belong together."""
     from cryptography import x509
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -247,7 +264,7 @@ def _load(certificate_path: Path, key_path: Path) -> _Pair | None:
 
 
 def _save(certificate_path: Path, key_path: Path, chain: list[x509.Certificate], key: EllipticCurvePrivateKey) -> None:
-    """Write both files, readable by this user only; each appears complete or not at all."""
+    """Write both files, readable by this user only, each of them atomically."""
     from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
     _write_private(key_path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
@@ -269,4 +286,4 @@ def _write_private(path: Path, content: bytes) -> None:
 
 
 def _no_password() -> str:
-    raise InputError("the key is locked by a password; give one without")
+    raise InputError("the key is protected by a password; give a key without one")

@@ -1,4 +1,4 @@
-"""The plain-HTTP page on which a phone fetches the certificate of the local authority and learns how to trust it."""
+"""The plain-HTTP page from which phones load the certificate of the local authority, with instructions to trust it."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>arview: trust this station</title>
 <style>{style}</style></head><body>
 <h1>Trust this station, once</h1>
-<p>The browser gives the camera to secure pages only. This station signs its pages with its own certificate,
-<b>{name}</b>. It may sign for addresses of local networks only, never for a site on the internet.</p>
-<p>The phone shows the certificate's SHA-256 fingerprint under its details; it must be the one on the station's
+<p>Browsers allow the camera on secure pages only. This station signs its pages with its own certificate,
+<b>{name}</b>. That certificate is valid for addresses of local networks only, never for a site on the internet.</p>
+<p>The phone shows the SHA-256 fingerprint in the details of the certificate. It must match the one on the station's
 terminal:<br><code>{fingerprint}</code></p>
 <h2>iPhone, iPad</h2>
 <ol><li>In Safari: <a class="button" href="{profile}">Load the profile</a>, then <i>Allow</i>.</li>
@@ -55,9 +55,13 @@ Linux and Firefox: <i>Settings › Privacy and security › Certificates › Aut
 
 
 def trust_app(certificates: Certificates) -> ASGIApp:
-    """The application: the page, and the certificate in two wrappings."""
+    """The ASGI application: the page, the certificate, and the certificate as an Apple configuration profile.
+
+    Raises:
+        ValueError: the certificate is the user's own.
+    """
     if certificates.authority_der is None:
-        raise ValueError("trust_app: the certificate is the user's own; there is nothing to trust")
+        raise ValueError("trust_app: the certificate is the user's own, so there is no authority to trust")
     der, name = certificates.authority_der, certificates.authority_name
     page = _PAGE.format(
         style=_STYLE,
@@ -79,15 +83,15 @@ def trust_app(certificates: Certificates) -> ASGIApp:
     async def mobileconfig(request: Request) -> Response:
         return Response(profile, media_type="application/x-apple-aspen-config", headers=headers)
 
-    async def lost(request: Request, error: Exception) -> Response:
-        return PlainTextResponse("nothing here but /", 404, headers)
+    async def not_found(request: Request, error: Exception) -> Response:
+        return PlainTextResponse("there is no such page; see /", 404, headers)
 
     routes = [Route("/", index), Route(CERTIFICATE_PATH, certificate), Route(PROFILE_PATH, mobileconfig)]
-    return Starlette(routes=routes, exception_handlers={404: lost, 405: lost})
+    return Starlette(routes=routes, exception_handlers={404: not_found, 405: not_found})
 
 
 def fingerprint(der: bytes) -> str:
-    """SHA-256 of a certificate, in pairs, as phones show it."""
+    """SHA-256 of a DER certificate in pairs of hexadecimal digits, as phones show it."""
     import hashlib
 
     digest = hashlib.sha256(der).hexdigest().upper()
@@ -95,7 +99,7 @@ def fingerprint(der: bytes) -> str:
 
 
 def apple_profile(der: bytes, name: str) -> bytes:
-    """A configuration profile (.mobileconfig) with one root certificate.
+    """An Apple configuration profile (.mobileconfig) with one root certificate.
 
     Payload ``com.apple.security.root``; Apple, Device Management, "CertificateRoot".
     """

@@ -1,4 +1,4 @@
-"""Snapshot: one frame with its overlay as PNG, with all about it inside."""
+"""Snapshots: a frame with its overlay as PNG, which also holds the data of the frame."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ import json
 from datetime import UTC, datetime
 
 from arview import __version__
+from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.documents import Document, camera_document
-from arview.live.stream.drawing import Drawing
-from arview.live.stream.feed import Tracked
+from arview.live.stream.feed import TrackedFrame
 from arview.live.stream.subject import Subject
 
 CHUNK = "arview"
-"""Name of the PNG's text chunk that holds the JSON."""
+"""Name of the text chunk of the PNG that holds the data as JSON."""
 
 
-def snapshot_png(subject: Subject, drawing: Drawing, tracked: Tracked) -> bytes:
-    """PNG of an annotated frame with a text chunk of JSON about it; takes some ten milliseconds."""
+def annotated_png(subject: Subject, annotator: FrameAnnotator, tracked: TrackedFrame) -> bytes:
+    """PNG of an annotated frame with its data as JSON in a text chunk; it takes tens of milliseconds."""
     from PIL import Image, PngImagePlugin
 
-    image = drawing.draw_record(tracked).image
-    about = PngImagePlugin.PngInfo()
-    about.add_itxt(CHUNK, json.dumps(_about(subject, tracked), ensure_ascii=False, allow_nan=False))
-    about.add_itxt("Software", f"arview {__version__}")
+    image = annotator.draw_with_status(tracked).image
+    chunks = PngImagePlugin.PngInfo()
+    chunks.add_itxt(CHUNK, json.dumps(_frame_data(subject, tracked), ensure_ascii=False, allow_nan=False))
+    chunks.add_itxt("Software", f"arview {__version__}")
     file = io.BytesIO()
-    Image.fromarray(image).save(file, "PNG", pnginfo=about, compress_level=3)
+    Image.fromarray(image).save(file, "PNG", pnginfo=chunks, compress_level=3)
     return file.getvalue()
 
 
-def _about(subject: Subject, tracked: Tracked) -> Document:
+def _frame_data(subject: Subject, tracked: TrackedFrame) -> Document:
     pose, inspection = tracked.pose, subject.inspection
     return {
         "arview": __version__,
@@ -37,7 +37,7 @@ def _about(subject: Subject, tracked: Tracked) -> Document:
         "part": subject.part.name,
         "serial": subject.serial or "",
         "model_hash": subject.part.model.source_hash,
-        "frame_id": tracked.picture.frame_id,
+        "frame_id": tracked.frame.frame_id,
         "state": str(pose.state),
         "quality": pose.quality,
         "reason": pose.reason,

@@ -1,4 +1,4 @@
-"""Client: one page that takes part."""
+"""Clients: the pages that take part."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from dataclasses import replace
 from typing import Any, get_args
 
 from arview.errors import InputError
-from arview.live.protocol import FRAME_IDS, Transport, Way
+from arview.live.protocol import FRAME_IDS, Transport, ViewMode
 from arview.live.security.refusals import Refusal
-from arview.live.stream.drawing import Drawing
-from arview.live.stream.feed import Feed, Tracked
-from arview.live.stream.newest import Inbox
-from arview.live.stream.subject import Look
+from arview.live.stream.annotator import FrameAnnotator
+from arview.live.stream.feed import Feed, TrackedFrame
+from arview.live.stream.newest import AsyncNewestSlot
+from arview.live.stream.subject import OverlayStyle
 from arview.live.transport.webrtc import Connection
 
-_LOOKS: dict[str, tuple[type, ...]] = {
+_STYLE_TYPES: dict[str, tuple[type, ...]] = {
     "ghost": (bool,),
     "edges": (str,),
     "labels": (bool,),
@@ -31,50 +31,52 @@ class Client:
     """A page that takes part.
 
     Attributes:
-        name: by which the page is called in addresses; not to be guessed.
-        feed, drawing: its own for a phone, common to all of a station.
-        way: what it wants back.
-        connection: its WebRTC connection, if that is its transport.
+        name: random name of the client in URLs.
+        feed, annotator: those of the phone, or those that all pages of a station camera share.
+        transport: how frames and poses are transmitted.
+        mode: what the page wants to receive.
+        connection: the WebRTC connection, if that is the transport.
         inbox: newest frame of the feed, for the transport without WebRTC.
-        held: frame that it keeps for a snapshot.
-        is_busy: a JPEG of it is being tracked.
-        seen_s: monotonic time of its last request.
+        held: frame that is kept for a snapshot.
+        is_busy: whether a request for a frame is being served.
+        joined_s, seen_s: monotonic times of joining and of the last request.
+        last_status: content of the last status message that was sent, and its monotonic time.
     """
 
-    def __init__(self, feed: Feed, drawing: Drawing, transport: Transport, way: Way) -> None:
+    def __init__(self, feed: Feed, annotator: FrameAnnotator, transport: Transport, mode: ViewMode) -> None:
         self.name = secrets.token_urlsafe(12)
-        self.feed, self.drawing, self.transport, self.way = feed, drawing, transport, way
+        self.feed, self.annotator, self.transport, self.mode = feed, annotator, transport, mode
         self.connection: Connection | None = None
-        self.inbox: Inbox[Tracked] = Inbox(asyncio.get_running_loop())
-        self.held: Tracked | None = None
+        self.inbox: AsyncNewestSlot[TrackedFrame] = AsyncNewestSlot(asyncio.get_running_loop())
+        self.held: TrackedFrame | None = None
         self.is_busy = False
         self.joined_s = self.seen_s = time.monotonic()
-        self.told: tuple[object, float] = (None, 0.0)  # what the last status said, and when
+        self.last_status: tuple[object, float] = (None, 0.0)
         if transport == "jpeg":
             feed.listen(self.inbox.put)
 
     async def close(self) -> None:
-        """Let go of the connection and of the feed's frames."""
+        """Close the connection and stop listening to the feed."""
         self.feed.unlisten(self.inbox.put)
         if self.connection is not None:
             await self.connection.close()
 
-    def find(self, frame_id: int) -> Tracked | None:
-        """A tracked frame that is still kept."""
-        if self.held is not None and self.held.picture.frame_id == frame_id:
+    def find(self, frame_id: int) -> TrackedFrame | None:
+        """The tracked frame with this id, if it is still kept."""
+        if self.held is not None and self.held.frame.frame_id == frame_id:
             return self.held
         return self.feed.find(frame_id)
 
     def seen(self) -> None:
-        """Note a sign of life."""
+        """Note the time of a request."""
         self.seen_s = time.monotonic()
 
 
-def one_of(value: Any, kind: Any, name: str) -> Any:
-    """A value that must be one of a Literal's.
+def choice_of(value: Any, kind: Any, name: str) -> Any:
+    """The value, which must be one of those of a Literal.
 
     Raises:
-        Refusal: another value.
+        Refusal: it is another value.
     """
     choices = get_args(kind)
     if not isinstance(value, str) or value not in choices:
@@ -82,30 +84,30 @@ def one_of(value: Any, kind: Any, name: str) -> Any:
     return value
 
 
-def check_control(control: dict[str, Any], look: Look, components: tuple[str, ...]) -> Look:
-    """The look after a control, all of which is checked.
+def check_control(control: dict[str, Any], style: OverlayStyle, components: tuple[str, ...]) -> OverlayStyle:
+    """The overlay style after a *Control* request, all of which is checked.
 
     Raises:
-        Refusal: an unknown key, a wrong type or value.
+        Refusal: an unknown key, or a wrong type or value.
     """
     for key, value in control.items():
         is_good = {
-            "way": isinstance(value, str) and value in get_args(Way),
-            "look": isinstance(value, dict),
+            "mode": isinstance(value, str) and value in get_args(ViewMode),
+            "style": isinstance(value, dict),
             "reset": isinstance(value, bool),
             "record": isinstance(value, bool),
             "hold": value is None or (type(value) is int and 0 <= value < FRAME_IDS),
         }.get(key, False)
         if not is_good:
             raise Refusal(400, "bad_control", f"control: {key[:40]!r} is unknown or has a wrong value")
-    wanted = control.get("look", {})
+    wanted = control.get("style", {})
     for key, value in wanted.items():
-        kinds = _LOOKS.get(key)
+        kinds = _STYLE_TYPES.get(key)
         if kinds is None or not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            raise Refusal(400, "bad_control", f"look: {key[:40]!r} is unknown or has a wrong value")
+            raise Refusal(400, "bad_control", f"style: {key[:40]!r} is unknown or has a wrong value")
     if wanted.get("only") is not None and wanted["only"] not in components:
-        raise Refusal(400, "bad_control", "look: only names no component of the part")
+        raise Refusal(400, "bad_control", "style: only is no component of the part")
     try:
-        return replace(look, **wanted)
+        return replace(style, **wanted)
     except InputError as error:
         raise Refusal(400, "bad_control", str(error)) from error

@@ -1,4 +1,4 @@
-"""The CAD as GLB for the page: one node a component, and one for its design edges."""
+"""The CAD model as GLB for the page: for each component a node with its mesh and one with its design edges."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from arview.guideviews.mesh_edges import mesh_edges
 
 
 def model_glb(model: Model) -> bytes:
-    """GLB of a model in mm in its own frame.
+    """GLB of a model, in mm in the model frame.
 
-    Component i is node ``c<i>``, a mesh whose corners are not shared, so that its normals are flat, and node
-    ``e<i>``, its creases and borders as LINES. (glTF says metres and +Y up; the page knows better.)
+    Component i is node ``c<i>``, a mesh whose faces share no vertices so that its normals are flat, and node ``e<i>``,
+    its creases and borders as LINES. Units and axes deviate from glTF (metres, +Y up); the page expects this.
     """
     import trimesh
     from trimesh.path.entities import Line

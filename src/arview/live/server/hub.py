@@ -1,4 +1,4 @@
-"""Hub: what all pages share. The subject, the clients with their feeds, the station camera, the recordings."""
+"""The hub: the state that all pages share. Subject, clients with their feeds, station camera, recordings."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import Any
 
 from arview.errors import ArviewError, InputError
 from arview.live.options import LiveOptions
-from arview.live.protocol import Transport, Way
+from arview.live.protocol import Transport, ViewMode
 from arview.live.security.refusals import Refusal
-from arview.live.server.clients import Client, check_control, one_of
+from arview.live.server.clients import Client, check_control, choice_of
 from arview.live.server.glb import model_glb
+from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.documents import (
     Document,
     feed_document,
     loading_document,
-    look_document,
     notice_documents,
     part_document,
+    style_document,
 )
-from arview.live.stream.drawing import Drawing
 from arview.live.stream.feed import Feed
 from arview.live.stream.notices import Notice
 from arview.live.stream.recording import Recordings
@@ -35,17 +35,18 @@ from arview.live.transport.webrtc import Connection
 
 logger = logging.getLogger("arview.live")
 
-TICK_S = 0.25
-STATUS_EVERY_S, RELOAD_EVERY_S = 1.0, 1.0
-OFFER_TIMEOUT_S = 10.0
-
 
 class Hub:
-    """The state of one run; all its methods belong to the event loop.
+    """The state of one run. Its methods must be called in the event loop.
 
     Args:
-        options: of the server.
-        addresses: at which WebRTC may be reached.
+        options: options of the server.
+        addresses: addresses at which WebRTC is offered.
+
+    Attributes:
+        subject, recordings: None while the part is being loaded.
+        clients: the pages that take part, by name.
+        watchers: number of screens that only watch.
     """
 
     def __init__(self, options: LiveOptions, addresses: Sequence[str]) -> None:
@@ -58,7 +59,7 @@ class Hub:
         self._part: tuple[int, Document] | None = None
         self._glb: asyncio.Task[bytes] | None = None
         self._station: StationCamera | None = None
-        self._shared: tuple[Feed, Drawing] | None = None
+        self._shared: tuple[Feed, FrameAnnotator] | None = None
         self._recorded: set[Path] = set()
         self._ticker: asyncio.Task[None] | None = None
         self._joining = 0
@@ -67,29 +68,29 @@ class Hub:
     # --- the part -------------------------------------------------------------------------------------
 
     def begin(self, subject: Subject) -> None:
-        """Everything is loaded: open the station camera, let pages take part."""
+        """Start with the loaded subject: open the station camera and admit pages."""
         self.subject = subject
-        self.recordings = Recordings(self.options.record_folder, subject.part.name)
+        self.recordings = Recordings(self.options.record_folder, subject.part.name, self.options.recording)
         if not self.options.is_phone:
-            feed, drawing = Feed(subject, "station"), Drawing(subject)
-            self._shared = feed, drawing
-            self._station = StationCamera(self.options.source, feed)
+            feed, annotator = Feed(subject, "station"), FrameAnnotator(subject)
+            self._shared = feed, annotator
+            self._station = StationCamera(self.options.source, feed, self.options.station)
             if self.options.record is not None:
-                self.recordings.start(feed, drawing, self.options.record)
-        self._ticker = asyncio.ensure_future(self._tick_for_ever())
+                self.recordings.start(feed, annotator, self.options.record)
+        self._ticker = asyncio.ensure_future(self._run_ticker())
 
     def ready(self) -> tuple[Subject, Recordings]:
         """The subject and the recordings.
 
         Raises:
-            Refusal: they are still being loaded.
+            Refusal: the part is still being loaded.
         """
         if self.subject is None or self.recordings is None:
             raise Refusal(503, "loading", "the part is being loaded; wait a moment", {"Retry-After": "1"})
         return self.subject, self.recordings
 
     async def part(self) -> Document:
-        """*Part*."""
+        """The *Part* document."""
         if self.subject is None:
             return self._loading
         revision = self.subject.revision
@@ -102,7 +103,7 @@ class Hub:
         return document
 
     async def glb(self) -> bytes:
-        """The model for the page, made once."""
+        """The CAD model as GLB, made once."""
         subject, _ = self.ready()
         if self._glb is None:
             self._glb = asyncio.ensure_future(asyncio.to_thread(model_glb, subject.part.model))
@@ -110,51 +111,51 @@ class Hub:
 
     # --- clients --------------------------------------------------------------------------------------
 
-    async def join(self, wish: dict[str, Any]) -> tuple[Client, str | None]:
-        """Take a page in; the client and the SDP of the answer, if it made an offer.
+    async def join(self, request: dict[str, Any]) -> tuple[Client, str | None]:
+        """Add a client for a *Join* request; returns it and the SDP that answers its offer, if it made one.
 
         Raises:
-            Refusal: loading, busy, or an offer that cannot be used.
+            Refusal: the part is being loaded, too many pages take part, or the offer cannot be used.
         """
         subject, recordings = self.ready()
-        transport: Transport = one_of(wish.get("transport"), Transport, "transport")
-        way: Way = one_of(wish.get("way", "poses"), Way, "way")
-        offer = wish.get("offer")
+        transport: Transport = choice_of(request.get("transport"), Transport, "transport")
+        mode: ViewMode = choice_of(request.get("mode", "poses"), ViewMode, "mode")
+        offer = request.get("offer")
         sdp = offer.get("sdp") if isinstance(offer, dict) and offer.get("type") == "offer" else None
         if transport == "webrtc" and not isinstance(sdp, str):
-            raise Refusal(400, "bad_offer", "webrtc needs an offer with its sdp")
-        if isinstance(before := wish.get("replaces"), str):
-            await self.leave(before)
-        if len(self.clients) + self._joining >= self.options.most_clients:
+            raise Refusal(400, "bad_offer", "transport webrtc needs an offer with its sdp")
+        if isinstance(previous := request.get("replaces"), str):
+            await self.leave(previous)
+        if len(self.clients) + self._joining >= self.options.max_clients:
             count = len(self.clients)
-            raise Refusal(503, "busy", f"busy: {count} of {self.options.most_clients} pages take part already")
+            raise Refusal(503, "busy", f"busy: {count} of {self.options.max_clients} pages take part")
         self._joining += 1
         try:
-            feed, drawing = self._shared or (Feed(subject, "phone"), Drawing(subject))
-            client = Client(feed, drawing, transport, way)
+            feed, annotator = self._shared or (Feed(subject, "phone"), FrameAnnotator(subject))
+            client = Client(feed, annotator, transport, mode)
             answer = await self._connect(client, str(sdp)) if transport == "webrtc" else None
         finally:
             self._joining -= 1
         self.clients[client.name] = client
-        logger.info("a page takes part by %s (%d of %d)", transport, len(self.clients), self.options.most_clients)
+        logger.info("a page joined by %s (%d of %d)", transport, len(self.clients), self.options.max_clients)
         if self.options.is_phone and self.options.record is not None:
             self._record_phone(recordings, client, self.options.record)
         return client, answer
 
     async def leave(self, name: str) -> bool:
-        """Let a client go; whether there was one."""
+        """Remove a client; returns whether there was one of that name."""
         client = self.clients.pop(name, None)
         if client is None:
             return False
-        logger.info("a page has left (%d of %d)", len(self.clients), self.options.most_clients)
-        await self._let_go(client)
+        logger.info("a page left (%d of %d)", len(self.clients), self.options.max_clients)
+        await self._release(client)
         return True
 
     def client(self, name: str) -> Client:
-        """The client of that name, seen now.
+        """The client of that name, whose request is noted.
 
         Raises:
-            Refusal: there is none.
+            Refusal: there is no such client.
         """
         client = self.clients.get(name)
         if client is None:
@@ -162,42 +163,42 @@ class Hub:
         client.seen()
         return client
 
-    async def control(self, client: Client, wish: dict[str, Any]) -> None:
-        """Do what a page asks for.
+    async def control(self, client: Client, request: dict[str, Any]) -> None:
+        """Carry out a *Control* request.
 
         Raises:
-            Refusal: an unknown wish or value; nothing is done then.
+            Refusal: an unknown key or a wrong value; then nothing is changed.
         """
         subject, recordings = self.ready()
         names = tuple(component.name for component in subject.part.model.components)
-        look = check_control(wish, client.drawing.look, names)
+        style = check_control(request, client.annotator.style, names)
         held = None
-        if wish.get("hold") is not None:
-            held = client.find(wish["hold"])
+        if request.get("hold") is not None:
+            held = client.find(request["hold"])
             if held is None:
-                raise Refusal(404, "no_such_frame", "that picture is no longer kept")
-        client.drawing.look = look
-        client.way = wish.get("way", client.way)
-        if wish.get("reset"):
+                raise Refusal(404, "no_such_frame", "that frame is no longer kept")
+        client.annotator.style = style
+        client.mode = request.get("mode", client.mode)
+        if request.get("reset"):
             client.feed.reset()
-        if "hold" in wish:
+        if "hold" in request:
             client.held = held
-        if wish.get("record") is True:
-            recordings.start(client.feed, client.drawing)
-        elif wish.get("record") is False:
+        if request.get("record") is True:
+            recordings.start(client.feed, client.annotator)
+        elif request.get("record") is False:
             await asyncio.to_thread(recordings.stop, client.feed)
 
-    # --- what is going on ------------------------------------------------------------------------------
+    # --- status ------------------------------------------------------------------------------
 
-    def watched(self) -> tuple[Feed, Drawing] | None:
-        """What a screen shows that only watches: the station, or the phone that came last."""
+    def watched(self) -> tuple[Feed, FrameAnnotator] | None:
+        """The feed for screens that only watch: the station camera, or the phone that joined last."""
         if self._shared is not None:
             return self._shared
         latest = max(self.clients.values(), key=lambda client: client.joined_s, default=None)
-        return (latest.feed, latest.drawing) if latest is not None else None
+        return (latest.feed, latest.annotator) if latest is not None else None
 
     def status(self, client: Client | None) -> Document:
-        """*Status*."""
+        """The *Status* document of a client, or without one."""
         shared = self._shared
         feed = client.feed if client is not None else shared[0] if shared is not None else None
         described = None
@@ -209,8 +210,8 @@ class Hub:
         return {
             "type": "status",
             "revision": self.subject.revision if self.subject is not None else 0,
-            "way": client.way if client is not None else None,
-            "look": look_document(client.drawing.look) if client is not None else None,
+            "mode": client.mode if client is not None else None,
+            "style": style_document(client.annotator.style) if client is not None else None,
             "feed": described,
             "notices": notice_documents(self._notices(feed)),
             "recording": {
@@ -219,11 +220,11 @@ class Hub:
                 "finished": self.recordings.finished if self.recordings is not None else [],
             },
             "clients": len(self.clients),
-            "most_clients": self.options.most_clients,
+            "max_clients": self.options.max_clients,
         }
 
     async def close(self) -> None:
-        """Let everyone go and finish the files."""
+        """Remove all clients, close the station camera and finish the files."""
         if self._ticker is not None:
             self._ticker.cancel()
             with suppress(asyncio.CancelledError):
@@ -244,76 +245,78 @@ class Hub:
             self._leaving.add(leaving)
             leaving.add_done_callback(self._leaving.discard)
 
-        connection = Connection(client.feed, client.drawing, lambda: client.way, self._addresses, ended)
+        connection = Connection(
+            client.feed, client.annotator, lambda: client.mode, self._addresses, ended, self.options.webrtc
+        )
         client.connection = connection
         try:
-            return await asyncio.wait_for(connection.answer(sdp), OFFER_TIMEOUT_S)
+            return await asyncio.wait_for(connection.answer(sdp), self.options.webrtc.offer_timeout_s)
         except (InputError, TimeoutError) as error:
-            await self._let_go(client)
+            await self._release(client)
             raise Refusal(400, "bad_offer", str(error) or "the offer could not be answered in time") from error
         except BaseException:
-            await self._let_go(client)
+            await self._release(client)
             raise
 
-    async def _let_go(self, client: Client) -> None:
+    async def _release(self, client: Client) -> None:
         await client.close()
         if self._shared is None:
             if self.recordings is not None:
                 await asyncio.to_thread(self.recordings.forget, client.feed)
             await asyncio.to_thread(client.feed.close)
-            await asyncio.to_thread(client.drawing.close)
-            # A peer connection and a session are full of cycles: without this some thirty of them pile up first.
+            await asyncio.to_thread(client.annotator.close)
+            # Peer connections and sessions hold reference cycles; without this call about thirty of them pile up.
             await asyncio.to_thread(gc.collect)
 
     def _record_phone(self, recordings: Recordings, client: Client, path: Path) -> None:
-        """Record a phone from its first frame: OUT.mp4, then the next of OUT-2.mp4, OUT-3.mp4, ... that is free."""
-        wanted, number = path, 1
-        while wanted in self._recorded or (number > 1 and wanted.exists()):
+        """Record a phone from its first frame: to OUT.mp4, else to the first free one of OUT-2.mp4, OUT-3.mp4, ..."""
+        target, number = path, 1
+        while target in self._recorded or (number > 1 and target.exists()):
             number += 1
-            wanted = path.with_name(f"{path.stem}-{number}{path.suffix}")
-        self._recorded.add(wanted)
-        recordings.start(client.feed, client.drawing, wanted)
+            target = path.with_name(f"{path.stem}-{number}{path.suffix}")
+        self._recorded.add(target)
+        recordings.start(client.feed, client.annotator, target)
 
     def _notices(self, feed: Feed | None) -> list[Notice]:
-        said = self.subject.notices() if self.subject is not None else []
+        notices = self.subject.notices() if self.subject is not None else []
         if self._station is not None:
-            said = [*said, *self._station.notices()]
+            notices = [*notices, *self._station.notices()]
         if feed is not None:
-            said = [*said, *feed.notices()]
+            notices = [*notices, *feed.notices()]
             if self.recordings is not None:
-                said = [*said, *self.recordings.notices(feed)]
-        return said
+                notices = [*notices, *self.recordings.notices(feed)]
+        return notices
 
-    async def _tick_for_ever(self) -> None:
+    async def _run_ticker(self) -> None:
         reloaded_s = 0.0
         while True:
-            await asyncio.sleep(TICK_S)
+            await asyncio.sleep(self.options.tick_s)
             try:
                 now_s = time.monotonic()
-                if now_s - reloaded_s >= RELOAD_EVERY_S and self.subject is not None:
+                if now_s - reloaded_s >= self.options.reload_interval_s and self.subject is not None:
                     reloaded_s = now_s
                     await asyncio.to_thread(self.subject.reload)
                 for client in list(self.clients.values()):
-                    if self._has_gone(client, now_s):
+                    if self._is_gone(client, now_s):
                         await self.leave(client.name)
                     else:
-                        self._tell(client, now_s)
+                        self._send_status(client, now_s)
             except ArviewError as error:
                 logger.warning("%s", error)
-            except Exception:  # the ticker serves all pages: it must go on
-                logger.exception("the regular look at all pages failed")
+            except Exception:  # the ticker serves all pages and must not end
+                logger.exception("the regular work for all pages failed")
 
-    def _has_gone(self, client: Client, now_s: float) -> bool:
+    def _is_gone(self, client: Client, now_s: float) -> bool:
         if client.connection is None:
             return not client.is_busy and now_s - client.seen_s > self.options.jpeg_silence_s
-        return not client.connection.is_connected and now_s - client.joined_s > self.options.connect_timeout_s
+        return not client.connection.is_connected and now_s - client.joined_s > self.options.webrtc.connect_timeout_s
 
-    def _tell(self, client: Client, now_s: float) -> None:
-        """Send a page its status when that has news, or once a second."""
+    def _send_status(self, client: Client, now_s: float) -> None:
+        """Send a page its status when it has changed, or when the last one is older than the interval."""
         if client.connection is None or not client.connection.is_connected:
             return
         status = self.status(client)
         news = (status["revision"], status["notices"], status["recording"]["is_on"], status["recording"]["finished"])
-        if news != client.told[0] or now_s - client.told[1] >= STATUS_EVERY_S:
-            client.told = news, now_s
+        if news != client.last_status[0] or now_s - client.last_status[1] >= self.options.status_interval_s:
+            client.last_status = news, now_s
             client.connection.send(status)

@@ -1,4 +1,4 @@
-"""The live server from start to end: sockets, certificates, loading, serving, closing."""
+"""The life cycle of the live server: sockets, certificates, loading, serving, closing."""
 
 from __future__ import annotations
 
@@ -25,28 +25,24 @@ from arview.live.security.certificates import (
 from arview.live.security.trust_page import trust_app
 from arview.live.server.app import make_app
 from arview.live.server.hub import Hub
-from arview.live.server.uvicorn_server import Server
+from arview.live.server.uvicorn_server import UvicornServer
 from arview.live.stream.subject import Subject
 from arview.live.transport.webrtc import raise_bitrates
 
 logger = logging.getLogger("arview.live")
 T = TypeVar("T")
 
-RENEW_EVERY_S = 12 * 3600.0
-WORKERS = 16
-"""Threads for drawing, JPEG and files; they mostly wait for each other's drawing."""
-
 
 @dataclass(frozen=True)
-class Place:
-    """Where the server listens.
+class Endpoint:
+    """The sockets, addresses and certificates of the server.
 
     Attributes:
         listener: bound socket of the pages.
-        port: of it.
-        addresses: at which it is reached, the one for links first.
-        certificates: None: plain HTTP.
-        trust_listener: bound socket of the page about the certificate, if it is the local authority's.
+        port: port of that socket.
+        addresses: addresses at which the server is reached, the one for links first.
+        certificates: certificates of HTTPS; None for plain HTTP.
+        trust_listener: bound socket of the page about the certificate, if the local authority signed it.
     """
 
     listener: socket.socket
@@ -57,100 +53,101 @@ class Place:
 
     @property
     def trust_link(self) -> str | None:
-        """Address of the page about the certificate."""
+        """URL of the page about the certificate, or None."""
         if self.trust_listener is None:
             return None
         return f"http://{self.addresses[0]}:{self.trust_listener.getsockname()[1]}/"
 
 
-def take_place(
+def open_endpoint(
     host: str | None, port: int, is_plain: bool = False, cert: Path | None = None, key: Path | None = None
-) -> Place:
-    """Bind the sockets and get the certificates.
+) -> Endpoint:
+    """Bind the sockets and load or create the certificates.
 
     Args:
-        host: see `choose_host`; with plain HTTP this machine's own browser only, whatever it is.
-        port: of the pages; the page about the certificate gets the next one. 0: any.
-        is_plain: HTTP without certificates, at 127.0.0.1: browsers give the camera to this address too.
-        cert, key: a certificate of the user's own.
+        host: see `choose_host`; plain HTTP is always served at the loopback address.
+        port: port of the pages; the page about the certificate gets the next one. 0 stands for any free port.
+        is_plain: serve HTTP without certificates at 127.0.0.1, where browsers allow the camera, too.
+        cert, key: certificate and key provided by the user.
 
     Raises:
-        InputError: a port or address that cannot be had, or a certificate that cannot be used.
-        OutputError: certificates cannot be kept.
+        InputError: a port or address is not available, or a certificate cannot be used.
+        OutputError: certificates cannot be stored.
     """
     if is_plain:
         if host not in (None, "localhost", LOOPBACK):
             raise InputError(
-                f"--http with --host {host}: browsers give the camera to plain HTTP at this machine itself only; "
-                "leave out --http, or --host"
+                f"--http with --host {host}: browsers allow the camera over plain HTTP on this machine only; "
+                "omit --http or --host"
             )
         listener = bind(LOOPBACK, port)
-        return Place(listener, listener.getsockname()[1], [LOOPBACK, "localhost"])
+        return Endpoint(listener, listener.getsockname()[1], [LOOPBACK, "localhost"])
     address, addresses = choose_host(host)
     listener = bind(address, port)
     try:
         if cert is not None and key is not None:
-            return Place(listener, listener.getsockname()[1], addresses, own_certificates(cert, key))
+            return Endpoint(listener, listener.getsockname()[1], addresses, own_certificates(cert, key))
         certificates = local_certificates(addresses)
         trust_listener = bind(address, port + 1 if port else 0)
-        return Place(listener, listener.getsockname()[1], addresses, certificates, trust_listener)
+        return Endpoint(listener, listener.getsockname()[1], addresses, certificates, trust_listener)
     except BaseException:
         listener.close()
         raise
 
 
 class LiveServer:
-    """Serves the pages of one part at one place.
+    """Serves the pages of one part.
 
     Args:
-        options: what is served, within which limits.
-        place: where; its sockets are closed at the end.
+        options: what is served, and within which limits.
+        endpoint: where it is served; its sockets are closed at the end.
+
+    Attributes:
+        access: what requests must present.
     """
 
-    def __init__(self, options: LiveOptions, place: Place) -> None:
-        self.options, self.place = options, place
-        names = [*place.addresses, *(["localhost"] if LOOPBACK in place.addresses else [])]
-        self.access = Access.to(names, place.port, place.certificates is not None)
+    def __init__(self, options: LiveOptions, endpoint: Endpoint) -> None:
+        self.options, self.endpoint = options, endpoint
+        names = [*endpoint.addresses, *(["localhost"] if LOOPBACK in endpoint.addresses else [])]
+        self.access = Access.to(names, endpoint.port, endpoint.certificates is not None)
         self._stop: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._is_stopped = False
 
     @property
     def origin(self) -> str:
-        """Scheme, address and port of the pages."""
-        return f"{self.access.scheme}://{self.place.addresses[0]}:{self.place.port}"
+        """Origin of the pages: scheme, address and port."""
+        return f"{self.access.scheme}://{self.endpoint.addresses[0]}:{self.endpoint.port}"
 
     @property
     def link(self) -> str:
-        """Address of the page with the token of this run."""
+        """URL of the page with the token of this run."""
         return f"{self.origin}/?token={self.access.token}"
 
     def stop(self) -> None:
-        """End `serve`, from any thread."""
+        """Make `serve` end; may be called from any thread."""
         self._is_stopped = True
         if self._loop is not None and self._stop is not None:
             with suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._stop.set)
 
     async def serve(self, load: Callable[[], Subject], on_ready: Callable[[Hub], None] = lambda hub: None) -> None:
-        """Serve until `stop`; files are finished then.
+        """Serve until `stop`, then finish the files.
 
         Args:
-            load: loads the part, in a thread; pages say so meanwhile.
-            on_ready: called when pages can take part.
-
-        Raises:
-            what ``load`` raises.
+            load: loads the part, in a thread, while the pages show that it is being loaded. What it raises is raised
+                here.
+            on_ready: called with the hub when pages can take part.
         """
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         if self._is_stopped:
             self._stop.set()
-        self._loop.set_default_executor(ThreadPoolExecutor(WORKERS, thread_name_prefix="arview-worker"))
+        self._loop.set_default_executor(ThreadPoolExecutor(self.options.workers, thread_name_prefix="arview-worker"))
         raise_bitrates()
-        hub = Hub(self.options, [address for address in self.place.addresses if address != "localhost"])
-        servers = [Server(make_app(hub, self.access), self.place.listener, self.place.certificates)]
-        if self.place.trust_listener is not None and self.place.certificates is not None:
-            servers.append(Server(trust_app(self.place.certificates), self.place.trust_listener))
+        hub = Hub(self.options, [address for address in self.endpoint.addresses if address != "localhost"])
+        servers = [UvicornServer(make_app(hub, self.access), self.endpoint.listener, self.endpoint.certificates)]
+        if self.endpoint.trust_listener is not None and self.endpoint.certificates is not None:
+            servers.append(UvicornServer(trust_app(self.endpoint.certificates), self.endpoint.trust_listener))
         stopped = asyncio.ensure_future(self._stop.wait())
         tasks = [asyncio.ensure_future(server.run_until_stopped()) for server in servers]
         tasks.append(asyncio.ensure_future(self._renew(servers[0])))
@@ -173,24 +170,24 @@ class LiveServer:
             tasks[-1].cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _renew(self, server: Server) -> None:
-        """Renew the server's certificate while it runs for months."""
+    async def _renew(self, server: UvicornServer) -> None:
+        """Renew the certificate of a server that runs for months."""
         while True:
-            await asyncio.sleep(RENEW_EVERY_S)
-            if self.place.trust_listener is None:
+            await asyncio.sleep(self.options.renewal_interval_s)
+            if self.endpoint.trust_listener is None:
                 continue
             try:
-                server.renew(await asyncio.to_thread(local_certificates, self.place.addresses))
-            except Exception as error:  # the present certificate is good for weeks yet
+                server.renew(await asyncio.to_thread(local_certificates, self.endpoint.addresses))
+            except Exception as error:  # the current certificate stays valid for weeks
                 logger.warning("the certificate could not be renewed: %s", error)
 
 
 async def _in_daemon_thread(work: Callable[[], T]) -> T:
-    """Like `asyncio.to_thread`, but does not keep the program from ending."""
+    """As `asyncio.to_thread`, but in a daemon thread, which does not keep the program from exiting."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[T] = loop.create_future()
 
-    def settle(result: T | None, error: BaseException | None) -> None:
+    def set_outcome(result: T | None, error: BaseException | None) -> None:
         if done.cancelled():
             return
         if error is not None:
@@ -205,8 +202,8 @@ async def _in_daemon_thread(work: Callable[[], T]) -> T:
             result = work()
         except BaseException as error:
             failure = error
-        with suppress(RuntimeError):  # the loop has ended meanwhile
-            loop.call_soon_threadsafe(settle, result, failure)
+        with suppress(RuntimeError):  # the loop has ended in the meantime
+            loop.call_soon_threadsafe(set_outcome, result, failure)
 
     threading.Thread(target=run, name="arview-loader", daemon=True).start()
     return await done

@@ -1,4 +1,4 @@
-"""What the server does before pages can take part: part, guide views, inspection, and a first run of the tracker."""
+"""Loading of part, guide views and inspection, and a first run of the tracker, before pages can take part."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def load_subject(
     view_options: GuideViewOptions | None = None,
     progress: StepProgress | None = None,
 ) -> Subject:
-    """Part, guide views (of a file, of the cache, or made now), inspection and camera.
+    """Load the part, its guide views (from a file, from the cache, or rendered now), inspection and camera.
 
     Raises:
-        InputError, MismatchError: one of the files cannot be used, or they do not belong together.
+        InputError, MismatchError: a file cannot be used, or the files do not belong together.
     """
     part = load_part(part_path, unit)
     if views_path is not None:
@@ -44,13 +44,13 @@ def load_subject(
     if options.is_phone:
         subject.camera(options.width, options.height)
     elif options.camera is not None:
-        with suppress(MismatchError):  # the size of a station's pictures is not known before the first
+        with suppress(MismatchError):  # the size of a station camera's pictures is only known from the first one
             subject.camera(options.width, options.height)
     return subject
 
 
 def warm_up(subject: Subject) -> threading.Thread:
-    """Have the tracker look at a picture of noise, in a thread, so that its loops are compiled when a phone comes."""
+    """Track a picture of noise, in a thread, so that the kernels are compiled before the first phone joins."""
 
     def run() -> None:
         began_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""The JSON documents of the protocol: pose, part, status."""
+"""The JSON documents of the protocol: *Pose*, *Part* and the parts of *Status*."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 from arview.camera import Camera
 from arview.inspection import ComponentDeviation, Finding, Inspection
 from arview.live.options import LiveOptions
-from arview.live.stream.feed import Feed, Tracked
+from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.notices import Notice
-from arview.live.stream.subject import Look, Subject
+from arview.live.stream.subject import OverlayStyle, Subject
 from arview.overlay.labels import arrow_scale, by_urgency, detail_text, value_text
 from arview.overlay.mesh import anchor_in_model, topology
 from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, OverlayOptions
@@ -18,13 +18,13 @@ from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, OverlayOptions
 Document = dict[str, Any]
 
 
-def pose_document(tracked: Tracked, now_s: float) -> Document:
-    """*Pose*: what was found in a frame; ``now_s`` is the monotonic time of the answer."""
+def pose_document(tracked: TrackedFrame, now_s: float) -> Document:
+    """*Pose*: the result of a frame; ``now_s`` is the monotonic time of the response."""
     pose = tracked.pose
     guide = pose.guide_cam_from_model
     return {
         "type": "pose",
-        "id": tracked.picture.frame_id,
+        "id": tracked.frame.frame_id,
         "revision": tracked.revision,
         "state": str(pose.state),
         "quality": round(pose.quality, 3),
@@ -40,12 +40,12 @@ def pose_document(tracked: Tracked, now_s: float) -> Document:
         "track_ms": _ms(tracked.done_s - tracked.started_s),
         "server_ms": _ms(now_s - tracked.arrived_s),
         "dropped": tracked.dropped,
-        "scale": round(tracked.picture.scale, 3),
+        "scale": round(tracked.frame.scale, 3),
     }
 
 
 def camera_document(camera: Camera) -> Document:
-    """Intrinsics in px."""
+    """Intrinsics of a camera, px."""
     return {
         "width": camera.width,
         "height": camera.height,
@@ -58,7 +58,7 @@ def camera_document(camera: Camera) -> Document:
 
 
 def loading_document(options: LiveOptions, state: str, text: str) -> Document:
-    """*Part* as long as there is none."""
+    """*Part* while the part is not loaded."""
     return {
         "revision": 0,
         "state": state,
@@ -74,7 +74,7 @@ def loading_document(options: LiveOptions, state: str, text: str) -> Document:
 
 
 def part_document(subject: Subject) -> Document:
-    """*Part*: the part, its components and what was measured of them."""
+    """*Part*: the part, its components and their measured deviations."""
     model, inspection = subject.part.model, subject.inspection
     ranks = {one.name: rank for rank, one in enumerate(by_urgency(inspection))} if inspection else {}
     components = []
@@ -86,7 +86,7 @@ def part_document(subject: Subject) -> Document:
                 "color": _hex(tuple(round(255 * value) for value in component.color)),
                 "anchor_in_model": anchor_in_model(component, topology(component)).tolist(),
                 "rank": ranks.get(component.name),
-                **_measured(found),
+                **_deviation_document(found),
             }
         )
     return {
@@ -101,7 +101,7 @@ def part_document(subject: Subject) -> Document:
             "bounds_in_model": model.bounds_in_model.tolist(),
         },
         "components": components,
-        "inspection": _inspection(inspection),
+        "inspection": _inspection_document(inspection),
         "arrow_scale": arrow_scale(inspection, model.diameter_mm, OverlayOptions()) if inspection else 1.0,
     }
 
@@ -130,19 +130,19 @@ def notice_documents(notices: list[Notice]) -> list[Document]:
     return [{"code": one.code, "level": one.level, "text": one.text} for one in notices]
 
 
-def look_document(look: Look) -> Document:
-    """The ``look`` of *Status* and *Control*."""
+def style_document(style: OverlayStyle) -> Document:
+    """The ``style`` of *Status* and *Control*."""
     return {
-        "ghost": look.ghost,
-        "edges": look.edges,
-        "labels": look.labels,
-        "opacity": look.opacity,
-        "only": look.only,
-        "status": look.status,
+        "ghost": style.ghost,
+        "edges": style.edges,
+        "labels": style.labels,
+        "opacity": style.opacity,
+        "only": style.only,
+        "status": style.status,
     }
 
 
-def _measured(found: ComponentDeviation | None) -> Document:
+def _deviation_document(found: ComponentDeviation | None) -> Document:
     if found is None:
         names = ("verdict", "verdict_text", "verdict_color", "distance_mm", "uncertainty_mm", "tolerance_mm")
         return {**dict.fromkeys(names), "displacement_mm": None, "missing": False, "value_text": "", "detail_text": ""}
@@ -161,7 +161,7 @@ def _measured(found: ComponentDeviation | None) -> Document:
     }
 
 
-def _inspection(inspection: Inspection | None) -> Document | None:
+def _inspection_document(inspection: Inspection | None) -> Document | None:
     if inspection is None:
         return None
     return {
@@ -175,7 +175,7 @@ def _inspection(inspection: Inspection | None) -> Document | None:
 
 
 def _source_name(source: str) -> str:
-    """A source without what must not be shown: passwords in addresses, folders of files."""
+    """A source without passwords in its address and without the folder of a file."""
     if "://" in source:
         scheme, rest = source.split("://", 1)
         return f"{scheme}://{rest.split('/', 1)[0].rsplit('@', 1)[-1]}"

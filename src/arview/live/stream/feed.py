@@ -1,4 +1,4 @@
-"""Feed: one stream of frames and its tracking, in a thread of its own that always takes the newest frame."""
+"""Feeds: a stream of frames and its tracking, in a thread that always takes the newest frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from arview.camera import Camera
 from arview.camera.read import guess_camera
 from arview.errors import ArviewError
-from arview.live.stream.frames import Incoming, Picture, to_jpeg
+from arview.live.stream.frames import DecodedFrame, IncomingFrame, to_jpeg
 from arview.live.stream.newest import NewestSlot
 from arview.live.stream.notices import Notice, without_folder
 from arview.live.stream.subject import Subject
@@ -24,31 +24,22 @@ from arview.tracking import TrackingSession
 
 logger = logging.getLogger("arview.live")
 
-KEPT_FRAMES = 12
-"""Tracked frames kept for a snapshot: what a page still shows after a slow network; 33 MB at 720p."""
-RATE_WINDOW_S = 2.0
-SILENT_S = 1.5
-"""A feed without a frame for so long is waiting."""
-UNREADABLE_IN_A_ROW = 15
-"""So many frames without a readable stamp, half a second, are told."""
-SCALED_BELOW = 0.95
-
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class TrackedFrame:
     """A frame with its pose.
 
     Attributes:
-        picture: what was tracked.
-        pose: of that frame.
-        camera: of the picture.
-        arrived_s, started_s, done_s: monotonic times.
-        dropped: frames that the feed passed over so far.
-        revision: of the part document.
-        serial: counts the tracked frames of the feed; frame ids may wrap around or repeat.
+        frame: the frame that was tracked.
+        pose: pose of the part in that frame.
+        camera: intrinsics of the frame.
+        arrived_s, started_s, done_s: monotonic times of its arrival, and of the start and end of its tracking.
+        dropped: number of frames that the feed had dropped by then.
+        revision: revision of the part document.
+        serial: number of the frame among the tracked frames of the feed; frame ids may wrap around or repeat.
     """
 
-    picture: Picture
+    frame: DecodedFrame
     pose: Pose
     camera: Camera
     arrived_s: float
@@ -60,44 +51,47 @@ class Tracked:
 
     @cached_property
     def jpeg(self) -> bytes:
-        """The plain picture as JPEG."""
-        return to_jpeg(self.picture.image)
+        """The picture without overlay as JPEG."""
+        return to_jpeg(self.frame.image)
 
 
 @dataclass
-class _Rate:
-    """Events a second over the last window."""
+class _EventRate:
+    """Events per second over the last ``window_s`` seconds."""
 
+    window_s: float
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=400))
 
     def tick(self) -> None:
         self._times.append(time.monotonic())
 
     def value(self) -> float:
-        since = time.monotonic() - RATE_WINDOW_S
-        return sum(moment > since for moment in tuple(self._times)) / RATE_WINDOW_S
+        since = time.monotonic() - self.window_s
+        return sum(moment > since for moment in tuple(self._times)) / self.window_s
 
 
 class Feed:
-    """Tracks the newest frame of one stream and tells its listeners.
+    """Tracks the newest frame of one stream and passes it to its listeners.
 
     Attributes:
         kind: "phone" or "station".
-        received: frames that came.
-        unreadable: of these, without a readable stamp.
-        failures: how often the tracking had to begin anew because of an error of its own.
-        newest: last tracked frame.
+        received: number of frames received.
+        unreadable: number of these without a readable stamp.
+        failures: how often the tracking was restarted after an internal error.
+        newest: the last tracked frame.
     """
 
     def __init__(self, subject: Subject, kind: str) -> None:
         self.kind = kind
         self.received = self.unreadable = self.failures = 0
-        self.newest: Tracked | None = None
-        self.received_rate, self.tracked_rate = _Rate(), _Rate()
+        self.newest: TrackedFrame | None = None
+        self.options = subject.options.feed
+        self.received_rate = _EventRate(self.options.rate_window_s)
+        self.tracked_rate = _EventRate(self.options.rate_window_s)
         self._subject = subject
-        self._slot: NewestSlot[Incoming] = NewestSlot()
-        self._listeners: list[Callable[[Tracked], None]] = []
-        self._kept: deque[Tracked] = deque(maxlen=KEPT_FRAMES)
+        self._slot: NewestSlot[IncomingFrame] = NewestSlot()
+        self._listeners: list[Callable[[TrackedFrame], None]] = []
+        self._kept: deque[TrackedFrame] = deque(maxlen=self.options.kept_frames)
         self._arrived_s: float | None = None
         self._session: TrackingSession | None = None
         self._wants_reset = False
@@ -108,119 +102,128 @@ class Feed:
         self._thread = threading.Thread(target=self._run, name=f"arview-{kind}", daemon=True)
         self._thread.start()
 
-    def put(self, incoming: Incoming) -> None:
-        """Offer a frame; one that still waits is dropped."""
+    def put(self, incoming: IncomingFrame) -> None:
+        """Add a frame; one that still waits is dropped."""
         self.received += 1
         self._arrived_s = incoming.arrived_s
         self.received_rate.tick()
         self._slot.put(incoming)
 
-    def listen(self, listener: Callable[[Tracked], None]) -> None:
-        """Have a function called, in the tracker's thread, with every tracked frame; it must not wait."""
+    def listen(self, listener: Callable[[TrackedFrame], None]) -> None:
+        """Call a function, in the thread of the tracker, with every tracked frame; it must not block."""
         self._listeners.append(listener)
 
-    def unlisten(self, listener: Callable[[Tracked], None]) -> None:
-        """Take a listener away."""
+    def unlisten(self, listener: Callable[[TrackedFrame], None]) -> None:
+        """Remove a listener."""
         if listener in self._listeners:
             self._listeners.remove(listener)
 
     def reset(self) -> None:
-        """Search again, from the next frame on."""
+        """Search for the part again, from the next frame on."""
         self._wants_reset = True
 
-    def find(self, frame_id: int) -> Tracked | None:
-        """A tracked frame that is still kept."""
-        return next((one for one in reversed(tuple(self._kept)) if one.picture.frame_id == frame_id), None)
+    def find(self, frame_id: int) -> TrackedFrame | None:
+        """The tracked frame with this id, if it is still kept."""
+        return next((one for one in reversed(tuple(self._kept)) if one.frame.frame_id == frame_id), None)
 
     def close(self) -> None:
-        """End the tracking; a frame being tracked is finished first."""
+        """End the tracking, after the frame that is being tracked."""
         self._slot.close()
         self._thread.join(timeout=5.0)
 
     @property
     def dropped(self) -> int:
-        """Frames passed over because a newer one had come."""
+        """Number of frames dropped because a newer one had arrived."""
         return self._slot.dropped
 
     @property
     def age_ms(self) -> float | None:
-        """Time since the newest frame came."""
+        """Milliseconds since the newest frame arrived; None before the first."""
         return None if self._arrived_s is None else 1e3 * (time.monotonic() - self._arrived_s)
 
     @property
     def state(self) -> tuple[str, str]:
-        """State of the stream and what to say of it."""
+        """State of the stream and its description for the page."""
         age_ms = self.age_ms
         if age_ms is None:
             return "waiting", "waiting for the first picture"
-        if age_ms > 1e3 * SILENT_S:
+        if age_ms > 1e3 * self.options.silence_s:
             return "waiting", f"no picture for {age_ms / 1e3:.0f} s"
         return "live", ""
 
     def notices(self) -> list[Notice]:
-        """What whoever looks at this feed has to know."""
-        said = [self._refused] if self._refused else []
+        """Conditions of this feed that its viewers have to know of."""
+        notices = [self._refused] if self._refused else []
         newest = self.newest
-        if newest is not None and newest.picture.scale < SCALED_BELOW:
-            said.append(
-                Notice("frames_scaled", "warning", f"pictures arrive at {newest.picture.scale:.0%} of their size")
+        if newest is not None and newest.frame.scale < self.options.min_scale:
+            notices.append(
+                Notice("frames_scaled", "warning", f"pictures arrive at {newest.frame.scale:.0%} of their size")
             )
-        if self._unreadable_in_a_row >= UNREADABLE_IN_A_ROW:
-            said.append(Notice("stamp_unreadable", "error", "pictures arrive damaged: their counter cannot be read"))
+        if self._unreadable_in_a_row >= self.options.max_unreadable:
+            notices.append(
+                Notice("stamp_unreadable", "error", "pictures arrive damaged: their frame counter cannot be read")
+            )
         if self.failures:
-            said.append(
-                Notice("tracking_failed", "error", f"the tracking failed and began anew, {self.failures} times")
+            notices.append(
+                Notice("tracking_failed", "error", f"the tracking failed and was restarted {self.failures} times")
             )
-        return said
+        return notices
 
     def _run(self) -> None:
         while (incoming := self._slot.take()) is not None:
             try:
                 self._step(incoming)
-            except Exception:  # a bug must not end the stream: begin anew with the next frame, and say so
-                logger.exception("tracking failed; it begins anew")
+            except Exception:  # a bug must not end the stream: restart with the next frame, and report it
+                logger.exception("tracking failed and is restarted")
                 self.failures += 1
                 self._shape = None
-        # A connection that broke can live on in cycles of references for a while; the pictures must not.
+        # Reference cycles can keep a broken connection alive for a while; its pictures are released now.
         self._kept.clear()
         self._session = self.newest = None
 
-    def _step(self, incoming: Incoming) -> None:
+    def _step(self, incoming: IncomingFrame) -> None:
         started_s = time.monotonic()
-        picture = incoming.open()
-        if picture is None:
+        frame = incoming.decode()
+        if frame is None:
             self.unreadable += 1
             self._unreadable_in_a_row += 1
             return
         self._unreadable_in_a_row = 0
-        tracked = self._track(picture, incoming.arrived_s, started_s)
+        tracked = self._track(frame, incoming.arrived_s, started_s)
         self.newest = tracked
         self._kept.append(tracked)
         self.tracked_rate.tick()
         for listener in tuple(self._listeners):
             listener(tracked)
 
-    def _track(self, picture: Picture, arrived_s: float, started_s: float) -> Tracked:
-        height, width = picture.image.shape[:2]
-        shape = width, height, picture.quarter_turns_clockwise
+    def _track(self, frame: DecodedFrame, arrived_s: float, started_s: float) -> TrackedFrame:
+        height, width = frame.image.shape[:2]
+        shape = width, height, frame.quarter_turns_clockwise
         if shape != self._shape:
-            self._begin(shape)
+            self._start_session(shape)
         if self._wants_reset and self._session is not None:
             self._wants_reset = False
             self._session.reset()
         self._serial += 1
         if self._session is None:
             reason = self._refused.text if self._refused else ""
-            pose = Pose(None, None, 0.0, TrackingState.SEARCHING, arrived_s, picture.frame_id, 0.0, reason)
+            pose = Pose(None, None, 0.0, TrackingState.SEARCHING, arrived_s, frame.frame_id, 0.0, reason)
         else:
-            pose = self._session.process(np.ascontiguousarray(picture.image), picture.frame_id, arrived_s)
-        return Tracked(
-            picture, pose, self._camera, arrived_s, started_s, time.monotonic(), self.dropped, self._subject.revision,
-            self._serial,
-        )  # fmt: skip
+            pose = self._session.process(np.ascontiguousarray(frame.image), frame.frame_id, arrived_s)
+        return TrackedFrame(
+            frame=frame,
+            pose=pose,
+            camera=self._camera,
+            arrived_s=arrived_s,
+            started_s=started_s,
+            done_s=time.monotonic(),
+            dropped=self.dropped,
+            revision=self._subject.revision,
+            serial=self._serial,
+        )
 
-    def _begin(self, shape: tuple[int, int, int]) -> None:
-        """Make a session for pictures of another size or turn, or say why there is none."""
+    def _start_session(self, shape: tuple[int, int, int]) -> None:
+        """Start a session for frames of another size or orientation, or note why there is none."""
         width, height, turns = shape
         self._shape, self._session, self._refused = shape, None, None
         try:

@@ -1,4 +1,4 @@
-"""Incoming: a frame as it came to the server; and how each kind becomes a picture of the size it was taken in."""
+"""Frames as the server receives them, and their decoding to pictures of the size in which they were taken."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from arview.live.stream.stamp import read_stamp
 from arview.video import Image
 from arview.video.color import rgb_from_video_frame
 
-MOST_SIDE_PX = 2560  # of a picture that is taken at all
-LEAST_SIDE_PX = 64
+MIN_SIDE_PX, MAX_SIDE_PX = 64, 2560
+"""Range of the sides of the pictures that are accepted."""
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A frame ready to be tracked.
+class DecodedFrame:
+    """A frame that is ready to be tracked.
 
     Attributes:
-        frame_id: 0 to 2^20 - 1, of who made it.
+        frame_id: 0 to 2^20 - 1, assigned by the page for a phone and by the server for a station camera.
         image: (H,W,3) uint8 RGB in the size in which it was taken.
-        quarter_turns_clockwise: applied by the browser to the sensor's picture.
-        scale: received over taken size; 1 when nothing scaled it on the way.
+        quarter_turns_clockwise: rotation that the browser applied to the picture of the sensor.
+        scale: received size over the size in which it was taken; 1 when the frame was not scaled in transit.
     """
 
     frame_id: int
@@ -37,23 +37,23 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Incoming:
-    """A frame on its way to the tracker.
+class IncomingFrame:
+    """A received frame before decoding.
 
     Attributes:
-        open: makes the picture, in the tracker's thread; None when it cannot be read.
-        arrived_s: monotonic time.
+        decode: decodes the frame, in the thread of the tracker; returns None when it cannot be read.
+        arrived_s: monotonic time of its arrival.
     """
 
-    open: Callable[[], Picture | None]
+    decode: Callable[[], DecodedFrame | None]
     arrived_s: float
 
 
-def from_stamped(frame: VideoFrame) -> Picture | None:
-    """The picture of a decoded WebRTC frame without its strip; None when the stamp cannot be read.
+def from_stamped(frame: VideoFrame) -> DecodedFrame | None:
+    """A WebRTC frame without the strip of its stamp; None when the stamp cannot be read.
 
-    A frame that was scaled on the way is scaled back, so that intrinsics and tracker stay as they are; that agrees with
-    `Camera.scaled` (pixel centres).
+    A frame that was scaled in transit is scaled back, so that the intrinsics and the tracker can stay as they are. The
+    scaling agrees with `Camera.scaled` (pixel centres).
     """
     if frame.format.name not in ("yuv420p", "yuvj420p", "nv12"):
         frame = frame.reformat(format="yuv420p")
@@ -61,20 +61,20 @@ def from_stamped(frame: VideoFrame) -> Picture | None:
     brightness = np.frombuffer(memoryview(plane), dtype=np.uint8)
     gray = brightness.reshape(-1, plane.line_size)[: frame.height, : frame.width]
     stamp = read_stamp(gray)
-    if stamp is None or max(stamp.width, stamp.height) > MOST_SIDE_PX or stamp.height < LEAST_SIDE_PX:
+    if stamp is None or max(stamp.width, stamp.height) > MAX_SIDE_PX or stamp.height < MIN_SIDE_PX:
         return None
     scale = frame.width / stamp.width
     image = rgb_from_video_frame(frame)[: min(frame.height, round(stamp.height * scale))]
     if image.shape[:2] != (stamp.height, stamp.width):
         image = np.asarray(cv2.resize(image, (stamp.width, stamp.height), interpolation=cv2.INTER_LINEAR), np.uint8)
-    return Picture(stamp.frame_id, image, stamp.quarter_turns_clockwise, scale)
+    return DecodedFrame(stamp.frame_id, image, stamp.quarter_turns_clockwise, scale)
 
 
 def from_jpeg(content: bytes) -> Image:
-    """(H,W,3) uint8 RGB of a JPEG; its size is looked at before it is decoded.
+    """(H,W,3) uint8 RGB of a JPEG. Its size is checked before it is decoded.
 
     Raises:
-        InputError: no JPEG, damaged, or of a size that no camera has.
+        InputError: the content is no JPEG, is damaged, or has a size outside `MIN_SIDE_PX` to `MAX_SIDE_PX`.
     """
     from PIL import Image as Pillow
 
@@ -83,8 +83,8 @@ def from_jpeg(content: bytes) -> Image:
             width, height = header.size
     except (OSError, ValueError, SyntaxError, Pillow.DecompressionBombError) as error:
         raise InputError("the body is not a JPEG picture") from error
-    if min(width, height) < LEAST_SIDE_PX or max(width, height) > MOST_SIDE_PX:
-        raise InputError(f"the picture is {width}×{height} px, expected {LEAST_SIDE_PX} to {MOST_SIDE_PX} a side")
+    if min(width, height) < MIN_SIDE_PX or max(width, height) > MAX_SIDE_PX:
+        raise InputError(f"the picture is {width}×{height} px, expected sides of {MIN_SIDE_PX} to {MAX_SIDE_PX} px")
     buffer = np.frombuffer(content, dtype=np.uint8)
     try:
         bgr = cv2.imdecode(buffer, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -1,4 +1,4 @@
-"""inspection.json as it changes while the server runs: the last good one is kept, and what is wrong is said."""
+"""An ``inspection.json`` that may change while the server runs: the last valid one is kept and faults are reported."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ _State = tuple[int, int, int] | None
 
 
 class InspectionFile:
-    """The inspection that is shown, and what is to be said of it.
+    """The inspection that is shown, and the notices about it.
 
     Args:
-        path: of the file; it must be good when the server starts.
-        model: that the inspection must belong to.
-        serial: of the specimen at hand; None: any.
-        max_age_s: an older inspection is called old; None: never.
+        path: the file; it must be valid when the server starts.
+        model: the model that the inspection must belong to.
+        serial: serial number of the part at the station; None: any.
+        max_age_s: age above which a notice calls the inspection old; None: never.
+
+    Attributes:
+        inspection: the last valid inspection.
 
     Raises:
         InputError, MismatchError: the file cannot be read or belongs to another model.
@@ -30,49 +33,51 @@ class InspectionFile:
     def __init__(self, path: Path, model: Model, serial: str | None, max_age_s: float | None) -> None:
         self.path, self._model = path, model
         self._serial, self._max_age_s = serial, max_age_s
-        self._seen = self._file_state()
+        self._read_state = self._file_state()
         self.inspection: Inspection = load_inspection(path, model)
-        self._trouble: Notice | None = None
-        self._doubted: _State = None
+        self._fault: Notice | None = None
+        self._unreadable_state: _State = None
 
     def reload(self) -> bool:
-        """Look whether the file has changed, and read it if so; True when another inspection is shown now.
+        """Read the file if it has changed; returns whether another inspection is shown now.
 
-        A file that cannot be read is looked at once more before it is complained of: it may be being written.
+        A file that cannot be read is reported at the second attempt only, because it may be in the middle of a write.
         """
         state = self._file_state()
-        if state == self._seen:
+        if state == self._read_state:
             return False
         try:
             inspection = load_inspection(self.path, self._model)
         except ArviewError as error:
-            if state == self._doubted:
+            if state == self._unreadable_state:
                 code = "inspection_model" if isinstance(error, MismatchError) else "inspection_unreadable"
-                self._trouble = Notice(
-                    code, "error", f"{without_folder(str(error), self.path)}; the last good one stays"
+                self._fault = Notice(
+                    code, "error", f"{without_folder(str(error), self.path)}; the last valid one is shown"
                 )
-                self._seen = state
-            self._doubted = state
+                self._read_state = state
+            self._unreadable_state = state
             return False
-        self._seen, self._doubted, self._trouble = state, None, None
+        self._read_state, self._unreadable_state, self._fault = state, None, None
         is_new = inspection != self.inspection
         self.inspection = inspection
         return is_new
 
     def notices(self, now: datetime | None = None) -> list[Notice]:
-        """What is to be said of the inspection at this moment."""
-        said = [self._trouble] if self._trouble else []
+        """The notices about the inspection at this time (default: now)."""
+        notices = [self._fault] if self._fault else []
         age_s = self.inspection.age_s(now or datetime.now(UTC))
         if self._max_age_s is not None and age_s > self._max_age_s:
-            said.append(Notice("inspection_old", "warning", f"measured {age_text(age_s)}: measure again"))
+            notices.append(Notice("inspection_old", "warning", f"measured {age_text(age_s)}: measure again"))
         measured = self.inspection.serial
         if self._serial and measured != self._serial:
             other = f"of {measured}" if measured else "without a serial number"
-            said.append(Notice("inspection_serial", "error", f"the inspection is {other}, this part is {self._serial}"))
-        return said
+            notices.append(
+                Notice("inspection_serial", "error", f"the inspection is {other}, this part is {self._serial}")
+            )
+        return notices
 
     def _file_state(self) -> _State:
-        """Changes whenever the file does."""
+        """Modification time, size and inode, which change whenever the file does; None when there is no file."""
         try:
             stat = self.path.stat()
         except OSError:

@@ -1,4 +1,4 @@
-"""Slots that hold one value, the newest: between threads, and from threads to a task. Nothing queues."""
+"""Slots that hold one value, the newest: from thread to thread, and from threads to a task. Nothing queues up."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ T = TypeVar("T")
 
 
 class NewestSlot(Generic[T]):
-    """Hands the newest value to one waiting thread.
+    """Passes the newest value to one waiting thread.
 
     Attributes:
-        dropped: values that another replaced before anyone took them.
+        dropped: number of values that were replaced before they were taken.
     """
 
     def __init__(self) -> None:
@@ -24,7 +24,7 @@ class NewestSlot(Generic[T]):
         self.dropped = 0
 
     def put(self, value: T) -> None:
-        """Offer a value; one that still waits is dropped and counted."""
+        """Store a value; one that still waits is dropped and counted."""
         with self._changed:
             if self._is_closed:
                 return
@@ -33,14 +33,14 @@ class NewestSlot(Generic[T]):
             self._changed.notify()
 
     def take(self, timeout_s: float | None = None) -> T | None:
-        """Wait for a value; None when the slot was closed or after the timeout."""
+        """Wait for a value and take it; None after the timeout or when the slot was closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._value is not None or self._is_closed, timeout_s)
             value, self._value = self._value, None
             return None if self._is_closed else value
 
     def close(self) -> None:
-        """Wake whoever waits; later values are refused."""
+        """Wake the waiting threads and ignore later values."""
         with self._changed:
             self._is_closed, self._value = True, None
             self._changed.notify_all()
@@ -51,33 +51,33 @@ class NewestSlot(Generic[T]):
         return self._is_closed
 
 
-class Inbox(Generic[T]):
-    """Hands the newest value, put by any thread, to one waiting task of an event loop."""
+class AsyncNewestSlot(Generic[T]):
+    """Passes the newest value, stored by any thread, to one waiting task of an event loop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._lock = threading.Lock()
         self._arrived = asyncio.Event()
         self._value: T | None = None
-        self._is_called = False
+        self._is_scheduled = False
 
     def put(self, value: T) -> None:
-        """Offer a value; one that still waits is dropped."""
+        """Store a value; one that still waits is dropped."""
         with self._lock:
             self._value = value
-            if self._is_called:
+            if self._is_scheduled:
                 return
-            self._is_called = True
-        with suppress(RuntimeError):  # the loop has ended: nobody waits
+            self._is_scheduled = True
+        with suppress(RuntimeError):  # the loop has ended, so that no task waits
             self._loop.call_soon_threadsafe(self._arrived.set)
 
     async def take(self) -> T:
-        """Wait for the next value."""
+        """Wait for the next value and take it."""
         while True:
             await self._arrived.wait()
             with self._lock:
                 value, self._value = self._value, None
-                self._is_called = False
+                self._is_scheduled = False
                 self._arrived.clear()
             if value is not None:
                 return value

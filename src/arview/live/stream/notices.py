@@ -1,4 +1,4 @@
-"""Notice: something that whoever looks at the page has to know."""
+"""Notices: conditions that the users of the page have to know of."""
 
 from __future__ import annotations
 
@@ -13,10 +13,15 @@ Level = Literal["info", "warning", "error"]
 
 @dataclass(frozen=True)
 class Notice:
-    """One line for the page, with a code that stays the same when the words change.
+    """A message of one line for the page.
+
+    Attributes:
+        code: a code of the protocol, which stays the same when the text changes.
+        level: severity.
+        text: the message.
 
     Raises:
-        ValueError: a code that the protocol does not know.
+        ValueError: the protocol does not define the code.
     """
 
     code: str
@@ -29,5 +34,5 @@ class Notice:
 
 
 def without_folder(text: str, path: str | Path) -> str:
-    """An error text for the page, which must not tell where files are."""
+    """An error message in which a path is reduced to its file name: pages must not show where files are."""
     return text.replace(str(path), Path(path).name)

@@ -1,4 +1,4 @@
-"""Recordings of what is shown: a thread draws the newest frames of a feed and writes them to a video."""
+"""Video recordings: a thread draws the overlay on the newest frames of a feed and writes them to a file."""
 
 from __future__ import annotations
 
@@ -14,134 +14,145 @@ import cv2
 import numpy as np
 
 from arview.errors import ArviewError
-from arview.live.stream.drawing import Drawing
-from arview.live.stream.feed import Feed, Tracked
+from arview.live.options import RecordingOptions
+from arview.live.stream.annotator import FrameAnnotator
+from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.newest import NewestSlot
 from arview.live.stream.notices import Notice
 from arview.video import Image, VideoSink
 
 logger = logging.getLogger("arview.live")
 
-FREE_BYTES = 500_000_000
-"""A recording ends before the disk is full: other programs need it too."""
-LONGEST_S = 3600.0
-_LOOK_EVERY_S = 5.0
-
 
 class Recorder:
-    """Records one feed until `stop`; frames that come while one is being drawn are left out.
+    """Records one feed until `stop`; frames that arrive while another is being drawn are dropped.
 
-    The first frame decides the size; later ones of another size (a phone that was turned) are fitted in with bars.
+    The first frame sets the size of the video. Later frames of another size (a phone that was rotated) are fitted in
+    with black bars.
 
-    Raises:
-        OutputError: the file cannot be written.
+    Args:
+        feed: the feed to record.
+        annotator: draws the overlay on its frames.
+        path: the video.
+        options: when the recording ends by itself.
+
+    Attributes:
+        fault: why the file could not be written; empty when it could.
     """
 
-    def __init__(self, feed: Feed, drawing: Drawing, path: Path) -> None:
-        self.path, self.trouble = path, ""
-        self._feed, self._drawing = feed, drawing
-        self._slot: NewestSlot[Tracked] = NewestSlot()
+    def __init__(
+        self, feed: Feed, annotator: FrameAnnotator, path: Path, options: RecordingOptions | None = None
+    ) -> None:
+        self.path, self.fault = path, ""
+        self._options = options or RecordingOptions()
+        self._feed, self._annotator = feed, annotator
+        self._slot: NewestSlot[TrackedFrame] = NewestSlot()
         self._sink: VideoSink | None = None
         self._began_s = time.monotonic()
-        self._free_looked_s = 0.0
+        self._disk_checked_s = 0.0
         self._thread = threading.Thread(target=self._run, name="arview-recorder", daemon=True)
         feed.listen(self._slot.put)
         self._thread.start()
 
     @property
     def seconds(self) -> float:
-        """Since it began."""
+        """Duration of the recording so far."""
         return time.monotonic() - self._began_s
 
     @property
     def is_running(self) -> bool:
-        """Whether frames are still taken."""
+        """Whether frames are still being recorded."""
         return self._thread.is_alive() and not self._slot.is_closed
 
     def stop(self) -> bool:
-        """End and finish the file; whether there is one. Waits for the encoder, so never call it in the event loop."""
+        """End the recording; returns whether there is a file.
+
+        It waits for the encoder, so do not call it in the event loop.
+        """
         self._feed.unlisten(self._slot.put)
         self._slot.close()
         self._thread.join()
-        return self._sink is not None and not self.trouble
+        return self._sink is not None and not self.fault
 
     def _run(self) -> None:
         try:
-            while (tracked := self._slot.take()) is not None and self._may_go_on():
+            while (tracked := self._slot.take()) is not None and self._may_continue():
                 self._write(tracked)
             if self._sink is not None:
                 self._sink.close()
         except Exception as error:
             if not isinstance(error, ArviewError):
                 logger.exception("recording failed")
-            self.trouble = str(error) or type(error).__name__
+            self.fault = str(error) or type(error).__name__
             if self._sink is not None:
                 self._sink.abort()
         self._feed.unlisten(self._slot.put)
         self._slot.close()
 
-    def _write(self, tracked: Tracked) -> None:
-        image = self._drawing.draw_record(tracked).image
+    def _write(self, tracked: TrackedFrame) -> None:
+        image = self._annotator.draw_with_status(tracked).image
         if self._sink is None:
             height, width = image.shape[:2]
             self._size = width, height
             self._sink = VideoSink(self.path, width, height)
         self._sink.write(_fitted(image, *self._size), tracked.arrived_s)
 
-    def _may_go_on(self) -> bool:
-        if time.monotonic() - self._free_looked_s < _LOOK_EVERY_S:
+    def _may_continue(self) -> bool:
+        if time.monotonic() - self._disk_checked_s < self._options.check_interval_s:
             return True
-        self._free_looked_s = time.monotonic()
-        return self.seconds < LONGEST_S and shutil.disk_usage(self.path.parent).free > FREE_BYTES
+        self._disk_checked_s = time.monotonic()
+        free_bytes = shutil.disk_usage(self.path.parent).free
+        return self.seconds < self._options.max_duration_s and free_bytes > self._options.min_free_bytes
 
 
 class Recordings:
     """The recordings of one run: running ones by feed, finished ones by number.
 
     Args:
-        folder: where those are put that a page asks for.
-        part_name: for their names.
+        folder: folder of the recordings that pages ask for.
+        part_name: name of the part, used in the file names.
+        options: when recordings end by themselves.
     """
 
-    def __init__(self, folder: Path, part_name: str) -> None:
-        self._folder, self._part_name = folder, part_name
+    def __init__(self, folder: Path, part_name: str, options: RecordingOptions | None = None) -> None:
+        self._folder, self._part_name, self._options = folder, part_name, options
         self._running: dict[Feed, Recorder] = {}
         self._finished: list[Path] = []
-        self._trouble: dict[Feed, str] = {}
+        self._fault: dict[Feed, str] = {}
 
     def of(self, feed: Feed) -> Recorder | None:
-        """The running recorder of a feed."""
+        """The running recorder of a feed, or None."""
         recorder = self._running.get(feed)
         return recorder if recorder is not None and recorder.is_running else None
 
-    def start(self, feed: Feed, drawing: Drawing, path: Path | None = None) -> None:
-        """Begin to record a feed, if it is not recorded yet; without a path under a name of its own."""
+    def start(self, feed: Feed, annotator: FrameAnnotator, path: Path | None = None) -> None:
+        """Start to record a feed unless it is being recorded; without a path, to a new file in the folder."""
         if self.of(feed) is None:
             self.stop(feed)
-            self._trouble.pop(feed, None)
-            self._running[feed] = Recorder(feed, drawing, path or self._new_path())
+            self._fault.pop(feed, None)
+            self._running[feed] = Recorder(feed, annotator, path or self._new_path(), self._options)
 
     def stop(self, feed: Feed) -> None:
-        """End the recording of a feed, if there is one; waits for the file."""
+        """End the recording of a feed, if there is one, and wait for its file."""
         recorder = self._running.pop(feed, None)
         if recorder is None:
             return
         if recorder.stop():
             self._finished.append(recorder.path)
             logger.info("recorded %s", recorder.path)
-        elif recorder.trouble:
-            self._trouble[feed] = recorder.trouble
-            logger.warning("%s", recorder.trouble)
+        elif recorder.fault:
+            self._fault[feed] = recorder.fault
+            logger.warning("%s", recorder.fault)
         else:
-            logger.warning("%s is not written: no picture came", recorder.path)
+            logger.warning("%s is not written: no picture arrived", recorder.path)
 
     def forget(self, feed: Feed) -> None:
-        """End the recording of a feed that has gone."""
+        """End the recording of a feed that was closed."""
         self.stop(feed)
-        self._trouble.pop(feed, None)
+        self._fault.pop(feed, None)
 
     def stop_all(self) -> None:
-        """Finish all files."""
+        """End all recordings."""
         for feed in list(self._running):
             self.stop(feed)
 
@@ -151,14 +162,14 @@ class Recordings:
         return list(range(len(self._finished)))
 
     def path(self, number: int) -> Path | None:
-        """File of a finished recording."""
+        """File of a finished recording, or None."""
         return self._finished[number] if 0 <= number < len(self._finished) else None
 
     def notices(self, feed: Feed) -> list[Notice]:
-        """What went wrong with the recording of a feed."""
+        """The notice about a failed recording of a feed, if there is one."""
         running = self._running.get(feed)
-        trouble = running.trouble if running is not None else self._trouble.get(feed, "")
-        return [Notice("recording_failed", "error", trouble.replace(f"{self._folder}/", ""))] if trouble else []
+        fault = running.fault if running is not None else self._fault.get(feed, "")
+        return [Notice("recording_failed", "error", fault.replace(f"{self._folder}/", ""))] if fault else []
 
     def _new_path(self) -> Path:
         name = re.sub(r"[^\w.-]+", "_", self._part_name).strip("._") or "part"
@@ -171,7 +182,7 @@ class Recordings:
 
 
 def _fitted(image: Image, width: int, height: int) -> Image:
-    """The picture at this size, with black bars where its shape differs."""
+    """The picture scaled to this size, with black bars where its aspect ratio differs."""
     own_height, own_width = image.shape[:2]
     if (own_width, own_height) == (width, height):
         return image

@@ -1,19 +1,18 @@
-"""The stamp: a strip of black and white cells below a picture that says which frame it is.
+"""The stamp: a strip of black and white cells below a picture that encodes the frame's id and size.
 
-WebRTC does not tell the receiver which camera frame a decoded one is, so the frame says it itself, through any
-encoder and any scaling of it. For a picture of width W:
+WebRTC does not tell the receiver which camera frame a decoded frame is. The stamp does, and it survives encoding and
+scaling. For a picture of width W:
 
-- the strip is ``strip_px(W) = 2 * ceil(W / 64)`` rows below the picture, over the full width (black where nothing
-  else);
+- the strip is ``strip_px(W) = 2 * ceil(W / 64)`` rows below the picture, over the full width;
 - it holds 2 rows of 32 cells: cell (r, c) spans columns ``c*W/32`` to ``(c+1)*W/32`` and, of the strip, rows
   ``r*S/2`` to ``(r+1)*S/2``; white (255) is 1, black (0) is 0;
 - the 64 bits, row after row, most significant first, are 8 bytes: 20 bits frame id, 13 bits W, 13 bits H (the
   picture's size without strip), 2 bits quarter turns, 16 bits CRC-16/CCITT-FALSE (poly 0x1021, init 0xFFFF, no
   reflection, no final xor) of the first 6 bytes.
 
-Quarter turns: how often the browser turned the sensor's picture clockwise to show it upright; it matters for
-calibrated cameras only. A phone (natural orientation portrait): ``(1 - screen.orientation.angle / 90) mod 4``; others
-``(-angle / 90) mod 4``.
+Quarter turns: how often the browser rotated the picture of the sensor clockwise to show it upright. They matter for
+calibrated cameras only. For a phone (natural orientation portrait) they are
+``(1 - screen.orientation.angle / 90) mod 4``, for other devices ``(-angle / 90) mod 4``.
 """
 
 from __future__ import annotations
@@ -24,18 +23,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 CELLS, ROWS = 32, 2
-LEAST_WIDTH_PX, MOST_PX = 64, 4096  # of the picture
-_LEAST_CONTRAST = 50.0  # grey levels between the means of the black and the white cells
+MIN_WIDTH_PX, MAX_PX = 64, 4096
+"""Smallest width of a picture, and bound on its sides (exclusive)."""
+_MIN_CONTRAST = 50.0
+"""Smallest difference between the means of the white and of the black cells, grey levels."""
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """What a strip says.
+    """The values that a strip encodes.
 
     Attributes:
         frame_id: 0 to 2^20 - 1.
-        width, height: of the picture without strip as it was stamped, px.
-        quarter_turns_clockwise: 0 to 3, applied to the sensor's picture.
+        width, height: size of the picture without the strip when it was stamped, px.
+        quarter_turns_clockwise: 0 to 3, rotation that the browser applied to the picture of the sensor.
     """
 
     frame_id: int
@@ -45,12 +46,12 @@ class Stamp:
 
 
 def strip_px(width: int) -> int:
-    """Rows of the strip below a picture of this width."""
+    """Height of the strip below a picture of this width, rows."""
     return 2 * -(-width // 64)
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE; of ``b"123456789"`` it is 0x29B1."""
+    """CRC-16/CCITT-FALSE; its value for ``b"123456789"`` is 0x29B1."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte << 8
@@ -59,8 +60,8 @@ def crc16(data: bytes) -> int:
     return crc
 
 
-def strip(stamp: Stamp) -> NDArray[np.uint8]:
-    """(S,W) uint8 strip, 0 and 255."""
+def stamp_strip(stamp: Stamp) -> NDArray[np.uint8]:
+    """The strip of a stamp, (S,W) uint8 with the values 0 and 255."""
     payload = (
         (stamp.frame_id << 28) | (stamp.width << 15) | (stamp.height << 2) | stamp.quarter_turns_clockwise
     ).to_bytes(6, "big")
@@ -72,26 +73,26 @@ def strip(stamp: Stamp) -> NDArray[np.uint8]:
 
 
 def stamped(image: NDArray[np.uint8], frame_id: int, quarter_turns_clockwise: int = 0) -> NDArray[np.uint8]:
-    """(H+S,W,3) uint8 RGB: the image with its strip below."""
+    """The image with its strip below, (H+S,W,3) uint8 RGB."""
     height, width = image.shape[:2]
-    below = strip(Stamp(frame_id, width, height, quarter_turns_clockwise))
+    below = stamp_strip(Stamp(frame_id, width, height, quarter_turns_clockwise))
     return np.concatenate([image, np.repeat(below[:, :, None], 3, axis=2)])
 
 
 def read_stamp(gray: NDArray[np.uint8]) -> Stamp | None:
-    """The stamp of a received frame, which may have been scaled; None when it cannot be read for sure.
+    """The stamp of a received frame, which may have been scaled; None when its checksum does not match.
 
     Args:
         gray: (H,W) uint8 brightness of the whole frame, strip included.
     """
     height, width = gray.shape
-    rows_px = width / 32.0  # of the strip, to within two rows of the unscaled frame
-    if width < LEAST_WIDTH_PX or height < 2 * rows_px:
+    rows_px = width / 32.0  # height of the strip, to within two rows of the unscaled frame
+    if width < MIN_WIDTH_PX or height < 2 * rows_px:
         return None
-    for whole_px in (float(strip_px(width)), rows_px, rows_px + 1.0):
-        means = _cell_means(gray, whole_px)
+    for strip_height_px in (float(strip_px(width)), rows_px, rows_px + 1.0):
+        means = _cell_means(gray, strip_height_px)
         low, high = means.min(), means.max()
-        if high - low < _LEAST_CONTRAST:
+        if high - low < _MIN_CONTRAST:
             continue
         coded = np.packbits(means.ravel() > 0.5 * (low + high)).tobytes()
         if crc16(coded[:6]) == int.from_bytes(coded[6:], "big"):
@@ -102,7 +103,7 @@ def read_stamp(gray: NDArray[np.uint8]) -> Stamp | None:
 
 
 def _cell_means(gray: NDArray[np.uint8], strip_height_px: float) -> NDArray[np.float64]:
-    """(2,32) mean brightness of the inner half of every cell."""
+    """Mean brightness of the inner half of each cell, (2,32)."""
     height, width = gray.shape
     means = np.zeros((ROWS, CELLS))
     cell_w, cell_h = width / CELLS, strip_height_px / ROWS
@@ -118,8 +119,8 @@ def _cell_means(gray: NDArray[np.uint8], strip_height_px: float) -> NDArray[np.f
 
 
 def _fits(stamp: Stamp, width: int, height: int) -> bool:
-    """Whether a received frame of this size can be the stamped one, scaled alike in both directions."""
-    if not (LEAST_WIDTH_PX <= stamp.width < MOST_PX and 0 < stamp.height < MOST_PX):
+    """Whether a received frame of this size can be the stamped one, scaled uniformly."""
+    if not (MIN_WIDTH_PX <= stamp.width < MAX_PX and 0 < stamp.height < MAX_PX):
         return False
     scale = width / stamp.width
     return abs(scale * (stamp.height + strip_px(stamp.width)) - height) <= max(2.0, 0.01 * height)

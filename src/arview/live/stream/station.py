@@ -1,4 +1,4 @@
-"""StationCamera: a camera, stream or file of the station, read for ever; what breaks is opened again."""
+"""The station camera: a camera, stream or file that is read continuously and reopened after failures."""
 
 from __future__ import annotations
 
@@ -9,33 +9,32 @@ import time
 import numpy as np
 
 from arview.errors import ArviewError
+from arview.live.options import StationOptions
 from arview.live.protocol import FRAME_IDS
 from arview.live.stream.feed import Feed
-from arview.live.stream.frames import Incoming, Picture
+from arview.live.stream.frames import DecodedFrame, IncomingFrame
 from arview.live.stream.notices import Notice, without_folder
 from arview.video import Frame, FrameSource, Image, open_source
 
 logger = logging.getLogger("arview.live")
 
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 8.0
-OPEN_TIMEOUT_S, READ_TIMEOUT_S = 10.0, 3.0
-FROZEN_S = 2.0
-"""A camera whose pictures are equal, pixel for pixel, for so long is frozen: sensors have noise."""
-_SAMPLED_PX = 7
-"""Every so many pixels are compared."""
-
 
 class StationCamera:
     """Reads a source in a thread and puts its frames into a feed.
 
-    A file or folder is played at its own rate, over and over; a camera or stream that ends or breaks is opened again
-    after a pause that doubles from half a second to eight.
+    A file or folder is played in a loop at its own frame rate. A camera or stream that ends or breaks is reopened after
+    a pause, which doubles with each failure.
+
+    Args:
+        spec: the source, see `arview.video.open_source`.
+        feed: receives the frames.
+        options: timeouts and pauses.
     """
 
-    def __init__(self, spec: str, feed: Feed) -> None:
-        self._spec, self._feed = spec, feed
+    def __init__(self, spec: str, feed: Feed, options: StationOptions | None = None) -> None:
+        self._spec, self._feed, self._options = spec, feed, options or StationOptions()
         self._ended = threading.Event()
-        self._trouble = ""
+        self._fault = ""
         self._count = 0
         self._sample: Image | None = None
         self._same_since_s: float | None = None
@@ -44,58 +43,61 @@ class StationCamera:
         self._thread.start()
 
     def close(self) -> None:
-        """Let go of the source."""
+        """Stop reading and release the source."""
         self._ended.set()
         self._thread.join(timeout=2.0)
 
     @property
     def state(self) -> tuple[str, str]:
-        """State of the stream and what to say of it."""
-        if self._trouble:
-            return "reconnecting", self._trouble
+        """State of the stream and its description for the page."""
+        if self._fault:
+            return "reconnecting", self._fault
         if self.is_frozen:
-            return "frozen", "the camera gives the same picture again and again"
+            return "frozen", "the camera delivers the same picture again and again"
         return self._feed.state
 
     @property
     def is_frozen(self) -> bool:
-        """Whether the pictures have been equal for a while."""
+        """Whether the pictures have been identical for longer than the options allow."""
         since_s = self._same_since_s
-        return self._is_live and since_s is not None and time.monotonic() - since_s > FROZEN_S
+        return self._is_live and since_s is not None and time.monotonic() - since_s > self._options.frozen_s
 
     def notices(self) -> list[Notice]:
-        """What whoever looks at the picture has to know."""
-        if self._trouble:
-            return [Notice("source_reconnecting", "error", f"{self._trouble}; it is tried again")]
+        """Conditions of the camera that viewers have to know of."""
+        if self._fault:
+            return [Notice("source_reconnecting", "error", f"{self._fault}; reconnecting")]
         if self.is_frozen:
-            return [Notice("source_frozen", "error", "the camera gives the same picture again and again")]
+            return [Notice("source_frozen", "error", "the camera delivers the same picture again and again")]
         state, text = self._feed.state
         if state == "waiting" and self._feed.newest is not None:
-            return [Notice("source_frozen", "error", f"the camera gives {text}")]
+            return [Notice("source_frozen", "error", f"the camera delivers {text}")]
         return []
 
     def _run(self) -> None:
-        pause_s = FIRST_PAUSE_S
+        options = self._options
+        pause_s = options.first_pause_s
         while not self._ended.is_set():
             count = self._count
             try:
-                with open_source(self._spec, open_timeout_s=OPEN_TIMEOUT_S, read_timeout_s=READ_TIMEOUT_S) as source:
+                with open_source(
+                    self._spec, open_timeout_s=options.open_timeout_s, read_timeout_s=options.read_timeout_s
+                ) as source:
                     self._play(source)
-                    trouble = source.ended_reason or ("the camera gives no more pictures" if source.is_live else "")
+                    fault = source.ended_reason or ("the camera delivers no more pictures" if source.is_live else "")
             except ArviewError as error:
-                trouble = str(error)
-            except Exception as error:  # a driver or decoder can raise anything; the station must not go dark for it
+                fault = str(error)
+            except Exception as error:  # drivers and decoders can raise anything, and the station must go on
                 logger.exception("reading %s failed", self._spec)
-                trouble = f"reading failed ({type(error).__name__})"
+                fault = f"reading failed ({type(error).__name__})"
             if self._ended.is_set():
                 return
-            self._trouble = without_folder(trouble, self._spec)
+            self._fault = without_folder(fault, self._spec)
             if self._count > count:
-                pause_s = FIRST_PAUSE_S
-            if trouble:
-                logger.warning("%s; trying again in %.1f s", trouble, pause_s)
+                pause_s = options.first_pause_s
+            if fault:
+                logger.warning("%s; trying again in %.1f s", fault, pause_s)
                 self._ended.wait(pause_s)
-                pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+                pause_s = min(2.0 * pause_s, options.max_pause_s)
 
     def _play(self, source: FrameSource) -> None:
         self._is_live = source.is_live
@@ -114,10 +116,11 @@ class StationCamera:
 
     def _put(self, frame: Frame) -> None:
         now_s = time.monotonic()
-        self._trouble = ""
-        sample = frame.image[::_SAMPLED_PX, ::_SAMPLED_PX].copy()
+        self._fault = ""
+        step = self._options.sample_step_px
+        sample = frame.image[::step, ::step].copy()
         if self._sample is None or not np.array_equal(sample, self._sample):
             self._sample, self._same_since_s = sample, now_s
-        picture = Picture(self._count % FRAME_IDS, frame.image)
+        decoded = DecodedFrame(self._count % FRAME_IDS, frame.image)
         self._count += 1
-        self._feed.put(Incoming(lambda: picture, now_s))
+        self._feed.put(IncomingFrame(lambda: decoded, now_s))

@@ -1,4 +1,4 @@
-"""Subject: what is looked at. The part, its guide views and its inspection, and what is made of them for one feed."""
+"""The subject: the part that is shown, with its guide views and its inspection."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from arview.tracking import TrackingSession
 from arview.tracking.guide_pose import guide_pose
 
 PHONE_FOV = "fov:66"
-"""Along the longer side: main cameras of phones have 24 to 28 mm equivalent, 65 to 72°."""
+"""Camera assumed for phones: field of view along the longer side. Their main cameras have 65 to 72° (24 to 28 mm)."""
 
 
 @dataclass(frozen=True)
-class Look:
-    """What the server draws.
+class OverlayStyle:
+    """What the server draws over the picture.
 
     Raises:
-        InputError: an opacity outside 0–1 or another edge mode.
+        InputError: the opacity is outside 0 to 1, or the edge mode is unknown.
     """
 
     ghost: bool = True
     edges: EdgeMode = "visible"
     labels: bool = True
     opacity: float = OverlayOptions.opacity
-    only: str | None = None  # the component that alone is drawn and labelled; None: all
-    status: bool = True  # the line at the lower edge; a page shows the same in its own letters
+    only: str | None = None  # the only component that is drawn and labelled; None: all
+    status: bool = True  # the status line at the lower edge; the page shows the same as text
 
     def __post_init__(self) -> None:
         self.overlay_options()
 
     def overlay_options(self) -> OverlayOptions:
-        """The same for the renderer."""
+        """The same style as options of the renderer."""
         return OverlayOptions(
             show_ghost=self.ghost,
             show_edges=self.edges,
@@ -55,12 +55,17 @@ class Subject:
     """The part and its inspection; safe to use from several threads.
 
     Args:
-        part: with its model.
+        part: the part with its model.
         views: guide views of that model.
-        options: of the server.
+        options: options of the server.
+
+    Attributes:
+        serial: serial number of the part at the station, or None.
+        revision: number of the part document, increased with each new inspection.
 
     Raises:
-        InputError, MismatchError: the inspection cannot be read or is another model's, or there is no such guide.
+        InputError, MismatchError: the inspection cannot be read or belongs to another model, or the guide view does
+            not exist.
     """
 
     def __init__(self, part: Part, views: GuideViewSet, options: LiveOptions) -> None:
@@ -76,12 +81,12 @@ class Subject:
 
     @property
     def inspection(self) -> Inspection | None:
-        """The inspection that is shown now."""
+        """The inspection that is currently shown."""
         with self._lock:
             return self._file.inspection if self._file else None
 
     def reload(self) -> bool:
-        """Read the inspection again if its file has changed; True when another one is shown now."""
+        """Read the inspection again if its file has changed; returns whether another one is shown now."""
         if self._file is None or not self._file.reload():
             return False
         with self._lock:
@@ -89,21 +94,21 @@ class Subject:
         return True
 
     def notices(self) -> list[Notice]:
-        """What is to be said of camera and inspection."""
-        said = [] if self._file is None else self._file.notices()
+        """The notices about camera and inspection."""
+        notices = [] if self._file is None else self._file.notices()
         if self._file is None:
-            said.append(Notice("inspection_none", "info", "no inspection: nothing has been measured"))
+            notices.append(Notice("inspection_none", "info", "no inspection: nothing has been measured"))
         if self.options.camera is None:
-            said.append(
+            notices.append(
                 Notice("camera_guessed", "warning", "camera not calibrated: distances to the part are only rough")
             )
-        return said
+        return notices
 
     def camera(self, width: int, height: int, quarter_turns_clockwise: int = 0) -> Camera:
-        """Intrinsics of the pictures of a feed.
+        """Intrinsics for the frames of a feed.
 
         Raises:
-            InputError, MismatchError: the camera file cannot be read or is for pictures of another shape.
+            InputError, MismatchError: the camera file cannot be read or is for frames of another aspect ratio.
         """
         spec, source = self.options.camera, self.options.source
         if spec is not None:
@@ -113,16 +118,16 @@ class Subject:
         return guess_camera(width, height)
 
     def session(self, camera: Camera) -> TrackingSession:
-        """A new session for a feed with this camera."""
+        """A new tracking session for a feed with this camera."""
         guide = None
         if self.options.guide is not None:
             guide = guide_pose(self.options.guide, self.part, self.views.view_range, camera)
         return TrackingSession(self.views, camera, self.part.model, guide_cam_from_model=guide)
 
-    def overlay(self, camera: Camera, look: Look) -> OverlayRenderer:
-        """What draws for a feed with this camera."""
+    def overlay(self, camera: Camera, style: OverlayStyle) -> OverlayRenderer:
+        """A renderer of the overlay for a feed with this camera."""
         inspection = self.inspection
-        if inspection is not None and look.only is not None:
-            wanted = tuple(one for one in inspection.components if one.name == look.only)
+        if inspection is not None and style.only is not None:
+            wanted = tuple(one for one in inspection.components if one.name == style.only)
             inspection = replace(inspection, components=wanted)
-        return OverlayRenderer(self.part.model, camera, inspection, look.overlay_options())
+        return OverlayRenderer(self.part.model, camera, inspection, style.overlay_options())

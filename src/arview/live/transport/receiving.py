@@ -1,9 +1,9 @@
-"""What a live receiver needs beyond aiortc: frames as soon as they are complete, no queue that grows, one interface.
+"""Changes to aiortc for live video: low latency, bounded queues, and candidates on chosen interfaces only.
 
-aiortc hands a frame to the decoder when the first packet of the next one has come, 33 ms late at 30 fps, lets the
-decoder's queue grow without limit when the machine is too slow, and offers ICE candidates on every interface but the
-loopback. These functions change that on one connection; they use private names of aiortc (1.14 to 1.16) and aioice,
-and do nothing where a later version no longer has them.
+aiortc passes a frame to the decoder when the first packet of the next frame arrives, which is 33 ms late at 30 fps. The
+queue of its decoder grows without limit on a slow machine, and it offers ICE candidates on all interfaces except the
+loopback. These functions change that for one connection. They use private names of aiortc (1.14 to 1.16) and aioice,
+and have no effect with later versions that no longer have these names.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from aiortc.jitterbuffer import JitterBuffer, JitterFrame
 
 logger = logging.getLogger("arview.live")
 
-WAITING_FRAMES = 3
-"""Encoded frames that may wait for the decoder; more means that it cannot keep up."""
+MAX_WAITING_FRAMES = 3
+"""Encoded frames that may wait for the decoder; when there are more, it cannot keep up."""
 _BUFFER = "_RTCRtpReceiver__jitter_buffer"
 _QUEUE = "_RTCRtpReceiver__decoder_queue"
 _ERROR = "_RTCRtpReceiver__decoder_error"
 
 
 class PromptJitterBuffer(JitterBuffer):
-    """Hands out a frame at its last packet, which carries the marker bit (RFC 3550 5.1, RFC 7741 4.1, RFC 6184 5.1)."""
+    """Releases a frame at its last packet, which has the marker bit (RFC 3550 5.1, RFC 7741 4.1, RFC 6184 5.1)."""
 
     def _remove_frame(self, sequence_number: int) -> JitterFrame | None:
         packets: list[Any] = []
@@ -43,10 +43,13 @@ class PromptJitterBuffer(JitterBuffer):
         return JitterFrame(data=b"".join(packet._data for packet in packets), timestamp=packets[0].timestamp)
 
 
-class ShortQueue(queue.Queue[Any]):
-    """The decoder's queue; when it is full all of it is dropped, and a key frame is asked for.
+class BoundedFrameQueue(queue.Queue[Any]):
+    """The queue of a decoder. When it is full, all its frames are dropped and a key frame is requested.
 
-    Frames depend on those before them, so that single ones cannot be dropped.
+    Single frames cannot be dropped because frames depend on those before them.
+
+    Attributes:
+        dropped: number of frames dropped so far.
     """
 
     def __init__(self, decoder_error: Any) -> None:
@@ -55,8 +58,8 @@ class ShortQueue(queue.Queue[Any]):
         self.dropped = 0
 
     def put(self, item: Any, block: bool = True, timeout: float | None = None) -> None:
-        """Add a frame, or None to end the decoder."""
-        if item is not None and self.qsize() >= WAITING_FRAMES:
+        """Add a frame, or None to stop the decoder."""
+        if item is not None and self.qsize() >= MAX_WAITING_FRAMES:
             while True:
                 try:
                     self.get_nowait()
@@ -67,18 +70,18 @@ class ShortQueue(queue.Queue[Any]):
         super().put(item, block, timeout)
 
 
-def make_prompt(receiver: Any) -> None:
-    """Change an aiortc receiver that has not begun to receive."""
+def reduce_latency(receiver: Any) -> None:
+    """Give an aiortc receiver, before it starts, the prompt jitter buffer and the bounded queue."""
     buffer, error = getattr(receiver, _BUFFER, None), getattr(receiver, _ERROR, None)
     if buffer is None or error is None or not hasattr(receiver, _QUEUE):
-        logger.warning("this aiortc is not known: frames are taken one frame late")
+        logger.warning("unknown version of aiortc: frames are received one frame late")
         return
     setattr(receiver, _BUFFER, PromptJitterBuffer(capacity=buffer.capacity, is_video=True))
-    setattr(receiver, _QUEUE, ShortQueue(error))
+    setattr(receiver, _QUEUE, BoundedFrameQueue(error))
 
 
-def bind_to(connection: Any, addresses: Sequence[str]) -> None:
-    """Have a peer connection, before it gathers, offer candidates at these addresses only."""
+def restrict_candidates(connection: Any, addresses: Sequence[str]) -> None:
+    """Make a peer connection, before it gathers candidates, offer these addresses only."""
     transports = [transceiver.receiver.transport for transceiver in connection.getTransceivers()]
     if connection.sctp is not None:
         transports.append(connection.sctp.transport)
@@ -86,7 +89,7 @@ def bind_to(connection: Any, addresses: Sequence[str]) -> None:
         ice = getattr(ice_transport.iceGatherer, "_connection", None)
         gather = getattr(ice, "get_component_candidates", None)
         if ice is None or gather is None:
-            logger.warning("this aiortc is not known: it offers all addresses of this machine")
+            logger.warning("unknown version of aiortc: it offers all addresses of this machine")
             continue
         ice.get_component_candidates = partial(_gather_at, gather, list(addresses))
 
@@ -94,5 +97,5 @@ def bind_to(connection: Any, addresses: Sequence[str]) -> None:
 async def _gather_at(
     gather: Callable[..., Awaitable[Any]], own: list[str], component: int, addresses: list[str], timeout: int = 5
 ) -> Any:
-    """Gathering as aioice does it, with our addresses instead of those that it would take."""
+    """Gather candidates as aioice does, at given addresses instead of those that it would choose."""
     return await gather(component=component, addresses=own, timeout=timeout)

@@ -1,4 +1,4 @@
-"""One WebRTC connection of one page: camera frames in, poses and pictures out, the newest only."""
+"""The WebRTC connection of a page: receives camera frames, sends poses and pictures, always the newest."""
 
 from __future__ import annotations
 
@@ -20,61 +20,60 @@ from aiortc.mediastreams import MediaStreamError, MediaStreamTrack
 from av.video.frame import VideoFrame
 
 from arview.errors import InputError
-from arview.live.protocol import CHANNEL, Way
+from arview.live.options import WebrtcOptions
+from arview.live.protocol import CHANNEL, ViewMode
+from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.documents import Document, pose_document
-from arview.live.stream.drawing import Drawing
-from arview.live.stream.feed import Feed, Tracked
-from arview.live.stream.frames import Incoming, from_stamped
-from arview.live.stream.newest import Inbox
+from arview.live.stream.feed import Feed, TrackedFrame
+from arview.live.stream.frames import IncomingFrame, from_stamped
+from arview.live.stream.newest import AsyncNewestSlot
 from arview.live.stream.stamp import stamped
-from arview.live.transport.receiving import bind_to, make_prompt
+from arview.live.transport.receiving import reduce_latency, restrict_candidates
 
-BEHIND_BYTES = 32_768
-"""So much waiting on the data channel, some fifteen answers, and new ones are left out."""
-MOST_CANDIDATES = 32
 _CLOCK_HZ = 90_000
 _BITRATES = {"DEFAULT_BITRATE": 2_500_000, "MIN_BITRATE": 500_000, "MAX_BITRATE": 8_000_000}
-"""Of what aiortc encodes, bit/s: its own limits are for video calls; labels are to be read over a local network."""
+"""Bitrates of aiortc's encoders, bit/s. Its own ones are for video calls, in which labels would not be readable."""
 _KBITS = "x-google-min-bitrate=800;x-google-start-bitrate=4000;x-google-max-bitrate=10000"
-"""What Chromium is asked to send: it would begin with 300 kbit/s, too blurred to find the part."""
+"""Bitrates that Chromium is asked to send, kbit/s. It would start at 300, too blurred to detect the part."""
 
 
 def raise_bitrates() -> None:
-    """Have aiortc encode at the rates above, in this process."""
+    """Make the encoders of aiortc use the bitrates above, in this process."""
     for codec in (aiortc.codecs.h264, aiortc.codecs.vpx):
         for name, value in _BITRATES.items():
             setattr(codec, name, value)
 
 
-class BackTrack(MediaStreamTrack):
-    """The newest picture of a feed as the page has asked for it, stamped; waits while there is none to send.
+class OutgoingVideoTrack(MediaStreamTrack):
+    """The track that sends the newest frames of a feed, stamped.
 
     Args:
-        feed: whose frames are sent.
-        drawing: draws them.
-        way: called for each frame; "video": annotated. "poses": plain, of a station; a phone has its own frames.
+        feed: the feed.
+        annotator: draws the overlay on its frames.
+        mode: called for each frame. In mode "video" annotated frames are sent, in mode "poses" the plain frames of a
+            station camera; a phone has its own frames.
     """
 
     kind = "video"
 
-    def __init__(self, feed: Feed, drawing: Drawing, way: Callable[[], Way]) -> None:
+    def __init__(self, feed: Feed, annotator: FrameAnnotator, mode: Callable[[], ViewMode]) -> None:
         super().__init__()
-        self._feed, self._drawing, self._way = feed, drawing, way
-        self._inbox: Inbox[Tracked] = Inbox(asyncio.get_running_loop())
+        self._feed, self._annotator, self._mode = feed, annotator, mode
+        self._inbox: AsyncNewestSlot[TrackedFrame] = AsyncNewestSlot(asyncio.get_running_loop())
         self._began_s = time.monotonic()
         self._ticks = -1
         feed.listen(self._inbox.put)
 
     async def recv(self) -> VideoFrame:
-        """The next frame to send."""
+        """Wait for the next frame to send."""
         while True:
             tracked = await self._inbox.take()
             if self.readyState != "live":
                 raise MediaStreamError
-            way = self._way()
-            if way == "poses" and self._feed.kind == "phone":
+            mode = self._mode()
+            if mode == "poses" and self._feed.kind == "phone":
                 continue
-            frame = await asyncio.to_thread(self._frame, tracked, way)
+            frame = await asyncio.to_thread(self._frame, tracked, mode)
             self._ticks = max(self._ticks + 1, round((time.monotonic() - self._began_s) * _CLOCK_HZ))
             frame.pts, frame.time_base = self._ticks, Fraction(1, _CLOCK_HZ)
             return frame
@@ -84,94 +83,103 @@ class BackTrack(MediaStreamTrack):
         self._feed.unlisten(self._inbox.put)
         super().stop()
 
-    def _frame(self, tracked: Tracked, way: Way) -> VideoFrame:
-        image = self._drawing.draw(tracked).image if way == "video" else tracked.picture.image
+    def _frame(self, tracked: TrackedFrame, mode: ViewMode) -> VideoFrame:
+        image = self._annotator.draw(tracked).image if mode == "video" else tracked.frame.image
         height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-        return VideoFrame.from_ndarray(stamped(image[:height, :width], tracked.picture.frame_id), format="rgb24")
+        return VideoFrame.from_ndarray(stamped(image[:height, :width], tracked.frame.frame_id), format="rgb24")
 
 
 class Connection:
     """A peer connection.
 
     Args:
-        feed: gets the page's camera frames, or has a station's.
-        drawing: of that feed.
-        way: what the page wants back, asked for each frame.
-        addresses: at which to offer ICE candidates.
-        on_end: called once when the connection has failed or was closed by the page.
+        feed: receives the camera frames of the page, or provides those of the station camera.
+        annotator: annotator of that feed.
+        mode: called for each frame; returns what the page wants to receive.
+        addresses: addresses at which ICE candidates are offered.
+        on_end: called once when the connection has failed or the page has closed it.
+        options: limits.
+
+    Attributes:
+        is_connected: whether the connection is established.
+        dropped: number of messages dropped because the page was too slow.
     """
 
     def __init__(
         self,
         feed: Feed,
-        drawing: Drawing,
-        way: Callable[[], Way],
+        annotator: FrameAnnotator,
+        mode: Callable[[], ViewMode],
         addresses: Sequence[str],
         on_end: Callable[[], None],
+        options: WebrtcOptions | None = None,
     ) -> None:
-        self._feed, self._drawing, self._way = feed, drawing, way
+        self._feed, self._annotator, self._mode = feed, annotator, mode
         self._addresses, self._on_end = addresses, on_end
+        self._options = options or WebrtcOptions()
         self._peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
         self._channel: Any = None
-        self._track: BackTrack | None = None
-        self._inbox: Inbox[Tracked] = Inbox(asyncio.get_running_loop())
+        self._track: OutgoingVideoTrack | None = None
+        self._inbox: AsyncNewestSlot[TrackedFrame] = AsyncNewestSlot(asyncio.get_running_loop())
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_closed = False
         self.is_connected = False
-        self.left_out = 0  # answers that the page was too slow for
+        self.dropped = 0
         self._peer.on("track", self._on_track)
         self._peer.on("datachannel", self._on_channel)
         self._peer.on("connectionstatechange", self._on_state)
 
     async def answer(self, offer_sdp: str) -> str:
-        """The SDP that answers a page's offer.
+        """The SDP that answers the offer of a page.
 
         Raises:
-            InputError: an offer that is damaged or asks for something else than the protocol says.
+            InputError: the offer is damaged or does not follow the protocol.
         """
         try:
-            await self._peer.setRemoteDescription(RTCSessionDescription(_checked(offer_sdp), "offer"))
+            await self._peer.setRemoteDescription(
+                RTCSessionDescription(_checked_offer(offer_sdp, self._options.max_candidates), "offer")
+            )
             videos = [one for one in self._peer.getTransceivers() if one.kind == "video"]
             if len(videos) != 1 or self._peer.sctp is None:
                 raise InputError("the offer needs one video transceiver and one data channel")
-            self._track = BackTrack(self._feed, self._drawing, self._way)
+            self._track = OutgoingVideoTrack(self._feed, self._annotator, self._mode)
             self._peer.addTrack(self._track)
-            bind_to(self._peer, self._addresses)
+            restrict_candidates(self._peer, self._addresses)
             await self._peer.setLocalDescription(await self._peer.createAnswer())
         except InputError:
             raise
-        except Exception as error:  # aiortc raises whatever its parser stumbles over
+        except Exception as error:  # the parser of aiortc raises exceptions of many types
             raise InputError(f"the offer cannot be used ({type(error).__name__})") from error
         self._feed.listen(self._inbox.put)
         self._start(self._send_poses())
-        return _faster(self._peer.localDescription.sdp)
+        return _with_bitrates(self._peer.localDescription.sdp)
 
     def send(self, document: Document) -> None:
-        """Send a message, or leave it out when the page is behind or not there yet."""
+        """Send a message; it is dropped when the channel is congested or not open yet."""
         channel = self._channel
         if channel is None or channel.readyState != "open":
             return
-        if channel.bufferedAmount > BEHIND_BYTES:
-            self.left_out += 1
+        if channel.bufferedAmount > self._options.max_buffered_bytes:
+            self.dropped += 1
             return
         channel.send(json.dumps(document, allow_nan=False))
 
     async def close(self) -> None:
-        """End the connection and all that belongs to it."""
+        """Close the connection with its tasks and tracks."""
         self._is_closed = True
         self._feed.unlisten(self._inbox.put)
         for task in self._tasks:
             task.cancel()
         if self._track is not None:
             self._track.stop()
-        with suppress(Exception):  # a connection that broke half-way cannot always be closed in good order
+        with suppress(Exception):  # a connection that broke while being set up cannot always be closed cleanly
             await asyncio.wait_for(self._peer.close(), timeout=5.0)
         self._peer.remove_all_listeners()
 
     def _on_track(self, track: Any) -> None:
         for transceiver in self._peer.getTransceivers():
             if transceiver.receiver.track is track:
-                make_prompt(transceiver.receiver)
+                reduce_latency(transceiver.receiver)
         self._start(self._drain(track))
 
     def _on_channel(self, channel: Any) -> None:
@@ -185,12 +193,12 @@ class Connection:
             self._on_end()
 
     async def _drain(self, track: Any) -> None:
-        """Take every decoded frame at once, so that none waits in aiortc."""
+        """Take every decoded frame immediately, so that none waits in aiortc."""
         with suppress(MediaStreamError):
             while True:
                 frame = await track.recv()
                 if self._feed.kind == "phone" and isinstance(frame, VideoFrame):
-                    self._feed.put(Incoming(partial(from_stamped, frame), time.monotonic()))
+                    self._feed.put(IncomingFrame(partial(from_stamped, frame), time.monotonic()))
 
     async def _send_poses(self) -> None:
         while True:
@@ -203,11 +211,14 @@ class Connection:
         task.add_done_callback(self._tasks.discard)
 
 
-def _checked(sdp: str) -> str:
-    """An offer without what would make the server look up names or call many addresses.
+def _checked_offer(sdp: str, max_candidates: int) -> str:
+    """An offer without candidates that would make the server resolve names or contact addresses outside the network.
 
-    The page's own candidates are hardly needed: its checks arrive here and tell its address. Without an end of
-    candidates the server waits for them.
+    The candidates of the page are hardly needed: its connectivity checks arrive here and show its address. The end of
+    candidates is removed so that the server waits for these checks.
+
+    Raises:
+        InputError: too many candidates, or other media than the protocol defines.
     """
     lines = []
     candidates = 0
@@ -217,8 +228,8 @@ def _checked(sdp: str) -> str:
         if line.startswith("a=candidate:"):
             fields = line.split()
             candidates += 1
-            if candidates > MOST_CANDIDATES:
-                raise InputError(f"the offer holds more than {MOST_CANDIDATES} candidates")
+            if candidates > max_candidates:
+                raise InputError(f"the offer holds more than {max_candidates} candidates")
             if len(fields) < 8 or fields[2].lower() != "udp" or not _is_local(fields[4]):
                 continue
         lines.append(line)
@@ -228,27 +239,27 @@ def _checked(sdp: str) -> str:
 
 
 def _is_local(address: str) -> bool:
-    """Whether this is an address, not a name, of a local network: no other is ever called."""
+    """Whether this is an address of a local network and not a name; no other is contacted."""
     try:
         return ipaddress.ip_address(address).is_private
     except ValueError:
         return False
 
 
-def _faster(sdp: str) -> str:
-    """An answer that asks Chromium for enough bits from the start; other browsers do not know the words."""
+def _with_bitrates(sdp: str) -> str:
+    """An answer that asks Chromium for a high bitrate from the start; other browsers ignore it."""
     lines = sdp.splitlines()
     video = [
         match.group(1) for line in lines if (match := re.match(r"a=rtpmap:(\d+) (?:VP8|H264)/90000", line)) is not None
     ]
-    told = set()
+    done = set()
     for index, line in enumerate(lines):
         match = re.match(r"a=fmtp:(\d+) ", line)
         if match and match.group(1) in video:
             lines[index] = f"{line};{_KBITS}"
-            told.add(match.group(1))
+            done.add(match.group(1))
     for payload in video:
-        if payload not in told:
+        if payload not in done:
             place = next(i for i, line in enumerate(lines) if line.startswith(f"a=rtpmap:{payload} "))
             lines.insert(place + 1, f"a=fmtp:{payload} {_KBITS}")
     return "\r\n".join(lines) + "\r\n"

@@ -171,7 +171,7 @@ export class Ghost {
   draw({ source, pose, guide, camera, isCritical, lineWidth }) {
     const { renderer } = this, shown = pose || guide;
     if (shown) {
-      this.#look(camera, shown, lineWidth);
+      this.#prepare(camera, shown, lineWidth);
       this.shared.dimming.value = pose && isCritical ? CRITICAL_DIMMING : 1;
       this.target.scissor.set(...this.#box(camera, shown, this.bent.window, this.target.height, false));
       renderer.setRenderTarget(this.target);
@@ -227,7 +227,7 @@ export class Ghost {
   }
 
   /** Set matrices and targets for a camera and a pose. */
-  #look(camera, pose, lineWidth) {
+  #prepare(camera, pose, lineWidth) {
     if (!this.camera?.isSame(camera)) this.#bendLike(camera);
     const { window } = this.bent;
     const scale = this.canvas.width / camera.width;

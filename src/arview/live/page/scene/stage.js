@@ -23,8 +23,8 @@ export class Stage {
    * @param onPick called with the name of a component that was pressed in the picture, or null beside all.
    * @param onResize called when everything has to be drawn anew.
    */
-  constructor(elements, look, onPick, onResize) {
-    Object.assign(this, elements, { look, onPick, onResize });
+  constructor(elements, style, onPick, onResize) {
+    Object.assign(this, elements, { style, onPick, onResize });
     try {
       this.ghost = new Ghost(this.canvas);
     } catch {
@@ -32,7 +32,7 @@ export class Stage {
       this.context = this.canvas.getContext("2d", CANVAS_OPTIONS);
     }
     this.part = null;
-    this.isChanged = true; // something else than picture and pose: the look, the part, the window
+    this.isChanged = true; // something else than picture and pose: the style, the part, the window
     this.labelBoxes = new Labels(this.labels, this.leaders, onPick);
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
     new ResizeObserver(() => this.measure()).observe(this.stage);
@@ -58,8 +58,8 @@ export class Stage {
     this.#arrange();
   }
 
-  setLook(look) {
-    this.look = look;
+  setStyle(style) {
+    this.style = style;
     this.isChanged = true;
     if (this.ghost?.components.length) this.ghost.style(this.#styles());
     this.#seenMs = -Infinity;
@@ -98,7 +98,7 @@ export class Stage {
       this.#seenMs = nowMs;
       this.labelBoxes.setSeen(this.ghost.seen());
     }
-    this.labelBoxes.update(ownPose, this.#place, this.#free.labels, this.look, !this.calm.matches);
+    this.labelBoxes.update(ownPose, this.#place, this.#free.labels, this.style, !this.calm.matches);
   }
 
   #drawn = null;
@@ -110,7 +110,7 @@ export class Stage {
   }
 
   #styles() {
-    const { ghost, edges, opacity, only } = this.look, isInspected = this.part.inspection !== null;
+    const { ghost, edges, opacity, only } = this.style, isInspected = this.part.inspection !== null;
     return this.part.components.map((one) => {
       const isContext = isInspected && one.verdict === null;
       const color = rgb(isContext ? CONTEXT : one.verdict_color ?? NEUTRAL);

@@ -45,9 +45,9 @@ export const getModel = async () => (await ask("/api/model.glb")).arrayBuffer();
 const REMEMBERED = "arview-client";
 
 /** Take part; {client, answer}. This page's earlier self, before a reload, leaves. */
-export async function join(wish, signal) {
+export async function join(request, signal) {
   const before = sessionStorage.getItem(REMEMBERED);
-  const json = before ? { ...wish, replaces: before } : wish;
+  const json = before ? { ...request, replaces: before } : request;
   const joined = await (await ask("/api/clients", { method: "POST", json, signal })).json();
   sessionStorage.setItem(REMEMBERED, joined.client);
   return joined;
@@ -60,7 +60,7 @@ export function leave(client) {
 }
 
 /** Ask for something; the client's Status. */
-export const control = async (client, wish) =>
-  (await ask(`/api/clients/${client}/control`, { method: "POST", json: wish })).json();
+export const control = async (client, request) =>
+  (await ask(`/api/clients/${client}/control`, { method: "POST", json: request })).json();
 
 export const getStatus = async (client, signal) => (await ask(`/api/clients/${client}/status`, { signal })).json();

@@ -4,13 +4,13 @@ import { Refusal, control, getModel, getPart } from "./api.js";
 import { JpegLink } from "./jpeg.js";
 import { NoWebrtc, WebrtcLink } from "./webrtc.js";
 
-export const WISHES = ["auto", "poses", "video", "jpeg"];
+export const CHOICES = ["auto", "poses", "video", "jpeg"];
 const FIRST_PAUSE_S = 1, LONGEST_PAUSE_S = 15, LOADING_PAUSE_S = 1, BUSY_PAUSE_S = 4;
 const MUTE_MS = 6000; // connected, sending, and nothing arrives: WebRTC does not work here
 
 export class Connection {
   link = null;
-  wish = "auto";
+  choice = "auto";
   hasGhost = true; // whether this page can draw one
   status = null;
   #part = null;
@@ -29,13 +29,13 @@ export class Connection {
     Object.assign(this, { video, events });
   }
 
-  get way() {
-    return this.wish === "video" || (!this.hasGhost && this.wish !== "poses") ? "video" : "poses";
+  get mode() {
+    return this.choice === "video" || (!this.hasGhost && this.choice !== "poses") ? "video" : "poses";
   }
 
   /** Whether automatic choice has given WebRTC up. */
   get hasFallenBack() {
-    return this.#isWebrtcBlocked && this.wish !== "jpeg";
+    return this.#isWebrtcBlocked && this.choice !== "jpeg";
   }
 
   /** Stay connected until `end`. */
@@ -49,7 +49,7 @@ export class Connection {
         this.#phase("retrying", reason, pauseS);
       } catch (error) {
         if (this.#isOver) return;
-        if (error instanceof NoWebrtc && this.wish === "auto") {
+        if (error instanceof NoWebrtc && this.choice === "auto") {
           this.#isWebrtcBlocked = true;
           continue;
         }
@@ -65,22 +65,22 @@ export class Connection {
     }
   }
 
-  /** Choose how to be connected: one of WISHES. */
-  choose(wish) {
-    const before = this.wish;
-    this.wish = wish;
+  /** Choose how to be connected: one of CHOICES. */
+  choose(choice) {
+    const before = this.choice;
+    this.choice = choice;
     this.#isWebrtcBlocked = false;
-    if (!this.link || wish === before) return;
-    const kind = wish === "jpeg" ? "jpeg" : "webrtc";
-    if (kind === this.link.kind) this.ask({ way: this.way });
+    if (!this.link || choice === before) return;
+    const kind = choice === "jpeg" ? "jpeg" : "webrtc";
+    if (kind === this.link.kind) this.ask({ mode: this.mode });
     else this.#restart();
   }
 
   /** Ask the server for something; its words when it refuses, else "". */
-  async ask(wish) {
+  async ask(request) {
     if (!this.link?.client) return "there is no connection to the station";
     try {
-      this.#tell(await control(this.link.client, wish));
+      this.#tell(await control(this.link.client, request));
       return "";
     } catch (error) {
       return error.message;
@@ -149,13 +149,13 @@ export class Connection {
       onFrame: this.events.onFrame,
       onEnd: this.#ended,
     };
-    const isJpeg = this.wish === "jpeg" || this.#isWebrtcBlocked;
+    const isJpeg = this.choice === "jpeg" || this.#isWebrtcBlocked;
     this.#phase("connecting", isJpeg ? "" : "by WebRTC");
     const link = isJpeg ? new JpegLink(isPhone, events) : new WebrtcLink(isPhone, this.video, events);
-    const { wish } = this;
+    const { choice } = this;
     this.link = null;
-    await link.open(this.way, this.#abort.signal);
-    if (this.#isOver || this.wish !== wish) {
+    await link.open(this.mode, this.#abort.signal);
+    if (this.#isOver || this.choice !== choice) {
       link.close();
       return null;
     }

@@ -19,9 +19,9 @@ export class JpegLink {
   }
 
   /** Take part; raises a Refusal. */
-  async open(way, signal) {
-    this.way = way;
-    this.client = (await join({ transport: "jpeg", way }, signal)).client;
+  async open(mode, signal) {
+    this.mode = mode;
+    this.client = (await join({ transport: "jpeg", mode }, signal)).client;
     this.#run();
     return this;
   }

@@ -28,7 +28,7 @@ export class WebrtcLink {
   }
 
   /** Connect; raises NoWebrtc or a Refusal. */
-  async open(way, signal) {
+  async open(mode, signal) {
     if (!globalThis.RTCPeerConnection) throw new NoWebrtc("this browser has no WebRTC");
     const peer = (this.peer = new RTCPeerConnection({ iceServers: [] }));
     try {
@@ -39,7 +39,7 @@ export class WebrtcLink {
       await peer.setLocalDescription(await peer.createOffer());
       await gathered(peer);
       const offer = { type: "offer", sdp: peer.localDescription.sdp };
-      const joined = await join({ transport: "webrtc", way, offer }, signal);
+      const joined = await join({ transport: "webrtc", mode, offer }, signal);
       this.client = joined.client;
       await peer.setRemoteDescription(joined.answer);
       await connected(peer, channel);
