@@ -1,4 +1,4 @@
-"""Whether every component is where the CAD has it: look-alikes are named, right parts are not, hidden ones neither."""
+"""Mismatched components of similar parts are reported; right parts and occluded components are not."""
 
 from __future__ import annotations
 
@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.assembly.monitor import (
-    EDGES_ALONE,
-    OPEN_FRAMES,
-    SUSPICIOUS_FRAMES,
-    AssemblyMonitor,
-    Look,
-    together,
-)
+from arview.assembly.edge_support import EdgeSupport
+from arview.assembly.log_odds import LogOddsOptions, fused_log_odds
+from arview.assembly.monitor import AssemblyMonitor, MonitorOptions
+from arview.assembly.observation import Observation
 from arview.cad.model import Model
 from arview.geometry import Array, apply
 from arview.tracking import TrackingSession
@@ -24,10 +20,11 @@ from helpers.synthetic import CAMERA, assembly, assembly_views, block, path, pic
 from helpers.synthetic import changed as changed_from
 
 MOVED_MM = 20.0
+OPTIONS = MonitorOptions()
 
 
 @cache
-def check() -> AssemblyMonitor:
+def monitor() -> AssemblyMonitor:
     return AssemblyMonitor(assembly_views(), CAMERA, assembly())
 
 
@@ -60,12 +57,20 @@ def views_of(count: int, seed: int) -> list[Array]:
     ]
 
 
+def said(log_odds: Array, is_visible: NDArray[np.bool_] | None = None) -> Observation:
+    """An observation with log odds (C,), without suspects."""
+    none = np.zeros(len(log_odds), dtype=bool)
+    zeros = np.zeros(len(log_odds))
+    support = EdgeSupport(zeros, zeros, zeros, zeros, zeros, zeros)
+    return Observation(log_odds, none, none if is_visible is None else is_visible, support)
+
+
 def about(pose: Array, seed: int) -> Array:
     """The pose as a tracker has it: half a degree and a millimetre off."""
     return wrong(pose, np.random.default_rng(seed), 0.3, 0.5)
 
 
-def named(messages: tuple[str, ...]) -> set[str]:
+def mismatched(messages: tuple[str, ...]) -> set[str]:
     names = {message.split()[1] for message in messages}
     assert set(messages) == {f"mismatch: {name} not seen where expected" for name in names}
     return names
@@ -80,11 +85,11 @@ def card_over(name: str, pose: Array, margin_px: int = 30) -> tuple[int, int, in
 
 
 def watch(frames: list[tuple[NDArray[np.uint8], Array]]) -> AssemblyMonitor:
-    """The check after frames with their poses."""
-    check().reset()
+    """The monitor after frames with their poses."""
+    monitor().reset()
     for image, pose in frames:
-        check().update(image, pose)
-    return check()
+        monitor().update(image, pose)
+    return monitor()
 
 
 def walk(model: Model | None, count: int, seed: int = 0, noise: float = 4.0) -> list[tuple[NDArray[np.uint8], Array]]:
@@ -95,12 +100,12 @@ def walk(model: Model | None, count: int, seed: int = 0, noise: float = 4.0) -> 
     ]
 
 
-def test_one_picture_names_what_is_missing_moved_or_swapped() -> None:
+def test_one_picture_shows_missing_moved_and_swapped_components() -> None:
     hits, pictures, others = 0, 0, 0
     for number, (parts, model) in enumerate(LOOK_ALIKES.items()):
         for k, pose in enumerate(views_of(2, seed=number)):
             image = picture(pose, model, seed=k, scene=(number + k) % 9, noise=4.0)
-            found = named(check().mismatches_in(image, about(pose, k)))
+            found = mismatched(monitor().mismatches_in(image, about(pose, k)))
             pictures += 1
             hits += bool(found & set(parts))
             others += bool(found - set(parts))
@@ -109,21 +114,21 @@ def test_one_picture_names_what_is_missing_moved_or_swapped() -> None:
 
 
 @pytest.mark.parametrize(("noise", "gain"), [(2.0, 1.0), (8.0, 1.0), (4.0, 0.55)])
-def test_a_right_part_is_not_named(noise: float, gain: float) -> None:
+def test_a_right_part_is_not_mismatched(noise: float, gain: float) -> None:
     for k, pose in enumerate(views_of(8, seed=50)):
         image = picture(pose, seed=k, scene=k % 9, noise=noise, gain=gain)
-        assert check().mismatches_in(image, about(pose, k)) == (), f"view {k}"
+        assert monitor().mismatches_in(image, about(pose, k)) == (), f"view {k}"
 
 
-def test_a_component_a_little_off_nominal_is_not_named() -> None:
+def test_a_component_a_little_off_nominal_is_not_mismatched() -> None:
     near = changed(post_1=(1.0, -0.7), block_1=(-0.8, 0.8))
     for k, pose in enumerate(views_of(6, seed=60)):
-        assert check().mismatches_in(picture(pose, near, seed=k, scene=k % 9), about(pose, k)) == (), f"view {k}"
+        assert monitor().mismatches_in(picture(pose, near, seed=k, scene=k % 9), about(pose, k)) == (), f"view {k}"
 
 
-def test_frames_add_up_and_reset_forgets() -> None:
+def test_evidence_adds_up_over_frames_until_reset() -> None:
     seen = watch(walk(changed(post_3=None), 4))
-    assert named(seen.mismatches) == {"post_3"}
+    assert mismatched(seen.mismatches) == {"post_3"}
     assert seen.uncertain == ()
     seen.reset()
     assert seen.mismatches == () and seen.uncertain == ()
@@ -132,31 +137,30 @@ def test_frames_add_up_and_reset_forgets() -> None:
     assert seen.mismatches == () and seen.uncertain == ()
 
 
-def test_a_component_set_right_is_cleared() -> None:
+def test_a_corrected_component_is_cleared() -> None:
     seen = watch(walk(changed(block_2=None), 4))
-    assert named(seen.mismatches) == {"block_2"}
+    assert mismatched(seen.mismatches) == {"block_2"}
     for azimuth_deg in range(-60, 20, 10):
         pose = pose_from(azimuth_deg, 45, 520)
         image = picture(pose, seed=azimuth_deg + 60)
-        for _ in range(7):  # it does not look at every frame
+        for _ in range(7):  # not every frame is observed
             seen.update(image, pose)
     assert seen.mismatches == ()
 
 
-def test_a_moved_component_stays_named_where_it_looks_right_along_the_way_it_moved(
+def test_a_displaced_component_stays_mismatched_when_seen_along_its_displacement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     count = len(assembly().components)
-    flags, shares = np.zeros(count, dtype=bool), np.zeros(count)
 
-    def watched(*said: float) -> tuple[str, ...]:
-        """The mismatches after looks from new directions that say so much against the third component."""
+    def watched(*ratios: float) -> tuple[str, ...]:
+        """The mismatches after observations from new directions with these log odds against the third component."""
         seen.reset()
-        for k, ratio in enumerate(said):
+        for k, ratio in enumerate(ratios):
             against = np.where(np.arange(count) == 2, ratio, 0.0)
-            monkeypatch.setattr(seen, "look", lambda *_: Look(against, flags, flags, shares, shares, shares, shares))  # noqa: B023
-            for _ in range(SUSPICIOUS_FRAMES):
+            monkeypatch.setattr(seen, "observe", lambda *_: said(against))  # noqa: B023
+            for _ in range(OPTIONS.suspect_frames):
                 seen.update(np.zeros((480, 640, 3), np.uint8), pose_from(-70 + 10 * k, 45, 520))
         return seen.mismatches
 
@@ -166,78 +170,78 @@ def test_a_moved_component_stays_named_where_it_looks_right_along_the_way_it_mov
     assert watched(-4.0, 3.0) == ()
 
 
-def test_what_blurred_pictures_said_is_soon_taken_back_from_the_same_direction(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evidence_of_blurred_pictures_is_soon_outweighed_from_the_same_direction(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     count = len(assembly().components)
-    flags, shares = np.zeros(count, dtype=bool), np.zeros(count)
-    said = itertools.chain([3.0, 3.0], itertools.repeat(-2.5))
+    ratios = itertools.chain([3.0, 3.0], itertools.repeat(-2.5))
 
-    def look(*_: object) -> Look:
-        against = np.where(np.arange(count) == 2, next(said), -3.0)
-        return Look(against, flags, flags, shares, shares, shares, shares)
+    def observe(*_: object) -> Observation:
+        return said(np.where(np.arange(count) == 2, next(ratios), -3.0))
 
-    monkeypatch.setattr(seen, "look", look)
+    monkeypatch.setattr(seen, "observe", observe)
     blank, pose = np.zeros((480, 640, 3), np.uint8), pose_from(0, 45, 520)
     for _ in range(2):
         seen.update(blank, pose)
     assert len(seen.mismatches) == 1
-    for _ in range(4 * SUSPICIOUS_FRAMES):
+    for _ in range(4 * OPTIONS.suspect_frames):
         seen.update(blank, pose)
     assert seen.mismatches == () and seen.uncertain == ()
 
 
-@pytest.mark.parametrize(("second", "is_named"), [(3.0, True), (-1.2, False)])
-def test_one_frame_of_a_watched_part_names_nothing(
-    monkeypatch: pytest.MonkeyPatch, second: float, is_named: bool
+@pytest.mark.parametrize(("second", "is_mismatched"), [(3.0, True), (-1.2, False)])
+def test_one_frame_alone_reports_no_mismatch(
+    monkeypatch: pytest.MonkeyPatch, second: float, is_mismatched: bool
 ) -> None:
     seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     count = len(assembly().components)
-    flags, shares = np.zeros(count, dtype=bool), np.zeros(count)
-    said = iter([np.where(np.arange(count) == 2, ratio, -3.0) for ratio in (3.0, second)])
-    monkeypatch.setattr(seen, "look", lambda *_: Look(next(said), flags, flags, shares, shares, shares, shares))
+    against = iter([np.where(np.arange(count) == 2, ratio, -3.0) for ratio in (3.0, second)])
+    monkeypatch.setattr(seen, "observe", lambda *_: said(next(against)))
     blank, pose = np.zeros((480, 640, 3), np.uint8), pose_from(0, 45, 520)
     seen.update(blank, pose)
     assert seen.mismatches == () and len(seen.uncertain) == 1
     seen.update(blank, pose)
-    assert (len(seen.mismatches) == 1) == is_named
+    assert (len(seen.mismatches) == 1) == is_mismatched
 
 
-@pytest.mark.parametrize(("was_shown", "frames"), [(True, OPEN_FRAMES), (False, SUSPICIOUS_FRAMES)])
-def test_what_comes_into_view_is_looked_at_soon(monkeypatch: pytest.MonkeyPatch, was_shown: bool, frames: int) -> None:
+@pytest.mark.parametrize(("was_visible", "frames"), [(True, OPTIONS.open_frames), (False, OPTIONS.suspect_frames)])
+def test_a_component_entering_the_view_is_observed_soon(
+    monkeypatch: pytest.MonkeyPatch, was_visible: bool, frames: int
+) -> None:
     seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     count = len(assembly().components)
-    others, shares = np.arange(count) != 2, np.zeros(count)
-    flags = others | was_shown
-    said = Look(np.where(others, -3.0, 0.0), np.zeros(count, dtype=bool), flags, shares, shares, shares, shares)
-    looks = []
-    monkeypatch.setattr(seen, "look", lambda *_: looks.append(1) or said)
+    others = np.arange(count) != 2
+    observation = said(np.where(others, -3.0, 0.0), others | was_visible)
+    observed = []
+    monkeypatch.setattr(seen, "observe", lambda *_: observed.append(1) or observation)
     for _ in range(2):
         seen.update(np.zeros((480, 640, 3), np.uint8), pose_from(-40, 45, 520))
     waited = 0
-    while len(looks) < 3:
+    while len(observed) < 3:
         seen.update(np.zeros((480, 640, 3), np.uint8), pose_from(20, 45, 520))
         waited += 1
     assert waited == frames
 
 
-def test_what_a_card_hides_is_no_mismatch() -> None:
+def test_an_occluded_component_is_no_mismatch() -> None:
     for name in ("post_1", "post_3", "block_1", "block_2"):
         for k, pose in enumerate(views_of(2, seed=70)):
             image = picture(pose, seed=k, scene=k, noise=3.0, card=card_over(name, pose))
-            assert name not in named(check().mismatches_in(image, about(pose, k))), f"{name}, view {k}"
+            assert name not in mismatched(monitor().mismatches_in(image, about(pose, k))), f"{name}, view {k}"
 
 
-def test_what_is_hidden_at_first_is_named_later_even_at_a_fast_turn() -> None:
+def test_what_is_hidden_at_first_is_mismatched_later_even_at_a_fast_turn() -> None:
     model = changed(block_2=None)
     poses = [pose_from(-70 + 7 * k, 40, 520) for k in range(20)]
     cards = [card_over("block_2", pose, 50) if k < 3 else None for k, pose in enumerate(poses)]
     frames = [(picture(p, model, seed=k, card=card), p) for k, (p, card) in enumerate(zip(poses, cards, strict=True))]
     assert watch(frames[:3]).mismatches == ()
-    assert named(watch(frames).mismatches) == {"block_2"}
+    assert mismatched(watch(frames).mismatches) == {"block_2"}
 
 
 @pytest.mark.parametrize("is_there", [True, False])
-def test_a_component_is_unseen_until_it_is_seen_at_its_place(is_there: bool) -> None:
+def test_a_component_is_unverified_until_it_is_confirmed_at_its_place(is_there: bool) -> None:
     model = None if is_there else changed(block_2=None)
     poses = [pose_from(-70 + 10 * k, 45, 520) for k in range(14)]
     cards = [card_over("block_2", pose, 50) if k < 3 else None for k, pose in enumerate(poses)]
@@ -248,21 +252,21 @@ def test_a_component_is_unseen_until_it_is_seen_at_its_place(is_there: bool) -> 
         seen.update(image, pose)
     assert "block_2" in seen.unverified and len(seen.unverified) < len(assembly_views().component_names)
     for image, pose in frames[3:]:
-        for _ in range(SUSPICIOUS_FRAMES):
+        for _ in range(OPTIONS.suspect_frames):
             seen.update(image, pose)
     assert ("block_2" in seen.unverified) != is_there
     assert not set(seen.unverified) - {"block_2"}
 
 
-def test_a_sure_part_is_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    looks = []
+def test_a_verified_part_is_observed_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    observed = []
     seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
-    look = seen.look
-    monkeypatch.setattr(seen, "look", lambda *of: looks.append(1) or look(*of))
+    observe = seen.observe
+    monkeypatch.setattr(seen, "observe", lambda *of: observed.append(1) or observe(*of))
     image = picture(pose_from(30, 45, 520))
     for _ in range(200):
         seen.update(image, pose_from(30, 45, 520))
-    assert 3 <= len(looks) <= 10
+    assert 3 <= len(observed) <= 10
 
 
 def test_a_part_of_one_component_has_nothing_to_mismatch() -> None:
@@ -273,21 +277,23 @@ def test_a_part_of_one_component_has_nothing_to_mismatch() -> None:
     assert alone.mismatches == () and alone.uncertain == () and alone.unverified == ()
 
 
-def test_a_session_never_calls_a_look_alike_tracked() -> None:
+def test_a_session_never_calls_a_similar_part_tracked() -> None:
     session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=path(1, 4)[0])
     for k, pose in enumerate(path(5, 4)):
         result = session.process(picture(pose, changed(post_1=None), seed=k, scene=4, noise=4.0), k, k / 30)
         if k >= 1:
-            assert named(result.mismatches) == {"post_1"}
+            assert mismatched(result.mismatches) == {"post_1"}
             assert result.state.value == "critical"
             assert "post_1 not seen where expected" in result.reason
 
 
-def test_what_is_hidden_is_in_doubt_only_where_the_network_is_sure() -> None:
+def test_an_occluded_component_is_suspect_only_where_the_network_is_sure() -> None:
     by_edges, by_network = np.array([3.0, 3.0, 3.0, -3.0, -3.0]), np.array([3.5, 1.0, np.nan, np.nan, -2.0])
-    seen, hidden = together(by_edges, by_network), together(by_edges, by_network, 0.0)
+    options = LogOddsOptions()
+    seen = fused_log_odds(by_edges, by_network, options)
+    hidden = fused_log_odds(by_edges, by_network, options, unoccluded=0.0)
     assert seen[0] > hidden[0] > 1.0
     assert seen[1] > 1.0 and hidden[1] < 0.0
-    assert seen[2] == pytest.approx(3.0 * EDGES_ALONE) and hidden[2] == 0.0
-    # What speaks for a component is seen: nothing hides it.
+    assert seen[2] == pytest.approx(3.0 * options.edges_alone) and hidden[2] == 0.0
+    # Evidence for a component comes from what is visible: nothing occludes it.
     assert np.all(seen[3:] == hidden[3:]) and seen[4] < -1.0

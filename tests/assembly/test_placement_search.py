@@ -1,4 +1,4 @@
-"""Components seen elsewhere: places where they may stand, and that what is hidden at its own place is found there."""
+"""Alternative placements, and misplaced components that are found there though their nominal placement is occluded."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from arview.assembly.monitor import AssemblyMonitor
-from arview.assembly.placement_search import Places, other_places
+from arview.assembly.placements import Placements, alternative_placements
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.geometry import exp_so3
@@ -22,8 +22,8 @@ TURN = exp_so3([0.3, -0.5, 0.8])
 
 
 @cache
-def places() -> Places:
-    return other_places(assembly())
+def placements() -> Placements:
+    return alternative_placements(assembly())
 
 
 @cache
@@ -43,7 +43,7 @@ def walled() -> Model:
 
 
 @cache
-def check() -> AssemblyMonitor:
+def monitor() -> AssemblyMonitor:
     around = ViewRange((420.0, 560.0), elevation_deg=(15.0, 35.0), azimuth_deg=(-95.0, -60.0))
     views = make_guide_views(walled(), around, GuideViewOptions(renderer="zbuffer"))
     return AssemblyMonitor(views, CAMERA, walled())
@@ -53,16 +53,16 @@ POSES = [pose_from(azimuth, 24.0, 480.0, walled()) for azimuth in (-80.0, -77.0,
 
 
 def against(model: Model | None, seed: int, noise: float = 3.0) -> dict[str, float]:
-    """What a picture says against each component."""
+    """Log odds against each component by one picture."""
     pose = POSES[seed % len(POSES)]
     image = picture(pose, model or walled(), seed=seed, scene=seed % 9, noise=noise)
-    look = check().look(image, wrong(pose, np.random.default_rng(seed), 0.2, 0.4, walled()))
-    return dict(zip([part.name for part in walled().components], look.against.tolist(), strict=True))
+    observation = monitor().observe(image, wrong(pose, np.random.default_rng(seed), 0.2, 0.4, walled()))
+    return dict(zip([part.name for part in walled().components], observation.log_odds.tolist(), strict=True))
 
 
-def test_components_may_stand_elsewhere_on_the_plate_and_clear_of_each_other() -> None:
-    assert len(places().shifts[NAMES.index("plate")]) == 0
-    for index, shifts in enumerate(places().shifts):
+def test_alternative_placements_lie_on_the_plate_and_clear_of_other_components() -> None:
+    assert len(placements().shifts[NAMES.index("plate")]) == 0
+    for index, shifts in enumerate(placements().shifts):
         if NAMES[index] == "plate":
             continue
         assert len(shifts) >= 8, NAMES[index]
@@ -78,35 +78,35 @@ def test_components_may_stand_elsewhere_on_the_plate_and_clear_of_each_other() -
                 assert apart[:2].max() > -0.5, f"{NAMES[index]} in {part.name}"
 
 
-def test_places_turn_with_the_model() -> None:
+def test_placements_turn_with_the_model() -> None:
     turned = [replace(part, vertices_in_model=part.vertices_in_model @ TURN.T) for part in assembly().components]
-    for index, shifts in enumerate(other_places(make_model("turned", tuple(turned))).shifts):
+    for index, shifts in enumerate(alternative_placements(make_model("turned", tuple(turned))).shifts):
         assert (len(shifts) == 0) == (NAMES[index] == "plate")
         if len(shifts):
             assert np.abs(shifts @ TURN[:, 2]).max() < 0.03 * np.linalg.norm(shifts, axis=1).max()
 
 
-def test_a_post_sunk_into_the_plate_stands_on_it_and_what_floats_on_nothing() -> None:
+def test_a_sunk_post_has_a_base_and_a_floating_one_has_none() -> None:
     plate = assembly().components[0]
     sunk = component("sunk", post((40, 40), 8, 4, 50), (0.5, 0.5, 0.5))
     floating = component("floating", post((110, 80), 8, 20, 50), (0.5, 0.5, 0.5))
-    found = other_places(make_model("both", (plate, sunk, floating)))
+    found = alternative_placements(make_model("both", (plate, sunk, floating)))
     assert [len(shifts) > 0 for shifts in found.shifts] == [False, True, False]
     assert found.swaps == ()
 
 
-def test_one_component_alone_has_no_places() -> None:
-    assert [len(shifts) for shifts in other_places(block()).shifts] == [0]
+def test_one_component_alone_has_no_placements() -> None:
+    assert [len(shifts) for shifts in alternative_placements(block()).shifts] == [0]
 
 
-def test_pairs_that_change_places_stand_foot_on_foot() -> None:
-    pairs = {(NAMES[one], NAMES[other]): shift for one, other, shift in places().swaps}
+def test_swapped_components_share_their_foot() -> None:
+    pairs = {(NAMES[one], NAMES[other]): shift for one, other, shift in placements().swaps}
     assert len(pairs) == 15
     assert pairs["post_1", "post_3"] == pytest.approx([94.0, 66.0, 0.0], abs=0.5)
     assert pairs["block_1", "block_2"] == pytest.approx([42.0, -27.0, 0.0], abs=0.5)
 
 
-def test_what_is_hidden_at_its_place_is_named_where_it_is_seen_elsewhere() -> None:
+def test_a_component_occluded_at_its_place_is_found_at_an_alternative_one() -> None:
     found = [against(changed(walled(), hidden=(26.0, 0.0)), seed) for seed in range(8)]
     assert np.median([said["hidden"] for said in found]) > 1.0
     assert sum(said["hidden"] > 0.5 for said in found) >= 6
@@ -114,25 +114,25 @@ def test_what_is_hidden_at_its_place_is_named_where_it_is_seen_elsewhere() -> No
 
 
 @pytest.mark.parametrize("noise", [3.0, 8.0])
-def test_what_is_hidden_and_right_is_not_seen_elsewhere(noise: float) -> None:
+def test_an_occluded_right_component_is_not_found_elsewhere(noise: float) -> None:
     for seed in range(8):
         said = against(None, seed, noise)
         assert said["hidden"] <= 0.1, f"picture {seed}"
         assert max(said.values()) < 1.0, f"picture {seed}"
 
 
-def test_a_component_surely_seen_before_is_not_looked_for_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_verified_component_is_not_searched_for(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
     def never(*of: object) -> np.ndarray:
         asked.append(of[-1])
         return np.full(len(walled().components), -np.inf)
 
-    monkeypatch.setattr(check()._elsewhere, "against", never)
+    monkeypatch.setattr(monitor()._observer._search, "log_odds", never)
     image = picture(POSES[0], walled(), seed=1, noise=3.0)
-    check().reset()
+    monitor().reset()
     for _ in range(4):
-        check().update(image, POSES[0])
+        monitor().update(image, POSES[0])
     hidden = [part.name for part in walled().components].index("hidden")
     assert asked[0].all()
     assert np.flatnonzero(asked[-1]).tolist() == [hidden]

@@ -5,13 +5,12 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.presence_net import component_looks
+from arview.assembly.presence_net import PartImage, component_crops
 from arview.cad.model import Component, Model, make_model
 from arview.core.atomic import replacing
 from arview.detection.features.edge_net import EdgeNet
@@ -55,7 +54,7 @@ class Looked:
 
     Attributes:
         solid: its seed.
-        pixels, drawn, lines: (N,S,S,4) uint8, (N,6,S,S) int8, 127 for 1, and (N,3,S,S) uint8, see `ComponentLook`.
+        pixels, drawn, lines: (N,S,S,4) uint8, (N,6,S,S) int8, 127 for 1, and (N,3,S,S) uint8, see `ComponentCrop`.
         sizes_px: (N,).
         is_wrong: (N,) bool.
     """
@@ -101,13 +100,13 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
         shown = _displaced(built, model, rng)
         image = _picture(shown, model, pose, options, (occluder, *others), photos, rng)
         cam_from_body = _off(pose, rng) @ rigid(np.eye(3), model.center_in_model)
-        seen = partial(component_looks, image, network.predict(image), intrinsics_of(CAMERA))
-        looks = seen(surface, model.diameter_mm, cam_from_body)
+        picture = PartImage(image, network.predict(image), intrinsics_of(CAMERA), cam_from_body)
+        looks = component_crops(picture, surface, model.diameter_mm)
         is_wrong = [model.components[look.index].name in changed for look in looks]
         for k in rng.permutation(len(variants))[:EXPECTED]:
             expected, names = variants[k]
             only = [i for i, component in enumerate(expected.components) if component.name in names]
-            more = seen(surfaces[k], model.diameter_mm, cam_from_body, only)
+            more = component_crops(picture, surfaces[k], model.diameter_mm, only)
             looks += more
             is_wrong += [k != number] * len(more)
         if looks:
@@ -115,7 +114,7 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
                 seed,
                 np.stack([look.pixels for look in looks]),
                 np.round(127.0 * np.stack([look.drawn for look in looks])).astype(np.int8),
-                np.stack([look.lines for look in looks]),
+                np.stack([look.edge_responses for look in looks]),
                 np.array([look.size_px for look in looks]),
                 np.array(is_wrong),
             )

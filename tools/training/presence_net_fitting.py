@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.presence_net import GLOBALS, SIDE_PX, overall
+from arview.assembly.presence_net import GLOBALS, SIDE_PX, global_inputs
 from arview.detection.scoring.pose_verifier import CHANNELS, LINES
 from networks.net2net import torch_with_onnx
 from networks.score_nets import Design, Shown, fit, fit_score_network, scored, together
@@ -79,7 +79,7 @@ def _inputs(one: Looked, index: Sequence[int], rng: np.random.Generator | None =
     """Looks as the network takes them; with random numbers altered."""
     shown, contrasts, explained = network_input(one, index, rng)
     sizes_px = [float(one.sizes_px[k]) for k in index]
-    return shown, np.stack([overall(*of) for of in zip(sizes_px, contrasts, explained, strict=True)])
+    return shown, np.stack([global_inputs(*of) for of in zip(sizes_px, contrasts, explained, strict=True)])
 
 
 def _report(network: Any, examples: Sequence[Looked], torch: Any) -> None:

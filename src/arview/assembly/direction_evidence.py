@@ -1,0 +1,104 @@
+"""Evidence gathered from each viewing direction.
+
+Pictures from one direction show the same edges and the same occlusions, but for noise and blur. They are therefore
+averaged, and further pictures add ever less; new directions add in full.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.geometry import Array
+
+
+@dataclass(frozen=True)
+class DirectionOptions:
+    """How observations from one direction are combined.
+
+    Attributes:
+        new_direction_deg: directions this far from all others are new.
+        max_directions: directions that are remembered, the latest.
+        repeat_decay: the n-th observation adds this to the power of n - 1 to the weight of their mean.
+        repeat_floor: every observation after the first `repeats_without_floor` adds this as well.
+        repeats_without_floor: see there.
+        clearing_weight: weight of a direction's evidence for a component that is called mismatched. A displaced
+            component looks right from directions along its displacement.
+    """
+
+    new_direction_deg: float = 6.0
+    max_directions: int = 64
+    repeat_decay: float = 0.35
+    repeat_floor: float = 0.03
+    repeats_without_floor: int = 4
+    clearing_weight: float = 0.5
+
+
+class DirectionEvidence:
+    """Log odds that observations have added, by direction.
+
+    Args:
+        component_count: C.
+        center_in_model: (3,) the part's centre, mm.
+        options: see `DirectionOptions`.
+    """
+
+    def __init__(self, component_count: int, center_in_model: Array, options: DirectionOptions) -> None:
+        self._options, self._center_in_model = options, center_in_model
+        self._directions = np.zeros((0, 3))
+        self._counts, self._sums = np.zeros((0, component_count)), np.zeros((0, component_count))
+
+    def add(self, cam_from_model: Array, log_odds: Array, is_mismatched: NDArray[np.bool_]) -> Array:
+        """Add an observation from a pose.
+
+        Args:
+            cam_from_model: (4,4).
+            log_odds: (C,) against each component; 0 where the observation says nothing.
+            is_mismatched: (C,) components that are called mismatched at present.
+
+        Returns:
+            (C,) by how much the evidence of this direction has changed.
+        """
+        nearest = self._nearest(cam_from_model)
+        if nearest < 0:
+            kept = self._options.max_directions - 1
+            none = np.zeros((1, len(log_odds)))
+            self._directions = np.concatenate([self._directions[-kept:], self._direction(cam_from_model)[None]])
+            self._counts = np.concatenate([self._counts[-kept:], none])
+            self._sums = np.concatenate([self._sums[-kept:], none])
+        counts, sums = self._counts[nearest], self._sums[nearest]
+        before = self._combined(counts, sums, is_mismatched)
+        counts += log_odds != 0.0
+        sums += log_odds
+        return self._combined(counts, sums, is_mismatched) - before
+
+    def observations_from(self, cam_from_model: Array) -> int:
+        """How many observations of a component, at most, were made from about this direction; 0 for a new one."""
+        nearest = self._nearest(cam_from_model)
+        return 0 if nearest < 0 else int(self._counts[nearest].max())
+
+    def is_new(self, cam_from_model: Array) -> bool:
+        """Whether no observation was made from about this direction."""
+        return self._nearest(cam_from_model) < 0
+
+    def _combined(self, counts: Array, sums: Array, is_mismatched: NDArray[np.bool_]) -> Array:
+        """Log odds (C,) of all observations from one direction, by how many they are and their sum."""
+        o = self._options
+        weight = (1.0 - o.repeat_decay**counts) / (1.0 - o.repeat_decay)
+        weight += o.repeat_floor * np.maximum(counts - o.repeats_without_floor, 0.0)
+        weight = weight * np.where((sums < 0.0) & is_mismatched, o.clearing_weight, 1.0)
+        return np.asarray(weight * sums / np.maximum(counts, 1.0))
+
+    def _direction(self, cam_from_model: Array) -> Array:
+        """(3,) unit vector from the part's centre to the camera."""
+        offset = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - self._center_in_model
+        return np.asarray(offset / np.linalg.norm(offset), dtype=np.float64)
+
+    def _nearest(self, cam_from_model: Array) -> int:
+        """Index of the remembered direction nearest to a pose's, or -1 if all are further than a new one's."""
+        cosines = self._directions @ self._direction(cam_from_model)
+        if len(cosines) == 0 or cosines.max() < np.cos(np.deg2rad(self._options.new_direction_deg)):
+            return -1
+        return int(np.argmax(cosines))

@@ -1,0 +1,415 @@
+"""How well image edges support each component at its nominal placement, and at displaced ones.
+
+For every component the kernels measure the share of its visible edge points that lie on image edges, at the best of
+the small shifts that tolerance and pose error allow; the same share at the best of many larger shifts; how the colours
+change across its outline; and whether the edges around it are found, which tells an occluded component from a missing
+one.
+
+Source: scores of a shifted edge template by Borgefors (PAMI 1988).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.assembly.image_edges import EdgePictures, find_thin_edges, mark_owners, strength_at
+from arview.assembly.visible_edges import VisibleEdges
+from arview.core.kernel import kernel
+from arview.geometry import Array
+from arview.refinement.projection import project_lines
+
+HALF_SCORE_STRENGTH = 20.0
+"""Edge strength, in half grey levels per px, that scores half of what the strongest edge scores."""
+MIN_INSIDE_SHARE = 0.8
+"""Share of a component's own points that must be inside the picture."""
+RUN_POINTS, MIN_RUN_POINTS = 10, 5
+"""Neighbouring outline points over which a colour change is averaged, and how many of them must be usable."""
+MAX_RUN_GAP_SQUARE = 144.0
+"""Squared distance in px between a run's first and last point."""
+MAX_RUN_CONTRAST = 10.0
+"""Colour change of a run, in standard deviations, above which it counts no more."""
+FIRST_REACH_PX, REACH_GROWTH, MAX_REACH_PX = 16.0, 1.5, 130.0
+"""Surrounding points are gathered within the first distance, which grows by the factor until there are enough."""
+
+
+class PointLimits(NamedTuple):
+    """Limits of the measurement. A NamedTuple, not a dataclass, because kernels take it.
+
+    Attributes:
+        min_slope: weakest image edge, grey levels per px of the strongest channel.
+        max_points: points measured per component.
+        min_points: points that a component must show to be measured at all.
+        well_supported: share of supported points from which on no displaced placement is tried, to save time.
+        typical_alternative: share that then stands for the best displaced placement.
+        color_reach_px: distance from an edge at which colours are compared.
+        max_surroundings: points of other components gathered around one.
+        min_surroundings: with fewer of them the surroundings are unknown and count as found.
+    """
+
+    min_slope: float = 1.5
+    max_points: int = 48
+    min_points: int = 14
+    well_supported: float = 0.8
+    typical_alternative: float = 0.45
+    color_reach_px: float = 3.0
+    max_surroundings: int = 16
+    min_surroundings: int = 8
+
+
+@dataclass(frozen=True)
+class EdgeSupportOptions:
+    """Shifts at which a component's edges are tried.
+
+    Attributes:
+        displaced_mm: a component may deviate this far from nominal,
+        displaced_share: but no further than this share of the part's diameter.
+        pose_px: error of the pose, added to both.
+        shift_cost: share of points that a shift to the border of what is allowed must gain.
+        searched_mm: larger shifts are tried up to this distance,
+        searched_share: this share of the part's diameter,
+        searched_px: and this distance in the picture, whichever is least.
+        search_gap_px: distance between the allowed and the nearest larger shift.
+        min_search_px: width of the ring of larger shifts where the bounds above leave less.
+        search_step_px: grid of the larger shifts.
+        points: see `PointLimits`.
+    """
+
+    displaced_mm: float = 2.5
+    displaced_share: float = 0.02
+    pose_px: float = 1.0
+    shift_cost: float = 0.2
+    searched_mm: float = 24.0
+    searched_share: float = 0.15
+    searched_px: float = 44.0
+    search_gap_px: float = 2.0
+    min_search_px: float = 6.0
+    search_step_px: int = 3
+    points: PointLimits = field(default_factory=PointLimits)
+
+
+class EdgeSupport(NamedTuple):
+    """What the edges of one picture say of each component; all (C,), -1 where a component shows too little.
+
+    Attributes:
+        supported: share of its points on image edges at the nominal placement.
+        displaced: share of its points on image edges at the best displaced placement.
+        contrast: mean colour change across its outline in standard deviations; -1 without an outline of its own.
+        surroundings: share of the points around its unsupported ones that lie on image edges; 1 if there are few.
+        others: share of all other components' points on image edges; 1 if there are none.
+        determined: number of points that determine its position in the least determined image direction.
+    """
+
+    supported: Array
+    displaced: Array
+    contrast: Array
+    surroundings: Array
+    others: Array
+    determined: Array
+
+
+class Projection(NamedTuple):
+    """Pose (4,4) and intrinsics (10,) of a picture, and the length in mm over which directions are projected."""
+
+    cam_from_body: Array
+    intrinsics: Array
+    step_mm: float
+
+
+class Shifts(NamedTuple):
+    """Shifts in px: (S,2) int64 near ones with the share (S,) that each must gain, and (T,2) int64 far ones."""
+
+    near: NDArray[np.int64]
+    near_costs: Array
+    far: NDArray[np.int64]
+
+
+class _Projected(NamedTuple):
+    """Edge points in the picture: pixels (N,2), image normals (N,2), depths (N,) mm."""
+
+    pixels: Array
+    normals: Array
+    depths: Array
+
+
+class _Points(NamedTuple):
+    """Points measured: indices (C,K), how many (C,), and which are supported (C,K)."""
+
+    chosen: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    hit: NDArray[np.bool_]
+
+
+class EdgeSupportMeter:
+    """Measures the edge support of the components in pictures of one part.
+
+    Args:
+        diameter_mm: of the part.
+        options: see `EdgeSupportOptions`.
+    """
+
+    def __init__(self, diameter_mm: float, options: EdgeSupportOptions | None = None) -> None:
+        self.options = options or EdgeSupportOptions()
+        self._diameter_mm = diameter_mm
+        self._pictures = EdgePictures()
+
+    def measure(
+        self, image: NDArray[np.uint8], edges: VisibleEdges, cam_from_body: Array, intrinsics: Array, px_per_mm: float
+    ) -> EdgeSupport:
+        """Edge support of all components.
+
+        Args:
+            image: (H,W,3) RGB, the picture around the part.
+            edges: visible from about its direction.
+            cam_from_body: (4,4) pose about the model's centre.
+            intrinsics: (10,) of the picture, see `intrinsics_of`.
+            px_per_mm: scale at the part's centre.
+        """
+        picture = self._pictures.of(image)
+        projection = Projection(cam_from_body, intrinsics, 0.01 * self._diameter_mm)
+        return EdgeSupport(
+            *measure_edge_support(picture, edges, projection, self._shifts(px_per_mm), self.options.points)
+        )
+
+    def _shifts(self, px_per_mm: float) -> Shifts:
+        """Shifts within the allowed deviation, and those beyond it within the searched distance."""
+        o, diameter_mm = self.options, self._diameter_mm
+        allowed = min(o.displaced_mm, o.displaced_share * diameter_mm) * px_per_mm + o.pose_px
+        searched = min(o.searched_mm * px_per_mm, o.searched_share * diameter_mm * px_per_mm, o.searched_px)
+        near = _disc(0.0, allowed, 1)
+        far = _disc(allowed + o.search_gap_px, max(searched, allowed + o.min_search_px), o.search_step_px)
+        return Shifts(near, o.shift_cost * np.sum(near**2, axis=1) / allowed**2, far)
+
+
+def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:
+    """(S,2) points of a grid between two radii."""
+    reach = step * int(outer_px // step)
+    axis = np.arange(-reach, reach + 1, step)
+    points = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    radius = np.linalg.norm(points, axis=1)
+    return np.ascontiguousarray(points[(radius >= inner_px) & (radius <= outer_px)], dtype=np.int64)
+
+
+@kernel
+def _best_shift(picture, c, places, along, count, scores, shifts, costs, hit):  # type: ignore[no-untyped-def]
+    """Share of ``count`` points on edges at the best shift (by the sum of scores less its cost); sets ``hit`` (count,).
+
+    Args:
+        picture: with thin edges and owners.
+        c: component.
+        places, along: (K,3,2) pixels across the edge at each point, and (K,2) normals in 127ths.
+        scores: (256,) by edge strength.
+        shifts, costs: (S,2) px, and the share (S,) that each must gain.
+        hit: becomes True for points on an edge at the best shift.
+    """
+    directions, strength, owners = picture.directions, picture.strength, picture.owners
+    best = -1e9
+    best_shift = 0
+    share = 0.0
+    for s in range(shifts.shape[0]):
+        total = -costs[s] * count
+        hits = 0
+        for k in range(count):
+            e = strength_at(directions, strength, owners, c, places[k], along[k], shifts[s, 0], shifts[s, 1])
+            hits += e > 0
+            total += scores[e]
+            if total + (count - 1 - k) < best:
+                break
+        if total > best:
+            best, best_shift, share = total, s, hits / count
+    dx, dy = shifts[best_shift, 0], shifts[best_shift, 1]
+    for k in range(count):
+        hit[k] = strength_at(directions, strength, owners, c, places[k], along[k], dx, dy) > 0
+    return share
+
+
+@kernel
+def _contrast(image, edges, projected, c, reach_px):  # type: ignore[no-untyped-def]
+    """Mean colour change across a component's outline in standard deviations, over runs of points; -1 without runs."""
+    pixels, normals, depths = projected.pixels, projected.normals, projected.depths
+    sides, is_own = edges.sides, edges.is_own
+    first, last = edges.starts[c], edges.starts[c + 1]
+    height, width = image.shape[:2]
+    total = 0.0
+    runs = 0
+    i = first
+    while i < last:
+        j = i
+        n = 0
+        change = np.zeros(3)
+        square = np.zeros(3)
+        while (
+            j < last
+            and j - i < RUN_POINTS
+            and sides[j, 0] == sides[i, 0]
+            and sides[j, 1] == sides[i, 1]
+            and depths[j] > 0
+            and (pixels[j, 0] - pixels[i, 0]) ** 2 + (pixels[j, 1] - pixels[i, 1]) ** 2 < MAX_RUN_GAP_SQUARE
+        ):
+            u, v, nu, nv = pixels[j, 0] + 0.5, pixels[j, 1] + 0.5, normals[j, 0] * reach_px, normals[j, 1] * reach_px
+            xa, ya, xb, yb = int(u - nu), int(v - nv), int(u + nu), int(v + nv)
+            if is_own[j] and min(xa, xb) >= 0 and min(ya, yb) >= 0 and max(xa, xb) < width and max(ya, yb) < height:
+                n += 1
+                for q in range(3):
+                    d = float(image[yb, xb, q]) - float(image[ya, xa, q])
+                    change[q] += d
+                    square[q] += d * d
+            j += 1
+        if n >= MIN_RUN_POINTS and sides[i, 0] != sides[i, 1]:
+            runs += 1
+            largest = 0.0
+            for q in range(3):
+                mean = change[q] / n
+                deviation = np.sqrt(max(square[q] / n - mean * mean, 1.0) / n)
+                largest = max(largest, abs(mean) / (deviation + 0.5))
+            total += min(largest, MAX_RUN_CONTRAST)
+        i = max(j, i + 1)
+    return total / runs if runs > 0 else -1.0
+
+
+@kernel
+def _surroundings(pixels, points, c, limits):  # type: ignore[no-untyped-def]
+    """Share of other components' points on edges, of those nearest to a component's unsupported points; 1 if few."""
+    chosen, sizes, hit = points.chosen, points.sizes, points.hit
+    low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
+    for k in range(sizes[c]):
+        if not hit[c, k]:
+            i = chosen[c, k]
+            low_u, high_u = min(low_u, pixels[i, 0]), max(high_u, pixels[i, 0])
+            low_v, high_v = min(low_v, pixels[i, 1]), max(high_v, pixels[i, 1])
+    reach = FIRST_REACH_PX
+    hits = 0
+    tried = 0
+    while reach < MAX_REACH_PX:
+        hits = 0
+        tried = 0
+        for o in range(sizes.shape[0]):
+            if o == c:
+                continue
+            for k in range(sizes[o]):
+                u, v = pixels[chosen[o, k], 0], pixels[chosen[o, k], 1]
+                if u < low_u - reach or u > high_u + reach or v < low_v - reach or v > high_v + reach:
+                    continue
+                for q in range(sizes[c]):
+                    j = chosen[c, q]
+                    if not hit[c, q] and (pixels[j, 0] - u) ** 2 + (pixels[j, 1] - v) ** 2 < reach * reach:
+                        tried += 1
+                        hits += hit[o, k]
+                        break
+        if tried >= limits.max_surroundings:
+            break
+        reach *= REACH_GROWTH
+    return hits / tried if tried >= limits.min_surroundings else 1.0
+
+
+@kernel
+def _usable_points(edges, projected, c, shape, usable):  # type: ignore[no-untyped-def]
+    """Own points of a component inside the picture: sets their indices in ``usable``.
+
+    Returns:
+        how many there are, 0 if too large a share is outside; and how many determine the position in the least
+        determined direction (the smaller eigenvalue of the normals' scatter matrix).
+    """
+    pixels, normals, depths = projected.pixels, projected.normals, projected.depths
+    height, width = shape
+    own = 0
+    inside = 0
+    xx, yy, xy = 0.0, 0.0, 0.0
+    for i in range(edges.starts[c], edges.starts[c + 1]):
+        if not edges.is_own[i]:
+            continue
+        own += 1
+        if depths[i] > 0 and 3 < pixels[i, 0] < width - 4 and 3 < pixels[i, 1] < height - 4:
+            usable[inside] = i
+            inside += 1
+            xx += normals[i, 0] ** 2
+            yy += normals[i, 1] ** 2
+            xy += normals[i, 0] * normals[i, 1]
+    if inside < MIN_INSIDE_SHARE * own:
+        inside = 0
+    return inside, 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+
+
+@kernel
+def _place_points(projected, usable, chosen, places, along):  # type: ignore[no-untyped-def]
+    """Choose evenly spread points of those usable: sets their indices, pixels and normals, see `_best_shift`.
+
+    Returns:
+        how many they are.
+    """
+    pixels, normals = projected.pixels, projected.normals
+    inside = usable.shape[0]
+    count = min(inside, chosen.shape[0])
+    for k in range(count):
+        i = usable[int((k + 0.5) * inside / count)]
+        chosen[k] = i
+        along[k, 0] = int(np.round(127.0 * normals[i, 0]))
+        along[k, 1] = int(np.round(127.0 * normals[i, 1]))
+        for t in range(3):
+            places[k, t, 0] = int(pixels[i, 0] + (t - 1) * normals[i, 0] + 0.5)
+            places[k, t, 1] = int(pixels[i, 1] + (t - 1) * normals[i, 1] + 0.5)
+    return count
+
+
+@kernel
+def measure_edge_support(picture, edges, projection, shifts, limits):  # type: ignore[no-untyped-def]
+    """`EdgeSupport` of all components.
+
+    Args:
+        picture: an `EdgePicture`; its working memory is overwritten.
+        edges: `VisibleEdges` from about the direction of the picture.
+        projection: `Projection` of the picture.
+        shifts: `Shifts` to try.
+        limits: see `PointLimits`.
+    """
+    shape = picture.strength.shape
+    count = edges.starts.shape[0] - 1
+    projected = _Projected(
+        *project_lines(
+            edges.points_in_body, edges.tangents, True, projection.cam_from_body, projection.intrinsics,
+            projection.step_mm,
+        )
+    )  # fmt: skip
+    pixels = projected.pixels
+    find_thin_edges(picture, limits.min_slope)
+    mark_owners(pixels, projected.depths, edges.component, picture.owners)
+    found = np.full((6, count), -1.0)
+    support = EdgeSupport(found[0], found[1], found[2], found[3], found[4], found[5])
+    points = _Points(
+        np.empty((count, limits.max_points), dtype=np.int64),
+        np.zeros(count, dtype=np.int64),
+        np.zeros((count, limits.max_points), dtype=np.bool_),
+    )
+    ignored = np.zeros(limits.max_points, dtype=np.bool_)
+    usable = np.empty(pixels.shape[0], dtype=np.int64)
+    places = np.empty((limits.max_points, 3, 2), dtype=np.int64)
+    along = np.empty((limits.max_points, 2), dtype=np.int64)
+    scores = np.arange(256) / (np.arange(256) + HALF_SCORE_STRENGTH)
+    no_costs = np.zeros(shifts.far.shape[0])
+    all_hits = 0.0
+    all_points = 0
+    for c in range(count):
+        inside, determined = _usable_points(edges, projected, c, shape, usable)
+        if inside < limits.min_points:
+            continue
+        kept = _place_points(projected, usable[:inside], points.chosen[c], places, along)
+        points.sizes[c] = kept
+        here = _best_shift(picture, c, places, along, kept, scores, shifts.near, shifts.near_costs, points.hit[c])
+        support.supported[c] = here
+        support.displaced[c] = limits.typical_alternative
+        if here < limits.well_supported:
+            support.displaced[c] = _best_shift(picture, c, places, along, kept, scores, shifts.far, no_costs, ignored)
+        support.contrast[c] = _contrast(picture.image, edges, projected, c, limits.color_reach_px)
+        support.determined[c] = determined
+        all_points += kept
+        all_hits += here * kept
+    for c in range(count):
+        if points.sizes[c] == 0:
+            continue
+        support.surroundings[c] = _surroundings(pixels, points, c, limits)
+        others = all_points - points.sizes[c]
+        support.others[c] = (all_hits - support.supported[c] * points.sizes[c]) / others if others > 0 else 1.0
+    return support
