@@ -1,4 +1,4 @@
-"""The rigid move that measurements along single directions agree on, what it leaves open, and how sure it is."""
+"""Robust rigid fit to measurements along single directions, with its covariance and its undetermined directions."""
 
 from __future__ import annotations
 
@@ -10,6 +10,13 @@ from arview.core.kernel import kernel
 from arview.geometry import Array
 
 TUKEY = 4.685
+"""Cut-off of Tukey's biweight in standard deviations: 95 % efficiency for normal errors."""
+_MAX_ITERATIONS = 20
+"""Iterations of reweighting; most fits converge in less than ten."""
+_CORRELATION_EDGES = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0])
+"""Upper ends of the distance bins, in correlation lengths, in which the correlation of residuals is estimated."""
+_MIN_PAIRS = 50
+"""Pairs that a distance bin needs for an estimate of its correlation."""
 
 
 @dataclass(frozen=True)
@@ -17,12 +24,12 @@ class RigidFit:
     """Result of `fit_rigid`.
 
     Attributes:
-        twist: (6,) rad and mm about the centre.
-        covariance: (6,6), zero along ``undetermined``.
-        undetermined: (K,6), see ``Move``.
+        twist: (6,) rotation vector (rad) and translation (mm) about the centre.
+        covariance: (6,6) of the twist, zero along ``undetermined``.
+        undetermined: (K,6), see `Move`.
         weights: (N,) robust weights 0–1.
         residual_mm: robust standard deviation of the inliers' residuals.
-        gain: (6,N) change of the twist by a change of each measurement.
+        gain: (6,N) derivative of the twist with respect to each measurement.
     """
 
     twist: Array
@@ -34,7 +41,7 @@ class RigidFit:
 
 
 def move_rows(points: Array, directions: Array, center: Array) -> Array:
-    """(N,6) how far points go along unit directions by a small move (rad, mm) about a centre."""
+    """(N,6) derivative of the displacement of points along unit directions by a small twist (rad, mm) about a centre."""
     return np.concatenate([np.cross(points - center, directions), directions], axis=1)
 
 
@@ -47,86 +54,99 @@ def fit_rigid(
     undetermined_mm: float,
     places: Array,
     min_sigma: float,
-    looked_rows: Array | None = None,
+    searched_rows: Array | None = None,
     min_support: float = 0.0,
     max_pairs: int = 1_000_000,
 ) -> RigidFit:
     """Weighted least squares with Tukey's biweight (Holland & Welsch 1977) on ``offsets ≈ rows @ twist``.
 
-    Directions that leave less than the data can tell are left out: those of the shape's symmetry (``free``) and those
-    whose standard deviation would exceed ``undetermined_mm``. The covariance takes residuals of neighbours to be as
-    alike as they are found to be.
+    Directions that cannot be determined are excluded: those of the shape's symmetry (``free``), and those whose
+    standard deviation would exceed ``undetermined_mm``. The covariance includes the correlation of neighbouring
+    residuals, which is estimated from the residuals themselves.
 
     Args:
         rows: (N,6) of `move_rows`.
-        offsets, sigmas: (N,) measured, and its predicted standard deviation.
-        free: (K,6) orthonormal, rotations times ``radius_mm``.
-        radius_mm: length that rotations are weighed with.
-        undetermined_mm: limit of a direction's standard deviation.
-        places: (N,D) coordinates in which neighbours are near each other, in correlation lengths or so.
-        min_sigma: robust standard deviation of normalised residuals is not taken to be less.
-        looked_rows: (L,6) of all that was looked at, whether it gave an offset or not; default ``rows``.
-        min_support: share of the information of ``looked_rows`` that must agree for a direction to be stated; below
-            twice as much its uncertainty grows.
-        max_pairs: points whose pairs say how alike residuals are; fewer take the covariance from every so manieth.
+        offsets: (N,) measured displacements, mm.
+        sigmas: (N,) predicted standard deviations of the offsets, mm.
+        free: (K,6) orthonormal directions that the shape leaves free, rotations multiplied by ``radius_mm``.
+        radius_mm: length that converts rotations to mm.
+        undetermined_mm: largest standard deviation of a direction that counts as determined.
+        places: (N,D) coordinates of the measurements in units of about one correlation length.
+        min_sigma: lower bound of the robust standard deviation of the normalised residuals.
+        searched_rows: (L,6) rows of all places searched, whether they gave an offset or not; default ``rows``.
+        min_support: share of the information of ``searched_rows`` that must agree for a direction to be determined;
+            below twice this share its uncertainty is increased.
+        max_pairs: points whose pairs are used to estimate the correlation; of more points every n-th is taken.
     """
     scale = np.repeat([1.0 / radius_mm, 1.0], 3)
     scaled = rows * scale
     white = scaled / sigmas[:, None]
-    target = offsets / sigmas
-    basis = _across(free)
-    weights = np.ones(len(rows))
-    spread = 1.0
-    # A direction is open when the data cannot hold it; neighbours are alike, so that few are independent.
-    information = basis.T @ white.T @ white @ basis
-    values, vectors = np.linalg.eigh(information)
-    is_held = values > max(4.0 / undetermined_mm**2, 1e-7 * values[-1] if len(values) else 0.0)
-    basis = basis @ vectors[:, is_held]
-    solution = np.zeros(6)
-    for _ in range(20):
-        weighted = white @ basis * weights[:, None]
-        normal = weighted.T @ (white @ basis)
-        solution, last = basis @ np.linalg.pinv(normal, hermitian=True) @ (weighted.T @ target), solution
-        left = target - white @ solution
-        spread = max(min_sigma, 1.4826 * float(np.median(np.abs(left))))
-        weights = np.clip(1.0 - (left / (TUKEY * spread)) ** 2, 0.0, None) ** 2
-        if np.abs(solution - last).max() < 1e-6:
-            break
+    basis = _observable_directions(white, _orthogonal_complement(free), undetermined_mm)
+    solution, residuals, weights = _reweighted(white, offsets / sigmas, basis, min_sigma)
     weighted = white @ basis * weights[:, None]
     inverse = np.linalg.pinv(weighted.T @ (white @ basis), hermitian=True)
-    gain = (basis @ inverse @ weighted.T) / sigmas  # scaled twist by offset
+    gain = (basis @ inverse @ weighted.T) / sigmas  # of the scaled twist
     is_in = weights > 0.0
     some = np.flatnonzero(is_in)
     stride = max(1, -(-len(some) // max_pairs))
     some = some[::stride]
-    middle = stride * _correlated(np.ascontiguousarray(weighted[some]), left[some], places[some], stride)
+    middle = stride * _correlated(np.ascontiguousarray(weighted[some]), residuals[some], places[some], stride)
     covariance = basis @ inverse @ middle @ inverse @ basis.T
-    shares, modes = _support(scaled, weights, scaled if looked_rows is None else looked_rows * scale, basis)
-    # Few of many agreeing is a sign of a wrong place among them: worse than their scatter shows.
-    grown = np.maximum(2.0 * min_support / np.maximum(shares, 1e-9), 1.0)
+    shares, modes = _support(scaled, weights, scaled if searched_rows is None else searched_rows * scale, basis)
+    # Where only few of many measurements agree, some of these may be wrong too: their scatter understates the error.
+    growth = np.maximum(2.0 * min_support / np.maximum(shares, 1e-9), 1.0)
     own = np.linalg.pinv(modes)
     inner = own @ covariance @ own.T
-    covariance = covariance + modes @ np.diag(np.diag(inner) * (grown**2 - 1.0)) @ modes.T
-    # What the covariance shows to be too poor to state is open as well.
+    covariance = covariance + modes @ np.diag(np.diag(inner) * (growth**2 - 1.0)) @ modes.T
+    # Directions whose covariance is too large, or whose support is too small, are undetermined as well.
     values, vectors = np.linalg.eigh(basis.T @ covariance @ basis)
     is_open = np.concatenate([(basis @ vectors[:, values > undetermined_mm**2]).T, modes[:, shares < min_support].T])
-    held = basis @ _across(is_open @ basis)
+    held = basis @ _orthogonal_complement(is_open @ basis)
     project = held @ held.T
+    inliers_mm = np.abs(residuals[is_in] * sigmas[is_in])
     return RigidFit(
         twist=project @ solution * scale,
         covariance=project @ covariance @ project * np.outer(scale, scale),
-        undetermined=_across(held.T).T,
+        undetermined=_orthogonal_complement(held.T).T,
         weights=weights,
-        residual_mm=1.4826 * float(np.median(np.abs(left[is_in] * sigmas[is_in]))) if is_in.any() else float("inf"),
+        residual_mm=1.4826 * float(np.median(inliers_mm)) if is_in.any() else float("inf"),
         gain=scale[:, None] * (project @ gain),
     )
 
 
-def _support(rows: Array, weights: Array, looked: Array, basis: Array) -> tuple[Array, Array]:
-    """Share of the information looked for that agrees, ascending, and the moves (6,B) it belongs to."""
+def _observable_directions(white: Array, allowed: Array, undetermined_mm: float) -> Array:
+    """(6,B) orthonormal directions within ``allowed`` (6,F) that whitened rows (N,6) determine.
+
+    The limit is four times the information of one independent measurement of that accuracy, because neighbouring
+    measurements are correlated.
+    """
+    information = allowed.T @ white.T @ white @ allowed
+    values, vectors = np.linalg.eigh(information)
+    is_held = values > max(4.0 / undetermined_mm**2, 1e-7 * values[-1] if len(values) else 0.0)
+    return allowed @ vectors[:, is_held]
+
+
+def _reweighted(white: Array, target: Array, basis: Array, min_sigma: float) -> tuple[Array, Array, Array]:
+    """Iteratively reweighted least squares: solution (6,), normalised residuals (N,) and weights (N,)."""
+    weights = np.ones(len(white))
+    solution, residuals = np.zeros(6), target
+    for _ in range(_MAX_ITERATIONS):
+        weighted = white @ basis * weights[:, None]
+        normal = weighted.T @ (white @ basis)
+        solution, last = basis @ np.linalg.pinv(normal, hermitian=True) @ (weighted.T @ target), solution
+        residuals = target - white @ solution
+        spread = max(min_sigma, 1.4826 * float(np.median(np.abs(residuals))))
+        weights = np.clip(1.0 - (residuals / (TUKEY * spread)) ** 2, 0.0, None) ** 2
+        if np.abs(solution - last).max() < 1e-6:
+            break
+    return solution, residuals, weights
+
+
+def _support(rows: Array, weights: Array, searched: Array, basis: Array) -> tuple[Array, Array]:
+    """Share of the information searched for that agrees, ascending, and the directions (6,B) that it belongs to."""
     from scipy.linalg import eigh
 
-    inner, outer = rows @ basis, looked @ basis
+    inner, outer = rows @ basis, searched @ basis
     if not basis.shape[1]:
         return np.zeros(0), basis
     wanted = outer.T @ outer
@@ -136,8 +156,8 @@ def _support(rows: Array, weights: Array, looked: Array, basis: Array) -> tuple[
     return shares, modes / np.linalg.norm(modes, axis=0)
 
 
-def _across(directions: Array) -> Array:
-    """Orthonormal columns across all rows, which may depend on each other."""
+def _orthogonal_complement(directions: Array) -> Array:
+    """Orthonormal columns (D,M) orthogonal to all rows of ``directions`` (K,D), which may be linearly dependent."""
     size = directions.shape[1]
     if not len(directions):
         return np.eye(size)
@@ -147,26 +167,27 @@ def _across(directions: Array) -> Array:
 
 
 def _correlated(rows: Array, residuals: Array, places: Array, stride: int = 1) -> Array:
-    """(B,B) covariance of ``rows.T @ errors`` when errors are as alike as residuals at the same distance are.
+    """(B,B) covariance of ``rows.T @ errors``, with errors correlated by distance as the residuals are.
 
-    Of every ``stride``-th row it is the share: each stands for so many neighbours.
+    ``rows`` are every ``stride``-th of all; each represents that many neighbours.
     """
-    edges = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0])
+    edges = _CORRELATION_EDGES
     if len(residuals) < 2:
         return rows.T @ rows
     bins = _distance_bins(np.ascontiguousarray(places), edges)
     products, counts = _binned_products(bins, residuals, len(edges) + 1)
     variance = float(np.mean(residuals**2)) * len(residuals) / max(len(residuals) - rows.shape[1], 1)
-    alike = np.where(counts > 50, products / np.maximum(counts, 1) / max(variance, 1e-300), 0.0)
-    alike = np.clip(alike, 0.0, 1.0)
-    # Once they are unlike they stay so: what a few pairs far apart show is chance.
-    alike = np.minimum.accumulate(alike)
-    alike[-1] = 0.0
-    return np.asarray(variance * (rows.T @ rows + stride * _spread(bins, alike, rows)))
+    correlation = np.where(counts > _MIN_PAIRS, products / np.maximum(counts, 1) / max(variance, 1e-300), 0.0)
+    correlation = np.clip(correlation, 0.0, 1.0)
+    # Correlation may only fall with distance: a rise in bins of few distant pairs is noise.
+    correlation = np.minimum.accumulate(correlation)
+    correlation[-1] = 0.0
+    return np.asarray(variance * (rows.T @ rows + stride * _correlated_sum(bins, correlation, rows)))
 
 
 @kernel
 def _distance_bins(places, edges):  # type: ignore[no-untyped-def]
+    """(N,N) index of the distance bin of each pair; the last bin is for distances beyond all edges."""
     n, d = places.shape
     bins = np.empty((n, n), dtype=np.uint8)
     for i in range(n):
@@ -184,6 +205,7 @@ def _distance_bins(places, edges):  # type: ignore[no-untyped-def]
 
 @kernel
 def _binned_products(bins, residuals, size):  # type: ignore[no-untyped-def]
+    """Sum of the products of pairs of residuals, and number of pairs, in each bin."""
     products, counts = np.zeros(size), np.zeros(size)
     for i in range(bins.shape[0]):
         for j in range(i):
@@ -193,15 +215,16 @@ def _binned_products(bins, residuals, size):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _spread(bins, alike, rows):  # type: ignore[no-untyped-def]
+def _correlated_sum(bins, correlation, rows):  # type: ignore[no-untyped-def]
+    """(B,B) sum over pairs i ≠ j of ``correlation`` times the outer product of rows i and j."""
     n, b = rows.shape
     result = np.zeros((b, b))
     for i in range(n):
         mixed = np.zeros(b)
         for j in range(n):
-            if j != i and alike[bins[i, j]] > 0.0:
+            if j != i and correlation[bins[i, j]] > 0.0:
                 for k in range(b):
-                    mixed[k] += alike[bins[i, j]] * rows[j, k]
+                    mixed[k] += correlation[bins[i, j]] * rows[j, k]
         for a in range(b):
             for k in range(b):
                 result[a, k] += rows[i, a] * mixed[k]

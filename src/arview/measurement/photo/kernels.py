@@ -1,4 +1,4 @@
-"""Kernels of the sweep: how alike a patch looks in several photos, along its normal."""
+"""Kernels of the object-space sweep: similarity of a patch in several photos as it moves along its normal."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import numpy as np
 from arview.core.kernel import kernel
 
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
-"""Sums may be done in any order: four numbers at a time."""
+"""LLVM flags that let sums be vectorised."""
+_MIN_POINTS = 9
+"""Patches with fewer points in use have no score."""
 
 
 @kernel(fastmath=_FAST, numpy_errors=True)
@@ -15,145 +17,185 @@ def sweep_scores(patches, is_on, shades, normals, steps, views, stack, min_contr
     """Mean correlation (ZNCC) over all pairs of views of patches moved along their normals.
 
     Args:
-        patches: (N,P,3) points in the model frame.
-        is_on: (N,P) which are used.
-        shades: (N,P,3) orthonormal over the points used: mean and slopes, which light may change from view to view.
-        normals: (N,3).
-        steps: (S,) mm.
+        patches: (N,P,3) points in the model frame, mm.
+        is_on: (N,P) which points are used.
+        shades: (N,P,3) brightness changes that light may cause from view to view (mean and slopes), orthonormal over
+            the points used; they are projected out.
+        normals: (N,3) unit.
+        steps: (S,) offsets along the normal, mm.
         views: (N,V) indices of photos, -1 for none.
         stack: the photos (`PhotoStack`).
-        min_contrast: standard deviation in grey levels; a view with less takes no part.
+        min_contrast: standard deviation in grey levels below which a view is ignored.
 
     Returns:
-        scores (N,S), -1 where fewer than two views take part; count (N,S) of views that do; alike (N,S,V) correlation
-        of each view with the mean of the others, -1 for none.
+        scores (N,S), -1 where fewer than two views contribute; count (N,S) of contributing views; similarity (N,S,V)
+        correlation of each view with the mean of the others, -1 for none.
     """
     pixels, starts, sizes, lenses, poses = stack
     n, p_all = is_on.shape
     s_all, v_all = len(steps), views.shape[1]
     scores = np.full((n, s_all), -1.0, dtype=np.float32)
     count = np.zeros((n, s_all), dtype=np.int8)
-    alike = np.full((n, s_all, v_all), -1.0, dtype=np.float32)
-    ahead = np.empty((v_all, 3, p_all))
-    toward = np.empty((v_all, 3))
+    similarity = np.full((n, s_all, v_all), -1.0, dtype=np.float32)
+    in_cam = np.empty((v_all, 3, p_all))
+    direction = np.empty((v_all, 3))
     values = np.empty((v_all, p_all))
     total = np.empty(p_all)
     shade = np.empty((3, p_all))
-    across, down = np.empty(p_all), np.empty(p_all)
+    u, v = np.empty(p_all), np.empty(p_all)
     for i in range(n):
-        used = 0
-        for p in range(p_all):
-            if is_on[i, p]:
-                for v in range(v_all):
-                    m = views[i, v]
-                    if m < 0:
-                        continue
-                    for k in range(3):
-                        ahead[v, k, used] = (
-                            poses[m, k, 0] * patches[i, p, 0] + poses[m, k, 1] * patches[i, p, 1]
-                            + poses[m, k, 2] * patches[i, p, 2] + poses[m, k, 3]
-                        )  # fmt: skip
-                for k in range(3):
-                    shade[k, used] = shades[i, p, k]
-                used += 1
-        if used < 9:
+        used = _to_cameras(patches[i], is_on[i], shades[i], normals[i], views[i], poses, in_cam, direction, shade)
+        if used < _MIN_POINTS:
             continue
-        for v in range(v_all):
-            m = views[i, v]
-            if m >= 0:
-                for k in range(3):
-                    toward[v, k] = (
-                        poses[m, k, 0] * normals[i, 0] + poses[m, k, 1] * normals[i, 1] + poses[m, k, 2] * normals[i, 2]
-                    )
         for s in range(s_all):
-            step = steps[s]
             total[:used] = 0.0
-            taking = 0
-            for v in range(v_all):
-                m = views[i, v]
-                alike[i, s, v] = -1.0
+            contributing = 0
+            for k in range(v_all):
+                m = views[i, k]
+                similarity[i, s, k] = -1.0
                 if m < 0:
                     continue
-                width, height, start = sizes[m, 0], sizes[m, 1], starts[m]
-                fx, fy, cx, cy = lenses[m, 0], lenses[m, 1], lenses[m, 2], lenses[m, 3]
-                k1, k2, p1, p2, k3 = lenses[m, 4], lenses[m, 5], lenses[m, 6], lenses[m, 7], lenses[m, 8]
-                mean, slope_a, slope_b = 0.0, 0.0, 0.0
-                step_x, step_y, step_z = step * toward[v, 0], step * toward[v, 1], step * toward[v, 2]
-                for p in range(used):
-                    inverse = 1.0 / (ahead[v, 2, p] + step_z)
-                    x = (ahead[v, 0, p] + step_x) * inverse
-                    y = (ahead[v, 1, p] + step_y) * inverse
-                    r2 = x * x + y * y
-                    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-                    across[p] = fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + cx
-                    down[p] = fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + cy
-                is_inside = True
-                for p in range(used):
-                    a, b = across[p], down[p]
-                    if not (a >= 0.0 and b >= 0.0 and a < width - 1 and b < height - 1):
-                        is_inside = False
-                        break
-                if not is_inside:
+                _project(in_cam[k], direction[k], steps[s], lenses[m], used, u, v)
+                if not _is_inside(u, v, used, sizes[m, 0], sizes[m, 1]):
                     continue
-                for p in range(used):
-                    a, b = across[p], down[p]
-                    ia, ib = int(a), int(b)
-                    fa, fb = a - ia, b - ib
-                    at = start + ib * width + ia
-                    top = pixels[at] * (1.0 - fa) + pixels[at + 1] * fa
-                    bottom = pixels[at + width] * (1.0 - fa) + pixels[at + width + 1] * fa
-                    values[v, p] = top * (1.0 - fb) + bottom * fb
-                for p in range(used):
-                    mean += values[v, p] * shade[0, p]
-                    slope_a += values[v, p] * shade[1, p]
-                    slope_b += values[v, p] * shade[2, p]
-                square = 0.0
-                for p in range(used):
-                    values[v, p] -= mean * shade[0, p] + slope_a * shade[1, p] + slope_b * shade[2, p]
-                    square += values[v, p] * values[v, p]
-                if square < used * min_contrast * min_contrast:
+                _sample(pixels, starts[m], sizes[m, 0], u, v, used, values[k])
+                if not _normalise(values[k], shade, used, min_contrast, total):
                     continue
-                scale = 1.0 / np.sqrt(square)
-                for p in range(used):
-                    values[v, p] *= scale
-                    total[p] += values[v, p]
-                alike[i, s, v] = 1.0
-                taking += 1
-            count[i, s] = taking
-            if taking < 2:
-                continue
-            square = 0.0
-            for p in range(used):
-                square += total[p] * total[p]
-            scores[i, s] = (square - taking) / (taking * (taking - 1))
-            for v in range(v_all):
-                if alike[i, s, v] < 0.0:
+                similarity[i, s, k] = 1.0
+                contributing += 1
+            count[i, s] = contributing
+            if contributing >= 2:
+                scores[i, s] = _compare(values, total, used, contributing, similarity[i, s])
+    return scores, count, similarity
+
+
+@kernel(fastmath=_FAST, numpy_errors=True)
+def _to_cameras(patch, is_on, shades, normal, views, poses, in_cam, direction, shade):  # type: ignore[no-untyped-def]
+    """Points in use, packed, and the normal in the frames of the cameras; shades packed alike. Returns their number."""
+    used = 0
+    for p in range(len(is_on)):
+        if is_on[p]:
+            for v in range(len(views)):
+                m = views[v]
+                if m < 0:
                     continue
-                along = 0.0
-                for p in range(used):
-                    along += values[v, p] * total[p]
-                rest = np.sqrt(max(square - 2.0 * along + 1.0, 1e-12))
-                alike[i, s, v] = (along - 1.0) / rest
-    return scores, count, alike
+                for k in range(3):
+                    in_cam[v, k, used] = (
+                        poses[m, k, 0] * patch[p, 0] + poses[m, k, 1] * patch[p, 1]
+                        + poses[m, k, 2] * patch[p, 2] + poses[m, k, 3]
+                    )  # fmt: skip
+            for k in range(3):
+                shade[k, used] = shades[p, k]
+            used += 1
+    for v in range(len(views)):
+        m = views[v]
+        if m >= 0:
+            for k in range(3):
+                direction[v, k] = poses[m, k, 0] * normal[0] + poses[m, k, 1] * normal[1] + poses[m, k, 2] * normal[2]
+    return used
+
+
+@kernel(fastmath=_FAST, numpy_errors=True, inline=True)
+def _project(in_cam, direction, step, lens, used, u, v):  # type: ignore[no-untyped-def]
+    """Pixels (u, v) of the points moved by ``step`` along the normal, through a lens fx fy cx cy k1 k2 p1 p2 k3."""
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
+    step_x, step_y, step_z = step * direction[0], step * direction[1], step * direction[2]
+    for p in range(used):
+        inverse = 1.0 / (in_cam[2, p] + step_z)
+        x = (in_cam[0, p] + step_x) * inverse
+        y = (in_cam[1, p] + step_y) * inverse
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        u[p] = fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + cx
+        v[p] = fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + cy
+
+
+@kernel(fastmath=_FAST, numpy_errors=True, inline=True)
+def _is_inside(u, v, used, width, height):  # type: ignore[no-untyped-def]
+    """Whether all pixels lie inside the picture."""
+    for p in range(used):
+        a, b = u[p], v[p]
+        if not (a >= 0.0 and b >= 0.0 and a < width - 1 and b < height - 1):
+            return False
+    return True
+
+
+@kernel(fastmath=_FAST, numpy_errors=True, inline=True)
+def _sample(pixels, start, width, u, v, used, values):  # type: ignore[no-untyped-def]
+    """Bilinear grey levels of the picture that begins at ``start`` in the stack."""
+    for p in range(used):
+        a, b = u[p], v[p]
+        ia, ib = int(a), int(b)
+        fa, fb = a - ia, b - ib
+        at = start + ib * width + ia
+        top = pixels[at] * (1.0 - fa) + pixels[at + 1] * fa
+        bottom = pixels[at + width] * (1.0 - fa) + pixels[at + width + 1] * fa
+        values[p] = top * (1.0 - fb) + bottom * fb
+
+
+@kernel(fastmath=_FAST, numpy_errors=True, inline=True)
+def _normalise(values, shade, used, min_contrast, total):  # type: ignore[no-untyped-def]
+    """Remove the shades from the values, scale them to length 1 and add them to ``total``; False without contrast."""
+    mean, slope_a, slope_b = 0.0, 0.0, 0.0
+    for p in range(used):
+        mean += values[p] * shade[0, p]
+        slope_a += values[p] * shade[1, p]
+        slope_b += values[p] * shade[2, p]
+    square = 0.0
+    for p in range(used):
+        values[p] -= mean * shade[0, p] + slope_a * shade[1, p] + slope_b * shade[2, p]
+        square += values[p] * values[p]
+    if square < used * min_contrast * min_contrast:
+        return False
+    scale = 1.0 / np.sqrt(square)
+    for p in range(used):
+        values[p] *= scale
+        total[p] += values[p]
+    return True
+
+
+@kernel(fastmath=_FAST, numpy_errors=True)
+def _compare(values, total, used, contributing, similarity):  # type: ignore[no-untyped-def]
+    """Mean correlation of all pairs of views, and into ``similarity`` that of each with the mean of the others."""
+    square = 0.0
+    for p in range(used):
+        square += total[p] * total[p]
+    score = (square - contributing) / (contributing * (contributing - 1))
+    for v in range(len(similarity)):
+        if similarity[v] < 0.0:
+            continue
+        along = 0.0
+        for p in range(used):
+            along += values[v, p] * total[p]
+        rest = np.sqrt(max(square - 2.0 * along + 1.0, 1e-12))
+        similarity[v] = (along - 1.0) / rest
+    return score
 
 
 @kernel
-def choose_views(visible, cosines, directions, most):  # type: ignore[no-untyped-def]
-    """The views (N,most) that see a sample best and from different sides, -1 for none.
+def choose_views(visible, cosines, directions, max_views):  # type: ignore[no-untyped-def]
+    """Choose the views of each sample greedily: seen at a steep angle, and from directions 20° apart where possible.
 
-    ``visible`` (N,M), ``cosines`` (N,M) to the normal, ``directions`` (M,3) to the cameras, unit. Greedy: steep and at
-    least 20° from those taken counts full.
+    Args:
+        visible: (N,M) which of M views see the sample.
+        cosines: (N,M) cosine between the sample's normal and the direction to the camera.
+        directions: (M,3) unit, towards the cameras.
+        max_views: number of views to choose.
+
+    Returns:
+        (N,max_views) indices of views, -1 for none.
     """
     n, m_all = visible.shape
-    views = np.full((n, most), -1, dtype=np.int64)
+    views = np.full((n, max_views), -1, dtype=np.int64)
     apart = np.empty(m_all)
     for i in range(n):
         apart[:] = 1.0
-        for k in range(most):
-            best, worth = -1, 0.0
+        for k in range(max_views):
+            best, score = -1, 0.0
             for m in range(m_all):
-                if visible[i, m] and cosines[i, m] * apart[m] > worth:
-                    best, worth = m, cosines[i, m] * apart[m]
+                if visible[i, m] and cosines[i, m] * apart[m] > score:
+                    best, score = m, cosines[i, m] * apart[m]
             if best < 0:
                 break
             views[i, k] = best
@@ -168,7 +210,18 @@ def choose_views(visible, cosines, directions, most):  # type: ignore[no-untyped
 
 @kernel
 def vote_shifts(scores, steps, normals, shifts, floor):  # type: ignore[no-untyped-def]
-    """(T,) sum over samples of their score, above ``floor``, where shifts (T,3) put them along their normals."""
+    """Sum over samples of how far their score exceeds ``floor`` where each shift puts them along their normals.
+
+    Args:
+        scores: (N,S) of `sweep_scores`.
+        steps: (S,) equally spaced offsets of the scores, mm.
+        normals: (N,3) unit.
+        shifts: (T,3) candidate translations, mm.
+        floor: score that counts as no support.
+
+    Returns:
+        (T,) votes.
+    """
     votes = np.zeros(shifts.shape[0])
     first, pitch = steps[0], steps[1] - steps[0]
     for t in range(shifts.shape[0]):
