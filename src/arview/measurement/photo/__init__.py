@@ -1,4 +1,4 @@
-"""Where components stand, measured in the photos themselves: by their surfaces and by their edges."""
+"""Positions of components measured in the photos themselves: from their surfaces (sweep) and from their edges."""
 
 from arview.measurement.photo.edges import EdgeOffsets, EdgePoints, edge_offsets
 from arview.measurement.photo.measure import measure_components_in_photos

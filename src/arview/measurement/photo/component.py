@@ -1,4 +1,4 @@
-"""What both ways of measuring a component share: its centre, what its shape leaves free, and the result in words."""
+"""What both methods of measuring a component in photos share: its geometry, its free directions and the result."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from arview.measurement.types import Method, Move
 
 
 class MeasuredComponent:
-    """One component of the model that the views show.
+    """A component of the model, as it is measured in the photos.
 
-    A *place* is (4,4) measured_from_nominal in the model frame.
+    A *place* is the (4,4) matrix ``measured_from_nominal`` in the model frame.
 
     Attributes:
         views, index, options: as given.
-        shape: the component.
-        center: (3,) of its bounding box.
-        corners: (8,3) of its bounding box.
-        radius_mm: half its diagonal.
-        px_mm: size of a pixel there.
-        free: (K,6) moves that its shape does not show, see `free_directions`.
+        shape: the component's mesh.
+        center: (3,) centre of its bounding box, mm.
+        corners: (8,3) corners of its bounding box, mm.
+        radius_mm: half the diagonal of the bounding box.
+        px_mm: size of a pixel at the component.
+        free: (K,6) motions that leave its shape unchanged, see `free_directions`.
     """
 
     def __init__(self, views: PhotoViews, index: int, part: Part | None, options: PhotoOptions) -> None:
@@ -39,27 +39,29 @@ class MeasuredComponent:
         self.free = free_directions(self.shape, part, self.center, self.radius_mm)
 
     def moved(self, place: Array, twist: Array) -> Array:
-        """A place after a further move (6,) about where it takes the centre."""
+        """The place after a further twist (6,) about the point to which the place takes the centre."""
         rotation = exp_so3(twist[:3])
         center = apply(place, self.center)
         return rigid(rotation, center - rotation @ center + twist[3:]) @ place
 
     def size_mm(self, twist: Array) -> float:
-        """The largest part of a move, turns at the component's rim."""
+        """Largest element of a twist in mm; rotations count at the component's rim."""
         return float(np.abs(twist * np.repeat([self.radius_mm, 1.0], 3)).max())
 
     def is_same(self, place: Array, other: Array) -> bool:
-        """Whether no corner of the component's box differs by a quarter of a pixel: too little to hide or show it."""
+        """Whether two places differ by less than a quarter of a pixel at all corners, too little to change what is
+        visible.
+        """
         apart = apply(place, self.corners) - apply(other, self.corners)
         return float(np.linalg.norm(apart, axis=1).max()) < 0.25 * self.px_mm
 
     def free_at(self, place: Array) -> Array:
-        """The free directions turned along with the component."""
+        """(K,6) the free directions, rotated with the component."""
         turn = place[:3, :3].T
         return np.concatenate([self.free[:, :3] @ turn, self.free[:, 3:] @ turn], axis=1)
 
     def shifts(self, reach_mm: float) -> Array:
-        """(T,3) shifts to try, nearest first."""
+        """(T,3) translations to try within ``reach_mm``, nearest first."""
         axis = np.arange(-reach_mm, reach_mm + 1e-9, max(0.5, reach_mm / 12))
         grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         return np.asarray(grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")])
@@ -67,25 +69,25 @@ class MeasuredComponent:
     def move(
         self, method: Method, fit: RigidFit, by_poses: Array, place: Array, systematic_mm: float, support: float
     ) -> Move:
-        """The result: a fit at its end, at a place.
+        """The measured move from the last fit.
 
         Args:
-            method: which way of measuring.
-            fit: the last one; its twist is already in ``place``.
-            by_poses: (6,6M) how the twist changes with the twists of the photos' poses.
-            place: where the component stands.
-            systematic_mm: standard deviation, in every direction, of what residuals do not show.
-            support: see ``Move``.
+            method: method of measurement.
+            fit: the last fit; its twist is already included in ``place``.
+            by_poses: (6,6M) derivative of the twist with respect to the twists of the photos' poses.
+            place: (4,4) where the component is.
+            systematic_mm: standard deviation, in every direction, of errors that the residuals do not show.
+            support: see `Move`.
         """
         scale = np.repeat([1.0 / self.radius_mm, 1.0], 3)
         project = np.eye(6) - fit.undetermined.T @ fit.undetermined
-        # What shifts a face by this turns a component by more: faces do not reach out to its rim.
+        # A shift of a face rotates the component by more than it would at the rim, since faces do not reach that far.
         systematic = np.diag(np.repeat([4.0, 1.0], 3)) * systematic_mm**2
         covariance = fit.covariance + project @ systematic @ project * np.outer(scale, scale)
         if self.views.pose_covariance is not None:
             covariance = covariance + by_poses @ self.views.pose_covariance @ by_poses.T
-        open_too = len(fit.undetermined) - len(self.free)
-        notes = (f"in {open_too} more directions than its shape leaves free it is not held",) if open_too > 0 else ()
+        extra = len(fit.undetermined) - len(self.free)
+        notes = (f"undetermined in {extra} directions beyond those that its symmetry leaves free",) if extra > 0 else ()
         twist = np.concatenate([log_so3(place[:3, :3]), apply(place, self.center) - self.center])
         return Move(
             component=self.shape.name,

@@ -1,8 +1,8 @@
 """A component's CAD edges and silhouettes, fitted to steps of brightness in all photos at once.
 
-Needs no texture. One-dimensional search along the normals of predicted edges (Harris, RAPID 1990; robust and with
-several hypotheses: Drummond & Cipolla 2002; Vacchetti, Lepetit & Fua 2004), hidden ones left out by the z-buffer, and
-a rigid move of the component in space that all of them agree on.
+This needs no texture. Steps are searched along the normals of predicted edges (Harris, RAPID 1990; robust and with
+several hypotheses: Drummond & Cipolla 2002; Vacchetti, Lepetit & Fua 2004), hidden edges are removed with the z-buffer,
+and one rigid motion of the component in space is fitted to all steps.
 """
 
 from __future__ import annotations
@@ -28,14 +28,20 @@ from arview.measurement.types import Move, NotMeasured
 
 @dataclass(frozen=True)
 class EdgePoints:
-    """Predicted edge points in the photos that see them: (N,3) points and unit tangents in the model, photo (N,)."""
+    """Predicted edge points in the photos that show them.
+
+    Attributes:
+        points: (N,3) in the model, mm.
+        tangents: (N,3) unit, in the model.
+        view: (N,) index of the photo.
+    """
 
     points: Array
     tangents: Array
     view: NDArray[np.int64]
 
     def of(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> EdgePoints:
-        """Some of them."""
+        """The chosen points."""
         return EdgePoints(self.points[which], self.tangents[which], self.view[which])
 
 
@@ -44,13 +50,15 @@ class EdgeOffsets:
     """Steps of brightness near predicted edge points.
 
     Attributes:
-        directions: (N,3) unit, across the edge and the line of sight, in the model: what a photo can say.
-        offsets_mm: (N,) how far along it the step is; 0 where there is none.
+        directions: (N,3) unit vectors in the model, across the edge and the line of sight; only this component of a
+            displacement is visible in the photo.
+        offsets_mm: (N,) position of the step along the direction; 0 where there is none.
         mm_per_px: (N,) size of a pixel in that direction.
-        slopes: (N,) grey levels per px in linear light, brighter along the direction is positive; 0 where no step.
-        seen: (N,) inside the photo.
-        hypotheses_mm, strengths: (N,K) all steps that were found, 0 = none.
-        pose_rows: (N,6) change of the offset with the twist of its photo's pose.
+        slopes: (N,) grey levels per px in linear light, positive where it gets brighter along the direction; 0 where
+            there is no step.
+        seen: (N,) whether the point is inside the photo.
+        hypotheses_mm, strengths: (N,K) positions and slopes of all steps found, 0 = none.
+        pose_rows: (N,6) derivative of the offset by the twist of its photo's pose.
     """
 
     directions: Array
@@ -67,15 +75,16 @@ def edge_offsets(
     edges: EdgePoints, center: Array, views: PhotoViews, reach_px: float, options: EdgeOptions, level: int = 0,
     shift_px: float = 0.0,
 ) -> EdgeOffsets:  # fmt: skip
-    """Look for a step of brightness across each predicted edge point.
+    """Find a step of brightness across each predicted edge point.
 
     Args:
-        edges: the points, in photos that are known to see them.
-        center: (3,) directions point away from it.
+        edges: points in photos that are known to show them.
+        center: (3,) point from which the directions lead away.
         views: the photos.
-        reach_px: how far is looked to either side, px of the level.
-        level: of the photos, 0 is full size, each further one half of it.
-        shift_px: look so far beside: what is found there is chance.
+        reach_px: search range to either side, px of the level.
+        options: see `EdgeOptions`.
+        level: resolution of the photos: 0 is full size, each further level half of it.
+        shift_px: search this far beside the edge; what is found there is due to chance.
     """
     n = len(edges.points)
     directions, mm_per_px, twists = np.zeros((n, 3)), np.ones(n), np.zeros((n, 6))
@@ -104,13 +113,15 @@ def edge_offsets(
         twists[of] = np.concatenate([np.cross(in_cam, by_cam), by_cam], axis=1) / size[:, None]
     chosen, slope = choose_steps(
         hypotheses / mm_per_px[:, None], strengths, 0.4 * reach_px, options.half_slope
-    )  # in px, whatever the distance
+    )  # in px, so that the choice does not depend on the distance
     return EdgeOffsets(directions, chosen * mm_per_px, mm_per_px, slope, seen, hypotheses, strengths, twists)
 
 
 def _across(camera: Camera, in_cam: Array, pixels: Array, tangents: Array) -> tuple[Array, Array]:
-    """(N,2) unit normals of edges in the picture, and (N,3) px along them by mm in the camera frame."""
-    # Through the lens by differences, of one micrometre per mm of depth.
+    """(N,2) unit normals of edges in the picture, and (N,3) derivative of the pixel along them by mm in the camera
+    frame.
+    """
+    # Numerical derivative through the lens, with steps of one micrometre per mm of depth.
     delta = 1e-6 * in_cam[:, 2:]
     by_cam = np.stack([(camera.project(in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)], axis=2)
     along = np.einsum("nij,nj->ni", by_cam, tangents)
@@ -123,7 +134,7 @@ def _across(camera: Camera, in_cam: Array, pixels: Array, tangents: Array) -> tu
 def _crop(
     views: PhotoViews, view: int, level: int, pixels: Array, reach_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Part of a photo in linear light around some pixels, and its first pixel (u, v)."""
+    """The part of a photo around some pixels in linear light, and its first pixel (u, v)."""
     stack = views.levels[level]
     width, height = stack.sizes[view]
     gray = stack.pixels[stack.starts[view] : stack.starts[view] + width * height].reshape(height, width)
@@ -138,7 +149,7 @@ def _crop(
 
 
 def pose_gain(views: PhotoViews, fit: RigidFit, view: NDArray[np.int64], rows: Array) -> Array:
-    """(6,6M) how a fitted twist changes with the poses, from ``rows`` (N,6) of each point with its own photo's."""
+    """(6,6M) derivative of a fitted twist by the poses, from that of each point (N,6) by the pose of its own photo."""
     result = np.zeros((6, 6 * len(views.cameras)))
     for v in np.unique(view):
         of = view == v
@@ -147,7 +158,7 @@ def pose_gain(views: PhotoViews, fit: RigidFit, view: NDArray[np.int64], rows: A
 
 
 class ComponentEdges:
-    """The measurement of one component by its edges."""
+    """Measurement of one component by its edges."""
 
     def __init__(self, body: MeasuredComponent) -> None:
         self.body, self.views, self.options = body, body.views, body.options
@@ -155,13 +166,13 @@ class ComponentEdges:
         self._predicted: tuple[Array, EdgePoints] | None = None
 
     def measure(self, start: Array | None = None) -> Move | NotMeasured:
-        """The component's move; ``start`` (4,4, measured_from_nominal) where it is roughly known already."""
+        """Measure the component's move; ``start`` (4,4) is its approximate place, None searches around nominal."""
         o = self.options.edges
         place = np.eye(4) if start is None else start
         edges = self.predicted(place)
         if len(edges.points) < o.min_points or len(np.unique(edges.view)) < 3:
-            return self._not("fewer than 3 photos show enough of its edges; take more of it")
-        # Coarse pictures first where a pixel is much finer than what is looked for.
+            return self._not("fewer than 3 photos show enough of its edges; take more photos of it")
+        # Start on reduced pictures where a pixel is much smaller than the displacements searched for.
         levels = [k for k in (2, 1) if self.body.px_mm * 2.0**k < 0.6]
         rounds = [(k, 6.0) for k in levels] + [(0, reach) for reach in o.reaches_px]
         if start is None:
@@ -189,9 +200,10 @@ class ComponentEdges:
         return self.body.move("edges", fit, by_poses, place, o.systematic_px * self.body.px_mm, support)
 
     def predicted(self, place: Array) -> EdgePoints:
-        """Edge points that the photos should show with the component at a place, joints left out.
+        """Edge points that the photos should show with the component at a place; joints with others are left out.
 
-        A place as good as the same as the last one shows the same points, moved along.
+        For a place that hardly differs from the previous one, the same points are moved along instead of rendered
+        again.
         """
         if self._predicted is not None and self.body.is_same(self._predicted[0], place):
             before, edges = self._predicted
@@ -231,17 +243,19 @@ class ComponentEdges:
         return edges
 
     def _capture(self, edges: EdgePoints, level: int) -> Array:
-        """Where most edges have a step, within the capture range: votes of shifts by all steps that were found."""
+        """Place within the capture range at which most edges have a step: all steps found vote for translations."""
         o = self.options.edges
         some = edges.of(np.arange(0, len(edges.points), max(1, len(edges.points) // 800)))
         px_mm = self.body.px_mm * 2.0**level
         found = edge_offsets(some, self.body.center, self.views, o.capture_mm / px_mm + 2.0, o, level)
         shifts = self.body.shifts(o.capture_mm)
-        worth = np.abs(found.strengths) / (np.abs(found.strengths) + o.half_slope)
-        order = np.argsort(-worth.max(axis=1), kind="stable")  # what weighs most first: losers are seen early
-        order = order[worth[order].max(axis=1) > 0.0]
+        weight = np.abs(found.strengths) / (np.abs(found.strengths) + o.half_slope)
+        order = np.argsort(
+            -weight.max(axis=1), kind="stable"
+        )  # strongest first, so that poor shifts are given up early
+        order = order[weight[order].max(axis=1) > 0.0]
         votes = _vote(
-            found.hypotheses_mm[order], worth[order], found.directions[order], shifts, max(0.4, 1.2 * px_mm), 0.99
+            found.hypotheses_mm[order], weight[order], found.directions[order], shifts, max(0.4, 1.2 * px_mm), 0.99
         )
         best = shifts[np.flatnonzero(votes > 0.99 * votes.max())[0]]
         return rigid(np.eye(3), best)
@@ -250,7 +264,9 @@ class ComponentEdges:
         self, edges: EdgePoints, found: EdgeOffsets, ok: NDArray[np.bool_], place: Array, dark_mm: float,
         is_last: bool = True,
     ) -> tuple[RigidFit, float]:  # fmt: skip
-        """Fit, with all edges shifted alike to the dark side as the round before showed; and that shift anew."""
+        """Fit with all edges shifted to the dark side by ``dark_mm``, as the previous round found; also the new such
+        shift.
+        """
         o = self.options.edges
         size, slope = found.mm_per_px[ok], found.slopes[ok]
         sigmas = _SIGMA_PX * size * np.sqrt((np.abs(slope) + o.half_slope) / np.abs(slope))
@@ -265,11 +281,13 @@ class ComponentEdges:
         )  # fmt: skip
         left = found.offsets_mm[ok] - rows @ fit.twist
         limit = o.max_dark_shift_px * self.body.px_mm
-        shift = float(np.sum(fit.weights * dark * left) / (1.05 * np.sum(fit.weights) + 1.0))  # a little held at none
+        shift = float(
+            np.sum(fit.weights * dark * left) / (1.05 * np.sum(fit.weights) + 1.0)
+        )  # with a weak prior at zero
         return fit, float(np.clip(shift, -limit, limit))
 
     def _support(self, edges: EdgePoints, place: Array) -> float:
-        """Share of the predicted points with a step within a pixel, less what is found beside them."""
+        """Share of predicted points with a step within one pixel, beyond what is found by chance beside the edges."""
         o = self.options.edges
         shares = []
         for shift_px in (0.0, -7.0, 7.0):
@@ -284,23 +302,32 @@ class ComponentEdges:
 
 
 CREASE_DEG = 35.0
-"""Faces that meet at more are an edge; less are facets of a curved surface, more or less coarse."""
+"""Faces that meet at a larger angle form an edge; smaller angles are facets of a curved surface."""
 _FEW_PAIRS = 700
-"""Points whose pairs say how alike errors are, while the place is still being sought."""
+"""Points used to estimate the correlation of errors while the place is still being refined."""
 _SIGMA_PX = 0.3
-"""Of a strong step; what residuals show replaces it."""
+"""Standard deviation assumed for a strong step; the scale that the residuals show replaces it."""
 
 
 @kernel(numpy_errors=True)
-def _vote(hypotheses, worth, directions, shifts, width, share):  # type: ignore[no-untyped-def]
-    """(T,) sum over points of the best step near where shifts (T,3) put it.
+def _vote(hypotheses, weights, directions, shifts, width, share):  # type: ignore[no-untyped-def]
+    """Sum over edge points of the best step near the place to which each shift moves the edge.
 
-    Shifts that cannot come to ``share`` of the best one's are given up, with what they have come to.
+    Args:
+        hypotheses: (N,K) positions of steps along the directions, mm.
+        weights: (N,K) of the steps, 0 = no step.
+        directions: (N,3) unit.
+        shifts: (T,3) candidate translations, mm.
+        width: distance at which a step no longer counts, mm.
+        share: a shift is abandoned once it cannot reach this share of the best vote so far.
+
+    Returns:
+        (T,) votes; those of abandoned shifts are incomplete.
     """
     votes = np.zeros(shifts.shape[0])
     rest = np.zeros(hypotheses.shape[0] + 1)
     for i in range(hypotheses.shape[0] - 1, -1, -1):
-        rest[i] = rest[i + 1] + worth[i].max()
+        rest[i] = rest[i + 1] + weights[i].max()
     highest = 0.0
     for t in range(shifts.shape[0]):
         total = 0.0
@@ -313,8 +340,8 @@ def _vote(hypotheses, worth, directions, shifts, width, share):  # type: ignore[
             best = 0.0
             for k in range(hypotheses.shape[1]):
                 off = (hypotheses[i, k] - along) / width
-                if worth[i, k] > 0.0 and abs(off) < 1.0:
-                    best = max(best, worth[i, k] * (1.0 - off * off))
+                if weights[i, k] > 0.0 and abs(off) < 1.0:
+                    best = max(best, weights[i, k] * (1.0 - off * off))
             total += best
         votes[t] = total
         highest = max(highest, total)

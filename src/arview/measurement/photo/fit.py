@@ -41,7 +41,7 @@ class RigidFit:
 
 
 def move_rows(points: Array, directions: Array, center: Array) -> Array:
-    """(N,6) derivative of the displacement of points along unit directions by a small twist (rad, mm) about a centre."""
+    """(N,6) derivative of the shift of points along unit directions by a small twist (rad, mm) about a centre."""
     return np.concatenate([np.cross(points - center, directions), directions], axis=1)
 
 

@@ -20,6 +20,7 @@ from arview.measurement.types import Method, Move, NotMeasured
 from arview.reconstruction.types import SparseModel
 
 MethodResults = dict[Method, Move | NotMeasured]
+"""The outcome of each method for one component."""
 
 
 def measure_components_in_photos(
@@ -30,21 +31,22 @@ def measure_components_in_photos(
     progress: Callable[[str, float], None] | None = None,
     names: Sequence[str] | None = None,
 ) -> dict[str, MethodResults]:
-    """Where components stand, by each of the two ways.
+    """Measure where components are, by each of the two methods.
 
-    Both look around the nominal place by themselves, and where the other found the component. The frame is that of
-    the poses: measure the datums, or the base by its name, to state moves relative to it.
+    Both methods search around the nominal place, and also where the other one found the component. Moves are stated in
+    the frame of the poses; measure the datums, or the base as a component, to state moves relative to them.
 
     Args:
-        sparse: placed photos, mm, within about 0.3 mm and 0.05° in the frame of the model; or views of it.
-        part: roles and declared symmetries; None takes every component to be inspected.
+        sparse: placed photos in mm, in the frame of the model within about 0.3 mm and 0.05°; or their views.
+        part: roles and declared symmetries; None inspects every component.
         model: the nominal CAD.
-        options: see ``PhotoOptions``.
-        progress: called with a component's name and the share that is done.
-        names: of the components to measure; default: those that are inspected.
+        options: see `PhotoOptions`.
+        progress: called with the name of a finished component and the share that is done.
+        names: components to measure; default: those inspected.
 
     Raises:
-        InputError: fewer than three photos, photos that cannot be read, no such component, poses not in the frame.
+        InputError: there are fewer than three photos, photos cannot be read, a component does not exist, or the poses
+            are not in the frame of the model.
     """
     options = options or PhotoOptions()
     views = sparse if isinstance(sparse, PhotoViews) else load_views(sparse, model)
@@ -64,15 +66,15 @@ def measure_components_in_photos(
 
 
 def measure_component(views: PhotoViews, index: int, part: Part | None, options: PhotoOptions) -> MethodResults:
-    """One component by both ways; when a way fails, whether the component is there at all is looked at."""
+    """Measure one component by both methods; if the edges fail, check whether the component is missing."""
     body = MeasuredComponent(views, index, part, options)
     edges = ComponentEdges(body).measure()
-    # Where edges found it is one more place to look at; what the surface says there is its own.
+    # The place found by edges is one more start of the sweep; the sweep's result there remains independent.
     sweep = ComponentSweep(body).measure([edges.measured_from_nominal] if isinstance(edges, Move) else [])
     if isinstance(edges, NotMeasured) and isinstance(sweep, Move):
         edges = ComponentEdges(body).measure(sweep.measured_from_nominal)
     if isinstance(edges, NotMeasured) and is_gone(body):
-        reason = "not there: the photos show the surface that it should stand on"
+        reason = "missing: the photos show the surface that it should stand on"
         return {
             "sweep": NotMeasured(body.shape.name, "sweep", reason, is_missing=True),
             "edges": NotMeasured(body.shape.name, "edges", reason, is_missing=True),
@@ -81,13 +83,13 @@ def measure_component(views: PhotoViews, index: int, part: Part | None, options:
 
 
 def is_gone(body: MeasuredComponent) -> bool:
-    """Whether the photos show what the component would hide: the surfaces of others that it stands on."""
+    """Whether the photos show the surfaces of other components that this one would hide."""
     o, model = body.options.sweep, body.views.model
     samples = sample_surface(body.shape, o.sample_spacing_px * body.px_mm, o.samples)
     contact = samples.of(near_others(samples.points, model, body.index, 0.5))
     if len(contact.points) < 10:
         return False
-    # Seen from the other side: the surface below faces against the component's own.
+    # The surface below faces opposite to the component's own.
     below = Samples(contact.points, -contact.normals)
     found = sweep_offsets(below.points, below.normals, body.views, 3.0 * body.px_mm, o, removed=body.index)
     looked = np.count_nonzero(found.views >= 0, axis=1) >= o.min_views

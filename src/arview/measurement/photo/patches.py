@@ -1,4 +1,4 @@
-"""Patches that follow a component's CAD surface, and what its shape leaves free."""
+"""Patches that follow a component's surface, distances to other components, and the motions its shape leaves free."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from arview.rendering.raycast import RayCaster
 
 
 def tangents_of(normals: Array) -> tuple[Array, Array]:
-    """Two unit vectors (N,3) each, across unit normals (N,3) and each other."""
+    """Two unit vectors (N,3) each, orthogonal to unit normals (N,3) and to each other."""
     helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     first = np.cross(normals, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -29,10 +29,21 @@ def tangents_of(normals: Array) -> tuple[Array, Array]:
 def cut_patches(
     samples: Samples, surface: RayCaster | None, normals_of_faces: Array | None, width: int, spacing_mm: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Patches shaped like the surface: points (N,P,3), and which of them (N,P) are on it.
+    """Cut patches that follow the surface.
 
-    A grid across the normal is projected along the normal onto the surface; points that miss it, or hit it more
-    than half a patch away or beyond an edge (60°), are off. Without a surface the patches are flat.
+    A grid across the normal is projected along the normal onto the surface. Points that miss it, that hit it more than
+    half a patch away, or that hit a face inclined by more than 60° are off the surface. Without a surface, patches are
+    flat.
+
+    Args:
+        samples: N surface points with normals.
+        surface: ray caster of the component's mesh, or None.
+        normals_of_faces: (F,3) unit normals of the mesh, or None.
+        width: grid points across a patch; P = width².
+        spacing_mm: distance between grid points.
+
+    Returns:
+        points (N,P,3) in mm, and (N,P) which of them are on the surface.
     """
     first, second = tangents_of(samples.normals)
     steps = (np.arange(width) - (width - 1) / 2) * spacing_mm
@@ -50,7 +61,9 @@ def cut_patches(
 
 
 def shades_of(is_on: NDArray[np.bool_]) -> Array:
-    """(N,P,3) what plain shading may add to patches: constant and slopes, orthonormal over the points that are on."""
+    """(N,P,3) brightness changes that shading may add to patches: constant and two slopes, orthonormal over the points
+    on.
+    """
     width = int(np.sqrt(is_on.shape[1]))
     a, b = (grid.ravel() for grid in np.meshgrid(*2 * [np.linspace(-1.0, 1.0, width)]))
     plain = np.stack([np.ones_like(a), a, b], axis=1)[None] * is_on[..., None]
@@ -65,7 +78,7 @@ def face_normals(component: Component) -> Array:
 
 
 def near_others(points: Array, model: Model, component: int, reach_mm: float) -> NDArray[np.bool_]:
-    """(N,) which points (N,3) are within ``reach_mm`` of the surface of another component."""
+    """(N,) which points (N,3) are within ``reach_mm`` of the surface of any other component."""
     result = np.zeros(len(points), dtype=np.bool_)
     for index, other in enumerate(model.components):
         corners = other.vertices_in_model[other.faces]
@@ -97,8 +110,12 @@ def near_edges(points: Array, component: Component, reach_mm: float) -> NDArray[
 
 
 def free_directions(component: Component, part: Part | None, center: Array, radius_mm: float) -> Array:
-    """(K,6) orthonormal moves (turn times ``radius_mm``, shift of the centre) that leave the shape as it is."""
-    # Components of one shape have the same ones about their centres: parts have many alike.
+    """(K,6) orthonormal motions (rotation times ``radius_mm``, translation of the centre) that leave the shape
+    unchanged.
+
+    These follow from continuous symmetries, found in the mesh or declared in the part file.
+    """
+    # Relative to their centres, components of one shape share their symmetries; the cache then serves all of them.
     local = np.round(component.vertices_in_model - center, 6) + 0.0
     symmetries = [
         replace(one, through_in_model=tuple((np.array(one.through_in_model) + center).tolist()))
@@ -121,7 +138,7 @@ def free_directions(component: Component, part: Part | None, center: Array, radi
 
 @lru_cache(maxsize=64)
 def _symmetries(vertices: bytes, faces: bytes) -> tuple[Symmetry, ...]:
-    """Exact symmetries of a mesh given as the bytes of (V,3) float64 and (F,3) int64."""
+    """Exact symmetries of a mesh, given as the bytes of its vertices (V,3) float64 and faces (F,3) int64."""
     points, corners = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
     found = find_symmetries(points, corners, near_share=0.0)
     return tuple(item.symmetry for item in found if item.is_exact)
@@ -129,7 +146,7 @@ def _symmetries(vertices: bytes, faces: bytes) -> tuple[Symmetry, ...]:
 
 @kernel
 def _nearer_than(points, corners, reach):  # type: ignore[no-untyped-def]
-    """Whether each point is nearer than ``reach`` to any triangle (T,3,3), to its plane or its edges."""
+    """Whether each point is nearer than ``reach`` to any triangle (T,3,3), measured to its plane or to its edges."""
     count = corners.shape[0]
     boxes = np.empty((count, 6))
     planes = np.empty((count, 3))

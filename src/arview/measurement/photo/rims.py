@@ -1,4 +1,4 @@
-"""Circular edges measured in the photos: the rim of a hole or pin, for datums."""
+"""Circular edges measured in the photos: the rims of holes and pins."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from arview.measurement.photo.views import PhotoViews
 
 @dataclass(frozen=True)
 class RimFit:
-    """Where a circular edge lies in its plane.
+    """Measured position of a circular edge in its plane.
 
     Attributes:
-        shift_mm: (3,) of its centre from nominal, across the axis, model axes.
-        covariance: (3,3) of it, zero along the axis.
-        radius_shift_mm: found minus nominal radius, with what light and chamfers do to the edge: no measure of a bore.
+        shift_mm: (3,) displacement of its centre from nominal, orthogonal to the axis, in model axes.
+        covariance: (3,3) of ``shift_mm``, zero along the axis.
+        radius_shift_mm: found minus nominal radius, which includes effects of light and chamfers and is therefore not a
+            measurement of the bore.
         used: number of edge points that agree.
         residual_mm: robust standard deviation of their residuals.
-        support: 0–1, share of the points looked at that agree.
+        support: 0–1, share of the points searched that agree.
     """
 
     shift_mm: Array
@@ -44,10 +45,16 @@ def fit_rim(
     reach_mm: float = 3.0,
     options: EdgeOptions | None = None,
 ) -> RimFit:
-    """The shift, across its axis, of a circular edge that stands out in the photos; its plane is taken to be known.
+    """Fit the translation of a circular edge within its plane, which is taken to be known.
 
-    ``center_in_model`` (3,) is the middle of the edge to look for: of a hole in a plate that of the rim on the
-    cameras' side. A chamfer has two such edges: give the outer one, which the plate's face ends at, and its diameter.
+    Args:
+        center_in_model: (3,) centre of the edge, mm. For a hole in a plate this is the rim on the cameras' side; a
+            chamfer has two such edges, of which the outer one, where the face ends, is meant.
+        axis: (3,) normal of the edge's plane, towards the cameras.
+        diameter_mm: of the edge.
+        views: the photos.
+        reach_mm: largest displacement that is found.
+        options: see `EdgeOptions`.
 
     Raises:
         InputError: the edge is not found in at least three photos.
@@ -61,14 +68,14 @@ def fit_rim(
     angle = 2.0 * np.pi * (np.arange(count) + 0.5) / count
     radial = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
     around = np.cross(axis, radial)
-    # Turns and shifts along the axis are not asked for; the place of the first turn is taken by the radius.
+    # Rotations and the translation along the axis are excluded; the radius takes the place of the first rotation.
     locked = [*np.eye(6)[1:3].tolist(), [0.0, 0.0, 0.0, *axis.tolist()]]
     shift, radius_mm = np.zeros(3), 0.5 * diameter_mm
     reaches_px = [max(reach_mm / px_mm, 4.0), 5.0, 3.0, 3.0, 3.0]
     for reach_px in reaches_px:
         rim = center + shift + radius_mm * radial
         edges, outward = _seen(views, rim, radial, around, axis)
-        # More than a radius away is the other side.
+        # The opposite side of the rim must stay out of reach.
         found = edge_offsets(edges, center + shift, views, min(reach_px, 0.8 * radius_mm / px_mm), o)
         ok = found.seen & (found.slopes != 0.0)
         if np.count_nonzero(ok) < o.min_points or len(np.unique(edges.view[ok])) < 3:
@@ -94,13 +101,15 @@ def fit_rim(
 
 
 def _rows(found: EdgeOffsets, outward: Array) -> Array:
-    """(N,6): growth of the radius, two that stand for nothing, shift."""
+    """(N,6) derivatives of the offsets by the radius, by two placeholders, and by the translation."""
     grown = np.sum(found.directions * outward, axis=1)
     return np.concatenate([grown[:, None], np.zeros((len(grown), 2)), found.directions], axis=1)
 
 
 def _seen(views: PhotoViews, rim: Array, radial: Array, around: Array, axis: Array) -> tuple[EdgePoints, Array]:
-    """The points of the rim that each photo sees, just above it, and their outward directions."""
+    """Points of the rim that each photo shows, and their outward directions (N,3); visibility is tested just above the
+    rim.
+    """
     points, tangents, outward, owner = [], [], [], []
     groups = (rim + 0.1 * axis)[:, None]
     for view in range(len(views.cameras)):

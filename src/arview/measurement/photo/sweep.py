@@ -1,7 +1,7 @@
-"""Object-space sweep: where along its normal a surface looks alike in the photos.
+"""Object-space sweep: the offset along its normal at which a surface looks alike in the photos.
 
-Plane sweeping (Collins, CVPR 1996; Gallup et al., CVPR 2007) with a plane for every sample, and in its place a patch
-of the CAD surface. Samples say how far they are off along their normals; together they say how the component moved,
+This is plane sweeping (Collins, CVPR 1996; Gallup et al., CVPR 2007) with one patch of the CAD surface for each sample
+in place of a plane. Each sample measures its offset along its normal; together they give the motion of the component,
 as in point-to-plane registration (Chen & Medioni 1992).
 """
 
@@ -36,12 +36,12 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class SweepOffsets:
-    """What a sweep says of each sample.
+    """Result of a sweep for each sample.
 
     Attributes:
         offsets_mm: (N,) along the normal, from the sample to the surface that the photos show.
-        variances_mm2: (N,) by image noise alone; neighbours share pixels, so their errors are alike.
-        is_ok: (N,) which say something; the others hold nothing.
+        variances_mm2: (N,) due to image noise alone; neighbouring samples share pixels, so their errors are correlated.
+        is_ok: (N,) which samples gave a valid offset; the values of the others are meaningless.
         scores: (N,) mean correlation of the views at the peak.
         views: (N,V) photos that were compared, -1 for none.
     """
@@ -62,15 +62,16 @@ def sweep_offsets(
     component: int | None = None,
     removed: int | None = None,
 ) -> SweepOffsets:
-    """Distance along the normal of any samples of nearly flat surfaces, e.g. of a datum plane.
+    """Measure the offset along the normal of samples of nearly flat surfaces, e.g. of a datum plane.
 
     Args:
         samples_in_model: (N,3) mm.
         normals: (N,3) unit, outwards.
-        views: the photos; what hides samples is taken from the model at its nominal place.
-        reach_mm: how far is looked to either side.
-        component: index of the component the samples are on: patches follow its surface. Else they are flat.
-        removed: index of a component that is taken not to be there.
+        views: the photos. Occlusion is computed from the model at its nominal place.
+        reach_mm: search range to either side.
+        options: see `SweepOptions`.
+        component: index of the component to which the samples belong: patches follow its surface. None: flat patches.
+        removed: index of a component that is assumed to be absent.
     """
     o = options or SweepOptions()
     samples = Samples(np.ascontiguousarray(samples_in_model), np.ascontiguousarray(normals))
@@ -96,16 +97,24 @@ def pick_views(
     place: Array | None = None,
     removed: int | None = None,
 ) -> Indices:
-    """(N,V) photos in which most of a sample's patch is seen.
+    """Choose the photos in which most of a sample's patch is visible.
 
-    Samples are of ``component``, which stands at ``place`` (4,4, default nominal), or of any (None); the component
-    ``removed`` hides nothing.
+    Args:
+        views: the photos.
+        samples: surface points with normals.
+        o: see `SweepOptions`.
+        component: index of the component to which the samples belong, or None.
+        place: (4,4) of that component; default nominal.
+        removed: index of a component that hides nothing.
+
+    Returns:
+        (N,V) indices of photos, -1 for none.
     """
     if not len(samples.points):
         return np.full((0, o.max_views), -1, dtype=np.int64)
     first, second = tangents_of(samples.normals)
     lift = samples.points + 0.05 * samples.normals
-    # Corners at half the way to those of the patch: at an edge patches reach beyond it, but only what is on it counts.
+    # Points half-way to the patch's corners: near an edge patches extend beyond the surface, which does not matter.
     half_mm = 0.25 * o.patch_px * views.mm_per_px(samples.points.mean(axis=0))
     groups = np.stack([lift, *(lift + half_mm * (a * first + b * second) for a, b in _CORNERS)], axis=1)
     toward = views.centres[None] - samples.points[:, None]
@@ -117,7 +126,7 @@ def pick_views(
         facing = np.flatnonzero(cosines[:, view] > o.min_cosine)
         if len(facing):
             window = views.window(view, scene, np.eye(4) if place is None else place, groups[facing].reshape(-1, 3))
-            # The middle must show the component itself; the corners must not be hidden.
+            # The centre must show the component itself; the corners must not be hidden.
             own = views.visible(view, window, groups[facing, :1], -1 if component is None else component)
             visible[facing, view] = own & views.visible(view, window, groups[facing])
     middle = toward.mean(axis=0)
@@ -126,13 +135,24 @@ def pick_views(
 
 
 _CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
+_MIN_SIMILARITY = 0.35
+"""Correlation with the mean of the other views below which a view is dropped."""
 
 
-def without_outliers(chosen: Indices, scores: Array, alike: Array, least: float = 0.35) -> Indices:
-    """The views without those unlike the others at the peak (highlights, something in front), where 3 remain."""
+def without_outliers(
+    chosen: Indices, scores: Array, similarity: Array, min_similarity: float = _MIN_SIMILARITY
+) -> Indices:
+    """Drop views that differ from the others at the peak (highlights, occlusion), where three views remain.
+
+    Args:
+        chosen: (N,V) photos, -1 for none.
+        scores: (N,S) mean correlations.
+        similarity: (N,S,V) correlation of each view with the mean of the others.
+        min_similarity: correlation below which a view is dropped.
+    """
     best = np.argmax(scores, axis=1)
-    own = alike[np.arange(len(best)), best]
-    kept = np.where(own >= least, chosen, -1)
+    own = similarity[np.arange(len(best)), best]
+    kept = np.where(own >= min_similarity, chosen, -1)
     enough = np.count_nonzero(kept >= 0, axis=1) >= 3
     return np.where(enough[:, None], kept, chosen)
 
@@ -141,27 +161,38 @@ def agreeing_scores(
     patches: Array, is_on: NDArray[np.bool_], shades: Array, normals: Array, steps: Array, chosen: Indices,
     views: PhotoViews, min_contrast: float,
 ) -> tuple[Array, Array, Indices]:  # fmt: skip
-    """Scores (N,S) and numbers of views (N,S) of `sweep_scores` without the views unlike the others; those left."""
+    """Sweep, drop the views that differ from the others, and sweep those samples again.
+
+    Args:
+        patches, is_on, shades, normals, steps, min_contrast: see `sweep_scores`.
+        chosen: (N,V) photos, -1 for none.
+        views: the photos.
+
+    Returns:
+        scores (N,S), numbers of views (N,S), and the views (N,V) that remain.
+    """
     stack = views.levels[0]
-    scores, count, alike = sweep_scores(patches, is_on, shades, normals, steps, chosen, stack, min_contrast)
-    kept = without_outliers(chosen, scores, alike)
-    less = np.flatnonzero((kept != chosen).any(axis=1))
-    scores[less], count[less], _ = sweep_scores(
-        patches[less], is_on[less], shades[less], normals[less], steps, kept[less], stack, min_contrast
+    scores, count, similarity = sweep_scores(patches, is_on, shades, normals, steps, chosen, stack, min_contrast)
+    kept = without_outliers(chosen, scores, similarity)
+    changed = np.flatnonzero((kept != chosen).any(axis=1))
+    scores[changed], count[changed], _ = sweep_scores(
+        patches[changed], is_on[changed], shades[changed], normals[changed], steps, kept[changed], stack, min_contrast
     )
     return scores, count, kept
 
 
 def _steps(reach_mm: float, step_mm: float) -> Array:
+    """Equally spaced offsets from at least -reach to +reach, mm, with zero in the middle."""
     count = max(2, int(np.ceil(reach_mm / step_mm)))
     return np.asarray(np.arange(-count, count + 1) * step_mm, dtype=np.float64)
 
 
 def _peaks(scores: Array, count: Array, steps: Array, on: Array, chosen: Indices, o: SweepOptions) -> SweepOffsets:
-    """Sub-pixel place of the best score by a parabola, its variance by the curvature and what is left of the views.
+    """Sub-pixel position of the best score by a parabola, with its variance.
 
-    The sum of squared differences of m views from their mean is (m - 1)(1 - score); its second derivative and the
-    variance of a pixel that its least value shows give the variance of the place.
+    The sum of squared differences of m views from their mean is (m - 1)(1 - score). Its second derivative, and the
+    pixel
+    variance that its minimum shows, give the variance of the position.
     """
     n, pitch = len(scores), steps[1] - steps[0]
     best = np.clip(np.argmax(scores, axis=1), 1, len(steps) - 2)
@@ -172,7 +203,7 @@ def _peaks(scores: Array, count: Array, steps: Array, on: Array, chosen: Indices
     bend = np.where(is_peak, bend, -1.0)
     offsets = steps[best] + 0.5 * pitch * (a - c) / bend
     views = count[rows, best].astype(np.float64)
-    freedom = np.maximum(views - 1.0, 1.0) * np.maximum(on - 4.0, 1.0)  # pixels of a patch share what they saw
+    freedom = np.maximum(views - 1.0, 1.0) * np.maximum(on - 4.0, 1.0)  # neighbouring pixels of a patch are correlated
     variances = 2.0 * (1.0 - np.minimum(b, 0.999)) / freedom / (-bend / pitch**2)
     is_ok = is_peak & (b > o.min_score) & (views >= o.min_views) & (variances < o.max_sigma_mm**2)
     is_ok &= on >= 0.4 * o.patch_points**2
@@ -180,7 +211,7 @@ def _peaks(scores: Array, count: Array, steps: Array, on: Array, chosen: Indices
 
 
 def pose_rows(views: PhotoViews, samples: Samples, chosen: Indices) -> Array:
-    """(N,6M) how much a sample's offset changes with the poses' twists: that of a point triangulated in its views."""
+    """(N,6M) derivative of a sample's offset by the twists of the poses: that of a point triangulated in its views."""
     count = len(views.cameras)
     moment = np.zeros((len(samples.points), 3, 3))
     parts = []
@@ -196,7 +227,7 @@ def pose_rows(views: PhotoViews, samples: Samples, chosen: Indices) -> Array:
         )
         by_model = by_cam @ pose[:3, :3]
         moment[of] += np.swapaxes(by_model, 1, 2) @ by_model
-        # A left twist (turn w, shift t) moves a point in the camera by w × x + t.
+        # A left twist (rotation w, translation t) moves a point x in the camera by w × x + t.
         turned = np.stack([
             np.stack([zero, z, -y], axis=1), np.stack([-z, zero, x], axis=1), np.stack([y, -x, zero], axis=1)
         ], axis=1)  # fmt: skip
@@ -210,7 +241,7 @@ def pose_rows(views: PhotoViews, samples: Samples, chosen: Indices) -> Array:
 
 
 class ComponentSweep:
-    """The sweep of one component: samples and patches in its nominal place, moved along as it is found elsewhere."""
+    """The sweep of one component; samples and patches are cut at its nominal place and moved with it."""
 
     def __init__(self, body: MeasuredComponent) -> None:
         self.body, self.views, self.options = body, body.views, body.options
@@ -225,16 +256,20 @@ class ComponentSweep:
         self._picked: list[tuple[Array, Indices]] = []
 
     def measure(self, starts: Sequence[Array] = ()) -> Move | NotMeasured:
-        """The component's move; ``starts`` (4,4, places) are tried beside what the coarse round finds."""
+        """Measure the component's move.
+
+        Args:
+            starts: places (4,4) to try besides the one that the coarse round finds.
+        """
         o = self.options.sweep
         chosen = self._pick(np.eye(4))
         seen = np.count_nonzero(chosen >= 0, axis=1) >= o.min_views
         if np.count_nonzero(seen) < o.min_samples:
-            return self._not(f"seen in fewer than {o.min_views} photos from near enough; take more of it")
+            return self._not(f"fewer than {o.min_views} photos show it well enough; take more photos of it")
         patches, is_on = self._cut(o.patch_points, o.patch_px / o.patch_points * self.body.px_mm)
         shades = shades_of(is_on)
         places = [self._coarse(chosen, seen), *starts]
-        place = max(places, key=lambda p: self._alike(p, patches, is_on, shades)) if starts else places[0]
+        place = max(places, key=lambda p: self._similarity(p, patches, is_on, shades)) if starts else places[0]
         fit: RigidFit | None = None
         range_px = o.fine_range_px
         for turn in range(o.rounds):
@@ -251,27 +286,27 @@ class ComponentSweep:
             if np.count_nonzero(ok) < o.min_samples:
                 return self._not(
                     f"weak texture: only {np.count_nonzero(ok)} of {np.count_nonzero(seen)} samples of its surface "
-                    "look alike in the photos"
+                    "could be matched between the photos"
                 )
             fit = self._fit(moved, found, seen, place)
             place = self.body.moved(place, fit.twist)
             step = self.body.size_mm(fit.twist)
-            if turn >= 1 and step < o.settled_mm:
+            if turn >= 1 and step < o.converged_mm:
                 break
             range_px = max(1.6, min(range_px, 0.6 * range_px + 2.0 * step / self.body.px_mm))
         assert fit is not None
         used = int(np.count_nonzero(fit.weights > 0.1))
         support = used / max(1, int(np.count_nonzero(seen)))
         if support < o.min_support or used < o.min_samples:
-            return self._not(f"weak texture or not there: {100 * support:.0f} % of its surface agrees on a place")
+            return self._not(f"weak texture, or missing: only {100 * support:.0f} % of its surface agrees on a place")
         if len(fit.undetermined) == 6:
-            return self._not("weak texture: in no direction does enough of its surface agree on a place")
+            return self._not("weak texture: too little of its surface agrees on a place in any direction")
         by_poses = fit.gain @ pose_rows(self.views, moved.of(ok), found.views[ok])
         systematic_mm = float(np.hypot(o.systematic_mm, o.systematic_share * fit.residual_mm))
         return self.body.move("sweep", fit, by_poses, place, systematic_mm, support)
 
-    def _alike(self, place: Array, patches: Array, is_on: NDArray[np.bool_], shades: Array) -> float:
-        """How much of the surface looks alike at a place, within a pixel along its normals."""
+    def _similarity(self, place: Array, patches: Array, is_on: NDArray[np.bool_], shades: Array) -> float:
+        """Sum of the samples' scores above 0.3 at a place, within a pixel along the normals; for comparing starts."""
         steps = 0.7 * self.body.px_mm * np.arange(-1.0, 2.0)
         normals = self.samples.normals @ place[:3, :3].T
         scores, _, _ = sweep_scores(
@@ -280,7 +315,7 @@ class ComponentSweep:
         return float(np.maximum(scores.max(axis=1) - 0.3, 0.0).sum())
 
     def _pick(self, place: Array) -> Indices:
-        """The photos to compare in; those of a place tried before, where that is as good as the same."""
+        """Photos for a place; those of an earlier place that hardly differs are used again."""
         for before, chosen in self._picked:
             if self.body.is_same(before, place):
                 return chosen
@@ -290,6 +325,7 @@ class ComponentSweep:
         return chosen
 
     def _cut(self, width: int, spacing_mm: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Patches on the component's surface, without what is near other components or sharp edges."""
         o = self.options.sweep
         patches, is_on = cut_patches(self.samples, self._caster, self._faces, width, spacing_mm)
         points = patches[is_on]
@@ -298,9 +334,11 @@ class ComponentSweep:
         return patches, is_on
 
     def _coarse(self, chosen: Indices, seen: NDArray[np.bool_]) -> Array:
-        """Where most samples look alike, within the capture range: votes of shifts, then a fit to the near peaks."""
+        """Place within the capture range at which most samples look alike: votes for translations, then a fit to near
+        peaks.
+        """
         o = self.options.sweep
-        # Coarse enough that the range takes some forty steps, with patches to match.
+        # Choose the resolution such that the range has about forty steps, with patches of matching size.
         level = int(np.clip(np.round(np.log2(0.4 / self.body.px_mm)) + 1, 1, 2))
         coarse_mm = self.body.px_mm * 2**level
         patches, is_on = self._cut(7, coarse_mm)
@@ -311,7 +349,7 @@ class ComponentSweep:
         )
         shifts = self.body.shifts(o.capture_mm)
         votes = vote_shifts(scores[seen], steps, normals[seen], shifts, 0.3)
-        # The nearest of equals: a shift that only slides a surface in itself wins nothing.
+        # Of equal votes the nearest shift wins, because sliding a surface within itself changes nothing.
         best = shifts[np.flatnonzero(votes > votes.max() - 0.005 * abs(votes.max()) - 1e-9)[0]]
         twist = np.concatenate([np.zeros(3), best])
         rows = move_rows(self.samples.points, normals, self.body.center)
@@ -329,6 +367,7 @@ class ComponentSweep:
         return self.body.moved(np.eye(4), twist)
 
     def _fit(self, moved: Samples, found: SweepOffsets, seen: NDArray[np.bool_], place: Array) -> RigidFit:
+        """Fit the component's motion to the offsets of the moved samples."""
         o, ok = self.options.sweep, found.is_ok
         rows = move_rows(moved.points, moved.normals, apply(place, self.body.center))
         return fit_rigid(
@@ -338,7 +377,9 @@ class ComponentSweep:
         )  # fmt: skip
 
     def _places(self, samples: Samples) -> Array:
-        """Where samples are, in patch widths; faces of other directions are far."""
+        """(N,6) positions in patch widths and scaled normals, so that faces of different orientation are far from each
+        other.
+        """
         return np.concatenate([samples.points / self.patch_mm, 8.0 * samples.normals], axis=1)
 
     def _not(self, reason: str) -> NotMeasured:

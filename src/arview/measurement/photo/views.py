@@ -1,4 +1,4 @@
-"""The photos and the model as the two ways of measuring see them."""
+"""The photos and the model in the form that both methods of measuring in photos use."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from arview.rendering.rasterizer import rasterise
 
 
 class PhotoStack(NamedTuple):
-    """All photos at one size, for the kernels.
+    """All photos at one resolution as flat arrays, for kernels.
 
     Attributes:
-        pixels: all pictures' grey levels one after the other, uint8.
-        starts: (M,) where each begins.
-        sizes: (M,2) width, height.
+        pixels: grey levels of all pictures one after another, uint8.
+        starts: (M,) index of each picture's first pixel.
+        sizes: (M,2) width and height, px.
         lenses: (M,9) fx fy cx cy k1 k2 p1 p2 k3.
         poses: (M,3,4) cam_from_model.
     """
@@ -38,7 +38,14 @@ class PhotoStack(NamedTuple):
 
 
 class RenderedWindow(NamedTuple):
-    """What an ideal camera sees of the model in part of a photo: 1/depth (0 = nothing) and component (-1)."""
+    """The model rendered without distortion into a window of a photo.
+
+    Attributes:
+        lens: fx, fy, cx, cy of the ideal camera.
+        origin: first column and row of the window, px; may be negative.
+        inverse_depth: (H,W) 1/mm, 0 where nothing is.
+        ids: (H,W) component index, -1 where nothing is.
+    """
 
     lens: tuple[float, float, float, float]
     origin: tuple[int, int]
@@ -56,7 +63,7 @@ class PhotoViews:
         cameras: of the photos, with distortion.
         cam_from_model: (M,4,4).
         levels: the photos at full, half and quarter size.
-        pose_covariance: see ``SparseModel``; None when it is not known.
+        pose_covariance: see `SparseModel`; None when unknown.
     """
 
     model: Model
@@ -68,30 +75,39 @@ class PhotoViews:
 
     @property
     def centres(self) -> Array:
-        """(M,3) camera centres in the model frame."""
+        """(M,3) camera centres in the model frame, mm."""
         return -np.einsum("mji,mj->mi", self.cam_from_model[:, :3, :3], self.cam_from_model[:, :3, 3])
 
     def gray(self, view: int) -> NDArray[np.uint8]:
-        """(H,W) uint8 picture of a photo."""
+        """(H,W) uint8 picture of one photo."""
         stack = self.levels[0]
         width, height = stack.sizes[view]
         return stack.pixels[stack.starts[view] : stack.starts[view] + width * height].reshape(height, width)
 
     def mm_per_px(self, point: Array) -> float:
-        """Size of a pixel at a point (3,): median over the photos that look at it."""
+        """Size of a pixel at a point (3,): median over the photos in front of which it lies.
+
+        Raises:
+            InputError: the point is behind every camera.
+        """
         depths = apply_all(self.cam_from_model, point)[:, 2]
         ahead = depths > 0
         if not ahead.any():
-            raise InputError("photos: no camera looks at the part; the poses are not in the frame of the CAD")
+            raise InputError("photos: the part is behind every camera; the poses are not in the frame of the CAD")
         return float(np.median(depths[ahead] / np.array([camera.fx for camera in self.cameras])[ahead]))
 
     def window(
         self, view: int, component: int | None, place: Array, around: Array, margin_px: int = 12
     ) -> RenderedWindow:
-        """The model around some points (N,3) as a photo without distortion shows it.
+        """Render the model around some points, as a photo without distortion shows it.
 
-        ``component`` stands at ``place`` (4,4, measured_from_nominal); None leaves all at nominal. A component of
-        -1 - i leaves component i out.
+        Args:
+            view: index of the photo.
+            component: index of the component that stands at ``place``; None renders all at nominal; ``-1 - i`` removes
+                component i.
+            place: (4,4) measured_from_nominal.
+            around: (N,3) points that the window must contain, mm.
+            margin_px: added on every side.
         """
         camera, pose = self.cameras[view], self.cam_from_model[view]
         vertices, faces, owner = self.model.mesh
@@ -104,7 +120,7 @@ class PhotoViews:
         pixels = camera.without_distortion().project(apply(pose, around))
         if not np.isfinite(pixels).all():
             return RenderedWindow((1.0, 1.0, 0.0, 0.0), (0, 0), np.zeros((1, 1)), np.full((1, 1), -1, dtype=np.int32))
-        spare = 0.15 * max(camera.width, camera.height)  # lenses may see beyond the ideal picture
+        spare = 0.15 * max(camera.width, camera.height)  # a distorted picture may show more than the ideal one
         largest = np.array([camera.width, camera.height]) + spare
         low = np.floor(np.clip(pixels.min(axis=0) - margin_px, -spare, largest)).astype(int)
         high = np.ceil(np.clip(pixels.max(axis=0) + margin_px, -spare, largest)).astype(int)
@@ -117,7 +133,7 @@ class PhotoViews:
     def visible(self, view: int, window: RenderedWindow, groups: Array, component: int = -1) -> NDArray[np.bool_]:
         """(N,) whether all points of each group (N,Q,3) are inside the photo and not hidden in the window.
 
-        With ``component`` the window must show that component there.
+        With ``component`` >= 0 the window must also show that component there.
         """
         stack = self.levels[0]
         return _all_visible(
@@ -130,12 +146,12 @@ def load_views(sparse: SparseModel, model: Model) -> PhotoViews:
     """Read the photos of a reconstruction whose poses are in mm and in the frame of the model.
 
     Raises:
-        InputError: fewer than three photos; a photo cannot be read, or its size is not its camera's.
+        InputError: there are fewer than three photos, a photo cannot be read, or its size differs from its camera's.
     """
     from arview.reconstruction.intake import read_photo
 
     if len(sparse.photos) < 3:
-        raise InputError(f"photos: {len(sparse.photos)} placed photos; at least 3 are needed to measure in them")
+        raise InputError(f"photos: {len(sparse.photos)} were placed; measuring in photos needs at least 3")
 
     def read(index: int) -> NDArray[np.uint8]:
         photo = sparse.photos[index]
@@ -161,7 +177,7 @@ def views_of(
     names: tuple[str, ...],
     pose_covariance: Array | None = None,
 ) -> PhotoViews:
-    """Views of grey pictures (H,W) that are already read."""
+    """Views of grey pictures (H,W) uint8 that are already in memory; see `PhotoViews` for the other arguments."""
     levels = []
     for level in range(3):
         if level:
@@ -179,12 +195,13 @@ def views_of(
 
 
 def apply_all(cam_from_model: Array, point: Array) -> Array:
-    """(M,3) one point (3,) in the frame of each of M cameras."""
+    """(M,3) a point (3,) in the frame of each of M cameras."""
     return np.asarray(cam_from_model[:, :3, :3] @ point + cam_from_model[:, :3, 3])
 
 
 @kernel
 def _all_visible(groups, pose, lens, size, ideal, origin, inverse_depth, ids, component):  # type: ignore[no-untyped-def]
+    """(N,) whether all points of each group are inside the picture and not behind the rendered surface."""
     margin = 2.0
     height, width = inverse_depth.shape
     result = np.zeros(groups.shape[0], dtype=np.bool_)
@@ -211,7 +228,7 @@ def _all_visible(groups, pose, lens, size, ideal, origin, inverse_depth, ids, co
             if iu < 0 or iv < 0 or iu >= width or iv >= height:
                 good = False
                 break
-            # A surface seen at up to 70° changes by some pixels' worth of depth within a pixel.
+            # The depth of a surface inclined by up to 70° varies within a pixel by the width of a few pixels.
             if (component >= 0 and ids[iv, iu] != component) or z * inverse_depth[iv, iu] > 1.0 + 4.0 / ideal[0]:
                 good = False
                 break
