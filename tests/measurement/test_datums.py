@@ -9,12 +9,11 @@ import pytest
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.measurement.datums.alignment import (
-    Alignment,
+from arview.measurement.datums.alignment import Alignment, align
+from arview.measurement.datums.datum_fit import correlation_factor
+from arview.measurement.datums.equations import (
     AlignmentOptions,
-    Equations,
-    align,
-    correlation_factor,
+    DatumEquations,
     move_equations,
     point_from_move,
     surface_equations,
@@ -30,7 +29,7 @@ def moved(points: Array, normals: Array, move: Array, origin: Array) -> Array:
     return np.einsum("ni,nij,j->n", normals, point_from_move(points - origin), move)
 
 
-def plane(rng: np.random.Generator, move: Array = TRUE, sigma: float = 0.02, outliers: float = 0.2) -> Equations:
+def plane(rng: np.random.Generator, move: Array = TRUE, sigma: float = 0.02, outliers: float = 0.2) -> DatumEquations:
     points = np.column_stack([rng.uniform(-145, 145, (600, 2)), np.zeros(600)])
     normals = np.tile([0.0, 0.0, 1.0], (600, 1))
     offsets = moved(points, normals, move, HOLES["B"]) + rng.normal(0, sigma, 600)
@@ -42,7 +41,7 @@ def plane(rng: np.random.Generator, move: Array = TRUE, sigma: float = 0.02, out
 def hole(
     label: str, rng: np.random.Generator, move: Array = TRUE, sigma: float = 0.02, radius_mm: float = 0.05,
     count: int = 180, arc: float = 2 * np.pi,
-) -> Equations:  # fmt: skip
+) -> DatumEquations:  # fmt: skip
     angle = np.linspace(0, arc, count, endpoint=False)
     normals = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
     points = HOLES[label] + 6.5 * normals
@@ -153,9 +152,9 @@ def test_what_makes_a_datum_useless() -> None:
         align([a, few, c], HOLES["B"], SIZE_MM)
     with pytest.raises(InputError, match=r"datum C \(hole\): only .* of 900"):
         align([a, b, replace(c, of=900)], HOLES["B"], SIZE_MM)
-    with pytest.raises(InputError, match=r"datum B \(hole\): its place is known to"):
+    with pytest.raises(InputError, match=r"datum B \(hole\): its position is uncertain by"):
         align([a, hole("B", rng, arc=0.15), c], HOLES["B"], SIZE_MM)
-    with pytest.raises(InputError, match="datum D: locks nothing"):
+    with pytest.raises(InputError, match="datum D: all that it could lock"):
         align([a, b, replace(a, label="D"), c], HOLES["B"], SIZE_MM)
 
 

@@ -19,7 +19,8 @@ from arview.geometry import apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, Verdict, load_inspection
 from arview.measurement import folder as folder_module
 from arview.measurement import run
-from arview.measurement.datums.in_photos import base_plane, find_rim, plane_samples
+from arview.measurement.datums.planes import base_plane, plane_samples
+from arview.measurement.datums.rims import find_rim
 from arview.measurement.folder import MetricReconstruction, read_folder
 from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure

@@ -11,9 +11,8 @@ import pytest
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_se3
-from arview.measurement.datums.alignment import (
-    Alignment,
-    align,
+from arview.measurement.datums.alignment import Alignment, align
+from arview.measurement.datums.equations import (
     move_equations,
     point_from_move,
     surface_equations,

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from arview.errors import InputError
-from arview.measurement.datums.alignment import AlignmentOptions
-from arview.measurement.datums.in_photos import DatumOptions
+from arview.measurement.datums.equations import AlignmentOptions
+from arview.measurement.datums.options import DatumOptions
 from arview.measurement.photo import PhotoOptions
 from arview.measurement.types import Method, Move, NotMeasured
 from arview.measurement.uncertainty.budget import UncertaintyOptions

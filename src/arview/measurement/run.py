@@ -18,15 +18,12 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import DistanceReport, ForeignReport, Inspection
 from arview.measurement.cloud_report import inspect_cloud
-from arview.measurement.datums.alignment import (
-    Alignment,
-    Equations,
-    align,
-    check_covered,
-    move_equations,
-)
+from arview.measurement.datums.alignment import Alignment, align
+from arview.measurement.datums.datum_fit import check_covered
+from arview.measurement.datums.equations import DatumEquations, move_equations
 from arview.measurement.datums.in_cloud import measure_datums_in_cloud
-from arview.measurement.datums.in_photos import base_plane, measure_datums_in_photos
+from arview.measurement.datums.in_photos import measure_datums_in_photos
+from arview.measurement.datums.planes import base_plane
 from arview.measurement.folder import MetricReconstruction, in_model_frame
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.photo import PhotoViews, load_views, measure_components_in_photos
@@ -192,7 +189,9 @@ def align_to_datums(
     return align(equations, origin, size_mm, rest, scale_std, finds_scale, options.alignment)
 
 
-def _plane_of_base(views: PhotoViews, model: Model, base: Sequence[str], options: MeasureOptions) -> list[Equations]:
+def _plane_of_base(
+    views: PhotoViews, model: Model, base: Sequence[str], options: MeasureOptions
+) -> list[DatumEquations]:
     """The base's large flat face, which is known better than the height of its edges; nothing where there is none."""
     component = model.component(base[0])
     plane = base_plane(component, views.centres.mean(axis=0) - component.bounds_in_model.mean(axis=0))
@@ -206,7 +205,7 @@ def _plane_of_base(views: PhotoViews, model: Model, base: Sequence[str], options
     return equations
 
 
-def _rest_of_base(measured: ComponentMeasurement, fitted: Move, datums: Sequence[Equations]) -> Equations:
+def _rest_of_base(measured: ComponentMeasurement, fitted: Move, datums: Sequence[DatumEquations]) -> DatumEquations:
     """The base's best fit; within a plane that is already known by its edges, as its narrow sides tell little."""
     edges = [move for move in measured.moves if move.method == "edges"]
     is_flat = any(datum.feature == "plane" for datum in datums)

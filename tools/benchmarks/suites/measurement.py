@@ -18,7 +18,8 @@ from arview.cad import load_part
 from arview.geometry import Array, apply, rigid, rotation_angle_rad
 from arview.inspection import ComponentDeviation, Details, MethodResult, Verdict, load_inspection
 from arview.measurement.datums.alignment import align
-from arview.measurement.datums.in_photos import DatumOptions, measure_datums_in_photos
+from arview.measurement.datums.in_photos import measure_datums_in_photos
+from arview.measurement.datums.options import DatumOptions
 from arview.measurement.folder import read_folder
 from arview.measurement.photo import load_views
 from arview.measurement.uncertainty.decision import decide

@@ -153,7 +153,9 @@ def measure_components_in_cloud(
             return _measure(moved, points, found.nominal_from_measured, o)
 
         second = list(threads.map(again, range(len(components))))
-        return list(threads.map(lambda i: _named(second[i], components[i], components, points, o), range(len(second))))
+        return list(
+            threads.map(lambda i: direction_names(second[i], components[i], components, points, o), range(len(second)))
+        )
 
 
 def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:
@@ -417,7 +419,7 @@ def _move(c: CloudComponent, fit: Registration, support: float, o: CloudDeviatio
     )  # fmt: skip
 
 
-def _named(
+def direction_names(
     found: Move | NotMeasured, c: CloudComponent, all_of_them: Sequence[CloudComponent], cloud: CloudPoints,
     o: CloudDeviationOptions,
 ) -> Move | NotMeasured:  # fmt: skip

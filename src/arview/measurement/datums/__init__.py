@@ -1,1 +1,1 @@
-"""Datums: features of the CAD, their measurement, and the coordinate system built on them."""
+"""Datums: their features in the CAD, their offsets measured in photos or a cloud, and the frame they define."""

@@ -1,4 +1,4 @@
-"""Datum features in the CAD: which faces of a component are a plane or a cylinder, where an edge runs."""
+"""Datum features in the CAD: faces of a component that form a plane or a cylinder, and straight edges."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from arview.cad.part import Datum
 from arview.errors import InputError
 from arview.geometry import Array
 
-_OFF_MM = 0.05
-"""A vertex so far from a plane or line is not on it."""
+_TOLERANCE_MM = 0.05
+"""Largest distance of a vertex from the plane, cylinder or line to which it belongs."""
 
 
 def _faces(component: Component) -> tuple[Array, Array]:
-    """Corners (F,3,3), and unit normals (F,3), zero where a face has no area."""
+    """Corners (F,3,3) and unit normals (F,3) of the faces; normals of faces without area are zero."""
     corners = component.vertices_in_model[component.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -25,26 +25,30 @@ def _faces(component: Component) -> tuple[Array, Array]:
 
 
 def flat_faces(component: Component, datum: Datum) -> NDArray[np.bool_]:
-    """(F,) the faces in a datum plane. Raises InputError when there are none."""
+    """(F,) which faces lie in a datum plane. Raises InputError when none does."""
     corners, normals = _faces(component)
     direction = np.array(datum.direction_in_model)
     heights = (corners - np.array(datum.point_in_model)) @ direction
-    found = (normals @ direction > 0.999) & (np.abs(heights).max(axis=1) < _OFF_MM)
+    found = (normals @ direction > 0.999) & (np.abs(heights).max(axis=1) < _TOLERANCE_MM)
     if not found.any():
         raise InputError(f"datum {datum.label}: {datum.component!r} has no flat face at {list(datum.point_in_model)}")
     return np.asarray(found)
 
 
 def round_faces(component: Component, datum: Datum) -> tuple[NDArray[np.bool_], float]:
-    """(F,) the faces of a cylinder about the datum's axis; 1 where they look outwards, -1 in a bore.
+    """Faces of a cylinder about the datum's axis.
 
-    Raises InputError when there are none.
+    Returns:
+        (F,) which faces these are, and 1 for faces that point outwards (pin), -1 for those of a bore.
+
+    Raises:
+        InputError: there are none.
     """
     corners, normals = _faces(component)
     axis, radius = np.array(datum.direction_in_model), 0.5 * float(datum.diameter_mm or 0.0)
     arms = corners - np.array(datum.point_in_model)
     radial = arms - (arms @ axis)[..., None] * axis
-    near = np.abs(np.linalg.norm(radial, axis=2) - radius).max(axis=1) < max(_OFF_MM, 0.02 * radius)
+    near = np.abs(np.linalg.norm(radial, axis=2) - radius).max(axis=1) < max(_TOLERANCE_MM, 0.02 * radius)
     found = near & (np.abs(normals @ axis) < 0.05) & normals.any(axis=1)
     if np.count_nonzero(found) < 6:
         raise InputError(
@@ -57,7 +61,12 @@ def round_faces(component: Component, datum: Datum) -> tuple[NDArray[np.bool_], 
 
 @dataclass(frozen=True)
 class EdgeLine:
-    """A straight edge: its ends (3,), mm, and the unit normals (2,3) of the faces that meet there."""
+    """A straight edge.
+
+    Attributes:
+        start, end: (3,) its ends, mm.
+        normals: (2,3) unit normals of the two faces that meet there.
+    """
 
     start: Array
     end: Array
@@ -65,23 +74,23 @@ class EdgeLine:
 
     @property
     def direction(self) -> Array:
-        """(3,) unit."""
+        """(3,) unit vector from start to end."""
         return np.asarray((self.end - self.start) / np.linalg.norm(self.end - self.start))
 
     def points(self, count: int, margin_mm: float) -> Array:
-        """(N,3) along it, without its ends."""
+        """(N,3) evenly spaced points, at least ``margin_mm`` (or a quarter of the length) from the ends."""
         length = float(np.linalg.norm(self.end - self.start))
         share = np.linspace(min(margin_mm / length, 0.25), 1.0 - min(margin_mm / length, 0.25), count)
         return np.asarray(self.start + share[:, None] * (self.end - self.start))
 
 
 def edge_line(component: Component, datum: Datum) -> EdgeLine:
-    """The edge of a component along the datum's line. Raises InputError when two flat faces do not meet there."""
+    """The edge of a component along the datum's line. Raises InputError when no two flat faces meet there."""
     corners, normals = _faces(component)
     axis, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
     arms = corners - point
     along = arms @ axis
-    on = np.linalg.norm(arms - along[..., None] * axis, axis=2) < _OFF_MM
+    on = np.linalg.norm(arms - along[..., None] * axis, axis=2) < _TOLERANCE_MM
     sides = np.flatnonzero((on.sum(axis=1) == 2) & normals.any(axis=1))
     different = [normals[i] for i in sides if abs(normals[i] @ normals[sides[0]]) < 0.9]
     if not different:

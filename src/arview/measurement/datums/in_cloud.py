@@ -1,4 +1,4 @@
-"""The datum features of a part file, measured in a cloud that has no photos: distances of its points to the CAD."""
+"""Datum features measured in a cloud without photos, from the distances of its points to the CAD."""
 
 from __future__ import annotations
 
@@ -14,49 +14,59 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
-from arview.measurement.datums.alignment import (
-    Equations,
+from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces
+from arview.measurement.datums.datum_fit import robust_weights
+from arview.measurement.datums.equations import (
+    DatumEquations,
     move_equations,
-    robust_weights,
     surface_equations,
 )
-from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces
-from arview.measurement.datums.in_photos import DatumOptions
+from arview.measurement.datums.options import DatumOptions
 from arview.measurement.photo.patches import near_others
 from arview.measurement.types import Move
 from arview.reconstruction.types import DenseCloud
 
 _GRID_MM = 0.5
-_MOST = 1500
-"""Points of a feature: more err together."""
+"""Cell of the grid on which the cloud is averaged."""
+_MIN_CLOUD_POINTS = 20
+"""Points near the part that a cloud needs at all."""
+_MAX_POINTS = 1500
+"""Points of a feature that are used; errors of denser points are correlated."""
+_MIN_POINTS = 12
+"""Points that a feature needs."""
+_CORRELATED_POINTS = 10.0
+"""Neighbouring points whose errors count as one."""
 _EDGE_BAND_MM = (2.0, 15.0)
-"""What of the faces beside an edge says where they meet: not its rounding, not their far end."""
+"""Distances from an edge between which its faces are used: beyond the rounding, but not as far as their other end."""
 
 
 def measure_datums_in_cloud(
     datums: tuple[Datum, ...], model: Model, cloud: DenseCloud, moves: Mapping[str, Move],
     options: DatumOptions | None = None,
-) -> list[Equations]:  # fmt: skip
-    """Offsets of each datum feature in a cloud (mm, within about a millimetre of the CAD's frame).
+) -> list[DatumEquations]:  # fmt: skip
+    """Measure the offsets of each datum feature in a cloud.
 
     Args:
         datums: of the part file, in order of precedence.
-        model: nominal.
-        cloud: of the part.
-        moves: best fits of components, for datums of the feature ``fit``.
-        options: of the reach, and how far from other components.
+        model: the nominal CAD.
+        cloud: of the part, in mm, within about a millimetre of the frame of the CAD.
+        moves: best fits of components, for datums with the feature ``fit``.
+        options: search range and distance from other components.
 
     Raises:
-        InputError: the CAD has no such feature, or the cloud does not cover it; the datum is named.
+        InputError: the CAD has no such feature, or the cloud does not cover it; the message names the datum.
     """
     o = options or DatumOptions()
     if not datums:
         return []
-    points = prepare_cloud(cloud, model.bounds_in_model + np.array([[-5.0], [5.0]]), _GRID_MM, 20)
+    points = prepare_cloud(cloud, model.bounds_in_model + np.array([[-5.0], [5.0]]), _GRID_MM, _MIN_CLOUD_POINTS)
     return [_measure(datum, model, points, moves, o) for datum in datums]
 
 
-def _measure(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str, Move], o: DatumOptions) -> Equations:
+def _measure(
+    datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str, Move], o: DatumOptions
+) -> DatumEquations:
+    """Offsets of one datum, by the method for its feature."""
     if datum.feature == "fit":
         if datum.component not in moves:
             raise InputError(f"datum {datum.label}: {datum.component!r} could not be measured as a whole")
@@ -71,7 +81,7 @@ def _measure(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str,
         around = np.linalg.norm(near.points - np.array(datum.point_in_model), axis=1) < o.point_radius_mm
         near, offsets, normals = near.only(around), offsets[around], normals[around]
     _check(datum, len(offsets))
-    if datum.feature in ("hole", "pin"):  # of a short bore the axis' tilt is the plane's to say
+    if datum.feature in ("hole", "pin"):  # a short bore does not determine the tilt of its axis
         axis = np.array(datum.direction_in_model)
         normals = normals - (normals @ axis)[:, None] * axis
     radius = np.full(len(offsets), side) if is_round else None
@@ -81,7 +91,8 @@ def _measure(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str,
     )
     if radius is None:
         return equations
-    # Bores in clouds from photos are rounded off, half filled: what the points are off any circle, its middle may be.
+    # Bores in clouds from photos are rounded and partly filled: the centre may be off as far as the points are off the
+    # circle.
     _, residuals = robust_weights(np.concatenate([normals, radius[:, None]], axis=1), offsets, variances)
     excess = float(np.mean(residuals**2) - np.median(variances))
     return replace(equations, form_mm=float(np.sqrt(max(0.0, excess))))
@@ -90,7 +101,7 @@ def _measure(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str,
 def _offsets(
     datum: Datum, model: Model, cloud: CloudPoints, faces: NDArray[np.bool_], o: DatumOptions
 ) -> tuple[CloudPoints, Array, Array]:
-    """Points near some faces of the datum's component, their signed distances and the faces' normals there."""
+    """Points near some faces of the datum's component, their signed distances, and the faces' normals there."""
     component = model.component(datum.component)
     surface = MeshSurface(component.vertices_in_model, component.faces)
     low, high = component.bounds_in_model[0] - o.reach_mm, component.bounds_in_model[1] + o.reach_mm
@@ -106,13 +117,13 @@ def _offsets(
         clear = chosen[~near_others(near.points[chosen], model, index, clear_mm)] if len(chosen) else chosen
         if len(clear) >= min(300, 0.3 * len(chosen)):
             break
-    if len(clear) > _MOST:
-        clear = np.sort(np.random.default_rng(0).permutation(clear)[:_MOST])
+    if len(clear) > _MAX_POINTS:
+        clear = np.sort(np.random.default_rng(0).permutation(clear)[:_MAX_POINTS])
     return near.only(clear), closest.distances[clear], closest.normals[clear]
 
 
-def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints, o: DatumOptions) -> Equations:
-    """Where the planes through both faces of an edge meet: each one's offset at two places along it."""
+def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints, o: DatumOptions) -> DatumEquations:
+    """The line in which planes through both faces of an edge meet: each plane's offset at two places along the edge."""
     line = edge_line(model.component(datum.component), datum)
     ends = line.points(2, 0.25 * float(np.linalg.norm(line.end - line.start)))
     parts: list[tuple[Array, Array, Array]] = []
@@ -134,8 +145,9 @@ def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints, o: DatumOption
         )
         at = np.stack([np.ones(2), (ends - line.start) @ line.direction, np.zeros(2)], axis=1)
         factor = max(1.0, float((share * residuals**2 / variances).sum() / max(1.0, share.sum() - 3.0)))
-        # Neighbours err together, over some millimetres: as one in ten points of the grid.
-        spread = 10.0 * factor * np.sum((at @ solver) ** 2 * variances, axis=1)
+        # Errors of neighbouring points are correlated over some millimetres.
+        # They count as one in ten points of the grid.
+        spread = _CORRELATED_POINTS * factor * np.sum((at @ solver) ** 2 * variances, axis=1)
         parts.append((at @ (solver @ offsets[band]), spread, np.tile(normal, (2, 1))))
     offsets, variances, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
     return surface_equations(
@@ -144,8 +156,9 @@ def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints, o: DatumOption
 
 
 def _check(datum: Datum, count: int) -> None:
-    if count < 12:
+    """Raise InputError when too few points of the cloud are on a datum."""
+    if count < _MIN_POINTS:
         raise InputError(
-            f"datum {datum.label} ({datum.feature}): {count} points of the cloud are on it, 12 are needed; is it "
-            "covered, or name another feature in the part file"
+            f"datum {datum.label} ({datum.feature}): {count} points of the cloud are on it, {_MIN_POINTS} are needed;"
+            " uncover it, or name another feature in the part file"
         )

@@ -16,7 +16,8 @@ from arview.cad.model import Component, Model
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply
-from arview.measurement.datums.alignment import Alignment, point_from_move
+from arview.measurement.datums.alignment import Alignment
+from arview.measurement.datums.equations import point_from_move
 from arview.measurement.uncertainty.combine import CombinedMove, quantile_of_length
 from arview.measurement.uncertainty.rice import rice_estimate
 from arview.reconstruction.types import PosedPhoto, SparseModel

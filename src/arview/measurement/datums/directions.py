@@ -1,0 +1,59 @@
+"""Subspaces of rigid motions: which directions data determine, what two have in common, what is left of one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arview.geometry import Array
+from arview.measurement.datums.equations import DOF_NAMES
+
+MIN_SHARE_OF_SIZE = 0.02
+"""A datum determines a direction when a motion along it displaces its points by more than this share of the part's
+size.
+"""
+
+
+def shift_origin(origin: Array) -> Array:
+    """(3,7) matrix that moves equations from the model's origin to another: subtract ``normals @
+    shift_origin(origin)``.
+    """
+    x, y, z = origin
+    shift = np.zeros((3, 7))
+    shift[:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    shift[:, 6] = origin
+    return shift
+
+
+def observable_directions(rows: Array, allowed: Array, weights: Array) -> Array:
+    """(6,K) orthonormal directions within ``allowed`` (6,F) that weighted, scaled rows (N,6) determine."""
+    if allowed.shape[1] == 0:
+        return allowed
+    share = weights / weights.sum()
+    projected = (rows * np.sqrt(share)[:, None]) @ allowed
+    _, values, right = np.linalg.svd(projected, full_matrices=False)
+    size = np.sqrt((share[:, None] * rows**2).sum())
+    return allowed @ right[values > MIN_SHARE_OF_SIZE * size].T
+
+
+def intersection(a: Array, b: Array) -> Array:
+    """Orthonormal basis of the intersection of two subspaces with orthonormal bases (6,K) and (6,L)."""
+    left, values, _ = np.linalg.svd(a.T @ b, full_matrices=False)
+    return a @ left[:, values > 1.0 - 1e-9]
+
+
+def orthogonal_complement(free: Array, columns: Array) -> Array:
+    """Orthonormal basis of the part of ``free`` (6,F) that is orthogonal to the orthonormal directions ``columns``
+    (6,K).
+    """
+    columns = columns[:, np.abs(columns).max(axis=0) > 0]
+    left, values, _ = np.linalg.svd(free - columns @ (columns.T @ free))
+    return left[:, : free.shape[1]][:, values[: free.shape[1]] > 0.5]
+
+
+def direction_names(directions: Array) -> str:
+    """Directions as ``rx ry tz``; oblique ones as their number."""
+    directions = directions[:, np.abs(directions).max(axis=0) > 0]
+    share = (directions**2).sum(axis=1)
+    if np.allclose(share.round(2) % 1.0, 0.0, atol=0.02):
+        return " ".join(name for name, one in zip(DOF_NAMES, share, strict=True) if one > 0.5)
+    return f"{directions.shape[1]} oblique directions"
