@@ -61,6 +61,7 @@ def against(model: Model | None, seed: int, noise: float = 3.0) -> dict[str, flo
 
 
 def test_alternative_placements_lie_on_the_plate_and_clear_of_other_components() -> None:
+    assert len(placements().shifts) == len(NAMES) == 7
     assert len(placements().shifts[NAMES.index("plate")]) == 0
     for index, shifts in enumerate(placements().shifts):
         if NAMES[index] == "plate":
@@ -80,7 +81,9 @@ def test_alternative_placements_lie_on_the_plate_and_clear_of_other_components()
 
 def test_placements_turn_with_the_model() -> None:
     turned = [replace(part, vertices_in_model=part.vertices_in_model @ TURN.T) for part in assembly().components]
-    for index, shifts in enumerate(alternative_placements(make_model("turned", tuple(turned))).shifts):
+    found = alternative_placements(make_model("turned", tuple(turned))).shifts
+    assert len(found) == len(NAMES)
+    for index, shifts in enumerate(found):
         assert (len(shifts) == 0) == (NAMES[index] == "plate")
         if len(shifts):
             assert np.abs(shifts @ TURN[:, 2]).max() < 0.03 * np.linalg.norm(shifts, axis=1).max()

@@ -109,7 +109,9 @@ def test_a_crop_shows_the_component_where_it_is() -> None:
 
 
 def test_network_inputs_have_their_shape() -> None:
-    for crop in crops(picture(POSES[0], noise=2.0), POSES[0]):
+    found = crops(picture(POSES[0], noise=2.0), POSES[0])
+    assert len(found) >= 4
+    for crop in found:
         seen, both = network_input(crop)
         assert seen.shape == (CHANNELS + LINES, SIDE_PX, SIDE_PX) and both.shape == (GLOBALS,)
         assert np.isfinite(seen).all() and np.isfinite(both).all()
@@ -121,7 +123,7 @@ def test_components_out_of_sight_have_no_crop() -> None:
     behind[2, 3] -= 2000.0
     assert crops(image, behind) == []
     far = pose_from(20.0, 45.0, 50_000.0)
-    assert all(crop.size_px < 3.0 for crop in crops(image, far, "post_1"))
+    assert crops(image, far, "post_1") == []
     assert network().log_odds([]).shape == (0,)
 
 

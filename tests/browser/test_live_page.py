@@ -237,13 +237,16 @@ def test_labels_stay_apart(chromium: Any, server: Running) -> None:
             draws = page.evaluate("window.draws")
             until(page, f"window.innerWidth === {width} && window.draws > {draws + 2}")
             until(page, "document.querySelectorAll('#labels .label:not(.off)').length >= 2")
+            checked = 0
             for _ in range(4):
                 page.wait_for_timeout(250)
-                check_labels(page, width, height)
+                checked += check_labels(page, width, height)
+            assert checked >= 2
             check_buttons(page)
 
 
-def check_labels(page: Any, width: int, height: int) -> None:
+def check_labels(page: Any, width: int, height: int) -> int:
+    """Number of labels, after each was found inside the screen and clear of the others."""
     boxes = page.evaluate(
         """[...document.querySelectorAll('#labels .label:not(.off)')].map((one) => {
             const {left, top, right, bottom} = one.getBoundingClientRect(); return [left, top, right, bottom]; })"""
@@ -252,6 +255,7 @@ def check_labels(page: Any, width: int, height: int) -> None:
         assert left >= 0 and top >= 0 and right <= width and bottom <= height, (width, height)
         for other in boxes[:i]:
             assert right <= other[0] or left >= other[2] or bottom <= other[1] or top >= other[3], (width, height)
+    return len(boxes)
 
 
 def check_buttons(page: Any) -> None:

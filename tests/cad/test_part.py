@@ -209,8 +209,6 @@ def test_settings_of_an_unknown_component(folder):
 
 def test_sample_part_file():
     path = SAMPLES / "bracket_plate" / "part.toml"
-    if not path.is_file():
-        pytest.skip("samples/bracket_plate is not built yet")
     part = load_part(path)
     assert "base_plate" not in part.inspected
     assert part.view_range is not None

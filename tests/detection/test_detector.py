@@ -439,6 +439,7 @@ def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
     rng = np.random.default_rng(5)
     for k in range(4):
         found = detector().hypotheses(detector().local.pyramid(picture(anywhere(rng), seed=k, scene=k, noise=12.0)))
+        assert len(found) >= 2
         logits = [hypothesis.logit for hypothesis in found]
         assert logits == sorted(logits, reverse=True)
         for i, a in enumerate(found):

@@ -289,6 +289,7 @@ def test_same_seed_same_pictures_and_other_seed_others() -> None:
     first, again = (
         [frame.image for frame in render_sequence(model, trajectory(model, options), photo, options)] for _ in range(2)
     )
+    assert len(first) == 2
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     other = replace(options, seed=5)
     assert not np.allclose(trajectory(model, options), trajectory(model, other))
@@ -381,6 +382,7 @@ def test_scene_is_read_back_with_its_truth(tmp_path: Path, photos: tuple[Path, .
     assert np.allclose(scene.camera.matrix, CAMERA.matrix)
     assert (scene.camera.width, scene.camera.height) == (640, 512)
     assert np.allclose(scene.poses, trajectory(shape("assembly"), options), atol=1e-9)
+    assert len(scene.frames) == 3
     for frame in scene.frames:
         assert scene.image(frame).shape == (512, 640, 3)
         mask = scene.mask(frame)
@@ -416,6 +418,7 @@ def test_look_alike_scene_says_what_is_wrong(tmp_path: Path, photos: tuple[Path,
     scene = load_scene(target / "test" / "000001")
     assert {c.name for c in scene.part.model.components} == {c.name for c in model.components}
     info = json.loads((scene.folder / "scene_gt_info.json").read_text())
+    assert len(info) == 2
     assert all("different_fract" in entries[0] for entries in info.values())
 
 
@@ -425,6 +428,7 @@ def test_recorded_trajectory_is_followed(tmp_path: Path, photos: tuple[Path, ...
     model = shape("bracket")
     job = Job("other", model, SequenceOptions(frames=2), photos, follow=followed)
     scene = load_scene(make_sequence(job, tmp_path) / "test" / "000001")
+    assert len(scene.poses) == 2
     for ours, theirs in zip(scene.poses, followed.poses[:2], strict=True):
         assert rotation_angle_rad(ours, theirs) < 1e-9
         assert np.allclose(

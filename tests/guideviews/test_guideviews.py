@@ -30,7 +30,9 @@ SPHERE = ViewRange((400.0, 700.0))
 
 @pytest.fixture(scope="module")
 def views() -> GuideViewSet:
-    return make_guide_views(assembly(), SPHERE, COARSE)
+    made = make_guide_views(assembly(), SPHERE, COARSE)
+    assert len(made) == 42 and made.arrays
+    return made
 
 
 def distances_to_mesh(points: Array, model: Model) -> Array:

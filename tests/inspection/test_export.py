@@ -79,7 +79,9 @@ def test_qif_has_the_structure_of_the_standard(found: Inspection) -> None:
     document = etree.fromstring(to_qif(found))
     assert schema.validate(document), schema.error_log
     assert int(document.get("idMax")) == max(int(one) for one in document.xpath("//@id"))
-    for one in document.xpath("//*[@n]"):
+    lists = document.xpath("//*[@n]")
+    assert len(lists) > 3
+    for one in lists:
         assert int(one.get("n")) == len(one), one.tag
     assert to_qif(found) == to_qif(found)
 

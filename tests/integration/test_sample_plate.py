@@ -13,7 +13,7 @@ from helpers.paths import SAMPLES
 
 FOLDER = SAMPLES / "plate"
 
-pytestmark = pytest.mark.skipif(not (FOLDER / "truth.json").is_file(), reason="samples/plate is not built yet")
+pytestmark = pytest.mark.integration
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +39,7 @@ def test_cad_part_file_and_truth_name_the_same_components(part, truth):
 
 def test_the_holes_of_the_datums_are_in_the_cad(part):
     points = part.model.component("base_plate").vertices_in_model
+    assert len(part.datums) == 3
     for datum in part.datums[1:]:
         away = np.linalg.norm(points[:, :2] - datum.point_in_model[:2], axis=1)
         assert np.count_nonzero(np.abs(away - datum.diameter_mm / 2) < 1e-3) > 30

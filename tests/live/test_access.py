@@ -147,6 +147,7 @@ def test_no_file_but_the_listed_ones_can_be_had(page: Http, path: str) -> None:
 
 def test_what_is_served_is_what_pages_need() -> None:
     served = page_files()
+    assert {"index.html", "watch.html", "main.js", "web/three.min.js"} <= set(served)
     assert not [
         name for name in served if name.endswith((".py", ".pem", ".key", ".map")) or name.startswith((".", "/"))
     ]

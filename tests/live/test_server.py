@@ -186,7 +186,9 @@ def test_model_glb_holds_the_cad_in_mm(page: Http, phones: Running) -> None:
     assert page.ask("GET", "/api/model.glb", If_None_Match=headers["etag"])[0] == 304
     scene = trimesh.load(io.BytesIO(content), file_type="glb")
     assert phones.hub.subject is not None
-    for index, component in enumerate(phones.hub.subject.part.model.components):
+    components = phones.hub.subject.part.model.components
+    assert len(components) > 10
+    for index, component in enumerate(components):
         mesh, lines = scene.geometry[f"c{index}"], scene.geometry[f"e{index}"]
         np.testing.assert_allclose(mesh.bounds, component.bounds_in_model, atol=1e-3)
         assert len(mesh.faces) == len(component.faces) and len(lines.entities) > 0

@@ -128,6 +128,7 @@ def test_screens_that_watch_get_motion_jpeg_and_only_so_many(playing: Running) -
     while pictures.count(b"--arview-frame") < 4 and time.monotonic() - began_s < 20:
         pictures += watching[0][1].read(20_000)
     parts = pictures.split(b"--arview-frame\r\n")[1:3]
+    assert len(parts) == 2
     for part in parts:
         head, content = part.split(b"\r\n\r\n", 1)
         length = int(head.split(b"Content-Length: ")[1].split(b"\r\n")[0])

@@ -169,14 +169,18 @@ def test_nothing_moved_and_broken_points(model, part, photos):
     twice = DenseCloud(*(np.concatenate([a, a]) for a in (
         broken, sound.normals, sound.colors, np.where(rng.random(len(broken)) < 0.1, np.nan, sound.sigma), sound.views
     )))  # fmt: skip
-    for found in measure_components_in_cloud(twice, model, part, photos):
+    results = measure_components_in_cloud(twice, model, part, photos)
+    assert len(results) == 4
+    for found in results:
         assert isinstance(found, Move)
         assert np.abs(found.displacement_mm).max() < 0.015
 
 
 def test_cloud_without_photos_or_normals(cloud, model, part, moved):
     bare = replace(cloud, normals=np.zeros_like(cloud.normals))
-    for found in measure_components_in_cloud(bare, model, part):
+    results = measure_components_in_cloud(bare, model, part)
+    assert {found.component for found in results} == set(moved)
+    for found in results:
         assert isinstance(found, Move)
         c = found.center_in_model
         assert np.abs(found.displacement_mm - (apply(moved[found.component], c) - c)).max() < 0.03

@@ -90,9 +90,10 @@ def test_verdicts_and_findings(inspection: Inspection) -> None:
 
 
 def test_budget_and_datums(inspection: Inspection) -> None:
-    for component in inspection.components:
-        if component.distance_mm is None or component.details is None:
-            continue
+    measured = [c for c in inspection.components if c.distance_mm is not None and c.details is not None]
+    assert {component.name for component in measured} == set(TRUTH)
+    for component in measured:
+        assert component.distance_mm is not None and component.details is not None
         lines = [line.std_mm for line in component.details.budget]
         assert lines == sorted(lines, reverse=True)
         k = component.details.k

@@ -37,6 +37,7 @@ def test_hints_and_reach_change_nothing_but_what_is_too_far(lumpy):
     inside = np.abs(free.distances) < 2.0
     assert np.array_equal(near.faces >= 0, inside)
     assert np.array_equal(near.distances[inside], free.distances[inside])
+    assert inside.any() and not inside.all()
     assert np.isnan(near.distances[~inside]).all()
 
 

@@ -308,6 +308,7 @@ def test_photos_see_the_side_that_faces_them() -> None:
     side = np.array([[high[0], middle[1], middle[2]]])
     seen = which_see(side, np.array([[1.0, 0.0, 0.0]]), sparse, model)[0]
     ahead = np.array([p.centre_in_scan[0] > 150 for p in sparse.photos])
+    assert 0 < ahead.sum() < len(ahead)
     assert seen.sum() >= 2 and not seen[~ahead].any()
 
 

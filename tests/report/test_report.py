@@ -191,6 +191,7 @@ def test_photos_that_are_gone_are_named(
     gallery = make_gallery(found, model, gone)
     assert gallery.unread
     assert all("img_" in reason for reason in gallery.unread)
+    assert gallery.components
     assert all(crops == () for crops in gallery.components.values())
     assert overview(found, model, gone, 400).shape == (248, 400, 3)  # the CAD alone
 

@@ -87,9 +87,9 @@ def test_a_part_at_the_rim_of_the_picture_is_looked_at_and_one_beside_it_is_not(
     better = second_look().better(
         image, stuck(image, wrong(truth, np.random.default_rng(1), 12.0, 8.0)), [in_body(truth)]
     )
-    if better is not None:
-        mm, _, deg = error(in_model(better), truth)
-        assert mm < 4.0 and deg < 2.0
+    assert better is not None
+    mm, _, deg = error(in_model(better), truth)
+    assert mm < 4.0 and deg < 2.0
     beside, behind = truth.copy(), truth.copy()
     beside[0, 3] += 600.0
     behind[2, 3] *= -1.0

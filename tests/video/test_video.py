@@ -108,6 +108,7 @@ def test_leaving_early_ends_the_reader(tmp_path: Path) -> None:
     source = open_source(write_clip(tmp_path / "a.mp4", CLIP))
     for frame in source:
         if frame.index == 2:
+            assert [thread for thread in threading.enumerate() if thread.name == "arview-reader"]
             break
     assert not [thread for thread in threading.enumerate() if thread.name == "arview-reader"]
 
