@@ -1,9 +1,16 @@
-"""The command line: parse, call one function, print. Everything heavy is imported inside the commands."""
+"""The command line: each command parses its options, calls one function of a library room and prints the result.
+
+There is a file for each command. Heavy libraries are imported inside the commands, so that ``arview --help`` is quick.
+"""
 
 from arview.cli import (
+    annotate,
     batch,
     calibrate,
+    check,
+    evaluate,
     export,
+    guideviews,
     history,
     inspect,
     live,
@@ -11,15 +18,20 @@ from arview.cli import (
     reconstruct,
     report,
     study,
-    tracking,
     verify,
 )
 from arview.cli.common import main
+from arview.cli.exit_codes import ExitCode
 
 __all__ = [
+    "ExitCode",
+    "annotate",
     "batch",
     "calibrate",
+    "check",
+    "evaluate",
     "export",
+    "guideviews",
     "history",
     "inspect",
     "live",
@@ -28,6 +40,5 @@ __all__ = [
     "reconstruct",
     "report",
     "study",
-    "tracking",
     "verify",
 ]

@@ -1,5 +1,6 @@
-"""``python -m arview.cli``."""
+"""The program, run as ``python -m arview.cli``."""
 
 from arview.cli import main
 
-main()
+if __name__ == "__main__":
+    main(prog_name="arview")

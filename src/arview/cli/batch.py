@@ -1,4 +1,4 @@
-"""The command batch: inspections of many parts, by Dask."""
+"""The command batch: inspections of many parts, distributed by Dask."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 import click
 
 from arview.cli.common import main, say
-from arview.cli.inspect import EXIT_CANNOT_MEASURE, EXIT_CODES, VerdictCommand
+from arview.cli.exit_codes import ExitCode, exit_code_of
 
 if TYPE_CHECKING:
     from arview.workflow.batch import JobResult
 
 
 @main.command(
-    cls=VerdictCommand,
     short_help="Inspect many parts, on this machine or a cluster.",
     epilog="""\b
 Examples:
@@ -26,14 +25,13 @@ Examples:
   arview batch jobs.toml --scheduler tcp://10.0.0.5:8786
 
 \b
-JOBS.toml:
-
-  out = "results"                # a folder or URL; a folder for each job below it
+A file JOBS.toml:
+  out = "results"                # a folder or URL; each job has a folder in it
   [defaults]                     # for jobs that do not say otherwise
   part = "part.toml"
   tolerance_mm = 0.5             # or any other field of a job
   [[job]]
-  serial = "PL-0417"             # its folder's name too, unless there is a name
+  serial = "PL-0417"             # also the name of its folder, unless there is a name
   photos = "photos/PL-0417"
   [[job]]
   name = "PL-0418_again"
@@ -43,31 +41,39 @@ JOBS.toml:
   # camera, video_camera, scale_file, unit, guard, max_frames, seed, threads, device, makes_pdf
 
 \b
-Paths are relative to JOBS.toml, or URLs that fsspec knows (s3, gs, abfs, sftp, http; some need a package, which is then
-named). With a URL as out, results are sent when they are complete. A job is known by the content of its inputs: one
-that is done is not done again, so an interrupted batch is simply run again, and a file may grow.
+Paths are relative to JOBS.toml, or URLs that fsspec knows (s3, gs, abfs, sftp, http; some need a package,
+which is then named). With a URL as out, results are sent when they are complete. A job is identified by
+the content of its inputs, and a finished one is not repeated: run an interrupted batch again to resume
+it, or add jobs to the file.
 
 \b
-A worker has one job at a time. A job whose worker dies goes to another one; one that fails by storage or memory is
-tried again; what cannot be done stops nothing else. A cluster's workers need arview, the same paths or URLs, and
-one thread: dask worker tcp://10.0.0.5:8786 --nthreads 1 --memory-limit 4GB
+A worker does one job at a time. A job whose worker dies is given to another one; a job that fails for
+lack of storage or memory is tried again; a job that cannot be done does not stop the others. The workers
+of a cluster need arview, the same paths or URLs, and one thread:
+  dask worker tcp://10.0.0.5:8786 --nthreads 1 --memory-limit 4GB
 
 \b
-Exit codes, the worst of all jobs: 0 all pass, 1 one fails, 2 one is undecided, 3 one could not be measured or has
-an error, 64 bad input or usage, 70 a bug in arview, 130 interrupted (what is finished is kept). 3 goes before 1.""",
+The exit code is the worst result of all jobs, in the order 3, 1, 2, 0.""",
+    exit_codes={
+        ExitCode.DONE: "all jobs pass",
+        ExitCode.FAIL: "a job fails",
+        ExitCode.UNDECIDED: "a job is undecided",
+        ExitCode.CANNOT_MEASURE: "a job could not be measured or ended with an error",
+        ExitCode.INTERRUPTED: "interrupted; finished jobs are kept",
+    },
 )
 @click.argument("jobs_path", metavar="JOBS.toml")
-@click.option("--scheduler", metavar="URL", help="tcp://host:port of a Dask scheduler; default: workers of our own.")
+@click.option("--scheduler", metavar="URL", help="tcp://host:port of a Dask scheduler; default: local workers.")
 @click.option("--workers", type=click.IntRange(min=1), metavar="N",
-              help="On this machine; default: one for two cores, as far as memory reaches.")  # fmt: skip
+              help="Local workers; default: one per two cores, as far as memory allows.")  # fmt: skip
 @click.option("--memory-limit", default="4GB", show_default=True, metavar="SIZE",
-              help="Per job, on this machine: a job that takes more is broken off.")  # fmt: skip
+              help="Memory per local job; a job that takes more is stopped.")  # fmt: skip
 @click.option("--retries", type=click.IntRange(min=0), default=2, show_default=True, metavar="N",
-              help="Of a job that was broken off.")  # fmt: skip
+              help="Retries of a job that was stopped.")  # fmt: skip
 @click.option("--connect-s", type=click.FloatRange(min=0.1), default=15.0, show_default=True, metavar="S",
-              help="How long a scheduler may take to answer.")  # fmt: skip
+              help="Seconds to wait for a scheduler.")  # fmt: skip
 @click.option("--store", metavar="FILE|URL", help="Also add the results to this store (`arview history`).")
-@click.option("--station", metavar="NAME", help="Where they were measured.")
+@click.option("--station", metavar="NAME", help="Name of the measuring station.")
 def batch(
     jobs_path: str, scheduler: str | None, workers: int | None, memory_limit: str, retries: int, connect_s: float,
     store: str | None, station: str | None,
@@ -100,15 +106,14 @@ def batch(
     kept = sum(one.is_kept for one in results)
     click.echo(f"{len(results)} jobs: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
                + (f"; {kept} of them done before" if kept else ""))  # fmt: skip
-    code = exit_code(results)
-    if code:
-        click.get_current_context().exit(code)
+    click.get_current_context().exit(worst_exit_code(results))
 
 
-def exit_code(results: list[JobResult]) -> int:
-    """The worst: no verdict, then fail, then undecided."""
-    codes = {EXIT_CODES.get(one.verdict, EXIT_CANNOT_MEASURE) for one in results}
-    return next((code for code in (EXIT_CANNOT_MEASURE, 1, 2) if code in codes), 0)
+def worst_exit_code(results: list[JobResult]) -> ExitCode:
+    """The worst of all jobs: no verdict, then fail, then undecided."""
+    codes = {exit_code_of(one.verdict) for one in results}
+    ranking = (ExitCode.CANNOT_MEASURE, ExitCode.FAIL, ExitCode.UNDECIDED)
+    return next((code for code in ranking if code in codes), ExitCode.DONE)
 
 
 def _line(result: JobResult) -> str:
@@ -117,7 +122,7 @@ def _line(result: JobResult) -> str:
 
 
 def _add(results: list[JobResult], store: str, station: str | None) -> None:
-    """Add what was measured to the store; what is there already stays as it is."""
+    """Add the results to the store; those already there stay as they are."""
     from arview.history import HistoryStore
     from arview.workflow.storage import read
 
@@ -126,7 +131,7 @@ def _add(results: list[JobResult], store: str, station: str | None) -> None:
         for one in results:
             content = read(f"{one.out}/inspection.json") if one.inspection_sha256 else None
             if content is None:
-                say(f"history: nothing of {one.name}")
+                say(f"history: no result of {one.name}")
                 continue
             path = Path(folder) / "inspection.json"
             path.write_bytes(content)

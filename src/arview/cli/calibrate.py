@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from arview.cli.common import main, output_path, progress_bar, say, write_bytes
+from arview.cli.common import Group, main, output_path, progress_bar, say, write_bytes
+from arview.cli.exit_codes import ExitCode
 from arview.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from arview.calibration.run import Calibration
 
-EXIT_NOT_ENOUGH = 4
 
-
-class _WithDefault(click.Group):
-    """A group whose command ``lens`` need not be named: ``arview calibrate PHOTOS …``."""
+class _WithDefault(Group):
+    """A group with the default command ``lens``: ``arview calibrate PHOTOS …``."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if args and args[0] not in self.commands and args[0] not in ("-h", "--help"):
@@ -36,17 +35,19 @@ Examples:
   arview calibrate clip.mp4 --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json --plot camera.png --profile
 
 \b
-1. Print the board (actual size), glue it on something flat. 2. Take 20 to 40 photos of it, or a slow video of a
-minute, in the mode and with the zoom that will be used, focus locked: tilted by 30° to 45° to all sides, from near
-and far, and so that it reaches every corner of the picture. 3. `arview calibrate PHOTOS` is short for
-`arview calibrate lens PHOTOS`; `arview calibrate lens --help` has its options.""",
+1. Print the board in actual size and glue it onto something flat.
+2. Take 20 to 40 photos of it, or a slow video of about a minute, in the mode and with the zoom that
+   will be used, with locked focus: tilted by 30° to 45° to all sides, from near and far, and reaching
+   every corner of the picture.
+3. Run `arview calibrate PHOTOS`, which is short for `arview calibrate lens PHOTOS`; the options are
+   listed by `arview calibrate lens --help`.""",
 )
 def calibrate() -> None:
-    """Calibrate a camera: print a board, photograph it, get the camera with its uncertainty."""
+    """Calibrate a camera: print a board, photograph it, and get the camera with its uncertainty."""
 
 
 @calibrate.command(
-    short_help="A ChArUco board to print, PDF in true scale.",
+    short_help="Make a ChArUco board to print: PDF in true scale.",
     epilog="""\b
 Examples:
   arview calibrate board -o board.pdf
@@ -55,8 +56,9 @@ Examples:
   arview calibrate board -o board.pdf --board charuco:9x6:25:18:DICT_4X4_50
 
 \b
-Without --board the squares are as large as fit on the paper. Print at 100 % ("actual size"); two rulers on the page
-show whether the printer kept it. What to give to `arview calibrate --board` is on the page too.""",
+Without --board the squares are as large as the paper allows. Print at 100 % ("actual size"); two
+rulers on the page show whether the printer kept the scale. The page also states what to give to
+`arview calibrate --board`.""",
 )
 @click.option("-o", "--output", required=True, metavar="PDF", help="File to write.")
 @click.option("--paper", default="A4", show_default=True, metavar="SIZE",
@@ -64,14 +66,14 @@ show whether the printer kept it. What to give to `arview calibrate --board` is 
 @click.option("--squares", metavar="COLUMNSxROWS", help="Number of squares.  [default: 11x8]")
 @click.option("--board", "board_spec", metavar="SPEC", help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY.")
 def board(output: str, paper: str, squares: str | None, board_spec: str | None) -> None:
-    """Write a ChArUco board as PDF whose lengths are exact."""
+    """Write a ChArUco board as a PDF in true scale."""
     from arview.fiducials.board import parse_board, spec_of
     from arview.fiducials.board_sheet import board_pdf, fit_board, parse_paper, place_board
 
     target = output_path(output, [])
     size = parse_paper(paper)
     if board_spec and squares:
-        raise InputError("--board says the number of squares too; leave out --squares")
+        raise InputError("--board already states the number of squares; leave out --squares")
     one = parse_board(board_spec) if board_spec else fit_board(size, *_parse_squares(squares))
     sheet = place_board(one, size)
     write_bytes(target, board_pdf(sheet))
@@ -85,37 +87,39 @@ def board(output: str, paper: str, squares: str | None, board_spec: str | None) 
 
 @calibrate.command(
     name="lens",
-    short_help="The camera from photos or a video of the board (the default).",
+    short_help="Calibrate from photos or a video of the board (default).",
     epilog="""\b
 Examples:
   arview calibrate photos/ --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json
   arview calibrate clip.mp4 --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json --plot camera.png
   arview calibrate *.heic --board charuco:11x8:21:16:DICT_5X5_100 --profile
-  arview calibrate photos/ --board charuco:9x6:25:18:DICT_4X4_50 -o camera.json -o ros:info.yaml -o cameras.txt
+  arview calibrate photos/ --board charuco:9x6:25:18:DICT_4X4_50 -o camera.json -o ros:info.yaml
 
 \b
--o may be given several times: .json is arview's own format (with uncertainties, covariance and verdict beside the
-numbers), .yaml and .xml OpenCV's, .txt COLMAP's; FORMAT:FILE asks for another: arview, bop, opencv, opencv-xml,
-opencv-json, ros, colmap. The camera is that of the sensor's picture: portrait and landscape photos of one phone give
-one camera, and the other commands turn it as they turn pictures.
+-o may be given several times: .json is arview's own format (with uncertainties, covariance and verdict),
+.yaml and .xml OpenCV's, .txt COLMAP's. FORMAT:FILE asks for another one: arview, bop, opencv, opencv-xml,
+opencv-json, ros, colmap. The camera describes the sensor's picture: portrait and landscape photos of one
+phone give one camera, and the other commands rotate it as they rotate pictures.
 
 \b
---profile keeps the calibration by make, model, focal length and size of the pictures, or by the name that is given:
-`--camera profile:NAME` in the other commands, and `--camera profile` where the pictures say what took them.
-`arview calibrate profiles` lists them. A calibration that is not enough is not written, unless --anyway.
-
-\b
-Exit codes: 0 good or usable, 4 not enough, 2 bad input, 130 interrupted.""",
+--profile stores the calibration under make, model, focal length and picture size, or under the name that
+is given, for `--camera profile:NAME` in the other commands, or `--camera profile` where the pictures say
+what took them. `arview calibrate profiles` lists them. An insufficient calibration is not written, unless
+--anyway is given.""",
+    exit_codes={
+        ExitCode.DONE: "the calibration is good or usable",
+        ExitCode.CANNOT_MEASURE: "the views are not enough for a calibration",
+    },
 )
 @click.argument("sources", nargs=-1, required=True, metavar="PHOTOS...|VIDEO")
 @click.option("--board", "board_spec", required=True, metavar="SPEC",
               help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, as printed on the board.")  # fmt: skip
 @click.option("-o", "--output", "outputs", multiple=True, metavar="[FORMAT:]CAMERA", help="Camera file to write.")
-@click.option("--profile", is_flag=False, flag_value="", metavar="[NAME]", help="Also keep it as a profile.")
-@click.option("--plot", metavar="PNG", help="Corners, residuals and uncertainty over the picture (png, svg, pdf).")
+@click.option("--profile", is_flag=False, flag_value="", metavar="[NAME]", help="Also store it as a profile.")
+@click.option("--plot", metavar="PNG", help="Plot corners, residuals and uncertainty over the picture (png, svg, pdf).")
 @click.option("--max-views", type=click.IntRange(min=5), default=40, show_default=True, metavar="N",
-              help="Views to calibrate from, the most telling of those found.")  # fmt: skip
-@click.option("--anyway", is_flag=True, help="Write the camera though the views are not enough.")
+              help="Views to calibrate from; the most informative ones are chosen.")  # fmt: skip
+@click.option("--anyway", is_flag=True, help="Write the camera even if the views are not enough.")
 def lens(
     sources: tuple[str, ...],
     board_spec: str,
@@ -155,7 +159,7 @@ def lens(
     not_enough = result.verdict.grade.value == "not enough"
     if not_enough and not (anyway and math.isfinite(result.verdict.focal_u)):
         say("no camera was written; do as advised" + ("" if anyway else ", or take it --anyway"))
-        click.get_current_context().exit(EXIT_NOT_ENOUGH)
+        click.get_current_context().exit(ExitCode.CANNOT_MEASURE)
     extra = record_of(result)
     if profile is not None:
         kept = profile_path(profile or profile_name(result.lens))
@@ -173,12 +177,12 @@ def lens(
         write_camera(result.camera, path, kind, extra)
         click.echo(f"wrote {path}")
     if not_enough:
-        click.get_current_context().exit(EXIT_NOT_ENOUGH)
+        click.get_current_context().exit(ExitCode.CANNOT_MEASURE)
 
 
-@calibrate.command(short_help="The calibrations that are kept.")
+@calibrate.command(short_help="List the stored calibrations.")
 def profiles() -> None:
-    """List the profiles that `--profile` has kept, and where they are."""
+    """List the profiles stored by `--profile`, and where they are."""
     from arview.camera.profiles import list_profiles, profile_folder
 
     found = list_profiles()
@@ -207,7 +211,7 @@ def _parse_squares(text: str | None) -> tuple[int | None, int | None]:
 
 
 def _print(result: Calibration) -> None:
-    """What was seen, the camera with U, the verdict and what to do; doubts go to stderr."""
+    """Print what was seen, the camera with U, the verdict and advice; warnings go to stderr."""
     seen, solution, judged = result.sightings, result.solution, result.verdict
     for warning in seen.warnings:
         say(f"warning: {warning}")

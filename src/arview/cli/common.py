@@ -1,59 +1,196 @@
-"""What the commands share: the group that turns errors into one line, options, bars, files."""
+"""What the commands share: how errors end a command, common options, progress bars and the writing of files."""
 
 from __future__ import annotations
 
+import errno
+import json
 import os
-import traceback
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from traceback import print_exception, walk_tb
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
 from arview import __version__
-from arview.core.atomic import replacing
+from arview.cli.exit_codes import ExitCode, help_rows
+from arview.core.atomic import is_device, replacing
 from arview.core.progress import Progress, StepProgress
-from arview.errors import ArviewError, OutputError
+from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError
 
-EXIT_ERROR, EXIT_BUG, EXIT_INTERRUPTED = 2, 1, 130
+if TYPE_CHECKING:
+    from arview.camera import Camera
+    from arview.geometry import Array
+    from arview.tracking import SessionOptions
+    from arview.video import FrameSource
+
+MODALITIES = ("region", "edge", "feature")
+_STORAGE_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS})
 
 
-class _Group(click.Group):
-    """Turns exceptions of the commands into one line on stderr and an exit code."""
+class Command(click.Command):
+    """A command whose help ends with its exit codes."""
+
+    def __init__(self, *args: Any, exit_codes: dict[ExitCode, str] | None = None, **options: Any) -> None:
+        """``exit_codes`` says what the results of this command mean, see `help_rows`; the rest is click's."""
+        super().__init__(*args, **options)
+        self.exit_codes = exit_codes
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog and the table of exit codes."""
+        super().format_epilog(ctx, formatter)
+        _write_exit_codes(formatter, help_rows(self.exit_codes))
+
+
+class Group(click.Group):
+    """A group of commands whose help ends with all exit codes."""
+
+    command_class = Command
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog and the table of exit codes."""
+        super().format_epilog(ctx, formatter)
+        _write_exit_codes(formatter, [(str(int(code)), code.meaning) for code in ExitCode])
+
+
+def _write_exit_codes(formatter: click.HelpFormatter, rows: list[tuple[str, str]]) -> None:
+    with formatter.section("Exit codes"):
+        formatter.write_dl(rows)
+
+
+class _Program(Group):
+    """The whole program: every way to end is turned into an exit code and at most one line on stderr."""
+
+    group_class = Group
+
+    def make_context(self, *args: Any, **options: Any) -> click.Context:
+        """Parse the options; --help prints here."""
+        with _closed_pipe_exits():
+            return super().make_context(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the chosen command."""
+        """Run the chosen command; Ctrl-C ends it."""
         try:
-            return super().invoke(ctx)
-        except ArviewError as error:
-            say(f"error: {error}")
-            ctx.exit(EXIT_ERROR)
+            with _closed_pipe_exits():
+                return super().invoke(ctx)
         except KeyboardInterrupt:
             say("interrupted")
-            ctx.exit(EXIT_INTERRUPTED)
-        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
-            raise
+            ctx.exit(ExitCode.INTERRUPTED)
+
+    def main(
+        self, args: Sequence[str] | None = None, *positional: Any, standalone_mode: bool = True, **options: Any
+    ) -> Any:
+        """Parse and run, then exit with an `ExitCode`. Without ``standalone_mode`` errors are raised instead."""
+        run = partial(super().main, args, *positional, standalone_mode=False, **options)
+        if not standalone_mode:
+            return run()
+        try:
+            result: Any = run()
+            if sys.stdout is not None:
+                sys.stdout.flush()  # a full or closed output shows itself now, not while the interpreter ends
+            code = result if isinstance(result, int) else ExitCode.DONE
+        except click.ClickException as error:
+            _show(error)
+            code = ExitCode.BAD_INPUT
+        except (click.Abort, KeyboardInterrupt):
+            say("interrupted")
+            code = ExitCode.INTERRUPTED
+        except CannotMeasureError as error:
+            say(f"could not measure: {error}")
+            code = ExitCode.CANNOT_MEASURE
+        except ArviewError as error:
+            say(f"error: {error}")
+            code = ExitCode.BAD_INPUT
+        except OSError as error:
+            code = _code_of_os_error(error)
         except Exception as error:
             say_bug(error)
-            ctx.exit(EXIT_BUG)
+            code = ExitCode.BUG
+        sys.exit(int(code))
+
+
+@contextmanager
+def _closed_pipe_exits() -> Iterator[None]:
+    """End without a word when the reader of the output closed the pipe, as ``| head`` does."""
+    try:
+        yield
+    except BrokenPipeError as error:
+        _discard(sys.stdout)
+        _discard(sys.stderr)
+        raise click.exceptions.Exit(ExitCode.CLOSED_PIPE) from error
+
+
+def _code_of_os_error(error: OSError) -> ExitCode:
+    """Exit code of an OSError that no command turned into a message: a full device or disk, or a bug."""
+    if error.errno == errno.EPIPE:  # found by the last flush
+        _discard(sys.stdout)
+        return ExitCode.CLOSED_PIPE
+    if error.errno not in _STORAGE_ERRORS:
+        say_bug(error)
+        return ExitCode.BUG
+    is_stdout = any(frame.f_code is click.echo.__code__ for frame, _ in walk_tb(error.__traceback__))
+    if _flush_error(sys.stdout) is not None or is_stdout:
+        _discard(sys.stdout)
+        name = "standard output"
+    else:
+        name = str(error.filename or "an output file")
+    say(f"error: {name}: cannot be written ({error.strerror})")
+    return ExitCode.BAD_INPUT
+
+
+def _flush_error(stream: TextIO | None) -> OSError | None:
+    """The error that writing what a stream still holds gives, or None."""
+    try:
+        if stream is not None:
+            stream.flush()
+    except OSError as error:
+        return error
+    except ValueError:  # closed already
+        return None
+    return None
+
+
+def _discard(stream: TextIO | None) -> None:
+    """Send what a stream still holds to the null device, so that the interpreter does not fail on it at its end."""
+    if stream is None:
+        return
+    try:
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
+    except (OSError, ValueError):  # not a stream of the operating system
+        return
+
+
+def _show(error: click.ClickException) -> None:
+    """Print a usage error, where stderr can be written to."""
+    try:
+        error.show()
+    except OSError:
+        _discard(sys.stderr)
 
 
 def say_bug(error: Exception) -> None:
-    """One line on an error that nobody foresaw; what Python knows of it when ARVIEW_DEBUG is set."""
+    """Print one line about an unexpected error, and its traceback when ARVIEW_DEBUG is set."""
     if os.environ.get("ARVIEW_DEBUG"):
-        traceback.print_exception(error)
+        print_exception(error)
     hint = "" if os.environ.get("ARVIEW_DEBUG") else " with what ARVIEW_DEBUG=1 prints"
     say(f"internal error: {type(error).__name__}: {error}; please report this{hint}")
 
 
 def say(text: str) -> None:
-    """One line on stderr, whatever the text holds."""
-    click.echo("arview: " + " ".join(text.split()), err=True)
+    """Print one line on stderr, whatever the text holds. A stderr that cannot be written to is ignored."""
+    try:
+        click.echo("arview: " + " ".join(text.split()), err=True)
+    except OSError:
+        _discard(sys.stderr)
 
 
 @click.group(
-    cls=_Group,
+    cls=_Program,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog="""\b
 Examples:
@@ -65,13 +202,26 @@ Examples:
   arview evaluate bop/castle --init truth
 
 \b
-PART is a part file (part.toml; `arview check --help` shows one) or a CAD file (STEP, glTF, OBJ, STL,
-PLY, 3MF). Exit codes: 0 done, 2 bad input, 130 interrupted (files are finished), 1 a bug in
-arview; of inspect, batch and measure, the verdict: see there.""",
+PART is a part file (part.toml; `arview check --help` shows one) or a CAD file (STEP, glTF, OBJ,
+STL, PLY, 3MF).
+
+\b
+Shell completion: put one of these lines into the start-up file of your shell.
+  bash   eval "$(_ARVIEW_COMPLETE=bash_source arview)"
+  zsh    eval "$(_ARVIEW_COMPLETE=zsh_source arview)"
+  fish   _ARVIEW_COMPLETE=fish_source arview | source""",
 )
 @click.version_option(__version__, prog_name="arview")
 def main() -> None:
-    """AR inspection of assemblies: find and track a part in video by its CAD, draw what was measured."""
+    """AR inspection of assemblies: find and track a part in video by its CAD, and draw what was measured."""
+
+
+def _parse_modalities(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in value.split(",") if name.strip())
+    unknown = [name for name in names if name not in MODALITIES]
+    if unknown or not names:
+        raise click.BadParameter(f"{value!r}: expected some of {','.join(MODALITIES)}")
+    return names
 
 
 UNIT = click.option("--unit", type=click.Choice(["mm", "cm", "m", "inch"]), help="Unit of the numbers in the CAD file.")
@@ -80,13 +230,67 @@ RENDERER = click.option(
     type=click.Choice(["auto", "pyrender", "zbuffer"]),
     default="auto",
     show_default=True,
-    help="What draws guide views: pyrender needs a GL library, zbuffer nothing.",
+    help="Renderer of the guide views: pyrender needs a GL library, zbuffer needs nothing.",
 )
+MODALITY = click.option(
+    "--modalities",
+    callback=_parse_modalities,
+    default=",".join(MODALITIES),
+    show_default=True,
+    metavar="LIST",
+    help="Modalities the tracker uses, separated by commas.",
+)
+
+
+def session_options(modalities: tuple[str, ...]) -> SessionOptions:
+    """Options of a tracking session that uses these modalities."""
+    from arview.tracking import SessionOptions
+
+    return SessionOptions(
+        use_region="region" in modalities,
+        use_edge="edge" in modalities,
+        use_texture="feature" in modalities,
+        # The pose recheck needs edges and colours.
+        use_recheck={"region", "edge"} <= set(modalities),
+    )
+
+
+def camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
+    """Camera of a source's frames. Without ``spec`` it is guessed, and a warning says so."""
+    from arview.camera.read import guess_camera, load_camera
+
+    if spec is not None:
+        return load_camera(spec, frames.width, frames.height, source, frames.quarter_turns_clockwise)
+    camera = guess_camera(frames.width, frames.height)
+    say(
+        f"WARNING: no --camera given: GUESSING a focal length of {camera.fx:.0f} px (1.2 × the longer side)"
+        " and no distortion; distances will be wrong by as much. Give a camera file, fov:DEG or exif"
+    )
+    return camera
+
+
+def load_pose(path: str) -> Array:
+    """``cam_from_model`` (4,4), mm, of a JSON file.
+
+    Raises:
+        InputError: the file cannot be read, is not JSON, or holds no rigid transform.
+    """
+    from arview.geometry import check_rigid
+
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except ValueError as error:
+        raise InputError(f"{path}: not valid JSON ({error})") from error
+    if not isinstance(content, dict) or "cam_from_model" not in content:
+        raise InputError(f'{path}: expected {{"cam_from_model": 4×4 row-major, mm}}')
+    return check_rigid(content["cam_from_model"], f"{path}: cam_from_model")
 
 
 @contextmanager
 def progress_bar(label: str, total: int | None = None) -> Iterator[StepProgress]:
-    """A bar on stderr, shown only on a terminal; yields a function of (done, in all)."""
+    """Show a bar on stderr if it is a terminal; yields the function that moves it."""
     from tqdm import tqdm
 
     with tqdm(desc=label, total=total, disable=None, leave=False, unit="") as bar:
@@ -100,7 +304,7 @@ def progress_bar(label: str, total: int | None = None) -> Iterator[StepProgress]
 
 @contextmanager
 def stage_bar() -> Iterator[Progress]:
-    """Like ``progress_bar`` for work in stages: yields a function of (stage, done, in all)."""
+    """Show a bar for work in stages on stderr if it is a terminal; yields the function that moves it."""
     from tqdm import tqdm
 
     with tqdm(disable=None, leave=False, unit="") as bar:
@@ -119,13 +323,21 @@ def stage_bar() -> Iterator[Progress]:
 
 
 def output_path(path: str, inputs: list[Any]) -> Path:
-    """The path of an output, after making sure that it can be one and overwrites no input."""
+    """The path of an output file.
+
+    Args:
+        path: what the user gave.
+        inputs: paths of inputs and other outputs that must not be overwritten; None is ignored.
+
+    Raises:
+        OutputError: the file cannot be written there, or would overwrite one of ``inputs``.
+    """
     target = Path(path)
     if not target.parent.is_dir():
         raise OutputError(f"{path}: there is no folder {target.parent}; create it first")
     if target.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file")
-    if not os.access(target.parent, os.W_OK):
+    if not os.access(target if is_device(target) else target.parent, os.W_OK):
         raise OutputError(f"{path}: the folder {target.parent} cannot be written to; choose another")
     for other in inputs:
         if other is not None and target.resolve() == Path(other).resolve():
@@ -134,7 +346,7 @@ def output_path(path: str, inputs: list[Any]) -> Path:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file that appears complete or not at all."""
+    """Write a file that appears complete or not at all. Raises OutputError."""
     try:
         with replacing(path) as file:
             file.write(content)

@@ -1,4 +1,4 @@
-"""The command export: an inspection in the formats of the trade."""
+"""The command export: an inspection in common exchange formats."""
 
 from __future__ import annotations
 
@@ -29,23 +29,26 @@ Examples:
   arview export out/inspection.json --to glb --part part.toml -o deviations.glb
 
 \b
-csv   one line a component; what is undetermined is empty
-qif   QIF 3.0 results (ISO 23952): position with spherical zone, x y z, rotation, with standard uncertainties
-dfq   Q-DAS ASCII transfer format (AQDEF): distance, dx, dy, dz, tilt of each component as characteristics
-glb   glTF 2.0: components at design and measured place, coloured by verdict, arrows; needs --part
+csv   one line per component
+qif   QIF 3.0 results (ISO 23952): position with spherical zone, x y z, rotation, with standard
+      uncertainties
+dfq   Q-DAS ASCII transfer format (AQDEF): distance, dx, dy, dz and tilt of each component as
+      characteristics
+glb   glTF 2.0: components at nominal and measured place, coloured by verdict, with arrows; needs --part
 html  the report, as `arview report` writes it
-pdf   the report on paper
+pdf   the report as PDF
+
 \b
-What is undetermined has no value in any of them. The fields of inspection.json itself are described in
-src/arview/inspection/schema/inspection-json.md and by the JSON Schema beside it.""",
+An undetermined quantity has no value in any of them. The fields of inspection.json are described in
+src/arview/inspection/schema/inspection-json.md and by the JSON Schema next to it.""",
 )
 @click.argument("inspection", metavar="INSPECTION")
 @click.option("--to", "formats", callback=_parse_formats, required=True, metavar="LIST",
               help="csv, qif, dfq, glb, html, pdf, separated by commas.")  # fmt: skip
-@click.option("-o", "--output", metavar="FILE|FOLDER", help="File to write, or folder; default: beside INSPECTION.")
+@click.option("-o", "--output", metavar="FILE|FOLDER", help="File to write, or folder; default: next to INSPECTION.")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file, for glb, html and pdf.")
 @click.option("--folder", metavar="OUT", help="Folder of `arview reconstruct`, for html and pdf.")
-@click.option("--photos", metavar="FOLDER", help="Where the photos are, for html and pdf.")
+@click.option("--photos", metavar="FOLDER", help="Folder of the photos, for html and pdf.")
 @UNIT
 def export(
     inspection: str,
@@ -89,7 +92,7 @@ def export(
 
 
 def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_path: str | None) -> dict[str, Path]:
-    """Where each format goes."""
+    """The file of each format."""
     inputs = [source, part_path]
     if output is not None and not Path(output).is_dir():
         if len(formats) > 1:

@@ -1,4 +1,4 @@
-"""The commands history: a store of inspections, and what it says over time."""
+"""The commands history …: a store of inspections, and what it says over time."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import click
 
 from arview.cli.common import main, output_path, progress_bar, say, write_bytes
+from arview.cli.exit_codes import ExitCode
 from arview.errors import ArviewError, InputError
 
 if TYPE_CHECKING:
     from arview.history import HistoryStore, Listed
 
-EXIT_DAMAGED = 3
 _QUANTITIES = ("distance", "dx", "dy", "dz", "tilt", "twist")
 
 STORE = click.option(
@@ -25,12 +25,12 @@ PART = click.option("--part", metavar="NAME", help="Only results of this part.")
 SERIAL = click.option("--serial", metavar="SERIAL", help="Only results of this serial.")
 STATION = click.option("--station", metavar="NAME", help="Only results of this station.")
 SINCE = click.option(
-    "--since", metavar="DATE", help="Only what was measured from then on: 2026-03-01 or with a time, UTC."
+    "--since", metavar="DATE", help="Only results measured from then on: 2026-03-01 or with a time, UTC."
 )
 
 
 @main.group(
-    short_help="Keep results, list them, trends and capability.",
+    short_help="Store results; list them, trends and capability.",
     epilog="""\b
 Examples:
   arview history add out/*/inspection.json --station cell-3
@@ -41,12 +41,13 @@ Examples:
   arview history add out/inspection.json --store postgresql://qa@db/arview
 
 \b
-The store only grows: results are added, never changed or deleted; the database itself refuses it. Each is known by the
-SHA-256 of its content, so that adding it again changes nothing. Two stations may add at once. SQLite serves one
-machine; for several use PostgreSQL (pip install 'arview[postgres]').""",
+The store only grows: results are added, never changed or deleted; the database itself refuses that.
+Each result is identified by the SHA-256 of its content, so that adding it again changes nothing. Two
+stations may add at the same time. SQLite serves one machine; use PostgreSQL for several
+(pip install 'arview[postgres]').""",
 )
 def history() -> None:
-    """Keep inspections in a store that only grows, and see what they say over time."""
+    """Store inspections, and see trends and capability over time."""
 
 
 @history.command(
@@ -57,11 +58,16 @@ Examples:
   arview history add out/*/inspection.json --station cell-3 --store /data/plate.sqlite
 
 \b
-Files that are no inspection are named and left out; the exit code is then 2. What is in the store already stays as it
-is.""",
+Files that are not inspections are named and left out. Results already in the store stay as they are.""",
+    exit_codes={
+        ExitCode.DONE: "all are in the store",
+        ExitCode.BAD_INPUT: "a file is not an inspection, or other bad input; the others were added",
+    },
 )
 @click.argument("inspections", nargs=-1, required=True, metavar="INSPECTION...")
-@click.option("--station", metavar="NAME", help="Where they were measured; default: ARVIEW_STATION or this machine.")
+@click.option(
+    "--station", metavar="NAME", help="Name of the measuring station; default: ARVIEW_STATION or this machine."
+)
 @STORE
 def add(inspections: tuple[str, ...], station: str | None, store: str | None) -> None:
     """Add the INSPECTIONs to the store."""
@@ -76,16 +82,16 @@ def add(inspections: tuple[str, ...], station: str | None, store: str | None) ->
                 continue
             new, same = new + added.is_new, same + (not added.is_new)
             if len(inspections) == 1:
-                state = "added as" if added.is_new else "is there already as"
+                state = "added as" if added.is_new else "already there as"
                 click.echo(f"{path}: {state} {added.id}, {added.content_hash[:12]}")
             progress(done, len(inspections))
         name = opened.name
     for reason in failed:
         say(f"error: {reason}")
     if len(inspections) > 1:
-        click.echo(f"{new} added, {same} there already, {len(failed)} refused: {name}")
+        click.echo(f"{new} added, {same} already there, {len(failed)} refused: {name}")
     if failed:
-        click.get_current_context().exit(2)
+        click.get_current_context().exit(ExitCode.BAD_INPUT)
 
 
 @history.command("list", short_help="List results.", epilog="""\b
@@ -96,8 +102,12 @@ Examples:
 @SERIAL
 @STATION
 @SINCE
-@click.option("--verdict", type=click.Choice(["pass", "fail", "undecided", "not_measured"]), help="Only these.")
-@click.option("--limit", type=click.IntRange(min=1), metavar="N", help="The newest N.")
+@click.option(
+    "--verdict",
+    type=click.Choice(["pass", "fail", "undecided", "not_measured"]),
+    help="Only results with this verdict.",
+)
+@click.option("--limit", type=click.IntRange(min=1), metavar="N", help="Only the newest N.")
 @STORE
 def list_results(
     part: str | None, serial: str | None, station: str | None, since: str | None, verdict: str | None,
@@ -122,7 +132,7 @@ Examples:
 @click.option("-o", "--output", metavar="FILE", help="Write its inspection.json.")
 @STORE
 def show(result: str, output: str | None, store: str | None) -> None:
-    """Show the RESULT of a number or of the beginning of a hash."""
+    """Show the RESULT with this number, or whose hash begins so."""
     target = None if output is None else output_path(output, [])
     with _open(store, must_exist=True) as opened:
         found, document = opened.find(result)
@@ -151,18 +161,18 @@ Examples:
   arview history chart --component nut_2 --of tilt --upper 0.5 -o tilt.png
 
 \b
-Individuals and moving ranges (ISO 7870-2): limits are 3 standard deviations by the mean moving range; a value beyond
-them, 8 in a row on one side of the mean or 6 in a row that rise or fall are out of the ordinary. Cp and Cpk
-(ISO 22514-2) come with their 95 % confidence intervals; they are called Pp and Ppk when the process is not in control,
-refused below 10 values and doubted below 50. A distance has an upper limit only, so Cpk alone; distances near zero are
-not normally distributed, dx, dy, dz are the better judges of a process. A serial that was measured again counts
-once, unless --repeats.""",
+Individuals and moving ranges (ISO 7870-2): the control limits are 3 standard deviations, estimated from
+the mean moving range. A value beyond them, 8 in a row on one side of the mean, or 6 in a row that rise or
+fall are signals. Cp and Cpk (ISO 22514-2) come with 95 % confidence intervals. They are called Pp and Ppk
+when the process is not in control, refused below 10 values, and given with a warning below 50. A distance
+has an upper limit only, hence Cpk alone. Distances near zero are not normally distributed; dx, dy and dz
+describe a process better. A serial that was measured again counts once, unless --repeats is given.""",
 )
-@click.option("--component", required=True, metavar="NAME", help="Component to look at.")
+@click.option("--component", required=True, metavar="NAME", help="Component to chart.")
 @click.option("--of", "quantity", type=click.Choice(_QUANTITIES), default="distance", show_default=True,
-              help="What of it.")  # fmt: skip
-@click.option("--lower", type=float, metavar="X", help="Lower limit, instead of that of the tolerance.")
-@click.option("--upper", type=float, metavar="X", help="Upper limit, instead of that of the tolerance.")
+              help="Quantity to chart.")  # fmt: skip
+@click.option("--lower", type=float, metavar="X", help="Lower limit, instead of the tolerance's.")
+@click.option("--upper", type=float, metavar="X", help="Upper limit, instead of the tolerance's.")
 @click.option("--repeats", is_flag=True, help="Count every measurement of a serial.")
 @click.option("-o", "--output", metavar="FILE", help="Picture to write: .svg, .png or .pdf.")
 @PART
@@ -173,7 +183,7 @@ def chart(
     component: str, quantity: str, lower: float | None, upper: float | None, repeats: bool, output: str | None,
     part: str | None, station: str | None, since: str | None, store: str | None,
 ) -> None:  # fmt: skip
-    """Trend of a component over the parts, with control limits, Cp and Cpk."""
+    """Show the trend of a component over the parts, with control limits, Cp and Cpk."""
     from dataclasses import replace
 
     from arview.history import capability, control_chart, series_of
@@ -229,7 +239,7 @@ Examples:
   arview history export -o all.jsonl
 
 \b
-.csv has a line for each component of each result, .jsonl the whole inspections, one a line.""")  # fmt: skip
+.csv has a line for each component of each result; .jsonl has one whole inspection per line.""")  # fmt: skip
 @click.option("-o", "--output", required=True, metavar="FILE", help="File to write: .csv or .jsonl.")
 @PART
 @SERIAL
@@ -253,8 +263,10 @@ def export(
     click.echo(f"wrote {target}: {len(found)} results")
 
 
-@history.command(short_help="Check that nothing was changed.", epilog="""\b
-Exit codes: 0 everything is as it was added, 3 something is not.""")  # fmt: skip
+@history.command(
+    short_help="Check that nothing was changed.",
+    exit_codes={ExitCode.DONE: "every result is as it was added", ExitCode.FAIL: "a result is damaged"},
+)
 @STORE
 def check(store: str | None) -> None:
     """Check each result against its hash."""
@@ -264,7 +276,7 @@ def check(store: str | None) -> None:
         click.echo(fault)
     click.echo(f"{count} results, {len(faults)} damaged")
     if faults:
-        click.get_current_context().exit(EXIT_DAMAGED)
+        click.get_current_context().exit(ExitCode.FAIL)
 
 
 def _open(store: str | None, must_exist: bool = False) -> HistoryStore:
@@ -295,7 +307,7 @@ def _number(value: float | None, sign: str, digits: int = 3) -> str:
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
-    """Columns as wide as they must be; the first and texts to the left, numbers to the right."""
+    """Print columns as narrow as their content allows: text to the left, numbers to the right."""
     widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
     numeric = [bool(rows) and all(row[i][:1] in "+-?0123456789" and "." in row[i] + "." for row in rows)
                and i > 0 and head[i] not in ("hash", "serial", "measured (UTC)") for i in range(len(head))]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The command that serves the live overlay: live."""
+"""The command live: the overlay, served to phones and screens."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from arview.cli.common import EXIT_INTERRUPTED, RENDERER, UNIT, main, output_path, progress_bar, say
+from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, say
+from arview.cli.exit_codes import ExitCode
 from arview.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
@@ -62,49 +63,52 @@ Examples:
   arview live --part part.toml --source clip.mp4 --camera camera.json --http
 
 \b
-Point a phone in the same network at the printed code. The first time it has to be told to trust the station,
-because browsers give the camera to secure pages only: the second address that is printed explains it. Nothing
-is installed on the phone and nothing leaves the local network. The link holds a token that is new in each run;
-whoever has it may look.
+Point a phone in the same network at the printed code. The first time, the phone has to be told to trust
+the station, because browsers give the camera to secure pages only; the second address that is printed
+explains how. Nothing is installed on the phone and nothing leaves the local network. The link holds a
+token that is new in each run; whoever has the link can watch.
 
 \b
 SOURCE phone: every phone sends its own camera and has its own tracker. A camera number, an RTSP or HTTP
-address, or a file (played at its own rate, over and over): all pages show that picture.
---http serves this machine's own browser only, without certificates, for trying things out.
+address, or a file (played in a loop at its own rate): all pages show that picture. --http serves the
+browser of this machine only, without certificates, for trying things out.
 
 \b
-CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt) or fov:DEG; it is
-scaled to the frames if their shape is the same. Without it a common phone is assumed, and the page says so:
-the overlay fits roughly, distances are not to be trusted.
+CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt) or fov:DEG. It
+is scaled to the frames if their aspect ratio is the same. Without it a common phone is assumed, and the
+page says so: the overlay fits roughly, and distances are unreliable.
 
 \b
-The page reloads inspection.json when it changes, and says when it is older than --max-age or of another
-serial number than the part file's (or --serial). Recordings made from the page are put in the folder of --record,
-or in the present one. Ctrl-C ends the run and finishes the files.""",
+The page reloads inspection.json when it changes, and warns when it is older than --max-age or has another
+serial number than the part file (or --serial). Recordings made from the page are put in the folder of
+--record, or in the current one. Ctrl-C ends the run and finishes the files.""",
+    exit_codes={ExitCode.INTERRUPTED: "ended by Ctrl-C; files are finished"},
 )
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
-@click.option("--guideviews", "views_path", metavar="SET", help="Guide views; without it they are made and kept.")
+@click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
 @click.option("--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are shown.")
-@click.option("--source", default="phone", show_default=True, metavar="SOURCE", help="Whose camera; see below.")
+@click.option(
+    "--source", default="phone", show_default=True, metavar="SOURCE", help="Camera or video to show; see below."
+)
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG; see below.")
 @click.option("--init", metavar="guide:NAME", help="Align the part with an outline first, as in annotate.")
 @click.option(
-    "--host", metavar="ADDRESS", help="Address to listen at; default: that in the local network. 0.0.0.0: all."
+    "--host", metavar="ADDRESS", help="Address to listen at; default: the one in the local network. 0.0.0.0: all."
 )
 @click.option("--port", type=click.IntRange(0, 65534), default=8443, show_default=True,
               help="Port of the pages; the page about the certificate gets the next one.")  # fmt: skip
 @click.option("--http", "is_plain", is_flag=True, help="Plain HTTP for a browser on this machine.")
-@click.option("--cert", metavar="PEM", type=click.Path(path_type=Path), help="Certificate chain of your own.")
-@click.option("--key", metavar="PEM", type=click.Path(path_type=Path), help="Its key.")
+@click.option("--cert", metavar="PEM", type=click.Path(path_type=Path), help="Your own certificate chain.")
+@click.option("--key", metavar="PEM", type=click.Path(path_type=Path), help="Key of that certificate.")
 @click.option("--clients", type=click.IntRange(1, 64), metavar="N",
-              help="Pages at once; default: 2 phones, or 8 that look at a station camera.")  # fmt: skip
-@click.option("--record", metavar="OUT.mp4", help="Record what is shown from the start; a second phone: OUT-2.mp4.")
-@click.option("--serial", metavar="TEXT", help="Serial number of the part at hand; default: the part file's.")
+              help="Most pages at once; default: 2 phones, or 8 pages of a station camera.")  # fmt: skip
+@click.option("--record", metavar="OUT.mp4", help="Record from the start; the video of a second phone is OUT-2.mp4.")
+@click.option("--serial", metavar="TEXT", help="Serial number of the part in view; default: that of the part file.")
 @click.option("--max-age", callback=_parse_age, default="24h", show_default=True, metavar="AGE",
-              help="An older inspection is called old: 8h, 3d, 90min, never.")  # fmt: skip
+              help="Age from which an inspection is called old: 8h, 3d, 90min, never.")  # fmt: skip
 @click.option("--size", callback=_parse_size, default="1280x720", show_default=True, metavar="WxH",
-              help="Of the phone's pictures, held sideways.")  # fmt: skip
-@click.option("--fps", type=float, default=30.0, show_default=True, help="Of the phone's pictures.")
+              help="Size of the phone's pictures in landscape.")  # fmt: skip
+@click.option("--fps", type=float, default=30.0, show_default=True, help="Frame rate of the phone's pictures.")
 @RENDERER
 @UNIT
 @click.pass_context
@@ -167,19 +171,19 @@ def live(
     asyncio.run(_serve(server, options, part_path, views_path, renderer, unit))
     say("ended; files are finished")
     _leave_threads()
-    ctx.exit(EXIT_INTERRUPTED)
+    ctx.exit(ExitCode.INTERRUPTED)
 
 
 def _leave_threads() -> None:
-    """End the program at once when a thread is still in a long search or compiling: nobody waits for its result."""
+    """End the program at once when a thread is still searching or compiling: its result is no longer needed."""
     if any(thread.name.startswith("arview-") and thread.is_alive() for thread in threading.enumerate()):
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(EXIT_INTERRUPTED)
+        os._exit(ExitCode.INTERRUPTED)
 
 
 def require_extra() -> None:
-    """Make sure that the libraries of the live server are there.
+    """Check that the libraries of the live server are installed.
 
     Raises:
         MissingDependencyError: with the line that installs them.
@@ -200,7 +204,7 @@ async def _serve(
     loop = asyncio.get_running_loop()
 
     def end(number: int) -> None:
-        """The first signal ends in good order; another one at once."""
+        """The first signal ends in good order; a second one ends at once."""
         loop.remove_signal_handler(number)
         server.stop()
 
@@ -213,7 +217,7 @@ async def _serve(
 
     def ready(hub: Hub) -> None:
         gc.collect()
-        gc.freeze()  # what is loaded stays: the collector need not look at it again while phones wait
+        gc.freeze()  # what is loaded stays: the collector need not visit it again while phones wait
         _print_welcome(server)
         if hub.subject is not None:
             for notice in hub.subject.notices():
@@ -234,14 +238,15 @@ def _print_welcome(server: LiveServer) -> None:
         click.echo(f"fingerprint:  {fingerprint(certificates.authority_der)}")
         if certificates.is_authority_new:
             _print_code(
-                "made just now: every phone has to trust this station once, so scan this first:", endpoint.trust_link
+                "new certificate authority: every phone has to trust this station once, so scan this first:",
+                endpoint.trust_link,
             )
     _print_code("the page, for phones that trust this station:", server.link)
     click.echo("Ctrl-C ends")
 
 
 def _print_code(caption: str, link: str) -> None:
-    """A QR code of an address, where there is a terminal to show it."""
+    """Print a QR code of an address if stdout is a terminal."""
     if not sys.stdout.isatty():
         return
     import segno
@@ -251,7 +256,7 @@ def _print_code(caption: str, link: str) -> None:
 
 
 def _tell_logs() -> None:
-    """Warnings of the server as lines on stderr."""
+    """Print warnings of the server as lines on stderr."""
 
     class Lines(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:

@@ -1,4 +1,4 @@
-"""The command measure: reconstruction → displacement of every component, with U and verdict."""
+"""The command measure: reconstruction → displacement, uncertainty and verdict of every component."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from arview.cli.common import UNIT, main, output_path, say, stage_bar
+from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from arview.measurement.types import Method
 
 METHODS = ("sweep", "edges", "cloud")
-EXIT_FAIL, EXIT_UNDECIDED = 3, 4
 
 
 def _parse_methods(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[Method, ...]:
@@ -37,44 +37,48 @@ Examples:
   arview measure --cloud scan.ply --part part.toml
 
 \b
-OUT is the folder of `arview reconstruct --part`; where that did not find the part, or with --cloud, the shape of the
-cloud says where it is. Components of the role 'inspect' are measured, in the photos twice
-(sweep: their surface; edges: their edges) and in the cloud where there is one; sweep and edges together are the
-result, the cloud is for comparison. Displacements are in the frame of the part file's datums; what they leave free,
-or all without datums, the best fit of the base decides. dx dy dz are those of the middle of a component's bounding
-box; ? is undetermined. U is the expanded uncertainty (k = 2; near zero as much as makes its interval hold the true
-distance 95 times of 100).
+OUT is the folder of `arview reconstruct --part`. If the part was not found there, or with --cloud, the
+part is located by the shape of the cloud. Components of the role 'inspect' are measured, in the photos
+twice (sweep: by their surface; edges: by their edges) and in the cloud if there is one. Sweep and edges
+together give the result; the cloud is for comparison. Displacements are in the frame of the part file's
+datums. Degrees of freedom that the datums leave free, or all of them without datums, are fixed by the
+best fit of the base component. dx, dy and dz are the displacement of the centre of a component's
+bounding box; ? means undetermined. U is the expanded uncertainty (k = 2; for small distances, chosen so
+that the interval holds the true distance with 95 % probability).
 
 \b
-A component passes when distance + guard * U is within its tolerance, fails when distance - guard * U is not, and is
-undecided between (ISO 14253-1). Tolerances come from the part file, else from --tolerance; they are radii: position
-tolerance zones of drawings (ISO 1101) are diameters, twice as large. INSPECTION holds all: covariance, methods,
-budget, datums; `arview annotate --inspection` draws it. Where there is a cloud, surfaces that belong to nothing in the
-CAD are foreign objects, and the signed distances of its points to the nominal CAD are written to the folder
-INSPECTION_distances: coloured PLY, a picture, histograms.
-
-\b
-Exit codes: 0 every component passes, 3 one fails or is missing, 4 none fails but one is undecided or was not
-measured, or there is a foreign object, 2 bad input, 130 interrupted.""",
+A component passes when distance + guard * U is within its tolerance, fails when distance - guard * U
+exceeds it, and is undecided otherwise (ISO 14253-1). Tolerances come from the part file, else from
+--tolerance. They are radii; position tolerance zones on drawings (ISO 1101) are diameters, twice as
+large. INSPECTION holds covariance, methods, uncertainty budget and datums; `arview annotate --inspection`
+draws it. Where there is a cloud, surfaces that belong to nothing in the CAD are reported as foreign
+objects, and the signed distances of the points to the nominal CAD are written to the folder
+INSPECTION_distances: coloured PLY, a picture, histograms.""",
+    exit_codes={
+        ExitCode.DONE: "every component passes, and there is no foreign object",
+        ExitCode.FAIL: "a component fails or is missing",
+        ExitCode.UNDECIDED: "none fails, but one is undecided or was not measured, or there is a foreign object",
+        ExitCode.CANNOT_MEASURE: "no component could be measured",
+    },
 )
 @click.argument("folder", metavar="[OUT]", required=False)
-@click.option("--cloud", "cloud_path", metavar="FILE", help="Measure a cloud alone instead: PLY, in mm, any frame.")
+@click.option("--cloud", "cloud_path", metavar="FILE", help="Measure a cloud instead: PLY, in mm, in any frame.")
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
 @click.option("-o", "--output", metavar="INSPECTION", help="File to write; default: inspection.json in OUT.")
-@click.option("--photos", metavar="FOLDER", help="Where the photos are, if not where they were.")
+@click.option("--photos", metavar="FOLDER", help="Folder of the photos, if they were moved.")
 @click.option("--tolerance", type=click.FloatRange(min=0, min_open=True), metavar="MM",
-              help="Largest distance allowed, for components without one in the part file.")  # fmt: skip
+              help="Tolerance of components that have none in the part file.")  # fmt: skip
 @click.option("--guard", type=click.FloatRange(0, 3), default=1.0, show_default=True, metavar="G",
-              help="Share of U kept from the tolerance; 0 is simple acceptance.")  # fmt: skip
+              help="Guard band as a multiple of U; 0 is simple acceptance.")  # fmt: skip
 @click.option("--methods", callback=_parse_methods, default=",".join(METHODS), show_default=True, metavar="LIST",
-              help="Ways of measuring, separated by commas.")  # fmt: skip
+              help="Measuring methods, separated by commas.")  # fmt: skip
+@click.option("--correct-bias", is_flag=True, help="Correct distances for the bias that noise gives small ones.")
+@click.option("--no-monte-carlo", is_flag=True, help="Combine uncertainties by root sum of squares only.")
+@click.option("--no-maps", is_flag=True, help="Do not write the pictures and the PLY of the distance map.")
 @click.option(
-    "--correct-bias", is_flag=True, help="Judge the most likely true distance: noise makes small ones larger."
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the Monte Carlo simulation."
 )
-@click.option("--no-monte-carlo", is_flag=True, help="Combine uncertainties by their sum of squares alone.")
-@click.option("--no-maps", is_flag=True, help="Leave out the distance map's pictures and PLY.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the Monte Carlo.")
-@click.option("--anyway", is_flag=True, help="Measure though the reconstruction does not have the CAD's shape.")
+@click.option("--anyway", is_flag=True, help="Measure even if the reconstruction contradicts the CAD's shape.")
 @UNIT
 def measure(
     folder: str | None,
@@ -92,9 +96,10 @@ def measure(
     anyway: bool,
     unit: str | None,
 ) -> None:
-    """Measure where the components of PART stand in the reconstruction OUT, or in a cloud: displacement, U, verdict."""
+    """Measure the displacement of each component of PART in the reconstruction OUT, or in a cloud."""
     from arview.cad import load_part
     from arview.inspection import save_inspection
+    from arview.inspection.summary import overall_verdict
     from arview.measurement import run
     from arview.measurement.folder import read_cloud, read_folder
     from arview.measurement.options import MeasureOptions
@@ -120,21 +125,11 @@ def measure(
         inspection = run.measure(reconstruction, part, options, progress)
     save_inspection(inspection, target)
     _print(inspection, target)
-    code = exit_code(inspection)
-    if code:
-        click.get_current_context().exit(code)
-
-
-def exit_code(inspection: Inspection) -> int:
-    """0 when all pass, 3 when one fails, 4 when one is undecided or not measured, or something foreign is there."""
-    verdicts = {component.verdict.value for component in inspection.components}
-    if "fail" in verdicts:
-        return EXIT_FAIL
-    return EXIT_UNDECIDED if verdicts - {"pass"} or inspection.foreign_objects else 0
+    click.get_current_context().exit(exit_code_of(overall_verdict(inspection).value))
 
 
 def _print(inspection: Inspection, target: Path) -> None:
-    """Datums, a line for each component, and a summary; doubts go to stderr."""
+    """Print datums, a line for each component, and a summary; warnings go to stderr."""
     for warning in inspection.warnings:
         say(f"warning: {warning}")
     system = inspection.datum_system
@@ -173,7 +168,7 @@ def _print(inspection: Inspection, target: Path) -> None:
 
 
 def print_components(inspection: Inspection) -> None:
-    """A line for each component."""
+    """Print a line for each component."""
     width = max(len(component.name) for component in inspection.components)
     head = ("dx", "dy", "dz", "distance", "U", "tilt")
     click.echo(
@@ -184,7 +179,7 @@ def print_components(inspection: Inspection) -> None:
 
 
 def _row(component: ComponentDeviation) -> str:
-    """Numbers in mm and degrees, ``?`` for what is undetermined."""
+    """Numbers in mm and degrees; ``?`` means undetermined."""
     values = [*component.displacement_mm, component.distance_mm, component.uncertainty_mm]
     signs = ("+", "+", "+", "", "")
     cells = [f"{'?' if v is None else format(v, f'{sign}.3f'):>9}" for v, sign in zip(values, signs, strict=True)]

@@ -1,4 +1,4 @@
-"""The command reconstruct: photos → poses, millimetres, dense cloud."""
+"""The command reconstruct: photos → camera poses, scale, dense cloud."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, get_args
 import click
 
 from arview.cli.common import UNIT, main, say, stage_bar
+from arview.cli.exit_codes import ExitCode
 from arview.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ STAGES = ("photos", "sparse", "scale", "dense")
 
 
 @main.command(
-    short_help="Make camera poses and a metric cloud of photos.",
+    short_help="Make camera poses and a metric cloud from photos.",
     epilog="""\b
 Examples:
   arview reconstruct photos/ --part part.toml -o out/
@@ -28,24 +29,28 @@ Examples:
   arview reconstruct photos/ --part part.toml --until sparse -o out/
 
 \b
-Photos: 20 to 60, 10 to 20 degrees apart, all around and from two heights, the part standing still, zoom and
-focus as they are, texture around the part (a patterned mat, printed sheets). JPEG, PNG, TIFF, HEIC. Without
---camera the lens is calibrated from the photos themselves; photos of other lenses or zooms are told apart.
+Photos: 20 to 60 of them, 10 to 20 degrees apart, all around and from two heights, the part standing
+still, zoom and focus unchanged, with texture around the part (a patterned mat, printed sheets). JPEG,
+PNG, TIFF, HEIC. Without --camera the lens is calibrated from the photos themselves; photos taken with
+different lenses or zooms are told apart.
 
 \b
-Millimetres come from what is known, in this order of trust, combined where there are several:
+The scale comes from what is known, in this order of trust; several sources are combined:
   --board charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY, or grid:COLUMNSxROWS:MARKER:GAP:DICTIONARY (mm)
-  --tag DICTIONARY:SIDE               every tag of the dictionary has this side in mm, as apriltag36h11:20
-  --scale-bar [DICTIONARY:]ID1:ID2:LENGTH   distance of the middles of two tags, known to 0.02 mm
-  --scale-file FILE                   the same in a TOML file: [[board]] spec = "...", [[tag]], [[scale_bar]], [rig]
+  --tag DICTIONARY:SIDE               every tag of the dictionary has this side in mm: apriltag36h11:20
+  --scale-bar [DICTIONARY:]ID1:ID2:LENGTH   distance of the centres of two tags, known to 0.02 mm
+  --scale-file FILE                   all of these in a TOML file: [[board]] spec = "...", [[tag]],
+                                      [[scale_bar]], [rig]
   --rig FILE.json                     centres_mm, cam_from_rig_mm or distances_mm of the cameras
-  --part PART                         the CAD, found in the photos; it also gives the frame. The base component
-                                      is taken to be as drawn: only something measured shows that it is not
+  --part PART                         the CAD, found in the photos; it also gives the frame. The base
+                                      component is assumed to be as drawn: only a measured length can
+                                      show that it is not
 
 \b
 OUT holds the files of every stage: photos.json, sparse/ (COLMAP model, points.ply), scale.json, metric/
 (COLMAP model in mm in the frame of the CAD), dense/ (depth maps in COLMAP's format), cloud.ply and
-reconstruction.json. A run that was interrupted goes on where it was; --force starts over.""",
+reconstruction.json. An interrupted run resumes where it stopped; --force starts over.""",
+    exit_codes={ExitCode.CANNOT_MEASURE: "the photos can be read but not reconstructed"},
 )
 @click.argument("source", metavar="PHOTOS|VIDEO")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file.")
@@ -58,14 +63,14 @@ reconstruction.json. A run that was interrupted goes on where it was; --force st
 @click.option("--rig", metavar="FILE", help="Known camera poses in mm.")
 @click.option("--until", type=click.Choice(STAGES), default="dense", show_default=True, help="Last stage to do.")
 @click.option("--band", type=click.FloatRange(min=0.1), default=5.0, show_default=True, metavar="MM",
-              help="How far components may be from their place, for the dense stage.")  # fmt: skip
+              help="Distance of components from their nominal place that the dense stage covers.")  # fmt: skip
 @click.option("--max-frames", type=click.IntRange(min=3), default=60, show_default=True, metavar="N",
-              help="Of a video: frames to take.")  # fmt: skip
+              help="Frames to take from a video.")  # fmt: skip
 @click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same cloud.")
-@click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Default: all cores.")
+@click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Threads; default: all cores.")
 @click.option("--device", default="auto", show_default=True, metavar="auto|cpu|cuda[:N]",
-              help="Where dense matching runs; auto takes a CUDA GPU where torch (arview[gpu]) sees one.")  # fmt: skip
-@click.option("--force", is_flag=True, help="Start over, though an earlier run left finished stages in OUT.")
+              help="Device for dense matching; auto takes a CUDA GPU if torch (arview[gpu]) finds one.")  # fmt: skip
+@click.option("--force", is_flag=True, help="Repeat all stages, even those already finished in OUT.")
 @UNIT
 def reconstruct(
     source: str,
@@ -118,7 +123,7 @@ def reconstruct(
 def _sources(
     boards: tuple[str, ...], tags: tuple[str, ...], bars: tuple[str, ...], scale_file: str | None, rig: str | None
 ) -> ScaleSources:
-    """What is known in the scene, from the options and the file together."""
+    """The known lengths in the scene, from the options and the file together."""
     from dataclasses import replace
 
     from arview.fiducials.board import parse_board, parse_tags
@@ -140,7 +145,7 @@ def _sources(
 
 
 def _print(result: Reconstruction, has_part: bool) -> None:
-    """What was found, in a few lines; doubts go to stderr."""
+    """Print what was found, in a few lines; warnings go to stderr."""
     for name, reason in result.intake.rejected:
         say(f"left out {name}: {reason}")
     for warning in result.intake.warnings:

@@ -1,4 +1,4 @@
-"""The command report: an inspection → one HTML file and a PDF for the file."""
+"""The command report: an inspection → one HTML file, and a PDF to file."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ Examples:
   arview report inspection.json --part part.toml --folder out/ --photos /mnt/photos
 
 \b
-INSPECTION is the file of `arview measure`. The report holds verdict, table of components, a picture of each finding
-(photo, ghost of the design place, arrow), distance map and histogram, uncertainty budget, datums, photos, how it was
-measured, and a 3D view of CAD, cloud and arrows. It is one file that needs no network and can be opened from a disk;
-the PDF has the same but for the 3D view, and the inspection itself as an attachment.
+INSPECTION is the file of `arview measure`. The report holds the verdict, a table of components, a picture
+of each finding (photo, ghost at the nominal place, arrow), distance map and histogram, uncertainty
+budget, datums, photos, how it was measured, and a 3D view of CAD, cloud and arrows. It is one file that
+needs no network. The PDF has all of this except the 3D view, and the inspection as an attachment.
+
 \b
-Pictures are made of the photos in the folder that `arview reconstruct` wrote (default: that of INSPECTION), and need
---part. What is not at hand is left out, and the report says so. An undetermined degree of freedom is written as
-undetermined.""",
+Pictures are made from the photos in the folder of `arview reconstruct` (default: that of INSPECTION), and
+need --part. Whatever is not available is left out, and the report says so.""",
 )
 @click.argument("inspection", metavar="INSPECTION")
-@click.option("-o", "--output", metavar="HTML", help="Page to write; default: report.html beside INSPECTION.")
+@click.option("-o", "--output", metavar="HTML", help="Page to write; default: report.html next to INSPECTION.")
 @click.option("--pdf", metavar="PDF", help="Also write a PDF.")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file that was measured against.")
-@click.option("--folder", metavar="OUT", help="Folder of `arview reconstruct`, if INSPECTION does not lie in it.")
-@click.option("--photos", metavar="FOLDER", help="Where the photos are, if not where they were.")
+@click.option("--folder", metavar="OUT", help="Folder of `arview reconstruct`, if INSPECTION is not in it.")
+@click.option("--photos", metavar="FOLDER", help="Folder of the photos, if they were moved.")
 @UNIT
 def report(
     inspection: str,

@@ -1,4 +1,4 @@
-"""The commands study …: what the registration can do, on simulated posts."""
+"""The commands study …: accuracy of the registration, on simulated posts."""
 
 from __future__ import annotations
 
@@ -15,26 +15,29 @@ if TYPE_CHECKING:
 
     from arview.measurement.studies import Study
 
-OUTPUT = click.option("-o", "--output", default="studies", show_default=True, metavar="FOLDER", help="For CSV and PNG.")
+OUTPUT = click.option(
+    "-o", "--output", default="studies", show_default=True, metavar="FOLDER", help="Folder for CSV and PNG."
+)
 QUICK = click.option("--quick", is_flag=True, help="Few runs with few points: seconds instead of minutes.")
 SEED = click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same figures.")
 
 
 @main.group(
+    short_help="Simulate registrations of posts.",
     epilog="""\b
 Examples:
   arview study noise -o studies/
   arview study density --quick
 
 \b
-Each command writes CSV and PNG to FOLDER and prints what they say. The posts are 16 mm across and 40 mm high,
-measured points are taken at random from their surface."""
+Each command writes CSV and PNG to FOLDER and prints a summary. The posts are 16 mm across and 40 mm
+high; measured points are sampled at random from their surface.""",
 )
 def study() -> None:
     """Simulate registrations of posts: bias, spread, and what they depend on."""
 
 
-@study.command(short_help="1 to 9 mm of displacement, true against estimated.")
+@study.command(short_help="Displacements of 1 to 9 mm: true against estimated.")
 @OUTPUT
 @QUICK
 @SEED
@@ -45,38 +48,43 @@ def displacement(output: str, quick: bool, seed: int) -> None:
     _write(lambda: displacement_study(quick, seed), output)
 
 
-@study.command(short_help="0 to 0.5 mm of noise: registration beside a cylinder fit.")
+@study.command(short_help="Noise of 0 to 0.5 mm: registration and cylinder fit.")
 @OUTPUT
 @QUICK
 @SEED
 def noise(output: str, quick: bool, seed: int) -> None:
-    """Bias and spread at 0 to 0.5 mm of noise of each point, 10,000 points, 100 runs a level."""
+    """Bias and spread at 0 to 0.5 mm of noise per point, with 10,000 points and 100 runs per level."""
     from arview.measurement.studies import noise_study
 
     _write(lambda: noise_study(quick, seed), output)
 
 
-@study.command(short_help="The length of a displacement near zero is measured too large.")
+@study.command(short_help="Bias of displacements near zero.")
 @OUTPUT
 @QUICK
 @SEED
 def rice(output: str, quick: bool, seed: int) -> None:
-    """10,000 measured lengths of displacements of 0 and 1 mm with 0.3 mm of noise, against Rice's density."""
+    """10,000 measured lengths of displacements of 0 and 1 mm with 0.3 mm of noise, against Rice's distribution.
+
+    Noise makes the length of a displacement near zero too large.
+    """
     from arview.measurement.studies import rice_study
 
     _write(lambda: rice_study(quick, seed), output)
 
 
-@study.command(short_help="Dense and sparse clouds, without noise.")
+@study.command(short_help="Dense and sparse clouds without noise.")
 @OUTPUT
 @QUICK
 @SEED
-@click.option("--runs", type=click.IntRange(min=1), metavar="N", help="Of the exact surface.  [default: 500]")
-@click.option("--cloud-runs", type=click.IntRange(min=1), metavar="N", help="Of ICP between clouds.  [default: 500]")
+@click.option("--runs", type=click.IntRange(min=1), metavar="N", help="Runs with the exact surface.  [default: 500]")
+@click.option(
+    "--cloud-runs", type=click.IntRange(min=1), metavar="N", help="Runs of ICP between clouds.  [default: 500]"
+)
 @click.option("--rows", default="abcd", show_default=True, help="a 240,965/240,965, b 24,099/24,099, c 240,965/24,099, "
               "d 240,965/2,411 points of reference and measured.")  # fmt: skip
 def density(output: str, quick: bool, seed: int, runs: int | None, cloud_runs: int | None, rows: str) -> None:
-    """Bias and CPU time of a displacement of 1 mm by number of points: exact surface and ICP between clouds.
+    """Bias and CPU time at a displacement of 1 mm, by number of points: exact surface and ICP between clouds.
 
     The full study takes more than an hour of CPU time, most of it in row a of ICP between clouds.
     """
@@ -87,7 +95,7 @@ def density(output: str, quick: bool, seed: int, runs: int | None, cloud_runs: i
     _write(lambda: density_study(quick, seed, runs, cloud_runs, rows), output)
 
 
-@study.command(short_help="Where the iteration stops: 0.1 to 1e-5 mm.")
+@study.command(short_help="Convergence thresholds of 0.1 to 1e-5 mm.")
 @OUTPUT
 @QUICK
 @SEED

@@ -1,4 +1,4 @@
-"""The command verify: acceptance test by known lengths."""
+"""The command verify: an acceptance test by known lengths."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 from arview.cli.common import main, output_path, say, write_bytes
+from arview.cli.exit_codes import ExitCode, exit_code_of
 
 if TYPE_CHECKING:
     from arview.acceptance.conformity import LengthResult, Verification
 
-EXIT_FAIL, EXIT_UNDECIDED = 3, 4
 _SHOWN = 12
 
 
@@ -25,31 +25,35 @@ Examples:
   arview verify points.csv lengths.csv --mpe 0.2
 
 \b
-MEASURED is an inspection.json (the middles of its components are the marks), the folder it is in, or a CSV of points
-with the columns name,x,y,z and perhaps U_mm (k = 2, of each coordinate). KNOWN is the truth.json of a rendered
-sample (all lengths between its components), a CSV with the columns from,to,mm,U_mm, or TOML:
+MEASURED is an inspection.json (the centres of its components are the marks), the folder it is in, or a
+CSV of points with the columns name,x,y,z and optionally U_mm (k = 2, of each coordinate). KNOWN is the
+truth.json of a rendered sample (all lengths between its components), a CSV with the columns
+from,to,mm,U_mm, or TOML:
   [[length]]
   between = ["post_1", "post_3"]
   mm = 221.268
-  U_mm = 0.004        # k = 2, of the certificate; 0 without
+  U_mm = 0.004        # k = 2, from the certificate; default 0
 
 \b
-In the manner of VDI/VDE 2634 part 1: the error of each length, measured minus known, against the maximum permissible
-error --mpe (A + L/K, at most B). A length passes when |error| + U of the known length is within it, fails when
-|error| - U is not, and is undecided between (ISO 14253-1). U as stated held when as many errors are within U as must
-be expected: of lengths without common marks by the binomial distribution, else by simulation.
-
-\b
-Exit codes: 0 passed, 3 a length fails or U did not hold, 4 undecided, 2 bad input.""",
+Following VDI/VDE 2634 part 1, the error of each length, measured minus known, is compared with the
+maximum permissible error --mpe (A + L/K, at most B). A length passes when |error| + U of the known length
+is within it, fails when |error| - U exceeds it, and is undecided otherwise (ISO 14253-1). The stated U is
+confirmed when as many errors are within U as must be expected: by the binomial distribution if no two
+lengths share a mark, by simulation otherwise.""",
+    exit_codes={
+        ExitCode.DONE: "every length passes, and the stated U is confirmed",
+        ExitCode.FAIL: "a length fails, or the stated U is too small",
+        ExitCode.UNDECIDED: "no length fails, but one is undecided",
+    },
 )
 @click.argument("measured", metavar="MEASURED")
 @click.argument("known", metavar="KNOWN")
-@click.option("--mpe", metavar="A+L/K[<=B]", help="Maximum permissible error in mm; without it only U is judged.")
-@click.option("-o", "--output", metavar="JSON", help="All lengths, errors and verdicts.")
-@click.option("--plot", metavar="PNG", help="Errors over the length (png, svg, pdf).")
+@click.option("--mpe", metavar="A+L/K[<=B]", help="Maximum permissible error in mm; without it only U is tested.")
+@click.option("-o", "--output", metavar="JSON", help="Write all lengths, errors and verdicts.")
+@click.option("--plot", metavar="PNG", help="Plot the errors over the length (png, svg, pdf).")
 @click.option("--all", "shows_all", is_flag=True, help=f"Print every length, not only the {_SHOWN} worst.")
 def verify(measured: str, known: str, mpe: str | None, output: str | None, plot: str | None, shows_all: bool) -> None:
-    """Test what was MEASURED against KNOWN lengths: errors, limit, and whether the stated U held."""
+    """Test what was MEASURED against KNOWN lengths: errors, limits, and whether the stated U is confirmed."""
     from arview.acceptance.conformity import parse_limit, record_of
     from arview.acceptance.conformity import verify as run
     from arview.acceptance.lengths import read_known, read_measured
@@ -68,9 +72,7 @@ def verify(measured: str, known: str, mpe: str | None, output: str | None, plot:
 
         write_bytes(picture, draw(test, picture.suffix.lower().removeprefix(".")))
         click.echo(f"wrote {picture}")
-    code = {"pass": 0, "fail": EXIT_FAIL}.get(test.verdict.value, EXIT_UNDECIDED)
-    if code:
-        click.get_current_context().exit(code)
+    click.get_current_context().exit(exit_code_of(test.verdict.value))
 
 
 def _print(test: Verification, shows_all: bool) -> None:

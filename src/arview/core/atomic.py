@@ -12,13 +12,18 @@ from typing import BinaryIO
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A binary file to write, which takes the place of ``path`` when the block ends without an error.
+    """Open a binary file for writing that takes the place of ``path`` when the block ends without an error.
 
-    It lies beside it under a hidden name until then; after an error nothing is left behind.
+    Until then it has a hidden name in the same folder; after an error nothing is left behind. A device or a pipe is
+    not replaced but written to.
 
     Raises:
-        OSError: the folder is missing or read-only, or the disk is full; the caller says it in words.
+        OSError: the folder is missing or read-only, or the disk is full. The caller turns it into a message.
     """
+    if is_device(path):
+        with path.open("wb") as file:
+            yield file
+        return
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -27,3 +32,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         Path(temporary).replace(path)
     finally:
         Path(temporary).unlink(missing_ok=True)
+
+
+def is_device(path: Path) -> bool:
+    """True for an existing device, pipe or socket: what is neither a file nor a folder."""
+    return path.exists() and not path.is_file() and not path.is_dir()

@@ -1,0 +1,278 @@
+"""The command annotate: a part is found and tracked in a video, and drawn on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, cast
+
+import click
+
+from arview.cli.common import (
+    MODALITY,
+    RENDERER,
+    UNIT,
+    camera_for,
+    load_pose,
+    main,
+    output_path,
+    progress_bar,
+    say,
+    session_options,
+)
+from arview.cli.exit_codes import ExitCode
+
+if TYPE_CHECKING:
+    from arview.annotation import AnnotateSummary
+    from arview.cad import Part
+    from arview.camera import Camera
+    from arview.geometry import Array
+    from arview.overlay.options import EdgeMode
+    from arview.tracking import TrackingSession
+
+
+class _Outputs(NamedTuple):
+    """Files that a run writes, where they were asked for."""
+
+    video: Path | None
+    poses: Path | None
+    learned: Path | None
+
+
+def _parse_moment(ctx: click.Context, parameter: click.Parameter, value: str | None) -> int | float | None:
+    """A frame number as int, ``2.5s`` as float seconds."""
+    if value is None:
+        return None
+    try:
+        moment: int | float = float(value[:-1]) if value.endswith("s") else int(value)
+    except ValueError:
+        moment = -1
+    if not 0 <= moment < float("inf"):
+        raise click.BadParameter(f"{value!r}: expected a frame number like 75, or seconds like 2.5s")
+    return moment
+
+
+@main.command(
+    short_help="Track a part in a video and draw on it.",
+    epilog="""\b
+Examples:
+  arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json -o out.mp4
+  arview annotate clip.mov --part housing.step --camera fov:65 --poses poses.jsonl
+  arview annotate "shots/*.jpg" --part part.toml --camera exif --start 10 --end 200
+  arview annotate rtsp://camera.local/1 --part part.toml --camera camera.json -o live.mp4
+  arview annotate 0 --part part.toml --camera fov:65 --init guide:iso -o live.mp4
+  arview annotate 0 --part part.toml --camera fov:65 --learned bracket.learned -o live.mp4
+
+\b
+Where tracking starts. Without --init the part is detected. --init POSE.json, {"cam_from_model": 4x4},
+starts near that pose. --init guide:NAME draws the outline of a guide view over the video, and tracking
+starts when the part is brought within about 15 degrees and 15 % of it. NAME is a view of the part file
+([guides.NAME]), or one of these as far as the declared range has them: front (camera at -Y), back (+Y),
+left (-X), right (+X), top (+Z), bottom (-Z), iso (front, right and above), middle (of the range); or a
+direction like az45_el30, with _d650 for the distance in mm and _r10 for the roll.
+
+\b
+While the part is tracked well, up to 48 small images of it from different sides are kept in memory;
+after a loss, every frame is first searched by them. --learned FILE reads such images from an earlier run
+(if the file exists) and writes all of them to it at the end, so that the next run under the same light
+finds the part sooner. They only suggest where to search: what is found must still fit the CAD.
+
+\b
+CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt), fov:DEG
+(field of view along the longer side), exif, or profile:NAME (stored by `arview calibrate --profile`;
+profile alone takes the one that matches what the source says of its camera).
+
+\b
+Each line of a poses file is a JSON object: index, time_s, state, quality, cam_from_model (4x4 row-major,
+mm), covariance (6x6), ms, reason (why the part is not tracked), mismatches, unverified (components that have
+not been verified yet), alternatives (poses that fit as well).
+Ctrl-C ends the run and finishes the files.""",
+)
+@click.argument("source")
+@click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
+@click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
+@click.option("--camera", "camera_spec", metavar="CAMERA", help="See below; without it the camera is guessed.")
+@click.option("--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are drawn.")
+@click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
+@click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
+@click.option("--init", metavar="WHERE", help="Pose of the first frame, or guide:NAME to align with; see below.")
+@click.option(
+    "--learned", "learned_path", metavar="FILE", help="Learned views: read if the file exists, written at the end."
+)
+@click.option("--start", callback=_parse_moment, metavar="S", help="First frame: number, or seconds like 2.5s.")
+@click.option("--end", callback=_parse_moment, metavar="S", help="Frame to stop at: number, or seconds like 8s.")
+@click.option("--stride", type=click.IntRange(min=1), default=1, help="Take every N-th frame.", metavar="N")
+@click.option("--fps", type=float, default=30.0, show_default=True, help="Frame rate of a folder or glob of pictures.")
+@click.option("--show-edges", type=click.Choice(["none", "visible", "all"]), default="visible", show_default=True,
+              help="CAD edges to draw.")  # fmt: skip
+@click.option("--no-ghost", is_flag=True, help="Leave out the translucent components.")
+@click.option("--no-labels", is_flag=True, help="Leave out the labels.")
+@click.option("--opacity", type=click.FloatRange(0.0, 1.0), help="Opacity of the translucent components, 0 to 1.")
+@MODALITY
+@RENDERER
+@UNIT
+@click.pass_context
+def annotate(
+    ctx: click.Context,
+    source: str,
+    part_path: str,
+    views_path: str | None,
+    camera_spec: str | None,
+    inspection_path: str | None,
+    output: str | None,
+    poses_path: str | None,
+    init: str | None,
+    learned_path: str | None,
+    start: int | float | None,
+    end: int | float | None,
+    stride: int,
+    fps: float,
+    show_edges: str,
+    no_ghost: bool,
+    no_labels: bool,
+    opacity: float | None,
+    modalities: tuple[str, ...],
+    renderer: str,
+    unit: str | None,
+) -> None:
+    """Find and track the part in SOURCE, and write the annotated video and/or the poses.
+
+    SOURCE is a video file, a picture, a folder or glob of pictures, a camera number or an RTSP/HTTP address.
+    """
+    from arview import annotation
+    from arview.cad import load_part
+    from arview.inspection import load_inspection
+    from arview.overlay import OverlayOptions, OverlayRenderer
+    from arview.tracking.guide_pose import GUIDE_PREFIX
+    from arview.video import VideoSink, open_source
+
+    if output is None and poses_path is None:
+        output = _default_output(source)
+        say(f"no -o or --poses given: writing {output}")
+    part = load_part(part_path, unit)
+    guide_name = init.removeprefix(GUIDE_PREFIX) if init and init.startswith(GUIDE_PREFIX) else None
+    init_path = init if guide_name is None else None
+    first_pose = load_pose(init_path) if init_path else None
+    inspection = load_inspection(inspection_path, part.model) if inspection_path else None
+    inputs: list[str | Path | None] = [
+        source,
+        part.path,
+        part.cad_path,
+        views_path,
+        camera_spec,
+        inspection_path,
+        init_path,
+    ]
+    outputs = _check_outputs(output, poses_path, learned_path, inputs)
+    first = start if isinstance(start, int) else None
+    last = end if isinstance(end, int) else None
+    with open_source(source, first, last, stride, fps) as frames:
+        camera = camera_for(frames, camera_spec, source)
+        session = _make_session(part, camera, views_path, renderer, modalities, guide_name, first_pose)
+        if outputs.learned is not None and outputs.learned.exists():
+            session.appearance_memory.load(outputs.learned)
+        overlay = sink = None
+        if outputs.video is not None:
+            drawing = OverlayOptions(
+                show_ghost=not no_ghost,
+                show_labels=not no_labels,
+                show_edges=cast("EdgeMode", show_edges),
+                opacity=OverlayOptions.opacity if opacity is None else opacity,
+            )
+            overlay = OverlayRenderer(part.model, camera, inspection, drawing)
+            sink = VideoSink(outputs.video, frames.width, frames.height, frames.fps, frames)
+        with progress_bar("frames", frames.frame_count) as progress:
+            summary = annotation.annotate(
+                frames,
+                session,
+                overlay,
+                sink,
+                outputs.poses,
+                progress=lambda done, pose: progress(done, frames.frame_count or 0),
+                start_s=start if isinstance(start, float) else None,
+                end_s=end if isinstance(end, float) else None,
+            )
+    if sink is not None and sink.audio_note:
+        say(f"warning: {sink.audio_note}")
+    _print_summary(summary, [path for path in (outputs.video, outputs.poses) if path is not None])
+    if outputs.learned is not None:
+        session.appearance_memory.save(outputs.learned)
+        click.echo(f"wrote {outputs.learned}: {len(session.appearance_memory)} learned views")
+    if summary.is_interrupted:
+        say("interrupted")
+        ctx.exit(ExitCode.INTERRUPTED)
+
+
+def _check_outputs(
+    video: str | None, poses: str | None, learned: str | None, inputs: list[str | Path | None]
+) -> _Outputs:
+    """The paths of the outputs, none of which overwrites an input or another output."""
+    return _Outputs(
+        output_path(video, inputs) if video else None,
+        output_path(poses, [*inputs, video]) if poses else None,
+        output_path(learned, [*inputs, video, poses]) if learned else None,
+    )
+
+
+def _make_session(
+    part: Part,
+    camera: Camera,
+    views_path: str | None,
+    renderer: str,
+    modalities: tuple[str, ...],
+    guide_name: str | None,
+    first_pose: Array | None,
+) -> TrackingSession:
+    """A tracking session on guide views from a file, or on cached ones, that starts as the options say."""
+    from arview.guideviews import GuideViewOptions, load_guide_views
+    from arview.guideviews.cache import cached_guide_views
+    from arview.tracking import TrackingSession
+    from arview.tracking.guide_pose import guide_pose
+
+    views = load_guide_views(Path(views_path), part.model) if views_path else None
+    guide = None
+    if guide_name is not None:
+        guide = guide_pose(guide_name, part, views.view_range if views else part.effective_view_range, camera)
+    if views is None:
+        with progress_bar("guide views") as progress:
+            views = cached_guide_views(
+                part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress
+            )
+    return TrackingSession(
+        views,
+        camera=camera,
+        model=part.model,
+        options=session_options(modalities),
+        initial_cam_from_model=first_pose,
+        guide_cam_from_model=guide,
+    )
+
+
+def _print_summary(summary: AnnotateSummary, written: list[Path]) -> None:
+    from arview.annotation import reasons_text
+
+    if summary.ended_reason:
+        say(f"warning: {summary.ended_reason}")
+    if summary.frames == 0:
+        click.echo("no frame was processed; nothing is written")
+        return
+    for path in written:
+        click.echo(f"wrote {path}")
+    states = ", ".join(f"{count} {state}" for state, count in sorted(summary.states.items()))
+    skipped = f", {summary.skipped} broken frames skipped" if summary.skipped else ""
+    tracking_ms = sorted(summary.ms)[len(summary.ms) // 2]
+    click.echo(
+        f"{summary.frames} frames in {summary.seconds:.1f} s ({summary.fps:.1f} fps end to end, tracking "
+        f"{tracking_ms:.1f} ms a frame): {states}{skipped}"
+    )
+    for state, reasons in sorted(summary.reasons.items()):
+        click.echo(f"{state} {sum(reasons.values())} frames: {reasons_text(reasons)}")
+    if summary.never_seen:
+        click.echo(f"not verified in any frame: {', '.join(summary.never_seen)}")
+
+
+def _default_output(source: str) -> str:
+    """Name in the current folder for the annotated video of a source."""
+    if source.isdecimal():
+        return f"camera_{source}_annotated.mp4"
+    stem = "".join(letter for letter in Path(source).stem if letter.isalnum() or letter in "-_. ")
+    return f"{stem.strip(' .') or 'video'}_annotated.mp4"

@@ -1,0 +1,48 @@
+"""The command check: what a part consists of, and what will be hard to find and track."""
+
+from __future__ import annotations
+
+import click
+
+from arview.cli.common import UNIT, Command, main
+
+
+class _CheckCommand(Command):
+    """Its help ends with a complete part file."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog, then the part file."""
+        from arview.cad import PART_FILE_EXAMPLE
+
+        super().format_epilog(ctx, formatter)
+        formatter.write("\nA part file is a TOML file like this one:\n\n" + PART_FILE_EXAMPLE)
+
+
+@main.command(
+    cls=_CheckCommand,
+    short_help="Print what a part consists of, and what will be hard.",
+    epilog="""\b
+Examples:
+  arview check part.toml
+  arview check housing.stl --unit mm --camera fov:65""",
+)
+@click.argument("part")
+@UNIT
+@click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG, for sizes in pixels.")
+def check(part: str, unit: str | None, camera_spec: str | None) -> None:
+    """Print what PART consists of, and what will be hard about finding and tracking it.
+
+    Symmetric or ambiguous shapes, components too small to be seen from the declared distance, thin or open
+    geometry. Findings are not errors: the exit code is 0.
+    """
+    from arview.cad import check_part, load_part
+    from arview.camera.read import load_camera
+    from arview.guideviews.findings import uniqueness_findings
+
+    loaded = load_part(part, unit)
+    camera = None
+    if camera_spec is not None:
+        size = (1280, 720) if camera_spec.startswith("fov:") else (None, None)
+        camera = load_camera(camera_spec, *size)
+    findings = uniqueness_findings(loaded.model, loaded.effective_view_range)
+    click.echo(check_part(loaded, camera).with_findings(findings).format())

@@ -1,0 +1,63 @@
+"""The exit codes of all commands, in one table."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """How a command ended.
+
+    0 to 3 are results. Errors lie above them: 64 and 70 are EX_USAGE and EX_SOFTWARE of ``sysexits.h``; 130 and 141
+    are what a shell reports for SIGINT and SIGPIPE (128 plus the number of the signal).
+    """
+
+    DONE = 0
+    FAIL = 1
+    UNDECIDED = 2
+    CANNOT_MEASURE = 3
+    BAD_INPUT = 64
+    BUG = 70
+    INTERRUPTED = 130
+    CLOSED_PIPE = 141
+
+    @property
+    def meaning(self) -> str:
+        """One phrase for the help texts and the documentation."""
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    ExitCode.DONE: "done, or everything passes",
+    ExitCode.FAIL: "a check fails",
+    ExitCode.UNDECIDED: "nothing fails, but something is undecided",
+    ExitCode.CANNOT_MEASURE: "the input can be read but not measured",
+    ExitCode.BAD_INPUT: "bad input or usage, or an output that cannot be written",
+    ExitCode.BUG: "a bug in arview",
+    ExitCode.INTERRUPTED: "interrupted",
+    ExitCode.CLOSED_PIPE: "the reader of the output closed the pipe",
+}
+_ERRORS = (ExitCode.BAD_INPUT, ExitCode.BUG, ExitCode.INTERRUPTED)
+_VERDICTS = {
+    "pass": ExitCode.DONE,
+    "fail": ExitCode.FAIL,
+    "undecided": ExitCode.UNDECIDED,
+    "not_measured": ExitCode.CANNOT_MEASURE,
+    "error": ExitCode.CANNOT_MEASURE,
+}
+
+
+def exit_code_of(verdict: str) -> ExitCode:
+    """Exit code of a verdict: ``pass``, ``fail``, ``undecided``, ``not_measured``, or ``error`` of a job."""
+    return _VERDICTS[verdict]
+
+
+def help_rows(results: dict[ExitCode, str] | None = None) -> list[tuple[str, str]]:
+    """Rows of the table of exit codes in a command's help: the code and its meaning.
+
+    Args:
+        results: what the results of this command mean; those not named are left out, except 0. Errors may be named
+            too, to say more of them.
+    """
+    meanings = {ExitCode.DONE: "done"} | {code: code.meaning for code in _ERRORS} | (results or {})
+    return [(str(int(code)), meanings[code]) for code in sorted(meanings)]
