@@ -22,7 +22,7 @@ from arview.acceptance.lengths import (
     read_measured,
 )
 from arview.acceptance.plot import draw
-from arview.cli import main
+from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.geometry import apply, exp_so3, rigid
 from arview.inspection import ComponentDeviation, Details, Inspection, Provenance, Verdict, save_inspection
@@ -171,7 +171,7 @@ def test_the_command(tmp_path: Path) -> None:
     (tmp_path / "off").mkdir()
     off, truth = inspection_and_truth(tmp_path / "off", off_mm=0.3)
     code, said = run(off, truth, "--mpe", "0.15")
-    assert code == 3
+    assert code == ExitCode.FAIL
     assert "verdict: fail" in said
     code, said = run(off, truth)  # without a limit U is judged
     assert "not stated" not in said
@@ -179,13 +179,13 @@ def test_the_command(tmp_path: Path) -> None:
     toml.write_text('name = "bar 7"\n[[length]]\nbetween = ["a", "b"]\nmm = 100.0\nU_mm = 0.03\n')
     points = tmp_path / "points.csv"
     points.write_text("name,x,y,z\na,0,0,0\nb,100.09,0,0\n")
-    assert run(points, toml, "--mpe", "0.1")[0] == 4  # 0.09 ± 0.03
+    assert run(points, toml, "--mpe", "0.1")[0] == ExitCode.UNDECIDED  # 0.09 ± 0.03
     assert run(points, toml, "--mpe", "0.2")[0] == 0
-    assert run(points, toml)[0] == 4  # neither limit nor U
+    assert run(points, toml)[0] == ExitCode.UNDECIDED  # neither limit nor U
     lengths = tmp_path / "lengths.csv"
     lengths.write_text("from,to,mm,U_mm\nb,a,100.0,\n")
     code, said = run(points, lengths, "--mpe", "0.05", "--all")
-    assert code == 3
+    assert code == ExitCode.FAIL
     assert "VDI/VDE 2634 part 1 asks for 35 lengths" in said
 
 
@@ -209,6 +209,6 @@ def test_bad_files_are_one_line(points: str | None, known: str | None, expected:
     (tmp_path / "p.csv").write_text(points or "name,x,y,z,U_mm\na,0,0,0,0.01\nb,5,0,0,0.01\n")
     (tmp_path / "k.toml").write_text(known or "[[length]]\nbetween = ['a', 'b']\nmm = 5\n")
     code, said = run(tmp_path / "p.csv", tmp_path / "k.toml")
-    assert code == 2
+    assert code == ExitCode.BAD_INPUT
     assert expected in said
     assert len(said.strip().splitlines()) == 1

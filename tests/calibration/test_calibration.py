@@ -33,7 +33,7 @@ from arview.camera.profiles import (
 )
 from arview.camera.read import load_camera
 from arview.camera.write import FORMATS, write_camera
-from arview.cli import main
+from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.fiducials.board import Board, cv_board, parse_board, spec_of
 from arview.fiducials.board_sheet import board_pdf, fit_board, parse_paper, place_board
@@ -489,9 +489,9 @@ def test_the_commands(photos: Path, tmp_path: Path) -> None:
     assert np.allclose(cameras[0], cameras[1])
     assert np.allclose(cameras[0], cameras[2])
     assert (tmp_path / "plot.svg").read_bytes().startswith(b"<?xml")
-    assert invoke(photos, "--board", SPEC)[0] == 2  # nothing to write
-    assert invoke(photos, "--board", SPEC, "-o", tmp_path / "a.tiff")[0] == 2
-    assert invoke(tmp_path / "nowhere", "--board", SPEC, "-o", tmp_path / "d.json")[0] == 2
+    assert invoke(photos, "--board", SPEC)[0] == ExitCode.BAD_INPUT  # nothing to write
+    assert invoke(photos, "--board", SPEC, "-o", tmp_path / "a.tiff")[0] == ExitCode.BAD_INPUT
+    assert invoke(tmp_path / "nowhere", "--board", SPEC, "-o", tmp_path / "d.json")[0] == ExitCode.BAD_INPUT
     assert not (tmp_path / "d.json").exists()
 
 
@@ -502,7 +502,7 @@ def test_a_calibration_that_is_not_enough_is_not_written(pictures: list[np.ndarr
         write_photo(tmp_path / f"{k}.jpg", gray)
     target = tmp_path / "camera.json"
     code, said = invoke(tmp_path, "--board", SPEC, "-o", target)
-    assert code == 4, said
+    assert code == ExitCode.CANNOT_MEASURE, said
     assert "verdict: not enough" in said
     assert "tilt the board more" in said
     assert not target.exists()

@@ -24,7 +24,7 @@ import arview.tracking
 from arview import __version__
 from arview.cad import load_part
 from arview.cad.viewpoint import viewpoint
-from arview.cli import main
+from arview.cli import ExitCode, main
 from arview.geometry import look_at
 from arview.inspection import Inspection, Provenance, save_inspection
 from arview.pose import Pose, TrackingState
@@ -96,7 +96,7 @@ ANNOTATE = ("--part", "part.toml", "--camera", "camera.json", "--renderer", "zbu
 
 def refused(result: Result, *words: str) -> None:
     """One line on stderr that holds the words, exit code 2, nothing on stdout."""
-    assert result.exit_code == 2, result.output
+    assert result.exit_code == 64, result.output
     assert result.stdout == ""
     lines = result.stderr.splitlines()
     assert len(lines) == 1, result.stderr
@@ -342,7 +342,7 @@ def test_inputs_are_never_overwritten(room: Path) -> None:
 @pytest.mark.parametrize("option", ["--start=x", "--end=-1", "--stride=0", "--modalities=edge,colour", "--opacity=2"])
 def test_bad_options(room: Path, option: str) -> None:
     result = run("annotate", "clip.mp4", *ANNOTATE, option)
-    assert result.exit_code == 2
+    assert result.exit_code == 64
     assert result.stderr.splitlines()[-1].startswith("Error: Invalid value")
 
 
@@ -361,7 +361,7 @@ def test_unexpected_errors_are_one_line(room: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(FakeSession, "process", explode)
     arguments = ("annotate", "clip.mp4", *ANNOTATE, "-o", "out.mp4")
     result = run(*arguments)
-    assert result.exit_code == 1
+    assert result.exit_code == ExitCode.BUG
     (line,) = result.stderr.splitlines()
     assert "ZeroDivisionError" in line and "please report" in line
     assert not (room / "out.mp4").exists()
@@ -439,7 +439,7 @@ def test_full_disk_is_one_line(room: Path, small_disk: Path) -> None:
 def test_program_prints_one_line_and_no_traceback(room: Path) -> None:
     program = [sys.executable, "-m", "arview.cli"]
     done = subprocess.run([*program, "check", "none.step"], capture_output=True, text=True, cwd=room)
-    assert done.returncode == 2
+    assert done.returncode == 64
     assert done.stderr.startswith("arview: error: none.step") and done.stderr.count("\n") == 1
     done = subprocess.run([*program, "--version"], capture_output=True, text=True, cwd=room)
     assert __version__ in done.stdout

@@ -21,7 +21,7 @@ import pytest
 import sqlalchemy as sa
 from click.testing import CliRunner, Result
 
-from arview.cli import main
+from arview.cli import ExitCode, main
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.history import HistoryStore, capability, control_chart, series_of
 from arview.history import store as store_module
@@ -188,7 +188,7 @@ def test_changes_behind_the_triggers_are_found(store: HistoryStore, tmp_path: Pa
     assert count == 1
     assert "does not have the hash" in faults[0]
     done = CliRunner().invoke(main, ["history", "check", "--store", str(tmp_path / "results.sqlite")])
-    assert done.exit_code == 3
+    assert done.exit_code == ExitCode.FAIL
 
 
 # ---- two stations at once
@@ -509,8 +509,8 @@ def test_the_commands(tmp_path: Path) -> None:
     assert "added as 1" in done.output
     (tmp_path / "bad.json").write_text("{}")
     mixed = run("add", *files, tmp_path / "bad.json", "--store", where)
-    assert mixed.exit_code == 2
-    assert f"11 added, 1 there already, 1 refused: {where}" in mixed.output
+    assert mixed.exit_code == 64
+    assert f"11 added, 1 already there, 1 refused: {where}" in mixed.output
     assert "schema_version" in mixed.output
     listing = run("list", "--store", where, "--limit", 3).output.splitlines()
     assert listing[-1] == "3 results"
@@ -538,7 +538,7 @@ def test_the_commands(tmp_path: Path) -> None:
 def test_commands_that_cannot_be_done(tmp_path: Path) -> None:
     where = tmp_path / "results.sqlite"
     missing_store = run("list", "--store", where)
-    assert (missing_store.exit_code, where.exists()) == (2, False)
+    assert (missing_store.exit_code, where.exists()) == (64, False)
     run("add", saved(tmp_path, "a", built(1, 0.1)), "--store", where)
     for arguments, message in (
         (["show", "77"], "no result 77"),
@@ -549,7 +549,7 @@ def test_commands_that_cannot_be_done(tmp_path: Path) -> None:
         (["list", "--since", "yesterday"], "expected a date"),
     ):
         refused = run(*arguments, "--store", where)
-        assert refused.exit_code == 2
+        assert refused.exit_code == 64
         assert message in refused.output
         assert "Traceback" not in refused.output
     few = run("chart", "--component", "block_1", "--store", where)

@@ -240,6 +240,6 @@ def test_the_command(tmp_path: Path, found: Inspection) -> None:
         (["--to", "csv", "-o", str(source)], "would overwrite an input"),
     ):
         refused = CliRunner().invoke(main, ["export", str(source), *arguments])
-        assert refused.exit_code == 2
+        assert refused.exit_code == 64
         assert message in refused.output
         assert "Traceback" not in refused.output

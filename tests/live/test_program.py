@@ -108,7 +108,7 @@ def test_a_part_that_cannot_be_read_ends_it_with_one_line(tmp_path: Path) -> Non
     (tmp_path / "part.toml").write_text("[part]\ncad = 'gone.step'\n")
     with program(tmp_path, "--part", "part.toml", "--http", "--port", str(free_port())) as process:
         out, err = process.communicate(timeout=60)
-    assert process.returncode == 2 and not out
+    assert process.returncode == 64 and not out
     (line,) = err.splitlines()
     assert line.startswith("arview: error: ") and "gone.step" in line
 
@@ -118,7 +118,7 @@ def test_a_busy_port_says_so_in_one_line(tmp_path: Path) -> None:
     port = str(taken.getsockname()[1])
     result = CliRunner().invoke(main, ["live", "--part", str(PART), "--http", "--port", port])
     taken.close()
-    assert result.exit_code == 2
+    assert result.exit_code == 64
     assert result.stderr == (
         f"arview: error: port {port} at 127.0.0.1 cannot be used (Address already in use); choose another with --port\n"
     )
@@ -145,7 +145,7 @@ def test_a_busy_port_says_so_in_one_line(tmp_path: Path) -> None:
 )
 def test_wrong_options_give_one_line(arguments: list[str], word: str) -> None:
     result = CliRunner().invoke(main, ["live", "--part", str(PART), "--port", "0", *arguments])
-    assert result.exit_code == 2 and word in result.stderr and "Traceback" not in result.stderr
+    assert result.exit_code == 64 and word in result.stderr and "Traceback" not in result.stderr
 
 
 def test_wrong_inspection_camera_or_guide_end_it_with_one_line(tmp_path: Path) -> None:
@@ -159,13 +159,13 @@ def test_wrong_inspection_camera_or_guide_end_it_with_one_line(tmp_path: Path) -
         (["--guideviews", str(PART)], "part.toml"),
     ):
         result = CliRunner().invoke(main, ["live", "--part", str(PART), "--http", "--port", "0", *arguments])
-        assert result.exit_code == 2 and word in result.stderr, result.stderr
+        assert result.exit_code == 64 and word in result.stderr, result.stderr
         assert len(result.stderr.splitlines()) == 1
 
 
 def test_a_part_that_is_not_there_is_said_before_anything_else() -> None:
     result = CliRunner().invoke(main, ["live", "--part", "nowhere.toml"])
-    assert result.exit_code == 2 and "nowhere.toml: no such file" in result.stderr
+    assert result.exit_code == 64 and "nowhere.toml: no such file" in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
 
@@ -178,7 +178,7 @@ def test_a_missing_extra_says_its_pip_line(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(importlib.util, "find_spec", find)
     result = CliRunner().invoke(main, ["live", "--part", str(PART)])
-    assert result.exit_code == 2
+    assert result.exit_code == 64
     assert "aiortc, segno" in result.stderr and "pip install 'arview[live]'" in result.stderr
 
 

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from arview.cad.model import Component, Model, make_model
 from arview.cad.part import ComponentSettings, Datum
-from arview.cli import main
+from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, load_inspection
@@ -124,7 +124,7 @@ def inspected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Inspection, Pat
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("arview.cad.load_part", lambda path, unit: plate_part())
         result = CliRunner().invoke(main, ["measure", "--cloud", str(folder / "scan.ply"), "--part", "part.toml"])
-    assert result.exit_code == 3, result.output
+    assert result.exit_code == ExitCode.FAIL, result.output
     return load_inspection(folder / "inspection.json", nominal()), folder, result.output, result.exit_code
 
 
@@ -177,7 +177,7 @@ def test_clouds_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no two datums whose distance says the scale"):
         in_model_frame(unscaled, replace(plate_part(), datums=()))
     result = CliRunner().invoke(main, ["measure", "--part", "p.toml"])
-    assert result.exit_code == 2 and "either OUT" in result.output
+    assert result.exit_code == 64 and "either OUT" in result.output
 
 
 # --- datum features --------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from arview.cad.part import ComponentSettings, Part
 from arview.cad.part_file import load_part
-from arview.cli import main
+from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.geometry import apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, Verdict, load_inspection
@@ -196,7 +196,7 @@ def test_the_command(inspection: Inspection, monkeypatch: pytest.MonkeyPatch, tm
     out = tmp_path / "inspection.json"
     arguments = ["measure", str(tmp_path), "--part", "p.toml", "-o", str(out)]
     result = CliRunner().invoke(main, [*arguments, "--guard", "0.5", "--methods", "edges,sweep", "--tolerance", "0.4"])
-    assert result.exit_code == 3, result.output  # block_1 fails
+    assert result.exit_code == ExitCode.FAIL, result.output  # block_1 fails
     assert seen[0].methods == ("sweep", "edges") and seen[0].decision.guard == 0.5 and seen[0].tolerance_mm == 0.4
     assert load_inspection(out, nominal()) == inspection
     lines = result.output.splitlines()
@@ -209,7 +209,7 @@ def test_the_command(inspection: Inspection, monkeypatch: pytest.MonkeyPatch, tm
     assert CliRunner().invoke(main, arguments).exit_code == 0
     doubtful = replace(good, components=(replace(good.components[0], verdict=Verdict.UNDECIDED),))
     monkeypatch.setattr(run, "measure", lambda *args: doubtful)
-    assert CliRunner().invoke(main, arguments).exit_code == 4
+    assert CliRunner().invoke(main, arguments).exit_code == ExitCode.UNDECIDED
 
 
 def test_folders_that_hold_no_measurement(tmp_path: Path) -> None:

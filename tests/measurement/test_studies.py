@@ -88,10 +88,10 @@ def test_command_writes_csv_and_picture(tmp_path):
     assert [row["offset_mm"] for row in rows] == ["0", "1"]
     assert (tmp_path / "s" / "rice.png").read_bytes()[:4] == b"\x89PNG"
     refused = CliRunner().invoke(main, ["study", "rice", "--quick", "-o", str(tmp_path / "s" / "rice.csv")])
-    assert refused.exit_code == 2
+    assert refused.exit_code == 64
     assert "is a file; give a folder" in refused.output
     wrong = CliRunner().invoke(main, ["study", "density", "--rows", "ax", "-o", str(tmp_path / "s")])
-    assert wrong.exit_code == 2
+    assert wrong.exit_code == 64
     assert "expected letters of abcd" in wrong.output
 
 

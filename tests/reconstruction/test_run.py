@@ -162,7 +162,7 @@ def command(*arguments: object) -> Result:
 def says(result: Result, *words: str) -> bool:
     """One line on stderr with the words, exit code 2, no traceback."""
     lines = result.stderr.strip().splitlines()
-    return result.exit_code == 2 and "Traceback" not in result.stderr and all(word in lines[-1] for word in words)
+    return result.exit_code == 64 and "Traceback" not in result.stderr and all(word in lines[-1] for word in words)
 
 
 def test_missing_and_empty_folders(tmp_path: Path) -> None:

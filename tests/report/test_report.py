@@ -351,7 +351,7 @@ def test_without_pango_the_page_is_made_all_the_same(
     monkeypatch.setattr(make_module, "_weasyprint", refuse)
     make_report(source, tmp_path / "r.html")
     done = CliRunner().invoke(main, ["report", str(source), "--pdf", str(tmp_path / "r.pdf")])
-    assert done.exit_code == 2
+    assert done.exit_code == 64
     assert "apt-get install" in done.output
     assert not (tmp_path / "r.pdf").exists()
 
@@ -394,5 +394,5 @@ def test_the_command(source: Path, tmp_path: Path) -> None:
         ([str(source), "-o", str(tmp_path / "no" / "r.html")], "there is no folder"),
     ):
         refused = CliRunner().invoke(main, ["report", *arguments])
-        assert refused.exit_code == 2
+        assert refused.exit_code == 64
         assert message in refused.output

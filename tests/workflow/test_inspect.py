@@ -15,7 +15,8 @@ from click.testing import CliRunner, Result
 import arview.measurement.folder
 import arview.measurement.run
 import arview.workflow.run
-from arview.cli import main
+from arview.cli import ExitCode, main
+from arview.cli.exit_codes import exit_code_of
 from arview.core.stage_cache import Stages, content_key
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.history import HistoryStore
@@ -293,6 +294,9 @@ def test_steps_that_are_passed_over_count_for_nothing() -> None:
 
 
 def test_every_verdict_has_a_code() -> None:
-    from arview.cli.inspect import EXIT_CODES
-
-    assert sorted(EXIT_CODES) == sorted(Verdict) and sorted(EXIT_CODES.values()) == [0, 1, 2, 3]
+    assert [exit_code_of(verdict.value) for verdict in sorted(Verdict, key=lambda one: exit_code_of(one.value))] == [
+        ExitCode.DONE,
+        ExitCode.FAIL,
+        ExitCode.UNDECIDED,
+        ExitCode.CANNOT_MEASURE,
+    ]

@@ -1,0 +1,130 @@
+"""The help texts: their examples are parsed by the program itself, and their exit codes come from one table."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from arview.cli import ExitCode, main
+from arview.cli.common import Command, Group
+from arview.cli.exit_codes import help_rows
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = ("README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").glob("*.md"))))
+EXAMPLE = re.compile(r"^ +(?:\.venv/bin/)?arview ((?:[^#\n]|(?<=\S)#)*)", re.MULTILINE)
+
+
+def commands(group: click.Group = main, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    yield path, group
+    for name, command in group.commands.items():
+        if isinstance(command, click.Group):
+            yield from commands(command, (*path, name))
+        else:
+            yield (*path, name), command
+
+
+def help_text(path: tuple[str, ...]) -> str:
+    done = CliRunner().invoke(main, [*path, "--help"], prog_name="arview")
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def parse(arguments: list[str]) -> None:
+    """Parse a command line as the program would, without running it. Raises click.ClickException."""
+    context = main.make_context("arview", list(arguments))
+    command: click.Command = main
+    while isinstance(command, click.Group):
+        rest = [*context._protected_args, *context.args]
+        name, found, rest = command.resolve_command(context, rest)
+        assert found is not None and name is not None
+        context = found.make_context(name, rest, parent=context)
+        command = found
+
+
+def examples(text: str) -> list[list[str]]:
+    text = re.sub(r"\\\n\s+", "", text)
+    return [shlex.split(match.group(1)) for match in EXAMPLE.finditer(text)]
+
+
+@pytest.mark.parametrize("path", [pytest.param(path, id=" ".join(path) or "arview") for path, _ in commands()])
+def test_examples_of_help_are_valid(path: tuple[str, ...]) -> None:
+    text = help_text(path)
+    found = examples(text)
+    assert found or path in {("history", "check"), ("calibrate", "profiles")} or path[:1] == ("study",)
+    for arguments in found:
+        parse(arguments)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_examples_of_documents_are_valid(document: str) -> None:
+    found = examples((ROOT / document).read_text(encoding="utf-8"))
+    for arguments in found:
+        parse(arguments)
+    assert found or document != "README.md"
+
+
+@pytest.mark.parametrize("wrong", [["check", "--bogus"], ["measure", "out/", "--part"], ["annotat", "x"]])
+def test_a_wrong_example_would_fail(wrong: list[str]) -> None:
+    with pytest.raises(click.UsageError):
+        parse(wrong)
+
+
+def test_every_help_ends_with_its_exit_codes() -> None:
+    seen = 0
+    for path, command in commands():
+        text = " ".join(help_text(path).split())
+        assert isinstance(command, Command | Group), path
+        rows = (
+            help_rows(command.exit_codes)
+            if isinstance(command, Command)
+            else [(str(int(code)), code.meaning) for code in ExitCode]
+        )
+        assert "Exit codes: " + " ".join(" ".join(row) for row in rows) in text, path
+        assert {"0", "64", "70", "130"} <= {code for code, _ in rows}
+        seen += 1
+    assert seen > 20
+
+
+def test_the_documents_have_the_same_table() -> None:
+    text = (ROOT / "docs" / "exit-codes.md").read_text(encoding="utf-8")
+    for code in ExitCode:
+        assert f"| {int(code)} | {code.meaning} |" in text, code
+
+
+def test_lines_of_help_fit_a_terminal() -> None:
+    for path, _ in commands():
+        for line in help_text(path).splitlines():
+            assert len(line) <= 120, (path, line)
+
+
+def test_batch_help_shows_its_file_as_it_must_be_written() -> None:
+    text = help_text(("batch",))
+    lines = [line.strip() for line in text.splitlines()]
+    start = lines.index("A file JOBS.toml:")
+    assert lines[start + 1].startswith('out = "results"') and lines[start + 2].startswith("[defaults]")
+
+
+def test_shell_completion() -> None:
+    program = [sys.executable, "-c", "from arview.cli import main; main(prog_name='arview')"]
+    script = subprocess.run(
+        program, capture_output=True, text=True, env={"_ARVIEW_COMPLETE": "bash_source", **environment()}, timeout=60
+    )
+    assert "_arview_completion" in script.stdout, script.stderr
+    words = {"COMP_WORDS": "arview ann", "COMP_CWORD": "1", "_ARVIEW_COMPLETE": "bash_complete"}
+    done = subprocess.run(program, capture_output=True, text=True, env={**words, **environment()}, timeout=60)
+    assert done.stdout.split() == ["plain,annotate"], done.stderr
+    assert "_ARVIEW_COMPLETE=bash_source arview" in help_text(())
+
+
+def environment() -> dict[str, str]:
+    import os
+
+    return dict(os.environ)
