@@ -148,7 +148,7 @@ def test_colmap(tmp_path: Path, line: str, expected: Camera) -> None:
 def test_colmap_with_several_cameras(tmp_path: Path) -> None:
     line = "PINHOLE 640 480 600 610 320 240"
     assert load_camera(str(write(tmp_path, f"1 {line}\n2 {line}\n"))).fy == 610
-    with pytest.raises(InputError, match=r"2 different cameras \(camera 1, camera 7\).*which one"):
+    with pytest.raises(InputError, match=r"2 different cameras \(camera 1, camera 7\).*keep only one"):
         load_camera(str(write(tmp_path, f"1 {line}\n7 PINHOLE 640 480 601 610 320 240\n")))
 
 

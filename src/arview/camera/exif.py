@@ -1,4 +1,4 @@
-"""Opening a photo, and the few EXIF entries of it that arview uses: how it is turned and what tells its lens."""
+"""Opening photos, and the EXIF entries that arview uses: the orientation, and those that identify the lens."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ _TURNS = {1: 0, 2: 0, 3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
 
 @dataclass(frozen=True)
 class PhotoExif:
-    """What a photo says about itself.
+    """EXIF data of a photo.
 
     Attributes:
-        width, height: in px as stored.
-        quarter_turns_clockwise: turn between the sensor's picture and the upright one.
-        make, model: of the camera; empty when unknown.
-        focal_length_mm, focal_length_35mm_mm: true focal length and its equivalent on 36 × 24 mm film, or None.
-        orientation: EXIF orientation 1–8 that is left to apply to the stored pixels (1 for HEIC: its reader turns).
+        width, height: size as stored, px.
+        quarter_turns_clockwise: turn from the sensor's picture to the upright one.
+        model, make: of the camera; empty when unknown.
+        focal_length_mm, focal_length_35mm_mm: focal length and its equivalent on 36 × 24 mm film, or None.
+        orientation: EXIF orientation 1–8 still to be applied to the stored pixels (1 for HEIC: its reader applies it).
         digital_zoom: 1 when unknown or not used.
         taken: date and time as the camera wrote it ("2026:11:21 18:15:00"); empty when unknown.
-        serial: of the camera body; empty when unknown.
+        serial: serial number of the camera body; empty when unknown.
     """
 
     width: int
@@ -55,14 +55,19 @@ class PhotoExif:
 
     @property
     def upright_size(self) -> tuple[int, int]:
-        """Width and height in px after the orientation has been applied."""
+        """Width and height in px once the orientation is applied."""
         return (self.height, self.width) if self.orientation >= 5 else (self.width, self.height)
 
 
 def open_picture(data: bytes) -> Image:
-    """Pillow's picture of a file's bytes, header read and pixels not yet decoded.
+    """Open a picture with Pillow, which reads the header and decodes the pixels when they are first used.
 
-    Raises InputError when they are no picture, MissingDependencyError for HEIC without pillow-heif.
+    Args:
+        data: content of the file.
+
+    Raises:
+        InputError: the data are not a readable picture, or one of far too many pixels.
+        MissingDependencyError: a HEIC photo, without pillow-heif.
     """
     from PIL import Image
 
@@ -79,7 +84,7 @@ def open_picture(data: bytes) -> Image:
 
 
 def exif_of(picture: Image) -> PhotoExif:
-    """EXIF data of an opened picture; entries that are absent or malformed keep their defaults."""
+    """EXIF data of an opened picture; absent and malformed entries keep their defaults."""
     try:
         exif = picture.getexif()
         details = exif.get_ifd(_EXIF_IFD)
@@ -102,9 +107,10 @@ def exif_of(picture: Image) -> PhotoExif:
 
 
 def read_exif(path: Path) -> PhotoExif:
-    """EXIF data of a photo; entries that are absent or malformed keep their defaults.
+    """EXIF data of a photo; absent and malformed entries keep their defaults.
 
-    Raises InputError when the file is no picture.
+    Raises:
+        InputError: the file cannot be read or is not a picture.
     """
     try:
         with open_picture(path.read_bytes()) as picture:
@@ -116,11 +122,11 @@ def read_exif(path: Path) -> PhotoExif:
 
 
 def focal_length_px(exif: PhotoExif, width: int, height: int) -> float | None:
-    """Focal length in px that the EXIF data tell for an uncropped picture of width × height px, or None.
+    """Focal length in px by the EXIF data, for an uncropped picture of width × height px; None when unknown.
 
-    The 35 mm equivalent compares diagonals (CIPA DCG-001): 43.27 mm for 36 × 24 mm film. Without it the true focal
-    length counts when the sensor's width is known. A value that no lens has (field of view above 150° or below 1°)
-    is not believed.
+    The 35 mm equivalent compares diagonals (CIPA DCG-001): 43.27 mm for 36 × 24 mm film. Without it the focal length is
+    used where the width of the sensor is known. Values outside the range of lenses (a field of view above 150° or below
+    1°) are rejected.
     """
     if exif.focal_length_35mm_mm:
         focal_px = exif.focal_length_35mm_mm * math.hypot(width, height) / math.hypot(36.0, 24.0)
@@ -133,7 +139,7 @@ def focal_length_px(exif: PhotoExif, width: int, height: int) -> float | None:
 
 
 def sensor_width_mm(model: str) -> float | None:
-    """Width of the sensor by the EXIF model name, None when the table (``sensor_widths.txt``) does not know it."""
+    """Width of the sensor of a camera model, from ``sensor_widths.txt``; None when the model is not listed."""
     names = [name for name in _sensor_widths_mm() if name.lower() in model.lower()]
     return _sensor_widths_mm()[max(names, key=len)] if names else None
 

@@ -13,12 +13,22 @@ from numpy.typing import ArrayLike
 from arview.errors import InputError
 from arview.geometry import Array
 
+COLMAP_HALF_PX = 0.5
+"""COLMAP puts (0, 0) on the corner of the first pixel, arview on its centre: added to arview's coordinates."""
+
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics of one camera at one image size.
+    """Intrinsics of a camera at one image size.
 
-    ``dist`` is (5,) = k1 k2 p1 p2 k3 of OpenCV. Raises InputError when a value cannot be a camera's.
+    Attributes:
+        width, height: of the image, px.
+        fx, fy: focal lengths, px.
+        cx, cy: principal point, px.
+        dist: (5,) distortion k1 k2 p1 p2 k3, as in OpenCV.
+
+    Raises:
+        InputError: a value that no camera has.
     """
 
     width: int
@@ -46,7 +56,7 @@ class Camera:
 
     @property
     def matrix(self) -> Array:
-        """(3,3) calibration matrix K in px."""
+        """(3,3) calibration matrix K, px."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
@@ -55,7 +65,7 @@ class Camera:
         return bool(np.any(self.dist != 0.0))
 
     def project(self, points_in_cam: ArrayLike) -> Array:
-        """Pixels (..., 2) of points (..., 3) in the camera frame; NaN for points not in front of it."""
+        """Pixels (..., 2) of points (..., 3) in the camera frame; NaN for points not in front of the camera."""
         points = np.asarray(points_in_cam, dtype=np.float64)
         z = points[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -86,7 +96,7 @@ class Camera:
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def scaled(self, width: int, height: int) -> Camera:
-        """The same camera for an image resized to width × height (the whole field of view kept)."""
+        """The camera for an image resized to width × height with the whole field of view."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -99,11 +109,11 @@ class Camera:
         )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The same camera for a window of its image, width × height from a pixel on."""
+        """The camera for a window of its image: width × height px, with (left, top) as the first pixel."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
     def rotated(self, quarter_turns_clockwise: int) -> Camera:
-        """The same camera for an image turned clockwise by quarter turns; distortion turns with it."""
+        """The camera for an image turned clockwise by quarter turns, distortion included."""
         camera = self
         for _ in range(quarter_turns_clockwise % 4):
             k1, k2, p1, p2, k3 = camera.dist
@@ -119,5 +129,5 @@ class Camera:
         return camera
 
     def without_distortion(self) -> Camera:
-        """The ideal camera with the same K."""
+        """The ideal camera with the same calibration matrix."""
         return replace(self, dist=np.zeros(5))

@@ -1,7 +1,7 @@
-"""Calibrations kept by phone, lens and mode: a folder of camera files, found again by what a photo or video says.
+"""Camera profiles: a folder of calibrations by phone, lens and mode, found by the metadata of a photo or video.
 
-A profile is arview's camera JSON with an object ``lens`` beside the numbers. The folder is ``$ARVIEW_PROFILES``, else
-``arview/cameras`` under ``$XDG_CONFIG_HOME`` or ``~/.config``.
+A profile is a camera file in arview's JSON with an object ``lens`` beside the intrinsics. The folder is
+``$ARVIEW_PROFILES``, else ``arview/cameras`` under ``$XDG_CONFIG_HOME`` or ``~/.config``.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif, read_ex
 from arview.errors import InputError
 
 _FOCAL_ROUNDING_MM, _EQUIVALENT_ROUNDING_MM, _ZOOM_TOLERANCE = 0.055, 0.5, 0.01
-"""What programs round in EXIF data; the 35 mm equivalent is in whole millimetres."""
+"""Differences of EXIF values that rounding explains; the 35 mm equivalent is written in whole millimetres."""
 _MAKE_KEYS = ("com.apple.quicktime.make", "com.android.manufacturer", "make")
 _MODEL_KEYS = ("com.apple.quicktime.model", "com.android.model", "model")
+"""Keys of a video's metadata that name the make and the model of the camera."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """One calibration: its name and file, and the lens it is of (see `lens_record`)."""
+    """A stored calibration: its name, its file and its lens, see `lens_record`."""
 
     name: str
     path: Path
@@ -32,7 +33,7 @@ class Profile:
 
 
 def profile_folder() -> Path:
-    """Where profiles are; it need not exist."""
+    """The folder of the profiles, which need not exist."""
     if folder := os.environ.get("ARVIEW_PROFILES"):
         return Path(folder)
     config = os.environ.get("XDG_CONFIG_HOME")
@@ -40,7 +41,15 @@ def profile_folder() -> Path:
 
 
 def lens_record(exif: PhotoExif, width: int, height: int) -> dict[str, Any]:
-    """What tells the lens and mode of a picture of the sensor's size width × height px; unknown entries are absent."""
+    """What identifies the lens and mode of a picture: make, model, focal lengths, zoom and size.
+
+    Args:
+        exif: metadata of the picture.
+        width, height: size of the picture as the sensor stored it, px.
+
+    Returns:
+        the entries that are known.
+    """
     entries = {
         "make": exif.make,
         "model": exif.model,
@@ -54,7 +63,7 @@ def lens_record(exif: PhotoExif, width: int, height: int) -> dict[str, Any]:
 
 
 def profile_name(lens: dict[str, Any]) -> str:
-    """A name for the profile of a lens: ``apple-iphone-12-4.2mm-4032x3024``."""
+    """The default name of the profile of a lens, for example ``apple-iphone-12-4.2mm-4032x3024``."""
     words = [str(lens.get("make", "")), str(lens.get("model", ""))]
     if words[1].lower().startswith(words[0].lower()):
         words = words[1:]
@@ -67,14 +76,18 @@ def profile_name(lens: dict[str, Any]) -> str:
 
 
 def profile_path(name: str, folder: Path | None = None) -> Path:
-    """The file of a profile of that name, which need not exist. Raises InputError for a name that is no file's."""
+    """The file of a profile, which need not exist.
+
+    Raises:
+        InputError: the name holds other characters than letters, digits, '.', '-', '+' and '_'.
+    """
     if not re.fullmatch(r"[\w.+-]{1,100}", name) or name.startswith("."):
         raise InputError(f"profile {name!r}: expected letters, digits, '.', '-' and '_'")
     return (folder or profile_folder()) / f"{name}.json"
 
 
 def list_profiles(folder: Path | None = None) -> list[Profile]:
-    """All profiles by name; files there that are none are passed over."""
+    """All profiles of a folder, by name; other files are ignored."""
     folder = folder or profile_folder()
     profiles = []
     for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
@@ -89,10 +102,10 @@ def list_profiles(folder: Path | None = None) -> list[Profile]:
 
 
 def find_profile(spec: str, source: str | Path | None = None, folder: Path | None = None) -> Path:
-    """The camera file of ``profile:NAME``, or of ``profile`` for what the source says of its camera.
+    """The camera file of ``profile:NAME``, or, for ``profile``, of the lens that the metadata of a source names.
 
     Raises:
-        InputError: there is no such profile; the message names those there are.
+        InputError: there is no such profile; the message lists the profiles.
     """
     folder = folder or profile_folder()
     name = spec.removeprefix("profile").removeprefix(":")
@@ -107,12 +120,19 @@ def find_profile(spec: str, source: str | Path | None = None, folder: Path | Non
 
 
 def profile_of_photo(exif: PhotoExif, folder: Path | None = None) -> Path:
-    """The camera file kept for the lens and mode of a photo. Raises InputError when there is none."""
+    """The camera file of the lens and mode of a photo.
+
+    Raises:
+        InputError: there is no profile of it.
+    """
     return _profile_of_lens(lens_record(exif, *_sensor_size(exif)), folder or profile_folder())
 
 
 def same_lens(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    """Whether two records are of one lens in one mode: make, model and size, and focal lengths where both say one."""
+    """Whether two records are of the same lens in the same mode.
+
+    Make, model, size and zoom must agree, and focal lengths where both records have them.
+    """
 
     def close(key: str, tolerance: float) -> bool:
         x, y = a.get(key), b.get(key)
@@ -135,27 +155,50 @@ def same_lens(a: dict[str, Any], b: dict[str, Any]) -> bool:
 
 
 def lens_of_source(source: Path) -> dict[str, Any]:
-    """`lens_record` of a photo, of the first photo of a folder, or of a video file. Raises InputError."""
+    """The lens record of a photo, of the first photo of a folder, or of a video file.
+
+    Raises:
+        InputError: the source is none of these, or cannot be read.
+    """
     if source.is_dir():
         photos = sorted(p for p in source.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES)
         if not photos:
-            raise InputError(f"camera 'profile': {source}: no photo there; give profile:NAME")
+            raise InputError(f"camera 'profile': {source}: the folder holds no photo; give profile:NAME")
         source = photos[0]
     if source.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES:
         exif = read_exif(source)
         return lens_record(exif, *_sensor_size(exif))
     if not source.is_file():
-        raise InputError(f"camera 'profile': {source} is no file that says its camera; give profile:NAME")
-    from arview.video import open_source
-
-    with open_source(source) as frames:
-        size = (frames.width, frames.height)
-        size = size[::-1] if frames.quarter_turns_clockwise % 2 else size
+        raise InputError(f"camera 'profile': {source} is not a file with metadata of its camera; give profile:NAME")
+    size = _stored_size(source)
     return lens_record(exif_of_video(source, *size), *size)
 
 
+def _stored_size(path: Path) -> tuple[int, int]:
+    """Width and height in px of a video's first frame as stored, before the turn of the display matrix.
+
+    Raises:
+        InputError: the file is not a video, or holds no frame that can be decoded.
+    """
+    import av
+
+    try:
+        with av.open(str(path.absolute())) as container:
+            frame = next(container.decode(video=0), None)
+    except (av.FFmpegError, OSError, ValueError, IndexError) as error:
+        raise InputError(f"camera 'profile': {path} cannot be read as a video; give profile:NAME") from error
+    if frame is None:
+        raise InputError(f"camera 'profile': {path} holds no frame that can be decoded; give profile:NAME")
+    return frame.width, frame.height
+
+
 def exif_of_video(path: Path, width: int, height: int) -> PhotoExif:
-    """Make and model that a phone wrote into a video of the sensor's size; videos hold no focal length."""
+    """The make and model in the metadata of a video; videos hold no focal length.
+
+    Args:
+        path: of the video; a file that cannot be read has no metadata.
+        width, height: size of its frames as stored, px.
+    """
     import av
 
     try:
@@ -173,6 +216,7 @@ def exif_of_video(path: Path, width: int, height: int) -> PhotoExif:
 
 
 def _profile_of_lens(lens: dict[str, Any], folder: Path) -> Path:
+    """The camera file of the first profile of a lens; raises InputError when there is none."""
     found = [profile.path for profile in list_profiles(folder) if same_lens(profile.lens, lens)]
     if not found:
         raise InputError(f"camera 'profile': none for {profile_name(lens)}; {_which(folder)}")
@@ -180,11 +224,13 @@ def _profile_of_lens(lens: dict[str, Any], folder: Path) -> Path:
 
 
 def _which(folder: Path) -> str:
+    """The end of an error message: which profiles there are, and how to make one."""
     known = [profile.name for profile in list_profiles(folder)]
     have = f"there are {', '.join(known[:8])}" if known else f"there are none in {folder}"
     return f"{have}; `arview calibrate … --profile` makes one"
 
 
 def _sensor_size(exif: PhotoExif) -> tuple[int, int]:
+    """Width and height in px of a photo as the sensor stored it."""
     width, height = exif.upright_size
     return (height, width) if exif.quarter_turns_clockwise % 2 else (width, height)

@@ -1,8 +1,8 @@
-"""Camera files: read the usual formats into a ``Camera``, scale it to the frames, write arview's own JSON.
+"""Reading camera files into a `Camera` that is scaled to the frames.
 
-Formats are told apart by what is in the file, not by its name: arview's JSON, BOP ``camera.json`` and
+The format is recognised by the content of the file, not by its name: arview's JSON, BOP ``camera.json`` and
 ``scene_camera.json``, OpenCV FileStorage (YAML, XML, JSON), ROS ``camera_info`` YAML, COLMAP ``cameras.txt``.
-Besides files, ``fov:DEG``, ``exif``, ``profile`` and ``profile:NAME`` are understood.
+``fov:DEG``, ``exif``, ``profile`` and ``profile:NAME`` name cameras without a file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, focal_length_px, read_exif
-from arview.camera.model import Camera
+from arview.camera.model import COLMAP_HALF_PX, Camera
 from arview.camera.profiles import find_profile
 from arview.errors import ArviewError, InputError, MismatchError, OutputError
 
@@ -37,7 +37,7 @@ _NUMBER = re.compile(r"[-+]?\.?(?:nan|inf)\b|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]
 
 @dataclass(frozen=True)
 class _Entry:
-    """What one camera entry of a file says; sizes are None where the file does not give them."""
+    """One camera of a file; the size is None where the file does not give it."""
 
     fx: float
     fy: float
@@ -56,22 +56,21 @@ def load_camera(
     source: str | Path | None = None,
     quarter_turns_clockwise: int = 0,
 ) -> Camera:
-    """Camera for frames of width × height px from a file, ``fov:DEG`` or ``exif``.
+    """The camera for frames of width × height px, from a file, a field of view, EXIF data or a profile.
 
     Args:
-        spec: path of a camera file (formats: see the module), ``fov:DEG`` (field of view in degrees along
-            the longer side of the frame), ``exif`` (focal length from the first photo of ``source``),
-            ``profile:NAME`` or ``profile`` (a calibration kept by `arview calibrate --profile`; the latter by what
-            ``source`` says of its camera).
-        width: width of the frames in px as the tracker sees them; None takes the file's size.
-        height: height of the frames in px; given together with ``width``.
-        source: photo, folder or glob of photos that ``exif`` reads; or video, for ``profile``.
-        quarter_turns_clockwise: turns that the video source has already applied to its frames. The camera
-            is turned with them, unless the file already describes the turned size.
+        spec: path of a camera file (see the module for the formats); ``fov:DEG``, the field of view in degrees along
+            the longer side of the frame; ``exif``, the focal length in the first photo of ``source``; ``profile:NAME``,
+            a calibration stored by `arview calibrate --profile`; or ``profile``, the one of the lens of ``source``.
+        width: width of the upright frames, px; None takes the size in the file.
+        height: height of the upright frames, px; given together with ``width``.
+        source: photo, folder or glob of photos, for ``exif`` and ``profile``; or video, for ``profile``.
+        quarter_turns_clockwise: turns that the video source has applied to its frames. The camera is turned alike,
+            unless the file gives the size of the turned frames.
 
     Raises:
-        InputError: the file is missing, unreadable, of no known format or holds impossible values.
-        MismatchError: the file is for frames of another shape.
+        InputError: the file is missing, cannot be read, has no known format or holds impossible values.
+        MismatchError: the file is for frames of another aspect ratio.
     """
     text = str(spec)
     if text.startswith("fov:"):
@@ -91,9 +90,10 @@ def load_camera(
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:
-    """Write arview's own JSON: width, height, fx, fy, cx, cy in px and dist = k1 k2 p1 p2 k3.
+    """Write a camera in arview's own JSON: width, height, fx, fy, cx, cy in px and dist = k1 k2 p1 p2 k3.
 
-    Raises OutputError when the file cannot be written.
+    Raises:
+        OutputError: the file cannot be written.
     """
     record = {
         "width": camera.width,
@@ -111,7 +111,7 @@ def save_camera(camera: Camera, path: str | Path) -> None:
 
 
 def guess_camera(width: int, height: int) -> Camera:
-    """An undistorted camera for uncalibrated frames: focal length 1.2 × the longer side, centred."""
+    """An undistorted camera for uncalibrated frames, with a focal length of 1.2 × the longer side."""
     return _centred_camera(1.2 * max(width, height), width, height)
 
 
@@ -136,13 +136,13 @@ def _camera_from_fov(spec: str, width: int | None, height: int | None) -> Camera
 
 
 def _scale_matches(file_size: tuple[Any, Any], frame_size: tuple[int, int]) -> bool:
-    """True when one factor maps the file's size to the frames' size within a pixel of rounding."""
+    """True when one factor maps the size in the file to that of the frames within a pixel of rounding."""
     scale = max(frame_size) / max(file_size)
     return all(abs(a * scale - b) <= 1.0 for a, b in zip(file_size, frame_size, strict=True))
 
 
 def _fit_to_frames(entry: _Entry, path: Path, width: int | None, height: int | None) -> Camera:
-    """Camera of the entry at the frames' size, after checks of its plausibility."""
+    """The camera of an entry at the size of the frames, after checks of its plausibility."""
     if width is None or height is None:
         if entry.width is None or entry.height is None:
             raise InputError(f"{path}: no image size in the camera file; add width and height in px")
@@ -172,7 +172,7 @@ def _fit_to_frames(entry: _Entry, path: Path, width: int | None, height: int | N
 
 
 def _checked_camera(entry: _Entry, width: int, height: int, path: Path) -> Camera:
-    """Camera of an entry; values that no camera can have raise InputError with the file name."""
+    """The camera of an entry; raises InputError, with the file name, for values that no camera has."""
     try:
         camera = Camera(width, height, entry.fx, entry.fy, entry.cx, entry.cy, np.array(entry.dist))
     except InputError as error:
@@ -192,14 +192,13 @@ def _checked_camera(entry: _Entry, width: int, height: int, path: Path) -> Camer
 
 
 def _only_entry(entries: Sequence[_Entry], path: Path) -> _Entry:
-    """The camera of the file; several that differ raise InputError."""
+    """The only camera of a file; raises InputError when it holds several that differ."""
     first = entries[0]
     if any(entry != first for entry in entries):
         labels = ", ".join(entry.label for entry in entries[:6])
         more = ", …" if len(entries) > 6 else ""
         raise InputError(
-            f"{path}: holds {len(entries)} different cameras ({labels}{more}); "
-            "which one? Leave only the wanted one in the file"
+            f"{path}: holds {len(entries)} different cameras ({labels}{more}); keep only one of them in the file"
         )
     return first
 
@@ -236,7 +235,7 @@ def _read_entries(path: Path) -> list[_Entry]:
 
 
 def _entry(get: Callable[[str], list[float] | None], model: str = "", label: str = "") -> _Entry:
-    """Entry from a look-up of numbers by key, with every spelling of the keys that the formats use."""
+    """An entry from a function that returns the numbers of a key, tried with all spellings that the formats use."""
 
     def first(keys: Iterable[str], count: int | None = None) -> list[float] | None:
         for key in keys:
@@ -280,7 +279,7 @@ def _entry(get: Callable[[str], list[float] | None], model: str = "", label: str
 
 
 def _padded_dist(dist: Sequence[float]) -> tuple[float, ...]:
-    """At least five distortion terms, so that equal cameras compare equal."""
+    """Distortion terms, filled up with zeros to five, so that equal cameras compare equal."""
     return tuple(dist) + (0.0,) * (5 - len(dist))
 
 
@@ -293,7 +292,7 @@ def _pixel_count(numbers: list[float] | None, name: str) -> int | None:
 
 
 def _flat_numbers(value: Any, key: str) -> list[float]:
-    """Numbers of a JSON value: a number, a list, rows of lists or a FileStorage matrix with ``data``."""
+    """The numbers of a JSON value: a number, a list, a list of rows, or a FileStorage matrix with ``data``."""
     if isinstance(value, dict) and "data" in value:
         value = value["data"]
     if isinstance(value, bool) or value is None or isinstance(value, dict):
@@ -344,15 +343,15 @@ def _entry_from_xml(text: str) -> _Entry:
 
 
 def _numbers(content: str) -> list[float]:
-    """Numbers in a text; YAML and OpenCV write not-a-number and infinity as ``.nan`` and ``.inf``."""
+    """The numbers in a text; YAML and OpenCV write NaN and infinity as ``.nan`` and ``.inf``."""
     return [float(re.sub(r"\.(?=[a-zA-Z])", "", number)) for number in _NUMBER.findall(content)]
 
 
 def _entry_from_yaml(text: str) -> _Entry:
-    """Entry of OpenCV's or ROS's YAML.
+    """The entry of a YAML file of OpenCV or ROS.
 
-    Both are block maps whose values are scalars, lists or matrices with a ``data`` list, so that a key's
-    value is its line and the deeper lines below it; a general YAML reader is not needed.
+    Both are block maps whose values are scalars, lists or matrices with a ``data`` list: the value of a key is its line
+    and the deeper lines below it. A general YAML reader is not needed.
     """
     if not re.search(r"^[ \t]*[\w\"']+[ \t]*:", text, re.MULTILINE):
         raise InputError(f"is not a camera file; expected {FORMATS}")
@@ -376,7 +375,7 @@ def _entry_from_yaml(text: str) -> _Entry:
 
 # --- COLMAP --------------------------------------------------------------------------------------------
 
-# Places of fx, fy, cx, cy and k1, k2, p1, p2, then k3 … k6 in the parameters.
+# Indices of fx, fy, cx, cy and of k1, k2, p1, p2, then k3 … k6, in the parameters of each model.
 _COLMAP_MODELS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
     "SIMPLE_PINHOLE": ((0, 0, 1, 2), ()),
     "PINHOLE": ((0, 1, 2, 3), ()),
@@ -386,7 +385,6 @@ _COLMAP_MODELS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
     "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
 }
 _COLMAP_LINE = re.compile(r"^\d+\s+[A-Z][A-Z_0-9]+\s+\d+\s+\d+\s")
-_COLMAP_HALF_PX = 0.5  # COLMAP puts (0, 0) on the corner of the first pixel, arview on its centre
 
 
 def _data_lines(text: str) -> list[str]:
@@ -418,16 +416,16 @@ def _entry_from_colmap(line: str) -> _Entry:
         raise InputError(f"{label}: {model} needs {expected} parameters, the file gives {len(params)}")
     fx, fy, cx, cy = (params[place] for place in places)
     dist = _padded_dist([params[place] for place in dist_places])
-    return _Entry(fx, fy, cx - _COLMAP_HALF_PX, cy - _COLMAP_HALF_PX, dist, width, height, label)
+    return _Entry(fx, fy, cx - COLMAP_HALF_PX, cy - COLMAP_HALF_PX, dist, width, height, label)
 
 
 # --- EXIF ----------------------------------------------------------------------------------------------
 
 
 def _camera_from_exif(source: str | Path | None, width: int | None, height: int | None) -> Camera:
-    """Camera of photos from the focal length that the phone or camera wrote into the first one."""
+    """The camera of photos by the focal length in the EXIF data of the first one."""
     if source is None:
-        raise InputError("camera 'exif': no source to read it from; give a photo, a folder or a glob of photos")
+        raise InputError("camera 'exif': no photo to read it from; give a photo, a folder or a glob of photos")
     photo = _first_photo(Path(source))
     exif = read_exif(photo)
     if width is None or height is None:

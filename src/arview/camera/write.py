@@ -1,4 +1,4 @@
-"""Writing a camera in every format that ``camera_files`` reads."""
+"""Writing camera files in every format that `arview.camera.read` reads."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from arview.camera.model import Camera
+from arview.camera.model import COLMAP_HALF_PX, Camera
 from arview.core.atomic import replacing
 from arview.errors import InputError, OutputError
-
-_COLMAP_HALF_PX = 0.5  # COLMAP puts (0, 0) on the corner of the first pixel, arview on its centre
 
 
 def write_camera(
@@ -22,13 +20,14 @@ def write_camera(
     """Write a camera file, which appears complete or not at all.
 
     Args:
-        camera: to write.
+        camera: the camera.
         path: of the file.
-        kind: one of FORMATS; None goes by the name: ``.json`` arview, ``.txt`` COLMAP, ``.xml`` and ``.yaml`` OpenCV.
-        extra: objects to put beside the numbers; arview's own format alone has room for them.
+        kind: one of FORMATS; None chooses by the suffix: ``.json`` arview, ``.txt`` COLMAP, ``.xml`` and ``.yaml``
+            OpenCV.
+        extra: objects to store beside the intrinsics; only arview's own format stores them.
 
     Raises:
-        InputError: an unknown format or name.
+        InputError: an unknown format or suffix.
         OutputError: the file cannot be written.
     """
     path = Path(path)
@@ -44,7 +43,11 @@ def write_camera(
 
 
 def format_of(path: Path) -> str:
-    """The format that a file name stands for. Raises InputError when none does."""
+    """The format for the suffix of a file name.
+
+    Raises:
+        InputError: the suffix has none.
+    """
     kinds = {".json": "arview", ".txt": "colmap", ".xml": "opencv-xml", ".yaml": "opencv", ".yml": "opencv"}
     kind = kinds.get(path.suffix.lower())
     if kind is None:
@@ -53,7 +56,7 @@ def format_of(path: Path) -> str:
 
 
 def holds_distortion(kind: str) -> bool:
-    """Whether a format says how the lens distorts; BOP's is for undistorted pictures."""
+    """Whether a format stores the distortion; that of BOP is for undistorted pictures."""
     return kind != "bop"
 
 
@@ -92,7 +95,7 @@ def _opencv(suffix: str) -> Callable[[Camera], str]:
 
 
 def _ros(camera: Camera) -> str:
-    """``camera_info`` as camera_calibration_parsers reads it."""
+    """``camera_info`` YAML as camera_calibration_parsers reads it."""
     projection = np.hstack([camera.matrix, np.zeros((3, 1))])
 
     def matrix(name: str, values: Any, rows: int, columns: int) -> str:
@@ -115,7 +118,7 @@ def _colmap(camera: Camera) -> str:
     terms: list[float] = []
     if camera.is_distorted:
         model, terms = ("FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]) if k3 else ("OPENCV", [k1, k2, p1, p2])
-    numbers = [camera.fx, camera.fy, camera.cx + _COLMAP_HALF_PX, camera.cy + _COLMAP_HALF_PX, *terms]
+    numbers = [camera.fx, camera.fy, camera.cx + COLMAP_HALF_PX, camera.cy + COLMAP_HALF_PX, *terms]
     line = " ".join(repr(float(value)) for value in numbers)
     return f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {model} {camera.width} {camera.height} {line}\n"
 
@@ -129,4 +132,4 @@ FORMATS: dict[str, Callable[[Camera], str]] = {
     "ros": _ros,
     "colmap": _colmap,
 }
-"""Text of a camera by format."""
+"""The function that writes a camera as text, by the name of the format."""

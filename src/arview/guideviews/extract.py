@@ -1,13 +1,15 @@
-"""What detector and tracker need of one view: contour points with normals and run lengths, edge points with tangents.
+"""Features of one view: contour points with normals and run lengths, edge points with tangents.
 
-The contour is traced in the silhouette; each of its points is then moved onto the mesh edge that makes it, so that
-its 3D place is that of the CAD and not of a pixel. Run lengths are how far the normal stays on the part (inwards)
-and off it (outwards): Stoiber et al., "A Sparse Gaussian Approach to Region-Based 6DoF Object Tracking" (ACCV 2020).
+The contour is traced in the silhouette; each of its points is then moved onto the mesh edge that causes it, so that
+its position is that of the CAD and not of a pixel. The run lengths of a contour point are how far its normal stays on
+the part (inwards) and on the background (outwards): Stoiber et al., "A Sparse Gaussian Approach to Region-Based 6DoF
+Object Tracking" (ACCV 2020).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,11 +18,17 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, MeshEdges, sample_visible_edges
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, EdgeSamples, MeshEdges, sample_visible_edges
 from arview.rendering.renderers import Rendering
 
-SNAP_PX = 1.6
-"""A contour pixel is moved onto a mesh edge sample at most this far away."""
+MAX_SHIFT_PX = 1.6
+"""Largest distance over which a contour pixel is moved onto a sample of a mesh edge."""
+MIN_CHAIN_PX = 24
+"""Shorter outlines, those of specks and pinholes, are left out."""
+TANGENT_REACH_PX = 5
+"""Neighbours along the outline, on either side, that a contour point's tangent is fitted to."""
+SHORT_EDGE_PX = 6.0
+"""Tangents of shorter edges are smoothed."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +36,14 @@ class ViewFeatures:
     """Features of one view; points are in the model frame, mm.
 
     Attributes:
-        contour_points: (C,3); contour_normals: (C,3) unit, outwards and across the line of sight.
+        contour_points: (C,3).
+        contour_normals: (C,3) unit vectors, outwards and across the line of sight.
         contour_runs_mm: (C,2) how far the normal stays on the part, and on the background.
-        contour_component: (C,).
-        edge_points: (E,3); edge_tangents: (E,3) unit; edge_kinds: (E,) EDGE_* bits; edge_component: (E,).
+        contour_component: (C,) component index.
+        edge_points: (E,3).
+        edge_tangents: (E,3) unit vectors.
+        edge_kinds: (E,) EDGE_* bits.
+        edge_component: (E,) component index.
     """
 
     contour_points: Array
@@ -46,7 +58,7 @@ class ViewFeatures:
 
 @kernel
 def _run_length(mask, u, v, du, dv, on_part, longest):  # type: ignore[no-untyped-def]
-    """Steps of one pixel from (u, v) along (du, dv) for which the mask stays ``on_part``."""
+    """Number of steps of one pixel from (u, v) along (du, dv) during which the mask stays ``on_part``."""
     height, width = mask.shape
     for step in range(1, longest + 1):
         x = int(np.round(u + du * (step - 0.5)))
@@ -59,7 +71,19 @@ def _run_length(mask, u, v, du, dv, on_part, longest):  # type: ignore[no-untype
 
 @kernel
 def _describe_contour(mask, xs, ys, starts, ends_, half, longest):  # type: ignore[no-untyped-def]
-    """Normals (pointing off the part) and run lengths at contour pixels chosen as indices into closed chains."""
+    """Positions, outward normals and run lengths at the pixels of closed outlines.
+
+    Args:
+        mask: (H,W) silhouette, > 0 on the part.
+        xs, ys: (N,) pixels of all outlines, one after the other.
+        starts, ends_: (N,) first index of each pixel's outline, and one past its last.
+        half: neighbours on either side that the tangent is fitted to.
+        longest: largest run length, px.
+
+    Returns:
+        u, v (N,) half a pixel outside the pixels' centres, normals (N,2), run lengths (N,2) on the part and on the
+        background, px, and whether both are at least a pixel (N,).
+    """
     count = xs.shape[0]
     u = np.empty(count)
     v = np.empty(count)
@@ -70,14 +94,14 @@ def _describe_contour(mask, xs, ys, starts, ends_, half, longest):  # type: igno
         first, last = starts[i], ends_[i]
         size = last - first
         k = i - first
-        # Tangent: least-squares line through the neighbours within `half` pixels along the chain.
+        # The tangent is the least-squares line through the neighbours along the outline.
         tx = 0.0
         ty = 0.0
         for s in range(1, half + 1):
-            ahead = first + (k + s) % size
-            behind = first + (k - s) % size
-            tx += s * (xs[ahead] - xs[behind])
-            ty += s * (ys[ahead] - ys[behind])
+            after = first + (k + s) % size
+            before = first + (k - s) % size
+            tx += s * (xs[after] - xs[before])
+            ty += s * (ys[after] - ys[before])
         norm = np.sqrt(tx * tx + ty * ty)
         u[i] = xs[i]
         v[i] = ys[i]
@@ -89,7 +113,7 @@ def _describe_contour(mask, xs, ys, starts, ends_, half, longest):  # type: igno
         if inner < outer:
             nx, ny = -nx, -ny
         normal[i, 0], normal[i, 1] = nx, ny
-        # The pixel's centre lies inside: the outline itself is about half a pixel further out.
+        # The centre of a pixel of the outline lies inside: the outline itself is about half a pixel further out.
         u[i] += 0.5 * nx
         v[i] += 0.5 * ny
         runs[i, 0] = _run_length(mask, u[i], v[i], -nx, -ny, True, longest)
@@ -100,7 +124,7 @@ def _describe_contour(mask, xs, ys, starts, ends_, half, longest):  # type: igno
 
 @kernel
 def _nearest_sample(u, v, sample_pixels, width, height, reach):  # type: ignore[no-untyped-def]
-    """Index of the nearest sample within ``reach`` px of each (u, v), or -1; by a pixel grid."""
+    """Index of the nearest sample within ``reach`` px of each (u, v), or -1, found by a grid of pixels."""
     grid = np.full((height, width), -1, dtype=np.int32)
     following = np.full(sample_pixels.shape[0], -1, dtype=np.int32)
     for i in range(sample_pixels.shape[0]):
@@ -126,7 +150,7 @@ def _nearest_sample(u, v, sample_pixels, width, height, reach):  # type: ignore[
 
 
 def _smooth_tangents(pixels: Array, tangents_px: Array, shape: tuple[int, int]) -> Array:
-    """Directions (N,2) in the picture averaged over neighbours within 3 px by their structure tensor."""
+    """Unit directions (N,2) in the picture, averaged over the neighbours within 3 px by their structure tensor."""
     x = np.round(pixels[:, 0]).astype(np.intp)
     y = np.round(pixels[:, 1]).astype(np.intp)
     flat = y * shape[1] + x
@@ -137,6 +161,15 @@ def _smooth_tangents(pixels: Array, tangents_px: Array, shape: tuple[int, int]) 
     )
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+class _Contour(NamedTuple):
+    """Contour points of one view; see the attributes of the same names of `ViewFeatures`."""
+
+    points: Array
+    normals: Array
+    runs_mm: Array
+    component: NDArray[np.int32]
 
 
 def extract_features(
@@ -154,16 +187,34 @@ def extract_features(
         cam_from_model: (4,4) its pose.
         camera: ideal camera of the view.
         edges: edges of the same model.
-        contour_count, edge_count: at most so many points are kept, evenly spread.
+        contour_count, edge_count: largest numbers of points, spread evenly over all that are found.
+    """
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    samples = sample_visible_edges(edges, cam_from_model, intrinsics, rendering.depth_mm, spacing_px=1.0)
+    tangents, usable = _edge_tangents(samples, cam_from_model, camera, rendering.depth_mm.shape)
+    chosen = usable[_evenly(len(usable), edge_count)]
+    contour = _contour(rendering, cam_from_model, camera, samples, contour_count)
+    return ViewFeatures(
+        contour_points=contour.points,
+        contour_normals=contour.normals,
+        contour_runs_mm=contour.runs_mm,
+        contour_component=contour.component,
+        edge_points=samples.points_in_model[chosen],
+        edge_tangents=tangents[chosen],
+        edge_kinds=samples.kinds[chosen],
+        edge_component=samples.component[chosen],
+    )
+
+
+def _edge_tangents(
+    samples: EdgeSamples, cam_from_model: Array, camera: Camera, shape: tuple[int, ...]
+) -> tuple[Array, NDArray[np.intp]]:
+    """Unit tangents (N,3) of edge samples in the model frame, and the indices of the samples that are usable.
+
+    Short edges of curved surfaces zigzag: their tangents are smoothed. Long edges along the line of sight have no
+    direction in the picture and are left out.
     """
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
-    depth = rendering.depth_mm
-    height, width = depth.shape
-    model_from_cam_rotation = cam_from_model[:3, :3].T
-    eye = -model_from_cam_rotation @ cam_from_model[:3, 3]
-    samples = sample_visible_edges(edges, cam_from_model, (fx, fy, cx, cy), depth, spacing_px=1.0)
-
-    # Directions in the picture; short edges of curved surfaces zigzag and are smoothed.
     tangents_in_cam = samples.tangents_in_model @ cam_from_model[:3, :3].T
     x = (samples.pixels[:, 0] - cx) / fx
     y = (samples.pixels[:, 1] - cy) / fy
@@ -177,66 +228,68 @@ def extract_features(
     norms = np.linalg.norm(tangents_px, axis=1)
     along_sight = norms < 0.05 * fx
     tangents_px /= np.maximum(norms, 1e-12)[:, None]
-    edge_tangents = samples.tangents_in_model
-    if len(samples.pixels):
-        is_short = samples.lengths_px < 6.0
-        smooth_px = _smooth_tangents(samples.pixels, tangents_px, (height, width))
-        smooth_in_cam = np.stack([smooth_px[:, 0] / fx, smooth_px[:, 1] / fy, np.zeros(len(smooth_px))], axis=1)
-        smooth_in_cam /= np.linalg.norm(smooth_in_cam, axis=1, keepdims=True)
-        edge_tangents = np.where(is_short[:, None], smooth_in_cam @ cam_from_model[:3, :3], edge_tangents)
-    usable = np.flatnonzero(~along_sight | (samples.lengths_px < 6.0)) if len(samples.pixels) else np.zeros(0, int)
-    chosen = usable[_evenly(len(usable), edge_count)]
+    if not len(samples.pixels):
+        return samples.tangents_in_model, np.zeros(0, dtype=np.intp)
+    is_short = samples.lengths_px < SHORT_EDGE_PX
+    smooth_px = _smooth_tangents(samples.pixels, tangents_px, (shape[0], shape[1]))
+    smooth_in_cam = np.stack([smooth_px[:, 0] / fx, smooth_px[:, 1] / fy, np.zeros(len(smooth_px))], axis=1)
+    smooth_in_cam /= np.linalg.norm(smooth_in_cam, axis=1, keepdims=True)
+    tangents = np.where(is_short[:, None], smooth_in_cam @ cam_from_model[:3, :3], samples.tangents_in_model)
+    return tangents, np.flatnonzero(~along_sight | is_short)
 
-    mask = rendering.silhouette
-    chains, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    chains = [chain[:, 0, :] for chain in chains if len(chain) >= 24]
-    if chains:
-        lengths = [len(chain) for chain in chains]
-        pixels = np.concatenate(chains).astype(np.float64)
-        firsts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
-        lasts = np.repeat(np.cumsum(lengths), lengths)
-        longest = max(width, height) // 2
-        u, v, normal_px, runs_px, ok = _describe_contour(
-            mask, pixels[:, 0].copy(), pixels[:, 1].copy(), firsts, lasts, 5, longest
-        )
-        border = (u > 2) & (v > 2) & (u < width - 3) & (v < height - 3)
-        keep = np.flatnonzero(ok & border)
-        keep = keep[_evenly(len(keep), contour_count)]
-        u, v, normal_px, runs_px = u[keep], v[keep], normal_px[keep], runs_px[keep]
-        inner = np.round(pixels[keep]).astype(np.intp)
-        z = depth[inner[:, 1], inner[:, 0]].astype(np.float64)
-        points_in_cam = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
-        contour_points = (points_in_cam - cam_from_model[:3, 3]) @ cam_from_model[:3, :3]
-        outline = np.flatnonzero(samples.kinds & EDGE_CONTOUR)
-        nearest = _nearest_sample(u, v, samples.pixels[outline], width, height, SNAP_PX)
-        snapped = nearest >= 0
-        contour_points[snapped] = samples.points_in_model[outline[nearest[snapped]]]
-        # The normal as a 3D vector across the line of sight, so that it projects to normal_px.
-        normals_in_cam = np.stack([normal_px[:, 0], normal_px[:, 1], np.zeros(len(u))], axis=1)
-        contour_normals = normals_in_cam @ cam_from_model[:3, :3]
-        sight = contour_points - eye
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        contour_normals -= np.sum(contour_normals * sight, axis=1, keepdims=True) * sight
-        contour_normals /= np.linalg.norm(contour_normals, axis=1, keepdims=True)
-        runs_mm = runs_px * (z / fx)[:, None]
-        component = rendering.component_ids[inner[:, 1], inner[:, 0]].astype(np.int32)
-    else:
-        contour_points, contour_normals = np.zeros((0, 3)), np.zeros((0, 3))
-        runs_mm, component = np.zeros((0, 2)), np.zeros(0, dtype=np.int32)
-    return ViewFeatures(
-        contour_points=contour_points,
-        contour_normals=contour_normals,
-        contour_runs_mm=runs_mm,
-        contour_component=component,
-        edge_points=samples.points_in_model[chosen],
-        edge_tangents=edge_tangents[chosen],
-        edge_kinds=samples.kinds[chosen],
-        edge_component=samples.component[chosen],
+
+def _contour(rendering: Rendering, cam_from_model: Array, camera: Camera, samples: EdgeSamples, count: int) -> _Contour:
+    """At most ``count`` points of the silhouette's outline; those near an edge sample of the contour lie on it."""
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    mask, depth = rendering.silhouette, rendering.depth_mm
+    height, width = depth.shape
+    found, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    chains = [chain[:, 0, :] for chain in found if len(chain) >= MIN_CHAIN_PX]
+    if not chains:
+        return _Contour(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, dtype=np.int32))
+    lengths = [len(chain) for chain in chains]
+    pixels = np.concatenate(chains).astype(np.float64)
+    firsts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+    lasts = np.repeat(np.cumsum(lengths), lengths)
+    longest = max(width, height) // 2
+    u, v, normal_px, runs_px, ok = _describe_contour(
+        mask, pixels[:, 0].copy(), pixels[:, 1].copy(), firsts, lasts, TANGENT_REACH_PX, longest
+    )
+    is_inside = (u > 2) & (v > 2) & (u < width - 3) & (v < height - 3)
+    keep = np.flatnonzero(ok & is_inside)
+    keep = keep[_evenly(len(keep), count)]
+    u, v, normal_px, runs_px = u[keep], v[keep], normal_px[keep], runs_px[keep]
+    inner = np.round(pixels[keep]).astype(np.intp)
+    z = depth[inner[:, 1], inner[:, 0]].astype(np.float64)
+    points_in_cam = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
+    points = (points_in_cam - cam_from_model[:3, 3]) @ cam_from_model[:3, :3]
+    outline = np.flatnonzero(samples.kinds & EDGE_CONTOUR)
+    nearest = _nearest_sample(u, v, samples.pixels[outline], width, height, MAX_SHIFT_PX)
+    is_moved = nearest >= 0
+    points[is_moved] = samples.points_in_model[outline[nearest[is_moved]]]
+    return _Contour(
+        points=points,
+        normals=_normals_across_sight(points, normal_px, cam_from_model),
+        runs_mm=runs_px * (z / fx)[:, None],
+        component=rendering.component_ids[inner[:, 1], inner[:, 0]].astype(np.int32),
     )
 
 
+def _normals_across_sight(points: Array, normals_px: Array, cam_from_model: Array) -> Array:
+    """Unit normals (C,3) in the model frame, across the line of sight, that project to normals (C,2) in the picture."""
+    model_from_cam_rotation = cam_from_model[:3, :3].T
+    eye = -model_from_cam_rotation @ cam_from_model[:3, 3]
+    normals_in_cam = np.stack([normals_px[:, 0], normals_px[:, 1], np.zeros(len(normals_px))], axis=1)
+    normals = normals_in_cam @ cam_from_model[:3, :3]
+    sight = points - eye
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    normals -= np.sum(normals * sight, axis=1, keepdims=True) * sight
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals
+
+
 def _evenly(available: int, wanted: int) -> NDArray[np.intp]:
-    """At most ``wanted`` indices spread evenly over ``available``."""
+    """At most ``wanted`` indices, spread evenly over ``available`` ones."""
     if available <= wanted:
         return np.arange(available)
     return np.floor((np.arange(wanted) + 0.5) * available / wanted).astype(np.intp)

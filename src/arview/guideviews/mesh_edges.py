@@ -1,7 +1,7 @@
-"""Edges of a triangle mesh and their visible samples in one view: creases, boundaries and silhouettes.
+"""Edges of a triangle mesh, and samples along those that are visible in one view.
 
-An edge is a crease when its two faces meet at more than a threshold, a silhouette when one of them faces the
-camera and the other does not (Appel 1967; Gooch et al. 1999). Hidden samples are removed with the z-buffer.
+An edge is a crease when its two faces meet at more than a threshold, and a silhouette when one of them faces the
+camera and the other does not (Appel 1967; Gooch et al. 1999). Hidden samples are removed by a depth test.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ EDGE_CONTOUR = 1
 EDGE_CREASE = 2
 """Kind bit: the two faces meet at an angle."""
 EDGE_SILHOUETTE = 4
-"""Kind bit: one face is turned away, or the edge is open."""
+"""Kind bit: one face is turned away from the camera, or the edge is open."""
 EDGE_SHARP = 8
-"""Kind bit: a crease so sharp that it is a design edge, not the facets of a curved surface."""
+"""Kind bit: a crease too sharp to be between two facets of a curved surface: an edge of the design."""
 SHARP_ANGLE_DEG = 50.0
+"""Dihedral angle above which a crease is sharp."""
 
 
 @dataclass(frozen=True)
 class MeshEdges:
-    """Unique edges of a model.
+    """The unique edges of a model; touching components keep edges of their own.
 
     Attributes:
         vertices_in_model: (V,3) mm.
@@ -50,9 +51,9 @@ class MeshEdges:
 
 
 def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
-    """Unique edges of all components; vertices at the same place (to a micrometre) count as one."""
+    """The edges of all components of a model, whose vertices are merged when they are within a micrometre."""
     vertices, faces, component_of_face = model.mesh
-    # Weld only inside a component: components that touch keep their own outlines.
+    # Vertices are merged inside a component only: components that touch keep their own outlines.
     owner = np.zeros(len(vertices), dtype=np.int64)
     owner[faces.ravel()] = np.repeat(component_of_face, 3)
     keys = np.concatenate([np.round(vertices * 1000.0).astype(np.int64), owner[:, None]], axis=1)
@@ -93,7 +94,17 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
 
 @kernel
 def facing(eye, point, normals, first, second):  # type: ignore[no-untyped-def]
-    """How far the two faces at an edge through a point are turned to the eye: > 0 is seen; 0 without a second face."""
+    """How far the two faces at an edge are turned to the eye.
+
+    Args:
+        eye: (3,) the camera's centre.
+        point: (3,) any point of the edge.
+        normals: (F,3) unit normals of the faces.
+        first, second: indices of the two faces; the second is -1 at an open edge.
+
+    Returns:
+        for each face the distance of the eye from its plane, positive on the side of the normal; 0 for no face.
+    """
     front0 = 0.0
     front1 = 0.0
     for k in range(3):
@@ -104,10 +115,35 @@ def facing(eye, point, normals, first, second):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _to_cam(rotation, translation, point):  # type: ignore[no-untyped-def]
+    """Coordinates of a point (3,) in the camera frame."""
+    x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
+    y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
+    z = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
+    return x, y, z
+
+
+@kernel
+def _depth_test(depth, column, row, z, tolerance):  # type: ignore[no-untyped-def]
+    """Compare a depth with the 3×3 pixels around a place: is any of them as deep, is any of them background?"""
+    is_visible = False
+    is_contour = False
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            d = depth[row + dy, column + dx]
+            if d <= 0:
+                is_contour = True
+            elif z - d < tolerance and d - z < tolerance:
+                is_visible = True
+    return is_visible, is_contour
+
+
+@kernel
 def _sample_visible(  # type: ignore[no-untyped-def]
     vertices, ends, faces, is_crease, is_sharp, normals, component, cam_from_model, fx, fy, cx, cy, depth,
     spacing_px, depth_tolerance
 ):  # fmt: skip
+    """The kernel of `sample_visible_edges`; returns the arrays of `EdgeSamples` in their order."""
     height, width = depth.shape
     rotation = cam_from_model[:3, :3]
     translation = cam_from_model[:3, 3]
@@ -132,14 +168,10 @@ def _sample_visible(  # type: ignore[no-untyped-def]
         crease = is_crease[e] and (front0 > 0 or front1 > 0)
         if not (silhouette or crease):
             continue
-        az = rotation[2, 0] * a[0] + rotation[2, 1] * a[1] + rotation[2, 2] * a[2] + translation[2]
-        bz = rotation[2, 0] * b[0] + rotation[2, 1] * b[1] + rotation[2, 2] * b[2] + translation[2]
+        ax, ay, az = _to_cam(rotation, translation, a)
+        bx, by, bz = _to_cam(rotation, translation, b)
         if az < 1.0 or bz < 1.0:
             continue
-        ax = rotation[0, 0] * a[0] + rotation[0, 1] * a[1] + rotation[0, 2] * a[2] + translation[0]
-        ay = rotation[1, 0] * a[0] + rotation[1, 1] * a[1] + rotation[1, 2] * a[2] + translation[1]
-        bx = rotation[0, 0] * b[0] + rotation[0, 1] * b[1] + rotation[0, 2] * b[2] + translation[0]
-        by = rotation[1, 0] * b[0] + rotation[1, 1] * b[1] + rotation[1, 2] * b[2] + translation[1]
         du = fx * (bx / bz - ax / az)
         dv = fy * (by / bz - ay / az)
         length = np.sqrt(du * du + dv * dv)
@@ -154,16 +186,8 @@ def _sample_visible(  # type: ignore[no-untyped-def]
             iu, iv = int(np.round(u)), int(np.round(v))
             if iu < 1 or iv < 1 or iu >= width - 1 or iv >= height - 1:
                 continue
-            visible = False
-            contour = False
-            for dy in range(-1, 2):
-                for dx in range(-1, 2):
-                    d = depth[iv + dy, iu + dx]
-                    if d <= 0:
-                        contour = True
-                    elif z - d < depth_tolerance and d - z < depth_tolerance:
-                        visible = True
-            if not visible:
+            is_visible, is_contour = _depth_test(depth, iu, iv, z, depth_tolerance)
+            if not is_visible:
                 continue
             if found == capacity:
                 capacity *= 2
@@ -184,9 +208,12 @@ def _sample_visible(  # type: ignore[no-untyped-def]
             pixels[found, 0] = u
             pixels[found, 1] = v
             lengths[found] = length
-            kinds[found] = (1 if contour else 0) + (2 if crease else 0) + (4 if silhouette else 0)
-            if crease and is_sharp[e]:
-                kinds[found] += 8
+            kinds[found] = (
+                (EDGE_CONTOUR if is_contour else 0)
+                + (EDGE_CREASE if crease else 0)
+                + (EDGE_SILHOUETTE if silhouette else 0)
+                + (EDGE_SHARP if crease and is_sharp[e] else 0)
+            )
             owners[found] = component[e]
             found += 1
     return points[:found], pixels[:found], tangents[:found], lengths[:found], kinds[:found], owners[:found]
@@ -194,11 +221,11 @@ def _sample_visible(  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class EdgeSamples:
-    """Visible samples along edges in one view.
+    """Visible samples along the edges of a model in one view.
 
     Attributes:
         points_in_model: (N,3) mm, exactly on the mesh edges.
-        pixels: (N,2) where the view's camera sees them.
+        pixels: (N,2) their projections.
         tangents_in_model: (N,3) unit vectors along the edge.
         lengths_px: (N,) length of the whole edge in the picture.
         kinds: (N,) uint8, EDGE_* bits.
@@ -220,14 +247,14 @@ def sample_visible_edges(
     depth_mm: NDArray[np.float32],
     spacing_px: float,
 ) -> EdgeSamples:
-    """Samples about every ``spacing_px`` along the creases and silhouettes that the depth map does not hide.
+    """Samples along the creases and silhouettes that are not hidden in a view.
 
     Args:
-        edges: the model's edges.
-        cam_from_model: (4,4).
+        edges: the edges of the model.
+        cam_from_model: (4,4) pose of the view.
         intrinsics: fx, fy, cx, cy in px of an ideal camera.
         depth_mm: (H,W) depth of the model in this view, 0 for background.
-        spacing_px: distance between samples along an edge.
+        spacing_px: mean distance between samples along an edge, in the picture.
     """
     fx, fy, cx, cy = intrinsics
     seen = depth_mm[depth_mm > 0]

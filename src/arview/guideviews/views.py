@@ -1,10 +1,11 @@
-"""GuideViewSet: guide views of a model over a declared range, rendered, saved and loaded."""
+"""Guide views: renderings of a model from directions all over a range, reduced to features, in a set that is saved."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,27 +24,29 @@ from arview.guideviews.mesh_edges import mesh_edges
 from arview.guideviews.sphere import directions_in_range, view_poses
 from arview.guideviews.store import read_arrays, write_arrays
 from arview.guideviews.surface import Surface, reduced_surface, surface_about
-from arview.rendering.renderers import (
-    PyrenderRenderer,
-    ZBufferRenderer,
-    open_renderer,
-)
+from arview.rendering.renderers import Rendering, open_renderer
 
 FORMAT_VERSION = 2
 _UNIT16 = 32767.0
+"""Components of unit vectors are stored as 16-bit integers, 1 as this."""
+MAX_THREADS = 8
+"""Threads that extract features."""
+MAX_PENDING = 32
+"""Renderings that wait for extraction, where one thread renders."""
 
 
 @dataclass(frozen=True)
 class GuideViewOptions:
-    """How guide views are made; every set remembers its own.
+    """How guide views are made; stored with the set.
 
     Attributes:
-        subdivisions: of the icosahedron; 4 gives 2,562 directions on the full sphere, about 4° apart.
-        margin_deg: views are made this far outside the declared range, for the tracker that follows beyond it.
+        subdivisions: subdivisions of the icosahedron whose vertices are the directions; 4 gives 2,562 directions on the
+            full sphere, about 4° apart.
+        margin_deg: how far outside the declared range views are made, since tracking goes on beyond it.
         resolution_px: side of the square picture of a view; the part fills about 85 % of it.
-        contour_points: kept per view; 200 as in RBGT.
-        edge_points: kept per view.
-        crease_angle_deg: faces that meet at more than this make an edge.
+        contour_points: largest number of contour points of a view; 200 as in RBGT.
+        edge_points: largest number of edge points of a view.
+        crease_angle_deg: dihedral angle above which an edge is a crease.
         renderer: ``auto``, ``pyrender`` or ``zbuffer``.
     """
 
@@ -66,7 +69,7 @@ class GuideViewOptions:
 
 @dataclass(frozen=True)
 class GuideView:
-    """One view: its pose and its features, see `ViewFeatures`."""
+    """One view: its index in the set, its pose and its features."""
 
     index: int
     cam_from_model: Array
@@ -83,9 +86,10 @@ class GuideViewSet:
         camera: ideal camera of the views.
         view_range: the declared range.
         options: how they were made.
-        center_in_model, diameter_mm: of the model's bounding box.
+        center_in_model, diameter_mm: centre and diagonal of the model's bounding box.
         poses: (N,4,4) ``cam_from_model`` of the views.
         directions: (N,3) unit vectors from the centre to the cameras.
+        arrays: the features of all views, packed; see `view`.
     """
 
     model_name: str
@@ -107,7 +111,7 @@ class GuideViewSet:
         return (self.view(index) for index in range(len(self)))
 
     def view(self, index: int) -> GuideView:
-        """The view of that index, decoded anew: all of a full sphere would take 80 MB if they were kept."""
+        """The view at an index, decoded at each call: all decoded views of a full sphere would take 80 MB."""
         arrays = self.arrays
         c0, c1 = arrays["contour_start"][index : index + 2]
         e0, e1 = arrays["edge_start"][index : index + 2]
@@ -125,23 +129,27 @@ class GuideViewSet:
 
     @property
     def surface(self) -> Surface:
-        """The surface of the model, perhaps of fewer faces, about its centre."""
+        """The surface of the model, reduced where it has many faces, about its centre."""
         points, faces, component = (
             np.array(self.arrays[f"surface_{name}"]) for name in ("points", "faces", "component")
         )
         return surface_about(points, faces, component, self.center_in_model)
 
     def nearest(self, cam_from_model: Array) -> GuideView:
-        """The view whose direction is nearest to that of the camera at this pose."""
+        """The view whose direction is nearest to that of the camera at a pose."""
         return self.view(self.nearest_index(cam_from_model))
 
     def nearest_index(self, cam_from_model: Array) -> int:
-        """Index of that view."""
+        """Index of the view whose direction is nearest to that of the camera at a pose."""
         eye = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3]
         return int(np.argmax(self.directions @ (eye - self.center_in_model)))
 
     def save(self, path: Path) -> None:
-        """Write the set to one file, atomically. Raises OutputError."""
+        """Write the set to one file, atomically.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         camera = self.camera
         meta = {
             "format_version": FORMAT_VERSION,
@@ -158,10 +166,10 @@ class GuideViewSet:
 
 
 def load_guide_views(path: Path, model: Model | None = None) -> GuideViewSet:
-    """Load a set; arrays are memory-mapped.
+    """Load a set, whose arrays are memory-mapped.
 
     Raises:
-        InputError: no such file, not a set, damaged, or of another format version.
+        InputError: the file is missing, is not a set, is damaged, or has another format version.
         MismatchError: the set was rendered from another model than the one given.
     """
     meta, arrays = read_arrays(path)
@@ -182,7 +190,7 @@ def load_guide_views(path: Path, model: Model | None = None) -> GuideViewSet:
 
 
 def _from_parts(meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> GuideViewSet:
-    """The set of a file's metadata and arrays."""
+    """A set from the metadata and the arrays of a file."""
     width, height, fx, fy, cx, cy = meta["camera"]
     arrays = dict(arrays)
     return GuideViewSet(
@@ -201,7 +209,11 @@ def _from_parts(meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> GuideV
 
 
 def guide_camera(model: Model, distance_mm: float, resolution_px: int) -> Camera:
-    """Square ideal camera in which the model's bounding sphere fills 85 % at that distance."""
+    """Square ideal camera in which the bounding sphere of a model fills 85 % of the picture at a distance.
+
+    Raises:
+        InputError: the camera would be inside the part.
+    """
     radius_mm = 0.5 * model.diameter_mm
     if distance_mm <= 1.05 * radius_mm:
         raise InputError(
@@ -214,7 +226,7 @@ def guide_camera(model: Model, distance_mm: float, resolution_px: int) -> Camera
 
 
 def view_distance_mm(view_range: ViewRange, model: Model) -> float:
-    """Distance the views are rendered from: harmonic mean of the range, since perspective goes with 1/distance."""
+    """Distance of the views: the harmonic mean of the range, since perspective changes with 1/distance."""
     low, high = view_range.distance_mm
     return max(2.0 / (1.0 / low + 1.0 / high), 0.75 * model.diameter_mm)
 
@@ -225,16 +237,16 @@ def make_guide_views(
     options: GuideViewOptions | None = None,
     progress: StepProgress | None = None,
 ) -> GuideViewSet:
-    """Render and extract the guide views of a model over a range.
+    """Render the guide views of a model over a range, and extract their features.
 
     Args:
-        model: the part, or one component of it.
-        view_range: declared range.
-        options: see GuideViewOptions.
-        progress: called with (views done, views in all).
+        model: of the part, or of one component.
+        view_range: the declared range.
+        options: how they are made; None for the defaults.
+        progress: called with the number of finished views and the number of all.
 
     Raises:
-        MissingDependencyError: pyrender was asked for and GL is not there.
+        MissingDependencyError: the renderer is pyrender, and its GL library is missing.
         InputError: the range puts the camera inside the part.
     """
     options = options or GuideViewOptions()
@@ -247,57 +259,11 @@ def make_guide_views(
     camera = guide_camera(model, distance_mm, options.resolution_px)
     directions = directions_in_range(view_range, options.subdivisions, options.margin_deg)
     poses = view_poses(directions, distance_mm, model.center_in_model)
-    edges = mesh_edges(model, options.crease_angle_deg)
-
-    def extract(rendering_and_pose: tuple[Any, Array]) -> ViewFeatures:
-        rendering, pose = rendering_and_pose
-        return extract_features(rendering, pose, camera, edges, options.contour_points, options.edge_points)
-
-    found: list[ViewFeatures] = []
-    renderer = open_renderer(model, camera, options.renderer)
-    try:
-        with ThreadPoolExecutor(max(1, min(8, os.cpu_count() or 1))) as pool:
-            if isinstance(renderer, PyrenderRenderer):
-                # One GL context, one thread: it renders while the pool extracts what is finished.
-                batch = 32
-                pending: list[Any] = []
-                for index, pose in enumerate(poses):
-                    pending.append(pool.submit(extract, (renderer.render(pose), pose)))
-                    if len(pending) >= batch:
-                        found.append(pending.pop(0).result())
-                        if progress:
-                            progress(index + 1, len(poses))
-                found.extend(future.result() for future in pending)
-            else:
-                assert isinstance(renderer, ZBufferRenderer)
-                for features in pool.map(lambda pose: extract((renderer.render(pose), pose)), poses):
-                    found.append(features)
-                    if progress:
-                        progress(len(found), len(poses))
-    finally:
-        renderer.close()
-    if progress:
-        progress(len(poses), len(poses))
-
-    def starts(counts: list[int]) -> NDArray[np.int64]:
-        return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-
-    surface_points, surface_faces, surface_component = reduced_surface(model)
-    arrays: dict[str, NDArray[Any]] = {
-        "surface_points": surface_points,
-        "surface_faces": surface_faces,
-        "surface_component": surface_component,
-        "contour_start": starts([len(f.contour_points) for f in found]),
-        "contour_points": np.concatenate([f.contour_points for f in found]).astype(np.float32),
-        "contour_normals": np.round(np.concatenate([f.contour_normals for f in found]) * _UNIT16).astype(np.int16),
-        "contour_runs_mm": np.concatenate([f.contour_runs_mm for f in found]).astype(np.float32),
-        "contour_component": np.concatenate([f.contour_component for f in found]).astype(np.int16),
-        "edge_start": starts([len(f.edge_points) for f in found]),
-        "edge_points": np.concatenate([f.edge_points for f in found]).astype(np.float32),
-        "edge_tangents": np.round(np.concatenate([f.edge_tangents for f in found]) * _UNIT16).astype(np.int16),
-        "edge_kinds": np.concatenate([f.edge_kinds for f in found]),
-        "edge_component": np.concatenate([f.edge_component for f in found]).astype(np.int16),
-    }
+    features = []
+    for found in _extracted(model, camera, poses, options):
+        features.append(found)
+        if progress:
+            progress(len(features), len(poses))
     return GuideViewSet(
         model_name=model.name,
         model_hash=model.source_hash,
@@ -309,5 +275,54 @@ def make_guide_views(
         diameter_mm=model.diameter_mm,
         poses=poses,
         directions=directions,
-        arrays=arrays,
+        arrays=_packed(model, features),
     )
+
+
+def _extracted(model: Model, camera: Camera, poses: Array, options: GuideViewOptions) -> Iterator[ViewFeatures]:
+    """Features of the views at some poses (N,4,4), in their order, rendered and extracted by a pool of threads."""
+    edges = mesh_edges(model, options.crease_angle_deg)
+
+    def extract(rendering: Rendering, pose: Array) -> ViewFeatures:
+        return extract_features(rendering, pose, camera, edges, options.contour_points, options.edge_points)
+
+    renderer = open_renderer(model, camera, options.renderer)
+    try:
+        with ThreadPoolExecutor(max(1, min(MAX_THREADS, os.cpu_count() or 1))) as pool:
+            if renderer.is_thread_safe:
+                yield from pool.map(lambda pose: extract(renderer.render(pose), pose), poses)
+                return
+            # One GL context, one thread: it renders while the pool extracts what is rendered.
+            pending: deque[Future[ViewFeatures]] = deque()
+            for pose in poses:
+                pending.append(pool.submit(extract, renderer.render(pose), pose))
+                if len(pending) >= MAX_PENDING:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+    finally:
+        renderer.close()
+
+
+def _packed(model: Model, features: Sequence[ViewFeatures]) -> dict[str, NDArray[Any]]:
+    """The arrays of a set: the features of all views one after the other, directions as 16-bit integers."""
+
+    def starts(counts: list[int]) -> NDArray[np.int64]:
+        return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+    surface_points, surface_faces, surface_component = reduced_surface(model)
+    return {
+        "surface_points": surface_points,
+        "surface_faces": surface_faces,
+        "surface_component": surface_component,
+        "contour_start": starts([len(f.contour_points) for f in features]),
+        "contour_points": np.concatenate([f.contour_points for f in features]).astype(np.float32),
+        "contour_normals": np.round(np.concatenate([f.contour_normals for f in features]) * _UNIT16).astype(np.int16),
+        "contour_runs_mm": np.concatenate([f.contour_runs_mm for f in features]).astype(np.float32),
+        "contour_component": np.concatenate([f.contour_component for f in features]).astype(np.int16),
+        "edge_start": starts([len(f.edge_points) for f in features]),
+        "edge_points": np.concatenate([f.edge_points for f in features]).astype(np.float32),
+        "edge_tangents": np.round(np.concatenate([f.edge_tangents for f in features]) * _UNIT16).astype(np.int16),
+        "edge_kinds": np.concatenate([f.edge_kinds for f in features]),
+        "edge_component": np.concatenate([f.edge_component for f in features]).astype(np.int16),
+    }

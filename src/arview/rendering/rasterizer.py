@@ -1,7 +1,7 @@
-"""A numba z-buffer: depth and face id per pixel of a triangle mesh, no GL needed.
+"""Z-buffer of a triangle mesh in numba: depth and face index of each pixel.
 
-Scanline rasteriser over 1/z, which is linear in the image (perspective-correct interpolation: Blinn, "Hyperbolic
-interpolation", IEEE CG&A 1992). A pixel belongs to a triangle when its centre (integer coordinates, OpenCV) lies
+A scanline rasteriser over 1/z, which is linear in the image (perspective-correct interpolation: Blinn, "Hyperbolic
+interpolation", IEEE CG&A 1992). A pixel belongs to a triangle when its centre (integer coordinates, as in OpenCV) lies
 inside; triangles that cross the near plane are clipped (Sutherland & Hodgman 1974).
 """
 
@@ -16,7 +16,7 @@ from arview.geometry import Array
 
 @kernel(inline=True)
 def _fill(u0, v0, w0, u1, v1, w1, u2, v2, w2, face, x_low, y_low, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
-    """Fill one projected triangle; w is 1/z at the corners; (x_low, y_low) is the origin of the buffers."""
+    """Draw one projected triangle into the buffers; w is 1/z at the corners, (x_low, y_low) the first pixel."""
     height, width = inverse_depth.shape
     area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
     if abs(area) < 1e-12:
@@ -54,7 +54,7 @@ def _fill(u0, v0, w0, u1, v1, w1, u2, v2, w2, face, x_low, y_low, inverse_depth,
 
 @kernel
 def fill_buffers(points, faces, fx, fy, cx, cy, near, x_low, y_low, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
-    """The kernel of `rasterise`: see there; the buffers (H,W), zero and -1 before, become what it returns."""
+    """The kernel of `rasterise`: draws into buffers (H,W) that hold 0 and -1 at first."""
     height, width = inverse_depth.shape
     count = points.shape[0]
     u = np.empty(count)
@@ -136,18 +136,18 @@ def rasterise(
     near_mm: float = 1.0,
     origin: tuple[int, int] = (0, 0),
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Z-buffer of a mesh seen by an ideal pinhole camera.
+    """Z-buffer of a mesh in the view of an ideal pinhole camera.
 
     Args:
         points_in_cam: (V,3) vertices in the camera frame, mm.
         faces: (F,3) vertex indices; both sides are drawn.
         fx, fy, cx, cy: intrinsics in px, pixel centres at integers.
         width, height: size of the buffer, px.
-        near_mm: nearer geometry is clipped.
+        near_mm: depth of the near plane, at which geometry is clipped.
         origin: (u, v) of the buffer's first pixel, to draw a window of a larger image.
 
     Returns:
-        inverse depth (H,W) in 1/mm, 0 where nothing is seen; face index (H,W), -1 where nothing is seen.
+        inverse depth (H,W) in 1/mm, 0 where there is no face; face index (H,W), -1 where there is none.
     """
     inverse_depth = np.zeros((height, width))
     face_ids = np.full((height, width), -1, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Rays against a triangle mesh: a bounding-volume hierarchy built once, cast by numba.
+"""Ray casting on a triangle mesh by a bounding-volume hierarchy.
 
 Binned surface-area heuristic (Wald, "On fast construction of SAH-based bounding volume hierarchies", 2007)
 and the ray-triangle test of Möller & Trumbore (1997). Both sides of a triangle are hit.
@@ -17,12 +17,12 @@ from arview.geometry import Array
 
 
 class Hierarchy(NamedTuple):
-    """The hierarchy as the kernels take it.
+    """A bounding-volume hierarchy, as the kernels take it.
 
     Attributes:
         bounds: (M,6) low xyz, high xyz of every node, mm.
-        links: (M,2) int32; a leaf's first triangle and count, an inner node's left child (right is next) and
-        0.
+        links: (M,2) int32; the first triangle and the count of a leaf; the left child (the right one follows it) and 0
+            of an inner node.
         triangles: (F,9) corner and two edge vectors, in the order of the leaves.
         order: (F,) int32 face index of every triangle.
     """
@@ -33,10 +33,99 @@ class Hierarchy(NamedTuple):
     order: NDArray[np.int32]
 
 
+BINS = 12
+"""Bins of the surface-area heuristic along the split axis."""
+
+
+@kernel
+def _bound_node(low, high, order, first, last, bounds):  # type: ignore[no-untyped-def]
+    """Write the box of some triangles into ``bounds`` (6,).
+
+    Returns:
+        the axis along which their centres are spread most, twice the spread, and twice the smallest centre.
+    """
+    for a in range(3):
+        bounds[a], bounds[3 + a] = 1e300, -1e300
+    axis, spread, origin = 0, -1.0, 0.0
+    for a in range(3):
+        smallest, largest = 1e300, -1e300
+        for k in range(first, last):
+            i = order[k]
+            bounds[a] = min(bounds[a], low[i, a])
+            bounds[3 + a] = max(bounds[3 + a], high[i, a])
+            middle = low[i, a] + high[i, a]
+            smallest = min(smallest, middle)
+            largest = max(largest, middle)
+        if largest - smallest > spread:
+            axis, spread, origin = a, largest - smallest, smallest
+    return axis, spread, origin
+
+
+@kernel
+def _best_plane(low, high, order, first, last, axis, origin, to_bin, box, sizes, cost):  # type: ignore[no-untyped-def]
+    """The last bin left of the plane of least cost; ``box`` (B,6), ``sizes`` (B,) and ``cost`` (B,) are scratch."""
+    bins = box.shape[0]
+    sizes[:] = 0
+    for b in range(bins):
+        for a in range(3):
+            box[b, a], box[b, 3 + a] = 1e300, -1e300
+    for k in range(first, last):
+        i = order[k]
+        b = int((low[i, axis] + high[i, axis] - origin) * to_bin)
+        sizes[b] += 1
+        for a in range(3):
+            box[b, a] = min(box[b, a], low[i, a])
+            box[b, 3 + a] = max(box[b, 3 + a], high[i, a])
+    # Area × count of everything left of each plane, then of everything right of it.
+    grown = np.empty(6)
+    cost[:] = 0.0
+    for side in range(2):
+        total = 0
+        for a in range(3):
+            grown[a], grown[3 + a] = 1e300, -1e300
+        for step in range(bins - 1):
+            b = step if side == 0 else bins - 1 - step
+            total += sizes[b]
+            for a in range(3):
+                grown[a] = min(grown[a], box[b, a])
+                grown[3 + a] = max(grown[3 + a], box[b, 3 + a])
+            dx, dy, dz = grown[3] - grown[0], grown[4] - grown[1], grown[5] - grown[2]
+            if total > 0:
+                cost[b if side == 0 else b - 1] += total * (dx * dy + dy * dz + dz * dx)
+    best = 0
+    for b in range(1, bins - 1):
+        if cost[b] < cost[best]:
+            best = b
+    return best
+
+
+@kernel
+def _partition(low, high, order, first, last, axis, origin, to_bin, plane, swap):  # type: ignore[no-untyped-def]
+    """Move the triangles left of a plane before the others, in stable order; returns the first index of the right."""
+    left, right = first, 0
+    for k in range(first, last):
+        i = order[k]
+        if int((low[i, axis] + high[i, axis] - origin) * to_bin) <= plane:
+            order[left] = i
+            left += 1
+        else:
+            swap[right] = i
+            right += 1
+    order[left:last] = swap[:right]
+    return left
+
+
 @kernel
 def _build(low, high, leaf_size):  # type: ignore[no-untyped-def]
-    """Nodes over boxes (F,3), (F,3): bounds (M,6), links (M,2), order (F,)."""
-    bins = 12
+    """The hierarchy over the boxes of triangles.
+
+    Args:
+        low, high: (F,3) corners of each triangle's box, mm.
+        leaf_size: a node of at most so many triangles is a leaf.
+
+    Returns:
+        bounds (M,6), links (M,2) and order (F,), see `Hierarchy`.
+    """
     count = low.shape[0]
     order = np.arange(count).astype(np.int32)
     swap = np.empty(count, dtype=np.int32)
@@ -45,74 +134,22 @@ def _build(low, high, leaf_size):  # type: ignore[no-untyped-def]
     ranges = np.empty((2 * count, 2), dtype=np.int32)
     ranges[0, 0], ranges[0, 1] = 0, count
     nodes = 1
-    box = np.empty((bins, 6))
-    sizes = np.empty(bins, dtype=np.int64)
-    cost = np.empty(bins)
-    grown = np.empty(6)
+    box = np.empty((BINS, 6))
+    sizes = np.empty(BINS, dtype=np.int64)
+    cost = np.empty(BINS)
     node = 0
     while node < nodes:
         first, last = ranges[node, 0], ranges[node, 1]
-        for a in range(3):
-            bounds[node, a], bounds[node, 3 + a] = 1e300, -1e300
-        axis, spread, origin = 0, -1.0, 0.0
-        for a in range(3):
-            smallest, largest = 1e300, -1e300
-            for k in range(first, last):
-                i = order[k]
-                bounds[node, a] = min(bounds[node, a], low[i, a])
-                bounds[node, 3 + a] = max(bounds[node, 3 + a], high[i, a])
-                middle = low[i, a] + high[i, a]
-                smallest = min(smallest, middle)
-                largest = max(largest, middle)
-            if largest - smallest > spread:
-                axis, spread, origin = a, largest - smallest, smallest
+        axis, spread, origin = _bound_node(low, high, order, first, last, bounds[node])
         if last - first <= leaf_size:
             links[node, 0], links[node, 1] = first, last - first
             node += 1
             continue
         cut = (first + last) // 2
         if spread > 0.0:
-            to_bin = bins * (1.0 - 1e-9) / spread
-            sizes[:] = 0
-            for b in range(bins):
-                for a in range(3):
-                    box[b, a], box[b, 3 + a] = 1e300, -1e300
-            for k in range(first, last):
-                i = order[k]
-                b = int((low[i, axis] + high[i, axis] - origin) * to_bin)
-                sizes[b] += 1
-                for a in range(3):
-                    box[b, a] = min(box[b, a], low[i, a])
-                    box[b, 3 + a] = max(box[b, 3 + a], high[i, a])
-            # Area × count of everything left of each plane, then of everything right of it.
-            cost[:] = 0.0
-            for side in range(2):
-                total = 0
-                for a in range(3):
-                    grown[a], grown[3 + a] = 1e300, -1e300
-                for step in range(bins - 1):
-                    b = step if side == 0 else bins - 1 - step
-                    total += sizes[b]
-                    for a in range(3):
-                        grown[a] = min(grown[a], box[b, a])
-                        grown[3 + a] = max(grown[3 + a], box[b, 3 + a])
-                    dx, dy, dz = grown[3] - grown[0], grown[4] - grown[1], grown[5] - grown[2]
-                    if total > 0:
-                        cost[b if side == 0 else b - 1] += total * (dx * dy + dy * dz + dz * dx)
-            best = 0
-            for b in range(1, bins - 1):
-                if cost[b] < cost[best]:
-                    best = b
-            left, right = first, 0
-            for k in range(first, last):
-                i = order[k]
-                if int((low[i, axis] + high[i, axis] - origin) * to_bin) <= best:
-                    order[left] = i
-                    left += 1
-                else:
-                    swap[right] = i
-                    right += 1
-            order[left:last] = swap[:right]
+            to_bin = BINS * (1.0 - 1e-9) / spread
+            plane = _best_plane(low, high, order, first, last, axis, origin, to_bin, box, sizes, cost)
+            left = _partition(low, high, order, first, last, axis, origin, to_bin, plane, swap)
             if first < left < last:
                 cut = left
         links[node, 0], links[node, 1] = nodes, 0
@@ -125,7 +162,7 @@ def _build(low, high, leaf_size):  # type: ignore[no-untyped-def]
 
 @kernel(inline=True)
 def _enter(bounds, node, ox, oy, oz, ix, iy, iz, limit):  # type: ignore[no-untyped-def]
-    """Distance at which the ray enters a node's box, 1e300 when it misses it or only beyond ``limit``."""
+    """Distance at which a ray enters a node's box; 1e300 when it misses the box or enters beyond ``limit``."""
     a, b = (bounds[node, 0] - ox) * ix, (bounds[node, 3] - ox) * ix
     near, far = min(a, b), max(a, b)
     a, b = (bounds[node, 1] - oy) * iy, (bounds[node, 4] - oy) * iy
@@ -141,9 +178,17 @@ def _enter(bounds, node, ox, oy, oz, ix, iy, iz, limit):  # type: ignore[no-unty
 
 @kernel
 def cast_ray(hierarchy, ox, oy, oz, dx, dy, dz, limit, any_hit):  # type: ignore[no-untyped-def]
-    """Distance (in lengths of the direction) and face of the nearest hit nearer than ``limit``.
+    """The nearest hit of one ray.
 
-    ``limit`` and -1 when there is none. With ``any_hit`` the first hit found ends the search.
+    Args:
+        hierarchy: see `Hierarchy`.
+        ox, oy, oz: origin of the ray, mm.
+        dx, dy, dz: its direction, of any length.
+        limit: hits at or beyond this distance, in lengths of the direction, are ignored.
+        any_hit: return the first hit found instead of the nearest, for tests of visibility.
+
+    Returns:
+        distance in lengths of the direction and face index; ``limit`` and -1 without a hit.
     """
     bounds, links, triangles, order = hierarchy
     ix = 1.0 / (dx if abs(dx) > 1e-30 else 1e-30)
@@ -198,6 +243,7 @@ def cast_ray(hierarchy, ox, oy, oz, dx, dy, dz, limit, any_hit):  # type: ignore
 
 @kernel
 def _cast_rays(hierarchy, origins, directions, distances, faces):  # type: ignore[no-untyped-def]
+    """Write the nearest hit of each ray (N,3) into ``distances`` (N,) and ``faces`` (N,)."""
     for i in range(origins.shape[0]):
         distance, face = cast_ray(
             hierarchy, origins[i, 0], origins[i, 1], origins[i, 2],
@@ -208,10 +254,19 @@ def _cast_rays(hierarchy, origins, directions, distances, faces):  # type: ignor
 
 
 class RayCaster:
-    """Nearest hits of rays on a triangle mesh."""
+    """Casts rays on a triangle mesh, of which it builds the hierarchy once."""
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, leaf_size: int = 4) -> None:
-        """Build the hierarchy over vertices (V,3) and faces (F,3); rays live in the vertices' frame."""
+        """Build the hierarchy.
+
+        Args:
+            vertices: (V,3) mm; rays are given in the same frame.
+            faces: (F,3) vertex indices.
+            leaf_size: largest number of triangles of a leaf.
+
+        Raises:
+            InputError: no faces, or arrays of other shapes.
+        """
         corners = np.asarray(vertices, dtype=np.float64)[np.asarray(faces)]
         if corners.ndim != 3 or corners.shape[1:] != (3, 3) or len(corners) == 0:
             raise InputError(f"ray caster: corners have shape {corners.shape}, expected (F, 3, 3) with F > 0")
@@ -221,7 +276,18 @@ class RayCaster:
         self.hierarchy = Hierarchy(bounds, links, np.ascontiguousarray(triangles[order]), order)
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Array, NDArray[np.int32]]:
-        """Distance (N,) in lengths of the direction (inf = none) and face (N,) (-1 = none) of rays (N,3)."""
+        """The nearest hit of each ray.
+
+        Args:
+            origins: (N,3) mm.
+            directions: (N,3) of any length.
+
+        Returns:
+            distances (N,) in lengths of the direction, inf without a hit; face indices (N,), -1 without a hit.
+
+        Raises:
+            InputError: arrays of other shapes.
+        """
         start = np.ascontiguousarray(origins, dtype=np.float64)
         toward = np.ascontiguousarray(directions, dtype=np.float64)
         if start.shape != toward.shape or start.ndim != 2 or start.shape[1] != 3:

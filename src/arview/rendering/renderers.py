@@ -1,7 +1,7 @@
-"""Offscreen rendering of a Model behind one small interface: depth, component ids, face ids, normals.
+"""Offscreen rendering of a model: depth, component ids and normals.
 
-Two backends draw the same picture, tested against each other to a pixel: `PyrenderRenderer` (OpenGL by EGL) and
-`ZBufferRenderer` (numba, no system library). Depth is the distance along the optical axis in mm, 0 = nothing.
+Two renderers draw the same picture to a pixel: `PyrenderRenderer` (OpenGL by EGL) and `ZBufferRenderer` (numba, no
+system library). Depth is the distance along the optical axis in mm, 0 where there is no part.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from arview.geometry import Array, apply
 from arview.rendering.rasterizer import rasterise
 
 gl_from_cv = np.diag([1.0, -1.0, -1.0, 1.0])
-"""OpenGL's camera frame (+Y up, -Z forward) from OpenCV's (+Y down, +Z forward)."""
+"""(4,4) from OpenCV's camera frame (+Y down, +Z forward) to OpenGL's (+Y up, -Z forward)."""
 
 GL_INSTALL_COMMAND = "apt-get install -y --no-install-recommends libegl1 libgl1"
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """What one camera sees of a model.
+    """A rendered view of a model.
 
     Attributes:
         depth_mm: (H,W) float32, along the optical axis; 0 where there is no part.
@@ -47,14 +47,14 @@ class Rendering:
         return np.where(self.component_ids >= 0, np.uint8(255), np.uint8(0))
 
     def normals_in_cam(self, camera: Camera) -> NDArray[np.float32]:
-        """(H,W,3) unit surface normals facing the camera, from the depth's gradients; 0 off the part."""
+        """(H,W,3) unit surface normals facing the camera, from the gradients of the depth; 0 off the part."""
         v, u = np.mgrid[0 : camera.height, 0 : camera.width]
         z = self.depth_mm.astype(np.float64)
         points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
         same = self.component_ids >= 0
         forward_u, backward_u = np.roll(points, -1, axis=1) - points, points - np.roll(points, 1, axis=1)
         forward_v, backward_v = np.roll(points, -1, axis=0) - points, points - np.roll(points, 1, axis=0)
-        # Of both one-sided differences the one with the smaller jump in depth stays on the surface.
+        # Of the two one-sided differences, the one with the smaller jump in depth stays on the surface.
         du = np.where((np.abs(forward_u[..., 2]) < np.abs(backward_u[..., 2]))[..., None], forward_u, backward_u)
         dv = np.where((np.abs(forward_v[..., 2]) < np.abs(backward_v[..., 2]))[..., None], forward_v, backward_v)
         normals = np.cross(dv, du)
@@ -64,28 +64,36 @@ class Rendering:
 
 
 class Renderer(Protocol):
-    """Draws one model with one ideal (distortion-free) camera."""
+    """Draws one model with one ideal (distortion-free) camera.
+
+    Attributes:
+        camera: of the pictures.
+        is_thread_safe: several threads may call `render` at once.
+    """
 
     camera: Camera
+    is_thread_safe: bool
 
     def render(self, cam_from_model: Array) -> Rendering:
-        """What the camera sees from this pose."""
+        """The view of the model at a pose (4,4)."""
         ...
 
     def close(self) -> None:
-        """Free the context; the renderer is not used afterwards."""
+        """Free the context; the renderer cannot be used afterwards."""
         ...
 
 
 class ZBufferRenderer:
-    """Renderer on the numba z-buffer: needs no system library, thread-safe."""
+    """Renderer on the numba z-buffer, which needs no system library."""
+
+    is_thread_safe = True
 
     def __init__(self, model: Model, camera: Camera) -> None:
         self.camera = camera.without_distortion()
         self._vertices, self._faces, self._component_of_face = model.mesh
 
     def render(self, cam_from_model: Array) -> Rendering:
-        """What the camera sees from this pose."""
+        """The view of the model at a pose (4,4)."""
         camera = self.camera
         inverse_depth, face_ids = rasterise(
             apply(cam_from_model, self._vertices), self._faces,
@@ -105,11 +113,13 @@ class ZBufferRenderer:
 class PyrenderRenderer:
     """Renderer on pyrender and EGL.
 
-    Its SEG pass is used: it draws without multisampling, so that depth and silhouette are not blurred.
+    It uses pyrender's SEG pass, which draws without multisampling, so that depth and silhouette are not blurred.
 
     Raises:
-        MissingDependencyError: no GL library or no working context; the message holds the command that fixes it.
+        MissingDependencyError: no GL library or no working context; the message holds the command that installs it.
     """
+
+    is_thread_safe = False
 
     def __init__(self, model: Model, camera: Camera) -> None:
         self.camera = camera.without_distortion()
@@ -122,7 +132,6 @@ class PyrenderRenderer:
             mesh = trimesh.Trimesh(component.vertices_in_model, component.faces, process=False)
             node = self._scene.add(pyrender.Mesh.from_trimesh(mesh, smooth=False))
             self._seg_node_map[node] = ((index + 1) % 256, (index + 1) // 256, 0)
-        # A margin of two diameters keeps the part inside the clip planes wherever it is in the picture.
         self._camera_type = pyrender.IntrinsicsCamera
         self._flags = pyrender.RenderFlags.SEG | pyrender.RenderFlags.SKIP_CULL_FACES
         self._diameter_mm = model.diameter_mm
@@ -136,9 +145,10 @@ class PyrenderRenderer:
             ) from error
 
     def render(self, cam_from_model: Array) -> Rendering:
-        """What the camera sees from this pose."""
+        """The view of the model at a pose (4,4)."""
         camera = self.camera
         center_z = float(apply(cam_from_model, self._center)[2])
+        # The margin keeps the part inside the clip planes wherever it is in the picture.
         near = max(1.0, center_z - 1.5 * self._diameter_mm)
         far = max(center_z + 1.5 * self._diameter_mm, near + 1.0)
         if self._camera_node is not None:
@@ -158,7 +168,10 @@ class PyrenderRenderer:
 
 
 def _import_pyrender() -> Any:
-    """Import pyrender headless; FACTS: three things must be set before, and absent libraries abort unclearly."""
+    """Import pyrender without a display.
+
+    Libraries are checked before, since pyrender aborts without a clear message where one is missing.
+    """
     for library in ("libEGL.so.1", "libGL.so.1"):
         try:
             ctypes.CDLL(library)
@@ -167,7 +180,7 @@ def _import_pyrender() -> Any:
                 f"the GL library {library} is missing; run: {GL_INSTALL_COMMAND}  (or choose --renderer zbuffer)"
             ) from error
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-    # pyrender reads numpy's old name of infinity, which numpy 2 has dropped.
+    # pyrender uses `np.infty`, which numpy 2 has dropped.
     vars(np).setdefault("infty", float("inf"))
     if "pyrender.viewer" not in sys.modules:
         stub = types.ModuleType("pyrender.viewer")
@@ -181,11 +194,11 @@ def _import_pyrender() -> Any:
 
 
 def open_renderer(model: Model, camera: Camera, backend: str = "auto") -> Renderer:
-    """Renderer by name: ``pyrender``, ``zbuffer``, or ``auto``: the z-buffer, which draws the same and is quicker.
+    """A renderer by name: ``pyrender``, ``zbuffer``, or ``auto``, the z-buffer, which draws the same and is faster.
 
     Raises:
-        InputError: unknown backend.
-        MissingDependencyError: ``pyrender`` was asked for and GL is not there.
+        InputError: unknown name.
+        MissingDependencyError: ``pyrender``, where its GL library is missing.
     """
     if backend in ("auto", "zbuffer"):
         return ZBufferRenderer(model, camera)
