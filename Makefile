@@ -3,13 +3,16 @@
 SHELL := /bin/bash
 READY := .venv/.ready
 SAMPLE := samples/plate
+# A worker for each core; each test file goes to one worker, in the order of tests/conftest.py.
+PARALLEL := -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: help demo test check bench evaluate soak clean
+.PHONY: help demo test test-fast check bench evaluate soak clean
 
 help:
 	@echo "make demo      inspect the sample plate by its photos: report and film in out/demo"
-	@echo "make test      run the tests"
-	@echo "make check     formatting, linting, types, tests"
+	@echo "make test      formatting, linting, types, all tests: ten minutes on two cores"
+	@echo "make test-fast the quick tests of every room: a minute"
+	@echo "make check     formatting, linting, types"
 	@echo "make bench     measure speed: out/bench.json"
 	@echo "make evaluate  measure accuracy on the recorded sequences: out/evaluation.json, out/evaluation.md"
 	@echo "make soak      the live server for ten minutes: does its memory grow, do its frames get old?"
@@ -24,8 +27,11 @@ demo: $(READY)
 	.venv/bin/arview inspect --part $(SAMPLE)/part.toml --photos $(SAMPLE)/photos --video $(SAMPLE)/clip.mp4 \
 	    -o out/demo; code=$$?; [ $$code -eq 1 ] || { echo "demo: exit code $$code, expected 1" >&2; exit 1; }
 
-test: $(READY)
-	.venv/bin/python -m pytest
+test: check
+	.venv/bin/python -m pytest $(PARALLEL)
+
+test-fast: $(READY)
+	.venv/bin/python -m pytest $(PARALLEL) -m "not slow and not browser"
 
 check: $(READY)
 	tools/check

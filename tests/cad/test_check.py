@@ -226,7 +226,7 @@ def test_the_report_is_text(tmp_path):
     assert check.findings[0].text == "views 3 and 7 look alike"
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not here")
+@pytest.mark.shared
 def test_real_parts():
     cube = check_part(load_part(DATA / "sequences" / "cube" / "models" / "assembly.glb"))
     assert "looks the same" in texts(cube, "problem")

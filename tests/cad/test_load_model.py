@@ -437,7 +437,7 @@ def test_importing_the_room_is_light():
 # --- real files ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not here")
+@pytest.mark.shared
 def test_plate_glb_is_in_metres_with_17_named_components():
     model = load_model(DATA / "plate" / "plate.glb")
     assert len(model.components) == 17
@@ -447,7 +447,7 @@ def test_plate_glb_is_in_metres_with_17_named_components():
     assert all(inspect_mesh(component).is_watertight for component in model.components)
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not here")
+@pytest.mark.shared
 @pytest.mark.parametrize("name", ["castle", "cube", "teabox", "dragon"])
 def test_sequence_glb_and_ply_are_the_same_part(name):
     folder = DATA / "sequences" / name / "models"

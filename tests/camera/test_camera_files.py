@@ -167,10 +167,9 @@ def test_bop_files(tmp_path: Path) -> None:
         load_camera(str(write(tmp_path, json.dumps(frames))), 640, 480)
 
 
+@pytest.mark.shared
 def test_bop_camera_of_the_shared_data() -> None:
     path = DATA / "sequences" / "castle" / "camera.json"
-    if not path.exists():
-        pytest.skip(f"{path} is absent")
     assert load_camera(str(path), 640, 480).fx > 300
 
 

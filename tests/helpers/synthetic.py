@@ -17,7 +17,8 @@ from arview.cad.model import Component, Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
 from arview.geometry import Array, apply, exp_se3, exp_so3, look_at, rigid, rotation_angle_rad
-from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
+from arview.guideviews import GuideViewOptions, GuideViewSet
+from arview.guideviews.cache import cached_guide_views
 from arview.rendering.rasterizer import rasterise
 from helpers.cad_files import box
 
@@ -92,8 +93,8 @@ def block() -> Model:
 
 @cache
 def assembly_views() -> GuideViewSet:
-    """Guide views of the assembly over RANGE, about 4° apart."""
-    return make_guide_views(assembly(), RANGE, GuideViewOptions(renderer="zbuffer"))
+    """Guide views of the assembly over RANGE, about 4° apart, from the user's cache: the code's hash keeps it fresh."""
+    return cached_guide_views(assembly(), RANGE, GuideViewOptions(renderer="zbuffer"))
 
 
 def pose_from(

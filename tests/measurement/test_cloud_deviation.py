@@ -289,7 +289,7 @@ def test_full_width_at_half_maximum_of_known_distributions():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not PLATE.is_dir(), reason="needs the plate photo set beside the checkout")
+@pytest.mark.shared
 def test_plate_as_built_with_weld_beads():
     """Points of the surface that was really rendered, weld beads included: only post_1 was displaced."""
     part = load_part(PLATE / "plate.glb")

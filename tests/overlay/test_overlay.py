@@ -448,7 +448,7 @@ def test_labels_avoid_what_they_should_not_cover() -> None:
     assert label.y + label.height <= 20 * CELL_PX or label.y >= 30 * CELL_PX
 
 
-@pytest.mark.skipif(not PLATE.is_dir(), reason="the plate sequence of ../shared/data is not here")
+@pytest.mark.shared
 @pytest.mark.parametrize("index", [0, 150])
 def test_edges_lie_on_the_edges_of_a_real_frame(index: int) -> None:
     scene = trimesh.load(PLATE / "models" / "assembly.glb")

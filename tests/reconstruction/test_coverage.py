@@ -92,7 +92,7 @@ def test_small_in_the_picture_or_outside_is_not_seen() -> None:
         coverage(part(), [])
 
 
-@pytest.mark.skipif(not PLATE.exists(), reason="shared data are absent")
+@pytest.mark.shared
 def test_the_plate_is_well_covered() -> None:
     truth = json.loads((PLATE / "truth.json").read_text())
     k = np.array(truth["K"])

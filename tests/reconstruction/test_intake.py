@@ -409,7 +409,7 @@ def test_odd_size_is_warned_of(tmp_path: Path) -> None:
     assert [found.camera.height for found in intake.lenses] == [600, 500]
 
 
-@pytest.mark.skipif(not PLATE.exists(), reason="shared data are absent")
+@pytest.mark.shared
 def test_the_plate_photos_pass_without_a_word() -> None:
     start = time.process_time()
     intake = intake_photos(PLATE)
@@ -473,7 +473,7 @@ def test_choice_prefers_the_sharpest_in_the_middle_of_each_step() -> None:
     assert choose_frames(travel, sharpness, options) == [12, 37, 61, 88]
 
 
-@pytest.mark.skipif(not SEQUENCES.exists(), reason="shared data are absent")
+@pytest.mark.shared
 def test_frames_of_a_real_sequence(tmp_path: Path) -> None:
     frames = str(SEQUENCES / "castle/test/000001/rgb/*.png")
     intake = intake_video(frames, tmp_path / "frames", camera=None)

@@ -497,7 +497,7 @@ def test_components_decide_between_twins() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not PLATE.exists(), reason="needs the shared plate data")
+@pytest.mark.shared
 def test_plate_scale_within_half_a_thousandth() -> None:
     truth = json.loads((PLATE / "truth.json").read_text())
     matrix, (k1, k2) = np.array(truth["K"]), truth["dist_k1_k2"]

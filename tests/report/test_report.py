@@ -303,6 +303,7 @@ def _decoded(pack: dict[str, Any]) -> Array:
     return np.asarray(whole * np.array(pack["step"]) + pack["low"])
 
 
+@pytest.mark.browser
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="there is no chromium")
 def test_the_view_works_from_a_file(source: Path, part: Part, patched: None, tmp_path: Path) -> None:
     page = tmp_path / "report.html"

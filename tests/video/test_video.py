@@ -256,10 +256,9 @@ def test_exif_orientation_of_pictures(tmp_path: Path) -> None:
     np.testing.assert_allclose(corner_colors(next(iter(source)).image), expected, atol=6)
 
 
+@pytest.mark.shared
 def test_shared_sequence() -> None:
     clip = SHARED / "sequences" / "plate" / "video.mp4"
-    if not clip.exists():
-        pytest.skip(f"{clip} is absent")
     source = open_source(clip, end=5)
     assert [frame.index for frame in source] == list(range(5))
     assert (source.width, source.height) == (640, 480)
