@@ -1,6 +1,7 @@
-"""annotate: source → session → overlay → sink, overlapped by threads with short queues between them.
+"""annotate: track a part through a video, and write the annotated video and the poses.
 
-Decoding runs in the source's thread, tracking in the caller's, drawing in one worker, encoding in the sink's.
+Source, tracking, drawing and encoding overlap in threads with short queues between them: frames are decoded in the
+source's thread, tracked in the caller's, drawn in one worker and encoded in the sink's.
 """
 
 from __future__ import annotations
@@ -24,10 +25,13 @@ from arview.errors import OutputError
 from arview.pose import Pose
 from arview.video import Frame, FrameSource, Image
 
-QUEUED_FRAMES = 3  # between tracking and drawing; 19 MB at 1080p
-MOST_REASONS = 4
+QUEUED_FRAMES = 3
+"""Frames that may wait between tracking and drawing; 19 MB at 1080p."""
+MAX_REASONS = 4
+"""Reasons that `reasons_text` lists; it counts the others."""
+FPS_WINDOW_S = 1.0
+"""The frame rate drawn on the picture is that of the last window."""
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
-FPS_WINDOW_S = 1.0  # the rate on the picture is that of the last second
 
 
 class Session(Protocol):
@@ -47,7 +51,7 @@ class Overlay(Protocol):
 
 
 class Sink(Protocol):
-    """What takes the pictures: `arview.video.VideoSink`."""
+    """What writes the annotated frames: `arview.video.VideoSink`."""
 
     frames_written: int
 
@@ -66,17 +70,17 @@ class Sink(Protocol):
 
 @dataclass(frozen=True)
 class AnnotateSummary:
-    """What a run did.
+    """Counts of one run.
 
     Attributes:
-        frames: processed.
+        frames: frames tracked.
         skipped: broken frames that the source left out.
-        seconds: from the first frame asked for to the finished files.
+        seconds: from the start of the run to the finished files.
         states: frames by tracking state.
-        reasons: frames by state and reason, of the frames that have one.
-        never_seen: components that no frame has shown surely, see `Pose.unverified`; none without a pose.
-        ms: (F,) time of detection and tracking of each frame.
-        ended_reason: why the source ended before its time, or empty.
+        reasons: frames by state and reason, of the frames that have a reason.
+        never_verified: components that no frame has verified, see `Pose.unverified`; empty if no frame has a pose.
+        ms: (F,) time of detection and tracking of each frame, milliseconds.
+        ended_reason: why the source ended early, or empty.
         is_interrupted: stopped by Ctrl-C; the files hold what was done until then.
     """
 
@@ -85,7 +89,7 @@ class AnnotateSummary:
     seconds: float
     states: dict[str, int]
     reasons: dict[str, dict[str, int]]
-    never_seen: tuple[str, ...]
+    never_verified: tuple[str, ...]
     ms: tuple[float, ...]
     ended_reason: str
     is_interrupted: bool
@@ -108,35 +112,30 @@ def annotate(
 ) -> AnnotateSummary:
     """Track the part through a source, and write the annotated video and the poses.
 
-    Ctrl-C ends the run in good order: what was tracked is drawn and both files are finished. Any other
-    exception removes the unfinished files and goes on to the caller. Memory is bounded by the queues.
+    Ctrl-C ends the run in good order: the frames tracked so far are drawn and both files are finished. Any other
+    exception removes the unfinished files and is raised again. Memory is bounded by the queues.
 
     Args:
-        source: frames.
+        source: of the frames.
         session: tracks.
-        overlay: draws; needed with a sink.
-        sink: gets the annotated frames; it is closed (or aborted) here.
-        poses_path: file for one JSON line a frame, see `PoseWriter`.
+        overlay: draws; required with a sink.
+        sink: writes the annotated frames; it is closed (or aborted) here.
+        poses_path: file for one JSON line per frame, see `PoseWriter`.
         progress: called after each frame with (frames done, pose).
-        start_s: time stamp in the source before which frames are passed over.
-        end_s: time stamp at which to stop.
+        start_s: time stamp of the source from which on frames are tracked.
+        end_s: time stamp of the source at which to stop.
 
     Raises:
-        OutputError: a file cannot be written, or no frame was in the wanted range.
+        OutputError: a file cannot be written, or no frame is in the range.
+        ValueError: a sink without an overlay.
     """
     if sink is not None and overlay is None:
         raise ValueError("annotate: a sink needs an overlay")
-    poses: PoseWriter | None = None
-    drawer: _Drawer | None = None
-    states: Counter[str] = Counter()
-    reasons: dict[str, Counter[str]] = {}
-    ms: list[float] = []
-    never_seen: tuple[str, ...] | None = None
-    is_interrupted = False
+    counts = _Counts()
+    outputs = _Outputs(sink)
     began = time.perf_counter()
     try:
-        poses = PoseWriter(poses_path) if poses_path is not None else None
-        drawer = _Drawer(overlay, sink) if sink is not None and overlay is not None else None
+        outputs.open(overlay, poses_path)
         try:
             for frame in source:
                 if start_s is not None and frame.time_s < start_s:
@@ -144,56 +143,108 @@ def annotate(
                 if end_s is not None and frame.time_s >= end_s:
                     break
                 pose = session.process(frame.image, frame.index, frame.time_s)
-                if drawer is not None:
-                    drawer.put(frame, pose)
-                if poses is not None:
-                    poses.write(pose)
-                states[str(pose.state)] += 1
-                if pose.reason:
-                    reasons.setdefault(str(pose.state), Counter())[pose.reason] += 1
-                if pose.cam_from_model is not None:
-                    never_seen = tuple(name for name in pose.unverified if never_seen is None or name in never_seen)
-                ms.append(pose.ms)
+                outputs.write(frame, pose)
+                counts.add(pose)
                 if progress:
-                    progress(len(ms), pose)
+                    progress(len(counts.ms), pose)
         except KeyboardInterrupt:
-            is_interrupted = True
-        if drawer is not None:
-            drawer.finish()
-        if not ms and not is_interrupted:
+            counts.is_interrupted = True
+        outputs.finish_drawing()
+        if not counts.ms and not counts.is_interrupted:
             raise OutputError(f"{source.name}: no frame in the wanted range; nothing is written")
-        if sink is not None:
-            if sink.frames_written:
-                sink.close()
-            else:
-                sink.abort()
-        if poses is not None:
-            poses.close()
+        outputs.close()
     except BaseException:
-        if drawer is not None:
-            drawer.stop()
-        if sink is not None:
-            sink.abort()
-        if poses is not None:
-            poses.abort()
+        outputs.abort()
         raise
-    return AnnotateSummary(
-        frames=len(ms),
-        skipped=source.skipped,
-        seconds=time.perf_counter() - began,
-        states=dict(states),
-        reasons={state: dict(counts) for state, counts in reasons.items()},
-        never_seen=never_seen or (),
-        ms=tuple(ms),
-        ended_reason=source.ended_reason,
-        is_interrupted=is_interrupted,
-    )
+    return counts.summary(source, time.perf_counter() - began)
+
+
+class _Counts:
+    """Counts of the frames tracked so far."""
+
+    def __init__(self) -> None:
+        self.ms: list[float] = []
+        self.is_interrupted = False
+        self._states: Counter[str] = Counter()
+        self._reasons: dict[str, Counter[str]] = {}
+        self._never_verified: tuple[str, ...] | None = None
+
+    def add(self, pose: Pose) -> None:
+        """Count a frame."""
+        self.ms.append(pose.ms)
+        self._states[str(pose.state)] += 1
+        if pose.reason:
+            self._reasons.setdefault(str(pose.state), Counter())[pose.reason] += 1
+        if pose.cam_from_model is not None:
+            before = self._never_verified
+            self._never_verified = tuple(name for name in pose.unverified if before is None or name in before)
+
+    def summary(self, source: FrameSource, seconds: float) -> AnnotateSummary:
+        """Summary of the run."""
+        return AnnotateSummary(
+            frames=len(self.ms),
+            skipped=source.skipped,
+            seconds=seconds,
+            states=dict(self._states),
+            reasons={state: dict(counts) for state, counts in self._reasons.items()},
+            never_verified=self._never_verified or (),
+            ms=tuple(self.ms),
+            ended_reason=source.ended_reason,
+            is_interrupted=self.is_interrupted,
+        )
+
+
+class _Outputs:
+    """The files of one run: the annotated video and the poses, each or none."""
+
+    def __init__(self, sink: Sink | None) -> None:
+        self._sink = sink
+        self._drawer: _Drawer | None = None
+        self._poses: PoseWriter | None = None
+
+    def open(self, overlay: Overlay | None, poses_path: str | Path | None) -> None:
+        """Open the file of the poses and start drawing."""
+        if poses_path is not None:
+            self._poses = PoseWriter(poses_path)
+        if self._sink is not None and overlay is not None:
+            self._drawer = _Drawer(overlay, self._sink)
+
+    def write(self, frame: Frame, pose: Pose) -> None:
+        """Add a frame to both files."""
+        if self._drawer is not None:
+            self._drawer.put(frame, pose)
+        if self._poses is not None:
+            self._poses.write(pose)
+
+    def finish_drawing(self) -> None:
+        """Wait until all frames are drawn."""
+        if self._drawer is not None:
+            self._drawer.finish()
+
+    def close(self) -> None:
+        """Finish both files; a video without a frame is removed."""
+        if self._sink is not None:
+            if self._sink.frames_written:
+                self._sink.close()
+            else:
+                self._sink.abort()
+        if self._poses is not None:
+            self._poses.close()
+
+    def abort(self) -> None:
+        """Remove both files."""
+        if self._drawer is not None:
+            self._drawer.stop()
+        if self._sink is not None:
+            self._sink.abort()
+        if self._poses is not None:
+            self._poses.abort()
 
 
 def reasons_text(reasons: dict[str, int]) -> str:
-    """The commonest reasons with their frames, e.g. ``too dark (80), only 8 to 12 % of the outline found (40)``.
+    """The most frequent reasons and their frames, e.g. ``too dark (80), only 8 to 12 % of the outline found (40)``.
 
-    Reasons that differ only in their numbers are one, with the span of those numbers.
+    Reasons that differ only in their numbers are counted together, with the range of those numbers.
     """
     counts: Counter[str] = Counter()
     numbers: dict[str, list[list[str]]] = {}
@@ -202,12 +253,12 @@ def reasons_text(reasons: dict[str, int]) -> str:
         counts[kind] += count
         numbers.setdefault(kind, []).append(_NUMBER.findall(reason))
     texts = []
-    for kind, count in counts.most_common(MOST_REASONS):
+    for kind, count in counts.most_common(MAX_REASONS):
         for column in zip(*numbers[kind], strict=True):
             low, high = min(column, key=float), max(column, key=float)
             kind = kind.replace("\0", low if low == high else f"{low} to {high}", 1)
         texts.append(f"{kind} ({count})")
-    others = counts.total() - sum(count for _, count in counts.most_common(MOST_REASONS))
+    others = counts.total() - sum(count for _, count in counts.most_common(MAX_REASONS))
     return ", ".join([*texts, f"other ({others})"] if others else texts)
 
 
@@ -223,20 +274,20 @@ class _Drawer:
         self._thread.start()
 
     def put(self, frame: Frame, pose: Pose) -> None:
-        """Queue a frame; raises what drawing or writing an earlier one raised."""
+        """Queue a frame; raises the exception of an earlier one, if drawing or writing it failed."""
         if self._error is not None:
             raise self._error
         self._waiting.put((frame, pose))
 
     def finish(self) -> None:
-        """Wait until all queued frames are written; raises what drawing or writing raised."""
+        """Wait until all queued frames are written; raises the exception of one that failed."""
         self._waiting.put(None)
         self._thread.join()
         if self._error is not None:
             raise self._error
 
     def stop(self) -> None:
-        """Throw away what is queued and end the thread."""
+        """Discard the queued frames and end the thread."""
         self._is_stopped = True
         if self._thread.is_alive():
             self._waiting.put(None)
@@ -245,7 +296,7 @@ class _Drawer:
     def _run(self) -> None:
         rate = _Rate()
         for frame, pose in iter(self._waiting.get, None):
-            # After an error the queue is emptied, so that nobody waits for a place in it.
+            # After an error the queue is still emptied, so that no caller waits for room in it.
             if self._error is not None or self._is_stopped:
                 continue
             try:
@@ -255,7 +306,7 @@ class _Drawer:
 
 
 class _Rate:
-    """Frames per second over the last window, renewed once a window so that the figure can be read."""
+    """Frames per second over the last window, updated once per window so that the number can be read."""
 
     def __init__(self) -> None:
         self._since_s = time.perf_counter()
@@ -263,7 +314,7 @@ class _Rate:
         self._fps: float | None = None
 
     def tick(self) -> float | None:
-        """Count a frame; the rate, or None in the first window."""
+        """Count a frame; returns the rate, or None in the first window."""
         self._count += 1
         passed_s = time.perf_counter() - self._since_s
         if passed_s >= FPS_WINDOW_S:
@@ -276,8 +327,9 @@ class PoseWriter:
     """Writes poses as JSON lines under a temporary name; `close` gives the file its name.
 
     A line holds ``index``, ``time_s``, ``state``, ``quality``, ``cam_from_model`` (4×4 row-major, mm, or
-    null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches`` (list),
-    ``unverified`` (components not seen yet) and ``alternatives`` (list of 4×4 poses that fit as well).
+    null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches``
+    (list), ``unverified`` (names of components not yet confirmed) and ``alternatives`` (list of 4×4 poses that fit as
+    well).
 
     Raises:
         OutputError: the file cannot be written.
@@ -320,7 +372,7 @@ class PoseWriter:
 
 
 def pose_line(pose: Pose) -> str:
-    """One line of ``poses.jsonl``; a covariance that is not finite becomes null."""
+    """A pose as a line of ``poses.jsonl``, see `PoseWriter`; a covariance that is not finite becomes null."""
     covariance = pose.covariance
     is_known = covariance is not None and bool(np.all(np.isfinite(covariance)))
     return json.dumps(

@@ -88,7 +88,7 @@ def test_video_and_poses_hold_every_frame_in_order(tmp_path: Path) -> None:
     assert (
         lines[4]["unverified"] == ["post", "nut"] and lines[5]["unverified"] == ["nut"] and lines[3]["unverified"] == []
     )
-    assert summary.never_seen == ("nut",)
+    assert summary.never_verified == ("nut",)
     assert lines[5]["cam_from_model"][0] == [1.0, 0.0, 0.0, 5.0] and lines[5]["time_s"] == 0.5
     assert lines[3]["cam_from_model"] is None and lines[3]["state"] == "lost"
     with open_source(tmp_path / "out.mp4") as video:

@@ -266,8 +266,8 @@ def _print_summary(summary: AnnotateSummary, written: list[Path]) -> None:
     )
     for state, reasons in sorted(summary.reasons.items()):
         click.echo(f"{state} {sum(reasons.values())} frames: {reasons_text(reasons)}")
-    if summary.never_seen:
-        click.echo(f"not verified in any frame: {', '.join(summary.never_seen)}")
+    if summary.never_verified:
+        click.echo(f"not verified in any frame: {', '.join(summary.never_verified)}")
 
 
 def _default_output(source: str) -> str:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
+from arview.annotation import Session
 from arview.camera import Camera
 from arview.core.progress import StepProgress
 from arview.errors import InputError
@@ -21,7 +22,6 @@ from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose, TrackingState
 from arview.tracking import SessionOptions, TrackingSession
 from arview.tracking.guide_pose import GUIDE_PREFIX, guide_pose
-from arview.video import Image
 
 COARSE = (50.0, 5.0)
 """5 cm / 5°: beyond it a pose is wrong."""
@@ -31,14 +31,6 @@ IN_VIEW = 0.5
 """Frames that show at least this share of the part are judged; with less, losing it is no fault."""
 OUT_OF_VIEW = 0.02
 """With less than this share in view, whoever says `tracked` is wrong."""
-
-
-class Session(Protocol):
-    """What tracks: `arview.tracking.TrackingSession`."""
-
-    def process(self, image: Image, index: int, time_s: float) -> Pose:
-        """Pose of the next frame."""
-        ...
 
 
 @dataclass(frozen=True)
