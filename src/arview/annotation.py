@@ -132,7 +132,7 @@ def annotate(
     if sink is not None and overlay is None:
         raise ValueError("annotate: a sink needs an overlay")
     counts = _Counts()
-    outputs = _Outputs(sink)
+    outputs = _OutputFiles(sink)
     began = time.perf_counter()
     try:
         outputs.open(overlay, poses_path)
@@ -194,7 +194,7 @@ class _Counts:
         )
 
 
-class _Outputs:
+class _OutputFiles:
     """The files of one run: the annotated video and the poses, each or none."""
 
     def __init__(self, sink: Sink | None) -> None:
