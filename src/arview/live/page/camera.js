@@ -1,23 +1,23 @@
-// The phone's camera: its pictures as they come, and its troubles in words.
+// The camera of the phone: its frames as they arrive, and messages about its failures.
 
-const WORDS = {
+const MESSAGES = {
   NotAllowedError: "The browser may not use the camera. Allow it for this page (at the lock beside the address), then try again.",
   SecurityError: "The browser may not use the camera. Allow it for this page (at the lock beside the address), then try again.",
   NotFoundError: "This device has no camera that the browser can use.",
   NotReadableError: "The camera is in use by another app. Close that app, then try again.",
   AbortError: "The camera did not start. Try again.",
-  OverconstrainedError: "The camera cannot give such pictures.",
+  OverconstrainedError: "The camera does not support this picture size or frame rate.",
 };
-const INSECURE = "Browsers give the camera to secure pages only. Open the https address that the station shows, and trust it once.";
+const INSECURE = "Browsers allow the camera on secure pages only. Open the https address that the station shows and trust it once.";
 
 export class Camera {
   #stream = null;
   #stopWatching = () => {};
 
   /**
-   * @param video element that plays the camera.
-   * @param onFrame called with (video, moment in ms) for every picture.
-   * @param onTrouble called with words, or with "" when all is well.
+   * @param video element that plays the camera stream.
+   * @param onFrame called with (video, time in ms) for every frame.
+   * @param onTrouble called with a message, or with "" when the camera works.
    */
   constructor(video, onFrame, onTrouble) {
     Object.assign(this, { video, onFrame, onTrouble });
@@ -27,11 +27,11 @@ export class Camera {
     return this.#stream !== null;
   }
 
-  /** Switch the back camera on, or another one; true when it gives pictures. */
+  /** Start the rear camera, or another one; returns whether it delivers pictures. */
   async start({ width, height, fps }) {
     this.stop();
     if (!navigator.mediaDevices?.getUserMedia) {
-      this.onTrouble(window.isSecureContext ? WORDS.NotFoundError : INSECURE);
+      this.onTrouble(window.isSecureContext ? MESSAGES.NotFoundError : INSECURE);
       return false;
     }
     try {
@@ -41,12 +41,12 @@ export class Camera {
       };
       this.#stream = await navigator.mediaDevices.getUserMedia({ audio: false, video });
     } catch (error) {
-      this.onTrouble(WORDS[error.name] ?? `The camera did not start: ${error.message}`);
+      this.onTrouble(MESSAGES[error.name] ?? `The camera did not start: ${error.message}`);
       return false;
     }
     const [track] = this.#stream.getVideoTracks();
-    track.addEventListener("ended", () => this.#lose("The camera was taken away. Try again."));
-    track.addEventListener("mute", () => this.onTrouble("The camera is paused by this device."));
+    track.addEventListener("ended", () => this.#lose("The camera was disconnected. Try again."));
+    track.addEventListener("mute", () => this.onTrouble("This device has paused the camera."));
     track.addEventListener("unmute", () => this.onTrouble(""));
     this.video.srcObject = this.#stream;
     await this.video.play().catch(() => {});
@@ -62,13 +62,13 @@ export class Camera {
     this.video.srcObject = null;
   }
 
-  #lose(words) {
+  #lose(message) {
     this.stop();
-    this.onTrouble(words);
+    this.onTrouble(message);
   }
 }
 
-/** Call a function for every new picture of a video, with the moment it was taken or came, in ms; returns how to end it. */
+/** Call a function for every new frame of a video with its time of capture or arrival, ms; returns a function that stops. */
 export function watchFrames(video, onFrame) {
   let isOn = true;
   if (video.requestVideoFrameCallback) {
@@ -80,12 +80,12 @@ export function watchFrames(video, onFrame) {
     };
     video.requestVideoFrameCallback(next);
   } else {
-    let before = -1;
+    let previous = -1;
     const next = (now) => {
       if (!isOn) return;
       requestAnimationFrame(next);
-      if (video.readyState < 2 || video.currentTime === before) return;
-      before = video.currentTime;
+      if (video.readyState < 2 || video.currentTime === previous) return;
+      previous = video.currentTime;
       onFrame(now);
     };
     requestAnimationFrame(next);
@@ -93,9 +93,9 @@ export function watchFrames(video, onFrame) {
   return () => { isOn = false; };
 }
 
-/** Quarter turns clockwise by which the browser has turned the sensor's picture to show it upright. */
+/** Quarter turns clockwise by which the browser rotated the picture of the sensor to show it upright. */
 export function quarterTurns(orientation = screen.orientation) {
-  // Older iPhones say the angle elsewhere, and not the shape.
+  // Older iPhones report the angle in window.orientation and do not report the type.
   if (!orientation) return "orientation" in window ? (1 - window.orientation / 90 + 8) % 4 : 0;
   const isUpright = orientation.type.startsWith("portrait"), isPhone = isUpright === (orientation.angle % 180 === 0);
   return ((isPhone ? 1 : 0) - orientation.angle / 90 + 8) % 4;

@@ -1,5 +1,5 @@
-// What this machine draws with. Without a graphics card (virtual machines, old terminals) WebGL and canvases are drawn
-// by the processor: then fewer samples are taken, and canvases stay in main memory instead of passing through WebGL.
+// Settings for the renderer of this machine. Without a GPU (virtual machines, old terminals) WebGL and canvases are
+// drawn by the processor: then antialiasing is switched off, and canvases stay in main memory.
 
 function rendererName() {
   const context = document.createElement("canvas").getContext("webgl2");
@@ -10,10 +10,10 @@ function rendererName() {
   return name;
 }
 
-const isByProcessor = /swiftshader|llvmpipe|softpipe|software|basic render/i.test(rendererName());
+const isSoftware = /swiftshader|llvmpipe|softpipe|software|basic render/i.test(rendererName());
 
-/** Of getContext("2d") for pictures. */
-export const CANVAS_OPTIONS = { alpha: false, willReadFrequently: isByProcessor };
+/** Options of getContext("2d") for pictures. */
+export const CANVAS_OPTIONS = { alpha: false, willReadFrequently: isSoftware };
 
-/** Of antialiasing; lines are smooth without. */
-export const SAMPLES = isByProcessor ? 0 : 4;
+/** Samples of antialiasing; lines are smooth without it. */
+export const SAMPLES = isSoftware ? 0 : 4;

@@ -1,4 +1,4 @@
-// Shapes that say what a colour says too. Each verdict and state has its own outline.
+// Icons. Each verdict and state has its own outline, so that colour is not the only cue.
 
 const PATHS = {
   pass: '<circle cx="12" cy="12" r="10"/><path class="ink" d="M7 12.5l3.4 3.4L17 9"/>',
@@ -28,7 +28,7 @@ const PATHS = {
   back: '<path d="M15 4l-8 8 8 8" fill="none" stroke="currentColor" stroke-width="2.8"/>',
 };
 
-/** An icon as an SVG element that assistive technology passes over. */
+/** An icon as an SVG element that is hidden from assistive technology. */
 export function icon(name) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
   svg.setAttribute("viewBox", "0 0 24 24");

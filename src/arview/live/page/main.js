@@ -1,4 +1,4 @@
-// The page: camera, connection, picture and controls put together.
+// The page: connects camera, connection, picture and controls.
 
 import { Camera, quarterTurns } from "./camera.js";
 import { Connection } from "./transport/connection.js";
@@ -67,7 +67,7 @@ const connection = new Connection(find("remote"), {
   onOpen() {
     player.mode = connection.mode;
     sendStyle();
-    if (connection.hasFallenBack) toast.say("This network blocks WebRTC: pictures go one by one");
+    if (connection.hasFallenBack) toast.show("This network blocks WebRTC: pictures are sent one by one");
   },
   onPose(pose) {
     player.takePose(pose, performance.now());
@@ -121,11 +121,11 @@ function draw() {
   refreshState(shown);
 }
 
-/** Take down when a picture was shown, and tell whoever listens. */
+/** Note when a picture was shown, and dispatch an event for listeners. */
 function note({ frame, pose, guide, isAnnotated }, isSame) {
   const nowMs = performance.now();
   if (frame && !isSame) {
-    // A station's picture was on its way before this page had it.
+    // A station's picture was in transit before it arrived at this page.
     const before = player.isPhone ? 0 : (pose?.server_ms ?? 0) + (connection.link?.rttMs ?? 0) / 2;
     state.latencies.push({ atMs: nowMs, ms: nowMs - frame.takenMs + before });
     drawn = { frame, order: frame.order, pose, guide, takenMs: frame.takenMs - before };
@@ -134,68 +134,68 @@ function note({ frame, pose, guide, isAnnotated }, isSame) {
   document.dispatchEvent(new CustomEvent("arview:drawn", { detail }));
 }
 
-// --- words and figures ------------------------------------------------------------------------------
+// --- status and figures ------------------------------------------------------------------------------
 
 function refreshState(shown = player?.shown) {
   const { phase, trouble, status, part } = state;
   const nowMs = performance.now();
   if (player?.isFrozen) {
     const ago = Math.round((Date.now() - player.frozenAt) / 1000);
-    return bar.say("frozen", `picture of ${ago < 2 ? "this moment" : `${ago} s ago`}; press Resume to go on`);
+    return bar.show("frozen", `picture taken ${ago < 2 ? "just now" : `${ago} s ago`}; press Resume to continue`);
   }
-  if (phase.name !== "connected") return bar.say(phase.name, sayWhen(phase));
-  if (part?.source === "phone" && trouble) return bar.say("trouble", trouble);
+  if (phase.name !== "connected") return bar.show(phase.name, retryText(phase));
+  if (part?.source === "phone" && trouble) return bar.show("trouble", trouble);
   if (!player.isAnswered(nowMs)) {
-    const words = status?.feed?.text || (camera.isOn || part?.source !== "phone" ? "for an answer of the station" : "for the camera");
-    return bar.say("waiting", words);
+    const words = status?.feed?.text || (camera.isOn || part?.source !== "phone" ? "for a response of the station" : "for the camera");
+    return bar.show("waiting", words);
   }
   const answer = shown?.pose ?? player.answer;
   if (answer.guide_cam_from_model && !answer.cam_from_model) {
-    return bar.say("align", "bring the part into the yellow outline");
+    return bar.show("align", "align the part with the yellow outline");
   }
-  const otherwise = {
-    critical: "the position is not sure",
+  const defaults = {
+    critical: "the pose is uncertain",
     searching: "for the part in the picture",
-    lost: "the part is not seen any more",
+    lost: "the part is no longer found",
   }[answer.state];
-  const why = answer.remark || otherwise;
-  bar.say(answer.state, [...(why ? [why] : []), ...answer.mismatches].join("; "));
+  const reason = answer.remark || defaults;
+  bar.show(answer.state, [...(reason ? [reason] : []), ...answer.mismatches].join("; "));
 }
 
-const sayWhen = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);
+const retryText = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);
 
 function refresh() {
   if (player) refreshState();
-  else bar.say(state.phase.name, sayWhen(state.phase));
+  else bar.show(state.phase.name, retryText(state.phase));
   const { phase, trouble, part, status } = state;
-  const said = [...(status?.notices ?? [])];
-  if (status?.feed && ["reconnecting", "frozen"].includes(status.feed.state) && !said.some((one) => one.code.startsWith("source_"))) {
-    said.push({ level: "error", text: status.feed.text });
+  const shown = [...(status?.notices ?? [])];
+  if (status?.feed && ["reconnecting", "frozen"].includes(status.feed.state) && !shown.some((one) => one.code.startsWith("source_"))) {
+    shown.push({ level: "error", text: status.feed.text });
   }
-  if (part?.inspection?.note) said.push({ level: "warning", text: part.inspection.note });
-  if (!stage.hasGhost) said.push({ level: "warning", text: "this browser has no WebGL 2: the station draws the overlay" });
-  notices.show(said.filter((one) => one.level !== "info"));
+  if (part?.inspection?.note) shown.push({ level: "warning", text: part.inspection.note });
+  if (!stage.hasGhost) shown.push({ level: "warning", text: "this browser has no WebGL 2: the station draws the overlay" });
+  notices.show(shown.filter((one) => one.level !== "info"));
   message.show(blocking(phase, trouble, part));
   const { recording } = status ?? {};
   setPressed("record", Boolean(recording?.is_on), recording?.is_on ? "stop" : "record", recording?.is_on ? clock(recording.seconds) : "Record");
   const link = connection.link;
   find("link-state").textContent = link
     ? [`Connected by ${link.kind === "jpeg" ? "JPEG over HTTP" : "WebRTC"}, ${player.mode === "video" ? "annotated video" : "poses"}`,
-      status?.feed ? `${status.feed.tracked_fps.toFixed(0)} of ${status.feed.received_fps.toFixed(0)} pictures a second tracked` : "",
+      status?.feed ? `${status.feed.tracked_fps.toFixed(0)} of ${status.feed.received_fps.toFixed(0)} pictures per second tracked` : "",
       link.rttMs === null ? "" : `network ${link.rttMs.toFixed(0)} ms`].filter(Boolean).join("; ")
     : "Not connected";
 }
 
-/** What has to be dealt with before anything can be seen. */
+/** The message about what has to be resolved before the page can show anything, or null. */
 function blocking(phase, trouble, part) {
   if (phase.name === "busy") {
-    return { sign: "busy", title: "Busy", text: `${phase.text}. This page goes on as soon as there is room.`, button: "Try now", onPress: () => connection.hurry() };
+    return { sign: "busy", title: "Busy", text: `${phase.text}. This page continues as soon as there is room.`, button: "Try now", onPress: () => connection.retryNow() };
   }
   if (phase.name === "denied") {
-    return { sign: "offline", title: "This link is not valid any more", text: `${phase.text}.`, button: "Try again", onPress: () => location.reload() };
+    return { sign: "offline", title: "This link is no longer valid", text: `${phase.text}.`, button: "Try again", onPress: () => location.reload() };
   }
   if (phase.name === "retrying") {
-    return { sign: "offline", title: "Connection lost, retrying", text: `${phase.text}.`, button: "Try now", onPress: () => connection.hurry() };
+    return { sign: "offline", title: "Connection lost, retrying", text: `${phase.text}.`, button: "Try now", onPress: () => connection.retryNow() };
   }
   if (phase.name === "loading" && phase.text) return { sign: "busy", title: "Loading", text: phase.text, button: "" };
   if (part?.source === "phone" && trouble) {
@@ -214,7 +214,7 @@ setInterval(() => {
     latencyMs: sorted.length ? sorted[sorted.length >> 1] : null,
     ageMs: drawn.frame ? nowMs - drawn.takenMs : null,
   });
-  requestDraw(); // an answer that stays away makes the ghost go
+  requestDraw(); // removes the overlay when no poses arrive
   refresh();
 }, FIGURES_EVERY_MS);
 
@@ -235,7 +235,7 @@ function changeStyle() {
   styleTimer = setTimeout(sendStyle, STYLE_DELAY_MS);
 }
 
-/** Have the server draw the same way: for annotated video, snapshots and recordings. */
+/** Make the server draw in the same style: for annotated video, snapshots and recordings. */
 async function sendStyle() {
   if (connection.link) await connection.ask({ style });
 }
@@ -263,7 +263,7 @@ function freeze() {
 
 async function snapshot() {
   const { link } = connection, frame = player?.shown?.frame;
-  if (!link || !frame) return toast.say("There is no picture to keep yet");
+  if (!link || !frame) return toast.show("There is no picture yet");
   try {
     clearTimeout(styleTimer);
     await connection.ask({ hold: frame.id, style });
@@ -273,9 +273,9 @@ async function snapshot() {
     const moment = new Date().toISOString().slice(0, 19).replaceAll(":", "");
     const file = [name, state.part.inspection?.serial || serial, moment].filter(Boolean).join("_").replace(/[^\w.-]+/g, "-");
     save(await answer.blob(), `${file}.png`);
-    toast.say("Snapshot saved, with its numbers inside");
+    toast.show("Snapshot saved, with its measurements inside");
   } catch (error) {
-    toast.say(`No snapshot: ${error.message}`);
+    toast.show(`No snapshot: ${error.message}`);
   } finally {
     if (!player.isFrozen) connection.ask({ hold: null });
   }
@@ -293,11 +293,11 @@ async function record() {
   const isOn = state.status?.recording.is_on;
   if (!isOn) state.isRecording = true;
   const refusal = await connection.ask({ record: !isOn });
-  if (refusal) toast.say(`No recording: ${refusal}`);
+  if (refusal) toast.show(`No recording: ${refusal}`);
 }
 
 function offerRecording(number) {
-  toast.say("Recording finished", { href: `/api/recordings/${number}`, text: "Save it", download: "" });
+  toast.show("Recording finished", { href: `/api/recordings/${number}`, text: "Save it", download: "" });
 }
 
 /** Open a section of the side sheet, or close it. */
@@ -324,7 +324,7 @@ find("opacity").addEventListener("input", (event) => {
   changeStyle();
 });
 find("search-again").addEventListener("click", async () => {
-  toast.say((await connection.ask({ reset: true })) || "Searching for the part anew");
+  toast.show((await connection.ask({ reset: true })) || "Searching for the part again");
 });
 find("transports").addEventListener("change", (event) => {
   connection.choose(event.target.value);
@@ -352,7 +352,7 @@ document.addEventListener("keydown", (event) => {
   act();
 });
 
-// --- beginning and end ------------------------------------------------------------------------------
+// --- start and end ------------------------------------------------------------------------------
 
 new ResizeObserver(() => {
   document.documentElement.style.setProperty("--bar", `${find("bar").offsetHeight}px`);

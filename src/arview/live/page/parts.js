@@ -1,11 +1,11 @@
-// The list of components with their verdicts, and the card of the one that is looked at alone.
+// The list of components with their verdicts, and the card of the isolated component.
 
 import { icon, make } from "./icons.js";
 
 const ORDER = ["fail", "undecided", "not_measured", "pass"];
-const WORDS = { fail: "FAIL", undecided: "UNDECIDED", not_measured: "NOT MEASURED", pass: "PASS" };
+const VERDICT_TEXTS = { fail: "FAIL", undecided: "UNDECIDED", not_measured: "NOT MEASURED", pass: "PASS" };
 
-/** "3 h ago" of seconds, in the largest unit that gives more than one. */
+/** An age as text, such as "3 h ago", in the largest unit of which there are at least two. */
 export function ageText(seconds) {
   if (seconds < -60) return "in the future";
   for (const [unit, length] of [["d", 86400], ["h", 3600]]) {
@@ -27,19 +27,19 @@ export class Parts {
 
   /** Show a part document. */
   setPart({ part, components, inspection }) {
-    const place = (one) => one.rank ?? Infinity;
-    this.components = [...components].sort((a, b) => place(a) - place(b));
+    const rank = (one) => one.rank ?? Infinity;
+    this.components = [...components].sort((a, b) => rank(a) - rank(b));
     this.inspected = this.components.filter((one) => one.rank !== null);
     const serial = inspection?.serial || part.serial;
     this.name.replaceChildren(make("b", "", [part.name]), serial ? ` ${serial}` : "");
-    const about = inspection ? `Inspected ${ageText(inspection.age_s)}${inspection.method ? `, ${inspection.method}` : ""}` : "Not inspected yet";
-    this.provenance.replaceChildren(about);
+    const provenance = inspection ? `Inspected ${ageText(inspection.age_s)}${inspection.method ? `, ${inspection.method}` : ""}` : "Not inspected yet";
+    this.provenance.replaceChildren(provenance);
     this.tally.replaceChildren(...tally(components));
     this.list.replaceChildren(...this.components.map((one) => this.#row(one)));
     this.show(components.some((one) => one.name === this.only) ? this.only : null);
   }
 
-  /** Mark the component that is looked at alone and show its card. */
+  /** Mark the isolated component and show its card; null for none. */
   show(name) {
     this.only = name;
     for (const row of this.list.querySelectorAll("button")) {
@@ -51,7 +51,7 @@ export class Parts {
     this.card.className = component?.verdict ?? "none";
   }
 
-  /** Name of the next inspected component, or the one before. */
+  /** Name of the inspected component after (step 1) or before (step -1) the isolated one. */
   neighbour(step) {
     const list = this.inspected.length ? this.inspected : this.components;
     const at = list.findIndex((one) => one.name === this.only);
@@ -101,7 +101,7 @@ export class Parts {
   }
 }
 
-/** Distance with U against the tolerance, to scale. */
+/** A bar that shows the distance and its U against the tolerance, to scale. */
 function gauge({ distance_mm: d, uncertainty_mm: u, tolerance_mm: tolerance }) {
   if (tolerance === null) return [];
   const end = Math.max(1.5 * tolerance, 1.1 * (d + (u ?? 0))), share = (value) => `${(100 * Math.min(1, Math.max(0, value / end))).toFixed(2)}%`;
@@ -117,10 +117,10 @@ function gauge({ distance_mm: d, uncertainty_mm: u, tolerance_mm: tolerance }) {
   return [bar];
 }
 
-/** How many components have which verdict, the gravest first. */
+/** Number of components by verdict, the most severe first. */
 export function tally(components) {
   return ORDER.flatMap((verdict) => {
     const count = components.filter((one) => one.verdict === verdict).length;
-    return count ? [make("span", `count ${verdict}`, [icon(verdict), `${count} ${WORDS[verdict]}`])] : [];
+    return count ? [make("span", `count ${verdict}`, [icon(verdict), `${count} ${VERDICT_TEXTS[verdict]}`])] : [];
   });
 }

@@ -1,28 +1,28 @@
-// Which picture to show with which pose: a ghost only ever lies on the very frame that its pose was found in.
+// Pairs frames with poses: an overlay is only shown on the frame in which its pose was measured.
 
 import { FrameRing } from "./transport/frames.js";
 import { Intrinsics } from "./scene/projection.js";
 import { FRAME_IDS, isNewer } from "./transport/stamp.js";
 
 const KEPT_FRAMES = 20, KEPT_POSES = 60, KEPT_TIMES = 300;
-const STALE_MS = 700; // without an answer for so long the ghost goes and the camera is shown as it is
+const STALE_MS = 700; // without a pose for so long the overlay is removed and the plain camera picture is shown
 
 export class Player {
-  /** @param isPhone whether this page has a camera of its own. */
+  /** @param isPhone whether this page has its own camera. */
   constructor(isPhone) {
     this.isPhone = isPhone;
-    this.own = new FrameRing(KEPT_FRAMES); // of this page's camera
-    this.sent = new FrameRing(isPhone ? 4 : KEPT_FRAMES); // by the server
+    this.own = new FrameRing(KEPT_FRAMES); // frames of this page's camera
+    this.sent = new FrameRing(isPhone ? 4 : KEPT_FRAMES); // frames that the server sent
     this.mode = "poses";
     this.shown = null;
     this.isFrozen = false;
     this.reset();
   }
 
-  /** Forget what belongs to a connection; the picture stays until there is another. */
+  /** Forget poses and frames of a connection; the picture stays until there is another. */
   reset() {
     this.poses = new Map();
-    this.takenMs = new Map(); // of this page's camera, by id
+    this.takenMs = new Map(); // capture times of this page's frames, by id
     this.answer = null;
     this.answeredMs = -Infinity;
     this.nextId = 0;
@@ -30,7 +30,7 @@ export class Player {
     this.sent.clear();
   }
 
-  /** Keep a picture of this page's camera; not in place of the one that waits for its answer. */
+  /** Keep a frame of this page's camera; it does not replace the one whose response is outstanding. */
   takeOwn(video, takenMs, turns, waiting = null) {
     const width = video.videoWidth & ~1, height = video.videoHeight & ~1;
     if (width < 64 || height < 64) return null;
@@ -41,32 +41,32 @@ export class Player {
     return this.own.take(video, width, height, { id, takenMs, turns }, [this.shown?.frame, waiting]);
   }
 
-  /** Keep a picture that the server sent; `cameMs` is when. */
-  takeSent(source, width, height, id, cameMs) {
-    const takenMs = this.takenMs.get(id) ?? cameMs;
+  /** Keep a frame that the server sent; `arrivedMs` is the time of its arrival. */
+  takeSent(source, width, height, id, arrivedMs) {
+    const takenMs = this.takenMs.get(id) ?? arrivedMs;
     return this.sent.take(source, width, height, { id, takenMs }, [this.shown?.frame]);
   }
 
-  /** Keep an answer. */
+  /** Keep a pose. */
   takePose(pose, nowMs) {
     if (!this.camera?.isSame(pose.camera)) this.camera = new Intrinsics(pose.camera);
     pose.lens = this.camera;
     this.poses.set(pose.id, pose);
     if (this.poses.size > KEPT_POSES) this.poses.delete(this.poses.keys().next().value);
-    // A server that begins to count anew is not an old answer.
+    // After STALE_MS an older id is accepted, too: the server may have started to count again.
     if (this.answer && !isNewer(pose.id, this.answer.id) && nowMs - this.answeredMs < STALE_MS) return;
     this.answer = pose;
     this.answeredMs = nowMs;
   }
 
-  /** Whether answers come. */
+  /** Whether poses arrive. */
   isAnswered(nowMs) {
     return nowMs - this.answeredMs < STALE_MS;
   }
 
   /**
-   * What belongs on the screen now: {frame, pose, guide, isAnnotated}; frame is null while there is none. A pose of null
-   * means a picture without ghost.
+   * What to show now: {frame, pose, guide, isAnnotated}. The frame is null while there is none; a pose of null means a
+   * picture without overlay.
    */
   choose(nowMs) {
     if (this.isFrozen && this.shown) return this.shown;

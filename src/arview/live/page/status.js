@@ -1,4 +1,4 @@
-// What the page says of itself: the state in a word, why, the figures, notices, and what keeps it from working.
+// The status display: state and reason, figures, notices, messages that block the page, toasts.
 
 import { icon, make } from "./icons.js";
 
@@ -12,39 +12,39 @@ const STATES = {
   connecting: ["busy", "Connecting"],
   retrying: ["offline", "Connection lost"],
   busy: ["busy", "Busy"],
-  denied: ["offline", "Not admitted"],
+  denied: ["offline", "Access denied"],
   trouble: ["camera", "No camera"],
   waiting: ["busy", "Waiting"],
   frozen: ["pause", "Frozen"],
 };
-/** Notices of which the inspector must not go on without knowing. */
+/** Notices that the inspector must not miss, with a prefix for their text. */
 const STRONG = { inspection_old: "Stale inspection: ", inspection_serial: "", inspection_model: "", inspection_unreadable: "" };
 const RANKS = { error: 0, warning: 1, info: 2 };
 
-const upper = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+const capitalized = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
 export class StatusBar {
   /** @param elements {icon, word, why, quality, meter, latency, age, body} */
   constructor(elements) {
     Object.assign(this, elements);
-    this.#said = "";
+    this.#shown = "";
   }
 
-  #said;
+  #shown;
 
-  /** Say a state, one of STATES, and why. */
-  say(state, why = "") {
-    const said = `${state} ${why}`;
-    if (said === this.#said) return;
-    this.#said = said;
+  /** Show a state, one of STATES, and its reason. */
+  show(state, reason = "") {
+    const text = `${state} ${reason}`;
+    if (text === this.#shown) return;
+    this.#shown = text;
     const [sign, word] = STATES[state];
     this.body.dataset.state = state;
     this.icon.replaceChildren(icon(sign));
     if (this.word.textContent !== word) this.word.textContent = word;
-    this.why.textContent = upper(why);
+    this.why.textContent = capitalized(reason);
   }
 
-  /** Show the figures; null is a dash. */
+  /** Show the figures; null is shown as a dash. */
   figures({ quality, latencyMs, ageMs }) {
     const text = (value, unit, digits = 0) => (value === null ? "–" : `${value.toFixed(digits)} ${unit}`);
     this.quality.textContent = quality === null ? "–" : `${Math.round(100 * quality)} %`;
@@ -56,18 +56,18 @@ export class StatusBar {
 }
 
 export class Notices {
-  #said = null;
+  #shown = null;
   #isOpen = false;
 
   constructor(box) {
     this.box = box;
   }
 
-  /** Show notices {level, text}; the gravest one, and the others when it is pressed. */
+  /** Show notices {level, text}: the most severe one, and all of them after a press on it. */
   show(notices) {
-    const said = JSON.stringify(notices);
-    if (said === this.#said) return;
-    this.#said = said;
+    const text = JSON.stringify(notices);
+    if (text === this.#shown) return;
+    this.#shown = text;
     this.notices = [...notices].sort((a, b) => RANKS[a.level] - RANKS[b.level] || (b.code in STRONG) - (a.code in STRONG));
     this.#draw();
   }
@@ -76,7 +76,7 @@ export class Notices {
     const shown = this.#isOpen ? this.notices : this.notices.slice(0, 1), more = this.notices.length - 1;
     this.box.replaceChildren(
       ...shown.map(({ code, level, text }, i) => {
-        const inside = [icon(level), make("span", "text", [upper((STRONG[code] ?? "") + text)])];
+        const inside = [icon(level), make("span", "text", [capitalized((STRONG[code] ?? "") + text)])];
         if (i === 0 && more > 0) inside.push(make("span", "more", [this.#isOpen ? "less" : `+${more}`]));
         const classes = `notice ${level} ${code in STRONG ? "strong" : ""} ${this.#isOpen ? "open" : ""}`;
         const line = make("button", classes, inside, { "aria-expanded": String(this.#isOpen) });
@@ -90,22 +90,22 @@ export class Notices {
   }
 }
 
-/** A card in the middle, for what has to be dealt with first. */
+/** A card in the middle for what has to be resolved first. */
 export class Message {
-  #said = null;
+  #shown = null;
 
   constructor(box) {
     this.box = box;
   }
 
-  /** Show words with a sign and a button, or nothing for null. */
+  /** Show an icon, a text and a button; null hides the card. */
   show(content) {
-    const said = content && `${content.title}|${content.text}|${content.button}`;
-    if (said === this.#said) return;
-    this.#said = said;
+    const text = content && `${content.title}|${content.text}|${content.button}`;
+    if (text === this.#shown) return;
+    this.#shown = text;
     this.box.hidden = !content;
     if (!content) return this.box.replaceChildren();
-    const inside = [icon(content.sign), make("h2", "", [content.title]), make("p", "", [upper(content.text)])];
+    const inside = [icon(content.sign), make("h2", "", [content.title]), make("p", "", [capitalized(content.text)])];
     if (content.button) {
       const button = make("button", "wide", [content.button]);
       button.addEventListener("click", content.onPress);
@@ -115,7 +115,7 @@ export class Message {
   }
 }
 
-/** A short word that goes away by itself. */
+/** A short message that disappears by itself. */
 export class Toast {
   #timer = 0;
 
@@ -123,8 +123,8 @@ export class Toast {
     this.box = box;
   }
 
-  /** Say something; a link {href, text, download} may be offered with it. */
-  say(text, link = null, seconds = link ? 12 : 5) {
+  /** Show a message, optionally with a link {href, text, download}. */
+  show(text, link = null, seconds = link ? 12 : 5) {
     clearTimeout(this.#timer);
     const inside = [make("span", "", [text])];
     if (link) inside.push(make("a", "", [link.text], { href: link.href, download: link.download ?? "" }));

@@ -1,9 +1,9 @@
-// A screen that only watches: the annotated picture as motion JPEG, and what is wrong in words.
+// A screen that only watches: the annotated picture as motion JPEG, with messages about failures.
 
 import { ask, getPart } from "./transport/api.js";
 import { Message, Notices } from "./status.js";
 
-const EVERY_MS = 2000;
+const REFRESH_MS = 2000;
 const film = document.getElementById("film");
 const notices = new Notices(document.getElementById("notices")), message = new Message(document.getElementById("message"));
 
@@ -40,10 +40,10 @@ async function refresh() {
     }
   } catch (error) {
     isOn = false;
-    const title = error.code === "no_token" ? "This link is not valid any more" : "Connection lost, retrying";
+    const title = error.code === "no_token" ? "This link is no longer valid" : "Connection lost, retrying";
     message.show({ sign: "offline", title, text: error.message });
   }
 }
 
 refresh();
-setInterval(refresh, EVERY_MS);
+setInterval(refresh, REFRESH_MS);

@@ -1,15 +1,16 @@
-// Picture and ghost in one WebGL canvas, so that they cannot drift apart.
+// Draws picture and ghost (the transparent CAD model) in one WebGL canvas, so that they cannot drift apart.
 //
-// The model is drawn as an ideal lens sees it into a texture, and the texture is bent like the lens over the picture.
+// The model is rendered into a texture by an ideal lens; the texture is then distorted like the real lens and drawn over
+// the picture.
 
 import { SAMPLES } from "../graphics.js";
-import { bend, eyeInModel, glProjection, glView, toCam } from "./projection.js";
+import { distortionGrid, eyeInModel, glProjection, glView, toCam } from "./projection.js";
 import { MeshEdges, welded } from "./mesh_edges.js";
 
 const THREE = globalThis.THREE;
 
 const BOX_MARGIN_PX = 8;
-const CELLS_ACROSS = 160; // of the map of who is seen where
+const CELLS_ACROSS = 160; // columns of the map of visible components
 const CRITICAL_DIMMING = 0.55;
 const GUIDE_RGB = [1, 0.867, 0.341], HALO_RGB = [0.063, 0.078, 0.106];
 
@@ -23,7 +24,7 @@ void main() {
   v_place = place.xyz;
   gl_Position = projection * place;
 }`;
-// Grazing faces a little denser, like glass; faces towards the camera brighter.
+// Faces at grazing angles are a little denser, like glass; faces towards the camera are brighter.
 const SURFACE_FRAGMENT = `
 precision highp float;
 in vec3 v_place;
@@ -35,8 +36,8 @@ void main() {
   float alpha = min(1.0, color.a * dimming * (1.25 - 0.35 * facing));
   result = vec4(color.rgb * (0.45 + 0.55 * facing) * alpha, alpha);
 }`;
-// A line is a rectangle as long as the edge and as wide as asked for on the screen, and a pixel more, over which it
-// fades. It is drawn a thousandth of its distance nearer than it is, or the faces beside it would cover it.
+// A line is a rectangle with the length of the edge and the given width on the screen plus one pixel, over which it
+// fades. It is drawn nearer than it is by a thousandth of its distance, so that adjacent faces do not cover it.
 const LINE_VERTEX = `
 precision highp float;
 in vec3 position, otherEnd;
@@ -91,14 +92,14 @@ out vec4 result;
 void main() { result = texture(image, v_uv); }`;
 
 export class Ghost {
-  /** Raises an Error when the browser has no WebGL 2. */
+  /** Throws an Error when the browser does not support WebGL 2. */
   constructor(canvas) {
     this.canvas = canvas;
     this.renderer = new THREE.WebGLRenderer({
       canvas, antialias: false, alpha: false, depth: false, powerPreference: "high-performance",
     });
     this.renderer.autoClear = false;
-    this.renderer.sortObjects = false; // surfaces come before lines anyway, as these are transparent
+    this.renderer.sortObjects = false; // surfaces are drawn before lines anyway, because lines are transparent
     this.renderer.setPixelRatio(1);
     this.shared = {
       view: { value: new THREE.Matrix4() },
@@ -107,7 +108,7 @@ export class Ghost {
       width: { value: 2 },
       dimming: { value: 1 },
     };
-    this.nobody = new THREE.Camera(); // the shaders have their own matrices
+    this.unusedCamera = new THREE.Camera(); // the shaders have their own matrices
     this.components = []; // {surface, lines, number, edges, center_in_model, corners_in_model}
     this.model = new THREE.Scene();
     this.numbers = new THREE.Scene();
@@ -123,7 +124,7 @@ export class Ghost {
     this.camera = null;
   }
 
-  /** Take the model from a GLB: component i is node c<i>. */
+  /** Load the model from a GLB, in which component i is node c<i>. */
   async load(buffer, count) {
     const gltf = await new THREE.GLTFLoader().parseAsync(buffer, "");
     gltf.scene.updateMatrixWorld(true);
@@ -136,12 +137,12 @@ export class Ghost {
     this.components = [];
     for (let i = 0; i < count; i++) {
       const mesh = gltf.scene.getObjectByName(`c${i}`);
-      if (!mesh?.isMesh) throw new Error(`the model holds no component ${i}`);
+      if (!mesh?.isMesh) throw new Error(`the model has no component ${i}`);
       this.components.push(this.#component(mesh.geometry.applyMatrix4(mesh.matrixWorld), i));
     }
   }
 
-  /** Colours of every component: {ghost: [r, g, b, alpha], edges: [r, g, b, alpha], isShown}, in 0 to 1. */
+  /** Colours of every component: {ghost: [r, g, b, alpha], edges: [r, g, b, alpha], isShown}, values from 0 to 1. */
   style(styles) {
     this.components.forEach(({ surface, lines, number }, i) => {
       const { ghost, edges, isShown } = styles[i];
@@ -149,13 +150,13 @@ export class Ghost {
       lines.material.uniforms.color.value.set(...edges);
       surface.visible = number.visible = isShown;
       lines.visible = isShown && edges[3] > 0;
-      // What has no colour of its own only hides; it comes first, so that nothing has to be taken back.
+      // Surfaces without a colour only occlude. They are drawn first, so that they do not erase others.
       surface.material.colorWrite = ghost[3] > 0;
     });
     this.model.children.sort((a, b) => Number(a.material.colorWrite) - Number(b.material.colorWrite));
   }
 
-  /** Size of the canvas in device pixels. */
+  /** Set the size of the canvas, device pixels. */
   resize(width, height) {
     if (this.canvas.width !== width || this.canvas.height !== height) this.renderer.setSize(width, height, false);
   }
@@ -163,8 +164,8 @@ export class Ghost {
   /**
    * Draw a picture and, over it, the model.
    * @param source canvas with the picture; null leaves it black.
-   * @param pose 16 numbers, or null.
-   * @param guide pose of the outline to align with, or null.
+   * @param pose cam_from_model, 16 numbers row-major, or null.
+   * @param guide pose of the outline to align the part with, or null.
    * @param camera Intrinsics of the picture, needed with a pose or guide.
    * @param lineWidth of edges, device pixels.
    */
@@ -173,11 +174,11 @@ export class Ghost {
     if (shown) {
       this.#prepare(camera, shown, lineWidth);
       this.shared.dimming.value = pose && isCritical ? CRITICAL_DIMMING : 1;
-      this.target.scissor.set(...this.#box(camera, shown, this.bent.window, this.target.height, false));
+      this.target.scissor.set(...this.#box(camera, shown, this.distortion.window, this.target.height, false));
       renderer.setRenderTarget(this.target);
       renderer.setClearColor(0x000000, 0);
       renderer.clear();
-      if (pose) renderer.render(this.model, this.nobody);
+      if (pose) renderer.render(this.model, this.unusedCamera);
       else this.#drawGuide(lineWidth);
       renderer.setRenderTarget(null);
     }
@@ -188,22 +189,22 @@ export class Ghost {
       if (old && (old.width !== source.width || old.height !== source.height)) this.texture.dispose();
       this.texture.image = source;
       this.texture.needsUpdate = true;
-      renderer.render(this.picture.scene, this.nobody);
+      renderer.render(this.picture.scene, this.unusedCamera);
     }
     if (!shown) return;
     const whole = { left: 0, top: 0, width: camera.width, height: camera.height };
     renderer.setScissorTest(true);
     renderer.setScissor(...this.#box(camera, shown, whole, this.canvas.height, true));
-    renderer.render(this.layer.scene, this.nobody);
+    renderer.render(this.layer.scene, this.unusedCamera);
     renderer.setScissorTest(false);
   }
 
   /**
-   * Who is seen where, in cells of the picture of the last pose drawn.
-   * @returns {columns, rows, cells}: number of the component + 1 in each cell, 0 for none.
+   * Map of the visible components for the last pose that was drawn.
+   * @returns {columns, rows, cells, window}: number of the component + 1 in each cell, 0 for none.
    */
-  seen() {
-    const { window } = this.bent, columns = CELLS_ACROSS;
+  visibility() {
+    const { window } = this.distortion, columns = CELLS_ACROSS;
     const rows = Math.max(1, Math.round((columns * window.height) / window.width));
     if (!this.small || this.small.height !== rows) {
       this.small?.dispose();
@@ -213,7 +214,7 @@ export class Ghost {
     renderer.setRenderTarget(this.small);
     renderer.setClearColor(0x000000, 0);
     renderer.clear();
-    renderer.render(this.numbers, this.nobody);
+    renderer.render(this.numbers, this.unusedCamera);
     renderer.readRenderTargetPixels(this.small, 0, 0, columns, rows, pixels);
     renderer.setRenderTarget(null);
     const cells = new Uint16Array(columns * rows);
@@ -226,10 +227,10 @@ export class Ghost {
     return { columns, rows, cells, window };
   }
 
-  /** Set matrices and targets for a camera and a pose. */
+  /** Set matrices and render targets for a camera and a pose. */
   #prepare(camera, pose, lineWidth) {
-    if (!this.camera?.isSame(camera)) this.#bendLike(camera);
-    const { window } = this.bent;
+    if (!this.camera?.isSame(camera)) this.#distortLike(camera);
+    const { window } = this.distortion;
     const scale = this.canvas.width / camera.width;
     const width = Math.ceil(window.width * scale), height = Math.ceil(window.height * scale);
     if (this.target?.width !== width || this.target?.height !== height) {
@@ -256,16 +257,16 @@ export class Ghost {
   }
 
   /**
-   * Box [x, y, width, height] around the model in a drawing of a window of the image plane that is `height` rows high;
-   * y counts from below as in GL. Outside of it nothing is drawn.
+   * Bounding box [x, y, width, height] of the model in a drawing, `height` rows high, of a window of the image plane; y
+   * counts from below as in GL. It limits the drawing.
    */
-  #box(camera, pose, window, height, isBent) {
+  #box(camera, pose, window, height, isDistorted) {
     const scale = height / window.height, reach = { left: Infinity, top: Infinity, right: -Infinity, bottom: -Infinity };
     const all = [0, 0, Math.ceil(window.width * scale), height];
     for (const { corners_in_model: corners } of this.components) {
       for (const corner of corners) {
         const [x, y, z] = toCam(pose, corner);
-        const pixel = isBent ? camera.project([x, y, z]) : z > 1 && [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy];
+        const pixel = isDistorted ? camera.project([x, y, z]) : z > 1 && [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy];
         if (!pixel) return all;
         reach.left = Math.min(reach.left, pixel[0]);
         reach.right = Math.max(reach.right, pixel[0]);
@@ -273,9 +274,9 @@ export class Ghost {
         reach.bottom = Math.max(reach.bottom, pixel[1]);
       }
     }
-    // A lens bends the sides of a box outwards by a few per cent at most.
-    const margin = BOX_MARGIN_PX + (isBent ? 0.03 * Math.max(reach.right - reach.left, reach.bottom - reach.top) : 0);
-    const clamp = (value, most) => Math.min(most, Math.max(0, value));
+    // Distortion moves the sides of a box outwards by a few per cent at most.
+    const margin = BOX_MARGIN_PX + (isDistorted ? 0.03 * Math.max(reach.right - reach.left, reach.bottom - reach.top) : 0);
+    const clamp = (value, max) => Math.min(max, Math.max(0, value));
     const left = clamp(Math.floor((reach.left - margin - window.left) * scale), all[2]);
     const right = clamp(Math.ceil((reach.right + margin - window.left) * scale), all[2]);
     const top = clamp(Math.floor((reach.top - margin - window.top) * scale), height);
@@ -283,10 +284,10 @@ export class Ghost {
     return [left, height - bottom, right - left, bottom - top];
   }
 
-  #bendLike(camera) {
+  #distortLike(camera) {
     this.camera = camera;
-    this.bent = bend(camera);
-    const { places, ideals, triangles, window } = this.bent, uvs = [];
+    this.distortion = distortionGrid(camera);
+    const { places, ideals, triangles, window } = this.distortion, uvs = [];
     for (let i = 0; i < ideals.length; i += 2) {
       uvs.push((ideals[i] - window.left) / window.width, 1 - (ideals[i + 1] - window.top) / window.height);
     }
@@ -296,7 +297,7 @@ export class Ghost {
     geometry.setIndex(triangles);
   }
 
-  /** The model's edges in two tones, so that they show on bright and on dark pictures. */
+  /** Draw the edges of the model in two tones, so that they are visible on bright and on dark pictures. */
   #drawGuide(lineWidth) {
     const kept = this.components.map(({ surface, lines }) => ({
       surface, lines, material: lines.material, color: surface.material.uniforms.color.value,
@@ -310,8 +311,8 @@ export class Ghost {
     for (const [material, times] of [[this.guide[0], 3], [this.guide[1], 1.4]]) {
       this.shared.width.value = times * lineWidth;
       for (const { lines } of kept) lines.material = material;
-      this.renderer.render(this.model, this.nobody);
-      for (const { surface } of kept) surface.visible = false; // their depth is there by now
+      this.renderer.render(this.model, this.unusedCamera);
+      for (const { surface } of kept) surface.visible = false; // their depth is in the buffer now
     }
     for (const { surface, lines, material, color, isSurfaceShown, isLineShown } of kept) {
       lines.material = material;
@@ -352,7 +353,7 @@ export class Ghost {
     });
   }
 
-  /** The foremost surface replaces what is behind it: one layer of glass, however many there are. */
+  /** The foremost surface replaces those behind it, so that only one layer is visible. */
   #surfaceMaterial() {
     const uniforms = { ...this.shared, color: { value: new THREE.Vector4() } };
     return this.#material(SURFACE_VERTEX, SURFACE_FRAGMENT, uniforms, {
@@ -385,7 +386,7 @@ export class Ghost {
   }
 }
 
-/** Blending of colours that are multiplied by their alpha. */
+/** Blending of colours with premultiplied alpha. */
 const OVER = {
   transparent: true,
   blending: THREE.CustomBlending,
@@ -395,7 +396,7 @@ const OVER = {
   blendDstAlpha: THREE.OneMinusSrcAlphaFactor,
 };
 
-/** Four corners a line; `corner` is (1 at the start and -1 at the end, side). Which lines are drawn is said later. */
+/** Four corners for each line; `corner` is (1 at the start or -1 at the end, side). chooseLines sets the index. */
 function lineGeometry({ starts, ends, count }) {
   const position = new Float32Array(12 * count), otherEnd = new Float32Array(12 * count), corner = new Float32Array(8 * count);
   for (let line = 0; line < count; line++) {
@@ -414,11 +415,11 @@ function lineGeometry({ starts, ends, count }) {
   return geometry;
 }
 
-/** Draw the lines that may be seen from a point of the model. */
+/** Select the lines that may be visible from a point in the model frame. */
 function chooseLines(geometry, edges, eye) {
   const { index } = geometry, { array } = index;
   let count = 0;
-  edges.forEachSeen(eye, (line) => {
+  edges.forEachVisible(eye, (line) => {
     for (const k of [0, 1, 2, 2, 1, 3]) array[count++] = 4 * line + k;
   });
   geometry.setDrawRange(0, count);

@@ -1,14 +1,14 @@
-// Labels as HTML beside the part with leader lines, and arrows of displacement, over the picture.
+// HTML labels beside the part with leader lines, and displacement arrows, drawn over the picture.
 
 import { icon, make } from "../icons.js";
 import { LabelLayout } from "./layout.js";
 import { toCam } from "./projection.js";
 
-const MOST_LABELS = 12;
-const NARROW_PX = 560, MOST_NARROW = 4; // on a phone held upright more would hide the part
-const LABEL_ROOM_PX = 55; // of the height, for each
-const LEAST_ROOM_PX = 200; // with less height only the component that is looked at alone has a label
-const CONTEXT_WEIGHT = 0.25; // how bad it is to cover a component that was not inspected, against one that was
+const MAX_LABELS = 12;
+const NARROW_PX = 560, MAX_NARROW_LABELS = 4; // on a phone in portrait more labels would hide the part
+const LABEL_ROOM_PX = 55; // height of the area for each label
+const MIN_ROOM_PX = 200; // in a lower area only an isolated component has a label
+const CONTEXT_WEIGHT = 0.25; // cost of covering a component that was not inspected, relative to an inspected one
 const SVG = "http://www.w3.org/2000/svg";
 const STUB_PX = 10, SIGN_PX = 24, ARROW_HEAD_PX = 11;
 
@@ -17,7 +17,7 @@ export class Labels {
   #labels = new Map(); // name → {element, leader, dot, sign, width, height}
   #arrows = new Map();
   #integral = null;
-  #seen = null;
+  #visible = null;
 
   /** @param onPick called with the name of a component whose label was pressed. */
   constructor(box, svg, onPick) {
@@ -25,7 +25,7 @@ export class Labels {
     this.part = null;
   }
 
-  /** Take a part document: labels are made anew. */
+  /** Set the part document; all labels are created again. */
   setPart(part, centersInModel) {
     this.part = part;
     this.centers = centersInModel;
@@ -41,8 +41,8 @@ export class Labels {
     for (const component of this.inspected) this.#add(component);
   }
 
-  /** Take the map of who is seen where (see Ghost.seen). */
-  setSeen({ columns, rows, cells, window }) {
+  /** Set the map of visible components (see Ghost.visibility). */
+  setVisibility({ columns, rows, cells, window }) {
     const integral = new Float64Array((columns + 1) * (rows + 1)), counts = new Map();
     for (let row = 0; row < rows; row++) {
       let sum = 0;
@@ -56,13 +56,13 @@ export class Labels {
       }
     }
     this.#integral = { columns, rows, integral, window };
-    this.#seen = counts;
+    this.#visible = counts;
   }
 
-  /** Take all labels off the picture. */
+  /** Remove all labels from the picture. */
   clear() {
     this.#layout.reset();
-    this.#seen = this.#integral = null;
+    this.#visible = this.#integral = null;
     this.hide();
   }
 
@@ -75,8 +75,8 @@ export class Labels {
   }
 
   /**
-   * Place everything for a pose.
-   * @param place {left, top, scale} of the picture on the stage: CSS px = left + scale * (u + 0.5).
+   * Place labels and arrows for a pose.
+   * @param place {left, top, scale} position of the picture on the stage: CSS px = left + scale * (u + 0.5).
    * @param area {left, top, width, height} that labels may use, CSS px.
    */
   update(pose, place, area, { labels, only }, glides) {
@@ -91,18 +91,18 @@ export class Labels {
     const wanted = this.inspected.filter((component) => !only || component.name === only);
     this.#drawArrows(wanted, toScreen);
     this.box.style.setProperty("--widest", `${Math.floor((area.width - 6) / 2)}px`);
-    const isNarrow = area.width < NARROW_PX, isCramped = area.height < LEAST_ROOM_PX && !only;
+    const isNarrow = area.width < NARROW_PX, isCramped = area.height < MIN_ROOM_PX && !only;
     if (this.box.classList.contains("narrow") !== isNarrow) {
       this.box.classList.toggle("narrow", isNarrow);
       this.remeasure();
     }
-    const most = isCramped ? 0 : isNarrow ? MOST_NARROW : Math.min(MOST_LABELS, Math.floor(area.height / LABEL_ROOM_PX));
+    const maxLabels = isCramped ? 0 : isNarrow ? MAX_NARROW_LABELS : Math.min(MAX_LABELS, Math.floor(area.height / LABEL_ROOM_PX));
     const requests = [], signs = new Map();
     for (const component of labels ? wanted : []) {
       const anchor = toScreen(component.anchor_in_model);
-      if (!anchor || !isInside(anchor, picture) || !this.#deserves(component)) continue;
+      if (!anchor || !isInside(anchor, picture) || !this.#isLabelled(component)) continue;
       signs.set(component.name, anchor);
-      if (requests.length === most) continue;
+      if (requests.length === maxLabels) continue;
       const label = this.#labels.get(component.name);
       if (!label.width) [label.width, label.height] = [label.element.offsetWidth, label.element.offsetHeight];
       requests.push({ key: component.name, width: label.width, height: label.height, x: anchor[0], y: anchor[1] });
@@ -111,7 +111,7 @@ export class Labels {
     const placed = this.#layout.place(area, requests, this.#extent(place, requests), covered, glides);
     const anchors = new Map(requests.map((one) => [one.key, one]));
     const names = new Set(placed.map((one) => one.key));
-    const taken = []; // signs do not cover each other; the more urgent one stays
+    const taken = []; // signs must not overlap; the more urgent one stays
     for (const [name, label] of this.#labels) {
       if (!names.has(name)) show(label, false);
       const sign = names.has(name) ? null : signs.get(name);
@@ -126,7 +126,7 @@ export class Labels {
     for (const one of placed) this.#put(one, anchors.get(one.key));
   }
 
-  /** Sizes must be measured again: the window or the font has changed. */
+  /** Measure the labels again, after a change of window or font. */
   remeasure() {
     for (const label of this.#labels.values()) label.width = 0;
   }
@@ -144,7 +144,7 @@ export class Labels {
     const leader = document.createElementNS(SVG, "path"), dot = document.createElementNS(SVG, "circle");
     leader.classList.add("leader", component.verdict);
     dot.classList.add("dot", component.verdict);
-    // Where there is no room for the label, its sign stands on the component.
+    // Where there is no room for the label, its sign is shown on the component.
     const sign = make("button", `sign off ${component.verdict}`, [icon(component.verdict)], { tabindex: "-1" });
     sign.addEventListener("click", () => this.onPick(component.name));
     this.box.append(element, sign);
@@ -152,8 +152,8 @@ export class Labels {
     const label = { element, leader, dot, sign, width: 0, height: 0, isShown: true };
     show(label, false);
     this.#labels.set(component.name, label);
-    const isWorthAnArrow = component.displacement_mm && component.distance_mm > (component.uncertainty_mm ?? 0);
-    if (component.verdict !== "pass" && isWorthAnArrow) {
+    const hasArrow = component.displacement_mm && component.distance_mm > (component.uncertainty_mm ?? 0);
+    if (component.verdict !== "pass" && hasArrow) {
       const arrow = document.createElementNS(SVG, "path");
       arrow.classList.add("arrow");
       this.svg.append(arrow);
@@ -161,12 +161,12 @@ export class Labels {
     }
   }
 
-  /** Whether the component is seen, if it passed; others get their label even when something hides them. */
-  #deserves({ index, verdict }) {
-    return verdict === "fail" || verdict === "undecided" || !this.#seen || (this.#seen.get(index) ?? 0) > 0;
+  /** Whether a component has a label: one that passed only while it is visible, others always. */
+  #isLabelled({ index, verdict }) {
+    return verdict === "fail" || verdict === "undecided" || !this.#visible || (this.#visible.get(index) ?? 0) > 0;
   }
 
-  /** First and last column of the screen with a component that must not be covered. */
+  /** First and last column of the screen with a component that should not be covered. */
   #extent(place, requests) {
     if (!this.#integral) return { left: Math.min(...requests.map((r) => r.x)), right: Math.max(...requests.map((r) => r.x)) };
     const { columns, rows, integral, window } = this.#integral;
@@ -178,7 +178,7 @@ export class Labels {
     return { left: x(first), right: x(last) };
   }
 
-  /** Share of a box on the screen that covers components. */
+  /** Fraction of a box on the screen that covers components. */
   #covered(place, left, top, width, height) {
     if (!this.#integral) return 0;
     const { columns, rows, integral, window } = this.#integral;
@@ -195,7 +195,7 @@ export class Labels {
     element.style.transform = `translate(${left.toFixed(1)}px, ${top.toFixed(1)}px)`;
     if (isNew) {
       element.classList.remove("arrives");
-      void element.offsetWidth; // the animation begins anew
+      void element.offsetWidth; // restarts the animation
       element.classList.add("arrives");
     }
     show(label, true);

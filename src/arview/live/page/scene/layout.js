@@ -1,14 +1,13 @@
-// Where labels go: two columns beside the part (boundary labelling, Bekos et al. 2007). Within a column the order is that
-// of the anchors and the rows are found by dynamic programming over what a label would cover, how far it is from its
-// component and how far it would have to move. Rows old and new are apart and in the same order, so that labels which
-// all go the same fraction of their way stay apart too: they glide without touching. When the order of a column
-// changes, its labels jump.
+// Layout of the labels in two columns beside the part (boundary labelling, Bekos et al. 2007). Within a column the labels
+// have the order of their anchors, and their rows minimise, by dynamic programming, the covered area, the distance to the
+// component and the movement. Old and new rows do not overlap and have the same order, so labels that all move by the
+// same fraction do not overlap either. When the order of a column changes, its labels jump.
 
-const STEP_PX = 6; // between rows that are tried
-const COVER_COST = 60; // of covering components wholly; in comparison a tenth of the area's height off costs 1
-const REACH_COST = 10, FULLNESS_COST = 3; // of crossing the area's width, and of the fuller column
-const STAY_GAIN = 1.5; // for staying in a column
-const GLIDE = 0.2; // fraction of the way gone at each call
+const STEP_PX = 6; // spacing of the candidate rows
+const COVER_COST = 60; // cost of a label that covers components entirely; an offset of a tenth of the area's height costs 1
+const REACH_COST = 10, FULLNESS_COST = 3; // cost of a leader across the whole area, and of a full column
+const STAY_GAIN = 1.5; // reward for staying in a column
+const GLIDE = 0.2; // fraction of the remaining path that labels move in each call
 const GAP_PX = 6;
 
 export class LabelLayout {
@@ -21,13 +20,13 @@ export class LabelLayout {
   }
 
   /**
-   * Boxes of labels.
+   * Compute the boxes of the labels.
    * @param area {left, top, width, height} that labels may use, px.
-   * @param requests [{key, width, height, x, y}], the most urgent first; x, y is what the label speaks of.
-   * @param part {left, right} of what should not be covered, px.
+   * @param requests [{key, width, height, x, y}], the most urgent first; x, y is the anchor.
+   * @param part {left, right} extent that should not be covered, px.
    * @param covered (left, top, width, height) → share of the box that covers components, 0 to 1.
-   * @param glides whether labels move gently.
-   * @returns [{key, left, top, side, isNew}]; labels for which there is no room are left out.
+   * @param glides whether labels move gradually.
+   * @returns [{key, left, top, side, isNew}]; labels without room are omitted.
    */
   place(area, requests, part, covered, glides) {
     const columns = this.#assign(area, requests, part);
@@ -38,7 +37,7 @@ export class LabelLayout {
     return ["left", "right"].flatMap((side) => this.#column(side, area, columns[side], covered, step));
   }
 
-  /** Who goes left and who right: to the column that is nearer, less full, and where the label is already. */
+  /** Assign labels to the columns: the nearer, the emptier, and the one in which the label already is are preferred. */
   #assign(area, requests, part) {
     const free = { left: area.height, right: area.height }, columns = { left: [], right: [] };
     const edges = this.#edges ?? part;
@@ -57,7 +56,7 @@ export class LabelLayout {
     return columns;
   }
 
-  /** Move the inner edges of both columns towards the sides of the part, as far as the area allows. */
+  /** Move the inner edges of both columns towards the sides of the part, within the area. */
   #moveEdges(area, part, widest, step) {
     const clamp = (value, low, high) => Math.max(low, Math.min(value, high));
     const first = area.left + widest.left, last = area.left + area.width - widest.right;
@@ -87,7 +86,7 @@ export class LabelLayout {
       const isNew = !old.some((other) => other.key === one.key);
       return { key: one.key, y: was + share * (rows[i] - was), isNew, height: one.height };
     });
-    // The area may have shrunk under labels on their way.
+    // The area may have shrunk while labels were moving.
     let low = area.top;
     for (const one of placed) {
       one.y = Math.max(one.y, low);
@@ -98,7 +97,7 @@ export class LabelLayout {
   }
 }
 
-/** Requests from top to bottom; two that were neighbours change places only when they clearly have to. */
+/** Requests from top to bottom; two previous neighbours swap only when their anchors clearly require it. */
 function sorted(requests, old) {
   const rank = new Map(old.map((one, i) => [one.key, i]));
   const order = [...requests].sort((a, b) => a.y - b.y || (a.key < b.key ? -1 : 1));
@@ -116,7 +115,7 @@ function sorted(requests, old) {
   return order;
 }
 
-/** Tops of labels in a column, in order and apart, of least total cost; null when they do not fit. */
+/** Tops of the labels in a column, in order and without overlap, of minimal cost; null when they do not fit. */
 function bestRows(area, order, lefts, covered, previous) {
   const count = order.length;
   if (!count) return [];

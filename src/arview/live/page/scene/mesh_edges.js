@@ -1,11 +1,11 @@
-// The edges of a mesh worth drawing: creases, open borders and candidates for the silhouette:
-// those between a face that looks at the camera and one that looks away.
+// The edges of a mesh to draw: creases, open borders and candidates for the silhouette, which lies between a face that
+// is turned to the camera and one that is turned away.
 
-const WELD_MM = 1e-4; // vertices closer than this are one: exporters repeat them at creases and seams
+const WELD_MM = 1e-4; // vertices closer than this are merged: exporters duplicate them at creases and seams
 const CREASE_COS = Math.cos((30 * Math.PI) / 180); // faces that meet at a larger angle form a crease
 const FLAT_COS = Math.cos((0.05 * Math.PI) / 180); // at a smaller angle they lie in one plane
 
-/** Triangles whose vertices at one place are one: {positions (x y z …), indices}. */
+/** Triangles whose coincident vertices are merged: {positions (x y z …), indices}. */
 export function welded(positions, indices) {
   const count = positions.length / 3, number = new Int32Array(count), kept = [];
   let size = 1024;
@@ -37,7 +37,7 @@ export function welded(positions, indices) {
 /**
  * Edges of triangles.
  * @param positions (x y z …) of the vertices, mm, welded.
- * @param indices three a triangle.
+ * @param indices three for each triangle.
  */
 export class MeshEdges {
   constructor(positions, indices) {
@@ -79,14 +79,14 @@ export class MeshEdges {
   #isCrease;
   #isClosed;
 
-  /** Call a function with the number of each edge that may be seen from a point [3] of the model. */
-  forEachSeen([x, y, z], act) {
+  /** Call a function with the number of each edge that may be visible from a point [3] in the model frame. */
+  forEachVisible([x, y, z], act) {
     const { starts } = this, normals = this.#normals;
     for (let i = 0; i < this.count; i++) {
       const dx = x - starts[3 * i], dy = y - starts[3 * i + 1], dz = z - starts[3 * i + 2], at = 6 * i;
       const isFront = normals[at] * dx + normals[at + 1] * dy + normals[at + 2] * dz > 0;
       const isOtherFront = normals[at + 3] * dx + normals[at + 4] * dy + normals[at + 5] * dz > 0;
-      // Of a closed body nothing is seen between two faces that are both turned away.
+      // Edges between two faces turned away are invisible if the body is closed.
       if (isFront !== isOtherFront || (this.#isCrease[i] && (isFront || !this.#isClosed))) act(i);
     }
   }

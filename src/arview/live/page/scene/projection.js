@@ -1,9 +1,9 @@
 // The pinhole camera with Brown distortion, in OpenCV's conventions: pixel (u, v), integers are pixel centres; camera
-// frame +X right, +Y down, +Z forward. The ghost is bent to fit the picture; the picture is shown as the lens made it.
+// frame +X right, +Y down, +Z forward. The ghost is distorted to fit the picture; the picture is not undistorted.
 
 const NEAR_MM = 1;
 
-/** Point [3] of the model in the camera frame; the pose is 16 numbers, row-major. */
+/** Transform a point [3] from the model to the camera frame; the pose is 16 numbers, row-major. */
 export function toCam(pose, [x, y, z]) {
   return [
     pose[0] * x + pose[1] * y + pose[2] * z + pose[3],
@@ -12,13 +12,13 @@ export function toCam(pose, [x, y, z]) {
   ];
 }
 
-/** Where the camera stands in the model [3]. */
+/** Position of the camera in the model frame [3]. */
 export function eyeInModel(pose) {
   return [0, 1, 2].map((k) => -(pose[k] * pose[3] + pose[4 + k] * pose[7] + pose[8 + k] * pose[11]));
 }
 
 export class Intrinsics {
-  /** From the `camera` of a Pose message. */
+  /** @param camera `camera` of a Pose message. */
   constructor({ width, height, fx, fy, cx, cy, dist }) {
     Object.assign(this, { width, height, fx, fy, cx, cy, dist });
     this.isDistorted = dist.some((term) => term !== 0);
@@ -40,7 +40,7 @@ export class Intrinsics {
     ];
   }
 
-  /** Pixel [u, v] of a point in the camera frame; null when it is not in front, or where the lens folds back. */
+  /** Pixel [u, v] of a point in the camera frame; null behind the camera and where the distortion is not monotone. */
   project([x, y, z]) {
     if (z <= NEAR_MM) return null;
     let a = x / z, b = y / z;
@@ -51,7 +51,7 @@ export class Intrinsics {
     return [this.fx * a + this.cx, this.fy * b + this.cy];
   }
 
-  /** Pixel of an ideal lens with the same K that shows what pixel (u, v) shows. */
+  /** The undistorted pixel, with the same K, of pixel (u, v). */
   ideal(u, v) {
     const xd = (u - this.cx) / this.fx, yd = (v - this.cy) / this.fy;
     let x = xd, y = yd;
@@ -63,7 +63,7 @@ export class Intrinsics {
     return [this.fx * x + this.cx, this.fy * y + this.cy];
   }
 
-  /** Largest squared radius, to 1.5 × the corner's radius, where the lens does not fold back. */
+  /** Largest squared radius, up to 1.5 × the radius of the corner, at which the distortion is monotone. */
   #monotoneLimit() {
     let corner = 0;
     for (const u of [0, this.width]) {
@@ -71,17 +71,17 @@ export class Intrinsics {
         corner = Math.max(corner, ((u - this.cx) / this.fx) ** 2 + ((v - this.cy) / this.fy) ** 2);
       }
     }
-    const [k1, k2, , , k3] = this.dist, most = 2.25 * corner;
+    const [k1, k2, , , k3] = this.dist, max = 2.25 * corner;
     for (let i = 1; i <= 400; i++) {
-      const r2 = (most * i) / 400;
-      if (1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) < 0.05) return (most * (i - 1)) / 400;
+      const r2 = (max * i) / 400;
+      if (1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) < 0.05) return (max * (i - 1)) / 400;
     }
-    return most;
+    return max;
   }
 }
 
 /**
- * Projection of GL (16 numbers, column-major) of an ideal lens onto the window {left, top, width, height} of the image
+ * GL projection matrix (16 numbers, column-major) of an ideal lens onto the window {left, top, width, height} of the image
  * plane, px, where pixel (u, v) reaches from u to u + 1: its centre lies at u + 0.5.
  */
 export function glProjection({ fx, fy, cx, cy }, window, nearMm, farMm) {
@@ -94,7 +94,7 @@ export function glProjection({ fx, fy, cx, cy }, window, nearMm, farMm) {
   ];
 }
 
-/** View matrix of GL (column-major) of a pose: GL looks along -Z, with +Y up. */
+/** GL view matrix (column-major) of a pose: GL looks along -Z, with +Y up. */
 export function glView(pose) {
   const signs = [1, -1, -1], view = [];
   for (let column = 0; column < 4; column++) {
@@ -107,10 +107,10 @@ export function glView(pose) {
 const NODES = 48;
 
 /**
- * Grid that bends an ideal picture like the lens: nodes over the real image with the ideal pixel of each, and the
- * window of the image plane that holds them all.
+ * Grid that distorts an ideal picture like the lens: nodes over the real image with the ideal pixel of each, and the
+ * window of the image plane that contains them all.
  */
-export function bend(camera) {
+export function distortionGrid(camera) {
   const columns = camera.isDistorted ? NODES : 1;
   const rows = camera.isDistorted ? Math.max(1, Math.round((NODES * camera.height) / camera.width)) : 1;
   const places = [], ideals = [], triangles = [];
@@ -119,7 +119,7 @@ export function bend(camera) {
     for (let column = 0; column <= columns; column++) {
       const x = (column / columns) * camera.width, y = (row / rows) * camera.height;
       let [u, v] = camera.isDistorted ? camera.ideal(x - 0.5, y - 0.5) : [x - 0.5, y - 0.5];
-      // Where the lens model folds back no ray exists; such nodes are kept near the image.
+      // Where the distortion is not monotone no ray exists; such nodes are kept near the image.
       u = Math.min(1.5 * camera.width, Math.max(-0.5 * camera.width, Number.isFinite(u) ? u : -1));
       v = Math.min(1.5 * camera.height, Math.max(-0.5 * camera.height, Number.isFinite(v) ? v : -1));
       places.push(x / camera.width, y / camera.height);

@@ -1,27 +1,27 @@
-// The stage: where the picture lies on the screen, and what is drawn over it.
+// The stage: position of the picture on the screen, and the drawing over it.
 
 import { CANVAS_OPTIONS } from "../graphics.js";
 import { Ghost } from "./ghost.js";
 import { Labels } from "./labels.js";
 
-const MOST_CANVAS_PX = 1600; // of the longer side; more is not seen, but has to be drawn
-const SEEN_EVERY_MS = 150;
+const MAX_CANVAS_PX = 1600; // longer side; larger canvases cost time without visible benefit
+const VISIBILITY_EVERY_MS = 150;
 const LINE_CSS_PX = 1.7;
 const PASS_DIMMING = 0.65; // ghosts of components that passed are fainter, so that the others stand out
 const NEUTRAL = "#46c4ff", CONTEXT = "#e2e8f0", CONTEXT_ALPHA = 0.5;
-const ROOMY = 0.8; // the picture moves aside for bars when it stays this large
+const ROOMY = 0.8; // the picture avoids the bars if it keeps this fraction of its size
 const MARGIN_PX = 8;
 
 export class Stage {
-  #seenMs = -Infinity;
+  #visibilityMs = -Infinity;
   #place = null;
   #size = null;
   #free = null;
 
   /**
    * @param elements {stage, canvas, leaders, labels, obstacles: [bar, notices, actions, card, side]}
-   * @param onPick called with the name of a component that was pressed in the picture, or null beside all.
-   * @param onResize called when everything has to be drawn anew.
+   * @param onPick called with the name of a component that was pressed in the picture, or null for a press beside all of them.
+   * @param onResize called when everything has to be redrawn.
    */
   constructor(elements, style, onPick, onResize) {
     Object.assign(this, elements, { style, onPick, onResize });
@@ -32,7 +32,7 @@ export class Stage {
       this.context = this.canvas.getContext("2d", CANVAS_OPTIONS);
     }
     this.part = null;
-    this.isChanged = true; // something else than picture and pose: the style, the part, the window
+    this.isChanged = true; // whether style, part or window have changed since the last drawing
     this.labelBoxes = new Labels(this.labels, this.leaders, onPick);
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
     new ResizeObserver(() => this.measure()).observe(this.stage);
@@ -41,18 +41,18 @@ export class Stage {
     document.fonts?.ready.then(() => this.labelBoxes.remeasure());
   }
 
-  /** Whether this browser can draw ghosts. */
+  /** Whether this browser can draw the overlay. */
   get hasGhost() {
     return this.ghost !== null;
   }
 
-  /** Take a part document. */
+  /** Set the part document. */
   setPart(part) {
     this.part = part;
     if (this.ghost?.components.length === part.components.length) this.#arrange();
   }
 
-  /** Take the CAD. */
+  /** Set the CAD model. */
   async setModel(buffer, part) {
     await this.ghost?.load(buffer, part.components.length);
     this.#arrange();
@@ -62,10 +62,10 @@ export class Stage {
     this.style = style;
     this.isChanged = true;
     if (this.ghost?.components.length) this.ghost.style(this.#styles());
-    this.#seenMs = -Infinity;
+    this.#visibilityMs = -Infinity;
   }
 
-  /** The window has changed. */
+  /** Update the layout after a change of the window. */
   measure() {
     this.#free = null;
     this.isChanged = true;
@@ -73,7 +73,7 @@ export class Stage {
     this.onResize();
   }
 
-  /** Draw what the player has chosen. */
+  /** Draw the choice of the player. */
   draw({ frame, pose, guide, isAnnotated }) {
     this.isChanged = false;
     if (!frame) return this.labelBoxes.hide();
@@ -94,9 +94,9 @@ export class Stage {
     this.#drawn = ownPose;
     if (!ownPose?.cam_from_model) return this.labelBoxes.hide();
     const nowMs = performance.now();
-    if (nowMs - this.#seenMs > SEEN_EVERY_MS) {
-      this.#seenMs = nowMs;
-      this.labelBoxes.setSeen(this.ghost.seen());
+    if (nowMs - this.#visibilityMs > VISIBILITY_EVERY_MS) {
+      this.#visibilityMs = nowMs;
+      this.labelBoxes.setVisibility(this.ghost.visibility());
     }
     this.labelBoxes.update(ownPose, this.#place, this.#free.labels, this.style, !this.calm.matches);
   }
@@ -124,7 +124,7 @@ export class Stage {
     });
   }
 
-  /** Put the canvas where the picture of this frame belongs. */
+  /** Position the canvas for the picture of this frame. */
   #lay(frame) {
     const shape = `${frame.width}×${frame.height}`;
     if (this.#free && this.#shape === shape) return;
@@ -136,48 +136,48 @@ export class Stage {
     const scale = fit(area), width = frame.width * scale, height = frame.height * scale;
     const left = area.left + (area.width - width) / 2, top = area.top + (area.height - height) / 2;
     Object.assign(this.canvas.style, { left: `${left}px`, top: `${top}px`, width: `${width}px`, height: `${height}px` });
-    const density = Math.min(devicePixelRatio || 1, MOST_CANVAS_PX / Math.max(width, height));
+    const density = Math.min(devicePixelRatio || 1, MAX_CANVAS_PX / Math.max(width, height));
     const size = [Math.max(1, Math.round(width * density)), Math.max(1, Math.round(height * density))];
     if (this.ghost) this.ghost.resize(...size);
     else [this.canvas.width, this.canvas.height] = size;
     this.#size = { width, height };
     this.#place = { left, top, scale };
     this.#free = { labels: inset(free, MARGIN_PX) };
-    this.#seenMs = -Infinity;
+    this.#visibilityMs = -Infinity;
   }
 
   #shape = "";
 
   #pick(event) {
     if (!this.#drawn || !this.ghost) return;
-    const { columns, rows, cells, window } = this.ghost.seen(), { scale } = this.#place;
+    const { columns, rows, cells, window } = this.ghost.visibility(), { scale } = this.#place;
     const box = this.canvas.getBoundingClientRect();
     const column = (((event.clientX - box.left) / scale - window.left) / window.width) * columns;
     const row = (((event.clientY - box.top) / scale - window.top) / window.height) * rows;
     const reach = Math.ceil(((24 / scale) * columns) / window.width); // a thumb is 48 px wide
-    let best = null, least = Infinity;
+    let best = null, nearest = Infinity;
     for (let r = Math.floor(row) - reach; r <= row + reach; r++) {
       for (let c = Math.floor(column) - reach; c <= column + reach; c++) {
         if (r < 0 || c < 0 || r >= rows || c >= columns) continue;
         const component = this.part.components[cells[r * columns + c] - 1];
         const distance = Math.hypot(c + 0.5 - column, r + 0.5 - row);
-        if (component && component.rank !== null && distance < least && distance <= reach) [best, least] = [component.name, distance];
+        if (component && component.rank !== null && distance < nearest && distance <= reach) [best, nearest] = [component.name, distance];
       }
     }
     this.onPick(best);
   }
 }
 
-/** The largest part of the stage beside bars along its sides, in its own coordinates. */
+/** The area of the stage that the bars along its sides leave free, in its own coordinates. */
 function freeOf(whole, obstacles) {
   let [left, top, right, bottom] = [0, 0, whole.width, whole.height];
   for (const one of obstacles) {
     const box = one.getBoundingClientRect();
-    const covers = getComputedStyle(one).getPropertyValue("--covers").trim() !== "0"; // not its visibility: that takes its time
+    const covers = getComputedStyle(one).getPropertyValue("--covers").trim() !== "0"; // not the visibility, which changes with a delay
     const shown = covers && box.width > 0 && box.height > 0 && one.childElementCount > 0;
     const x0 = box.left - whole.left, x1 = box.right - whole.left, y0 = box.top - whole.top, y1 = box.bottom - whole.top;
     if (!shown || x1 <= left || x0 >= right || y1 <= top || y0 >= bottom) continue;
-    // What is cut off is the side that costs the least room.
+    // Cut off the side that costs the least area.
     const costs = {
       top: (y1 - top) * (right - left), bottom: (bottom - y0) * (right - left),
       left: (x1 - left) * (bottom - top), right: (right - x0) * (bottom - top),

@@ -1,6 +1,6 @@
-// Requests to the server, and its refusals in words.
+// Requests to the server, and its error messages.
 
-/** A refusal by the server, or no answer at all (code "offline"). */
+/** An error response of the server, or no response at all (code "offline"). */
 export class Refusal extends Error {
   constructor(status, code, message, waitS = 0) {
     super(message);
@@ -10,7 +10,7 @@ export class Refusal extends Error {
 
 const TIMEOUT_MS = 12_000;
 
-/** fetch that raises a Refusal for everything but a success. */
+/** As fetch, but throws a Refusal for everything except success. */
 export async function ask(path, { method = "GET", json, body, headers = {}, keepalive = false, signal } = {}) {
   const all = { ...headers };
   if (json !== undefined) {
@@ -26,15 +26,15 @@ export async function ask(path, { method = "GET", json, body, headers = {}, keep
     });
   } catch (error) {
     if (signal?.aborted) throw error;
-    throw new Refusal(0, "offline", "the station does not answer");
+    throw new Refusal(0, "offline", "the station does not respond");
   }
   if (answer.ok) return answer;
-  let said = {};
+  let document = {};
   try {
-    said = await answer.json();
-  } catch { /* an error that is not from arview's own code has no words */ }
+    document = await answer.json();
+  } catch { /* an error that arview did not send has no JSON body */ }
   throw new Refusal(
-    answer.status, said.error ?? "error", said.message ?? `the station answered ${answer.status}`,
+    answer.status, document.error ?? "error", document.message ?? `the station responded with status ${answer.status}`,
     Number(answer.headers.get("Retry-After")) || 0,
   );
 }
@@ -42,24 +42,24 @@ export async function ask(path, { method = "GET", json, body, headers = {}, keep
 export const getPart = async () => (await ask("/api/part")).json();
 export const getModel = async () => (await ask("/api/model.glb")).arrayBuffer();
 
-const REMEMBERED = "arview-client";
+const CLIENT_KEY = "arview-client";
 
-/** Take part; {client, answer}. This page's earlier self, before a reload, leaves. */
+/** Join; returns {client, answer}. The client of this page before a reload leaves. */
 export async function join(request, signal) {
-  const before = sessionStorage.getItem(REMEMBERED);
-  const json = before ? { ...request, replaces: before } : request;
+  const previous = sessionStorage.getItem(CLIENT_KEY);
+  const json = previous ? { ...request, replaces: previous } : request;
   const joined = await (await ask("/api/clients", { method: "POST", json, signal })).json();
-  sessionStorage.setItem(REMEMBERED, joined.client);
+  sessionStorage.setItem(CLIENT_KEY, joined.client);
   return joined;
 }
 
 /** Leave, even while the page is being closed. */
 export function leave(client) {
-  sessionStorage.removeItem(REMEMBERED);
+  sessionStorage.removeItem(CLIENT_KEY);
   ask(`/api/clients/${client}`, { method: "DELETE", keepalive: true }).catch(() => {});
 }
 
-/** Ask for something; the client's Status. */
+/** Send a Control request; returns the Status of the client. */
 export const control = async (client, request) =>
   (await ask(`/api/clients/${client}/control`, { method: "POST", json: request })).json();
 

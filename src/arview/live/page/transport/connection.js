@@ -1,4 +1,4 @@
-// The connection to the server for as long as the page lives: which transport, what when it breaks, and that in words.
+// The connection to the server: choice of the transport, reconnection after failures, and messages about both.
 
 import { Refusal, control, getModel, getPart } from "./api.js";
 import { JpegLink } from "./jpeg.js";
@@ -6,12 +6,12 @@ import { NoWebrtc, WebrtcLink } from "./webrtc.js";
 
 export const CHOICES = ["auto", "poses", "video", "jpeg"];
 const FIRST_PAUSE_S = 1, LONGEST_PAUSE_S = 15, LOADING_PAUSE_S = 1, BUSY_PAUSE_S = 4;
-const MUTE_MS = 6000; // connected, sending, and nothing arrives: WebRTC does not work here
+const MUTE_MS = 6000; // connected and sending for so long while nothing arrives: WebRTC does not work here
 
 export class Connection {
   link = null;
   choice = "auto";
-  hasGhost = true; // whether this page can draw one
+  hasGhost = true; // whether this page can draw the overlay
   status = null;
   #part = null;
   #modelHash = null;
@@ -21,9 +21,9 @@ export class Connection {
   #abort = new AbortController();
 
   /**
-   * @param video element for what the server sends.
+   * @param video element for the video that the server sends.
    * @param events {onPhase({name, text, inS}), onPart(part), onModel(buffer, part), onOpen(link), onPose, onStatus,
-   *     onFrame}; names of phases: loading, connecting, connected, retrying, busy, denied.
+   *     onFrame}. Names of phases: loading, connecting, connected, retrying, busy, denied.
    */
   constructor(video, events) {
     Object.assign(this, { video, events });
@@ -33,7 +33,7 @@ export class Connection {
     return this.choice === "video" || (!this.hasGhost && this.choice !== "poses") ? "video" : "poses";
   }
 
-  /** Whether automatic choice has given WebRTC up. */
+  /** Whether the automatic choice has fallen back from WebRTC to JPEG. */
   get hasFallenBack() {
     return this.#isWebrtcBlocked && this.choice !== "jpeg";
   }
@@ -56,7 +56,7 @@ export class Connection {
         if (!(error instanceof Refusal || error instanceof NoWebrtc || error.name === "AbortError")) console.error(error);
         if (error.code === "loading") this.#phase("loading", error.message, LOADING_PAUSE_S);
         else if (error.code === "busy") this.#phase("busy", error.message.replace(/^busy: /, ""), (pauseS = BUSY_PAUSE_S));
-        else if (error.code === "no_token") this.#phase("denied", "arview was started again: scan the code at the station once more", LONGEST_PAUSE_S);
+        else if (error.code === "no_token") this.#phase("denied", "arview was restarted: scan the code at the station again", LONGEST_PAUSE_S);
         else this.#phase("retrying", error.message, Math.max(pauseS, error.waitS ?? 0));
         if (error.code === "loading") pauseS = 0.5;
       }
@@ -65,22 +65,22 @@ export class Connection {
     }
   }
 
-  /** Choose how to be connected: one of CHOICES. */
+  /** Choose the transport: one of CHOICES. */
   choose(choice) {
-    const before = this.choice;
+    const previous = this.choice;
     this.choice = choice;
     this.#isWebrtcBlocked = false;
-    if (!this.link || choice === before) return;
+    if (!this.link || choice === previous) return;
     const kind = choice === "jpeg" ? "jpeg" : "webrtc";
     if (kind === this.link.kind) this.ask({ mode: this.mode });
     else this.#restart();
   }
 
-  /** Ask the server for something; its words when it refuses, else "". */
+  /** Send a Control request; returns the error message, or "" on success. */
   async ask(request) {
     if (!this.link?.client) return "there is no connection to the station";
     try {
-      this.#tell(await control(this.link.client, request));
+      this.#handleStatus(await control(this.link.client, request));
       return "";
     } catch (error) {
       return error.message;
@@ -88,11 +88,11 @@ export class Connection {
   }
 
   /** Try again now. */
-  hurry() {
+  retryNow() {
     this.#skipPause();
   }
 
-  /** Leave. */
+  /** Leave for good. */
   end() {
     this.#isOver = true;
     this.#abort.abort();
@@ -136,7 +136,7 @@ export class Connection {
     }
   }
 
-  /** Connect and stay; why it ended, or null when another transport was chosen. */
+  /** Connect until the connection ends; returns the reason, or null when another transport was chosen. */
   async #connect(onOpen) {
     const isPhone = this.#part.source === "phone";
     const ended = new Promise((resolve) => { this.#ended = resolve; });
@@ -145,7 +145,7 @@ export class Connection {
         if (pose.revision !== this.#part.revision) this.#refreshSoon();
         this.events.onPose(pose);
       },
-      onStatus: (status) => this.#tell(status),
+      onStatus: (status) => this.#handleStatus(status),
       onFrame: this.events.onFrame,
       onEnd: this.#ended,
     };
@@ -166,14 +166,14 @@ export class Connection {
     this.events.onOpen(link);
     const reason = await ended;
     this.link = null;
-    if (reason === MUTE) throw new NoWebrtc("pictures do not get through by WebRTC");
+    if (reason === MUTE) throw new NoWebrtc("pictures do not arrive by WebRTC");
     return reason;
   }
 
   #openMs = 0;
   #isRefreshing = false;
 
-  #tell(status) {
+  #handleStatus(status) {
     this.status = status;
     if (this.#part && status.revision !== this.#part.revision) this.#refreshSoon();
     const { link } = this;
@@ -192,7 +192,7 @@ export class Connection {
       await this.#refreshPart();
     } catch (error) {
       if (!(error instanceof Refusal)) console.error(error);
-      await new Promise((resolve) => setTimeout(resolve, 1000)); // the next answer asks again
+      await new Promise((resolve) => setTimeout(resolve, 1000)); // the next answer triggers another attempt
     } finally {
       this.#isRefreshing = false;
     }

@@ -1,4 +1,4 @@
-// The last frames, each with its id, so that an answer that comes later finds the very picture it speaks of.
+// A ring of the last frames with their ids, so that a pose that arrives later finds the frame it belongs to.
 
 import { CANVAS_OPTIONS } from "../graphics.js";
 import { isNewer } from "./stamp.js";
@@ -7,16 +7,16 @@ export class FrameRing {
   #slots = [];
   newest = null;
 
-  /** Keeps so many frames. */
+  /** @param size number of frames to keep. */
   constructor(size) {
     this.size = size;
   }
 
   /**
-   * Keep a copy of a picture.
-   * @param source video or canvas, of which the upper width × height px are the picture.
+   * Keep a copy of a frame.
+   * @param source video or canvas whose upper width × height px are the picture.
    * @param about {id, turns, takenMs}
-   * @param pinned frames that must not be overwritten, because they are on the screen or on their way.
+   * @param pinned frames that must not be overwritten because they are shown or being sent.
    */
   take(source, width, height, about, pinned) {
     const slot = this.#slots.length < this.size ? this.#add() : this.#oldest(pinned);
@@ -34,7 +34,7 @@ export class FrameRing {
     return this.#slots.find((slot) => slot.id === id) ?? null;
   }
 
-  /** The newest frame with an id for which `is` holds. */
+  /** The newest frame whose id satisfies a predicate. */
   newestWhere(is) {
     return this.#slots.reduce((best, slot) => (is(slot.id) && (!best || isNewer(slot.id, best.id)) ? slot : best), null);
   }

@@ -1,24 +1,24 @@
-// Transport without WebRTC: JPEG pictures by HTTP, one in flight.
+// Transport without WebRTC: JPEG pictures over HTTP, one at a time.
 
 import { ask, getStatus, join, leave } from "./api.js";
 
-const QUALITY = 0.85, STATUS_EVERY_MS = 1000, PATIENCE = 3;
+const QUALITY = 0.85, STATUS_EVERY_MS = 1000, MAX_FAILURES = 3;
 
 export class JpegLink {
   kind = "jpeg";
   client = null;
   rttMs = null;
   sent = 0;
-  inFlight = null; // the frame that waits for its answer
+  inFlight = null; // the frame whose response is outstanding
   #abort = new AbortController();
   #waiting = null; // wakes the loop when there is a picture to send
 
-  /** Like WebrtcLink; there is no video element. */
+  /** As WebrtcLink, without a video element. */
   constructor(isPhone, events) {
     Object.assign(this, { isPhone, events });
   }
 
-  /** Take part; raises a Refusal. */
+  /** Join; throws a Refusal. */
   async open(mode, signal) {
     this.mode = mode;
     this.client = (await join({ transport: "jpeg", mode }, signal)).client;
@@ -26,7 +26,7 @@ export class JpegLink {
     return this;
   }
 
-  /** Offer a picture of the camera; it is sent if it is the newest when the line is free. */
+  /** Offer a frame of the camera; it is sent if it is still the newest when no other is in flight. */
   send(frame) {
     this.newest = frame;
     this.#waiting?.();
@@ -53,7 +53,7 @@ export class JpegLink {
       } catch (error) {
         if (signal.aborted) return;
         failures += 1;
-        const isOver = error.code === "no_such_client" || error.code === "no_token" || failures >= PATIENCE;
+        const isOver = error.code === "no_such_client" || error.code === "no_token" || failures >= MAX_FAILURES;
         if (isOver) {
           this.close();
           this.events.onEnd(error.message);
@@ -64,7 +64,7 @@ export class JpegLink {
     }
   }
 
-  /** Send the newest picture and take its answer. */
+  /** Send the newest frame and process the response. */
   async #exchange(signal) {
     if (!this.newest) {
       await new Promise((resolve) => {
@@ -84,21 +84,21 @@ export class JpegLink {
       method: "POST", body, headers: { "Content-Type": "image/jpeg" }, signal,
     });
     this.sent += 1;
-    await this.#take(answer, takenMs, sentMs);
+    await this.#process(answer, takenMs, sentMs);
     return -1;
   }
 
-  /** Take the next picture of a station. */
+  /** Get the next frame of the station camera. */
   async #fetch(after, signal) {
     const sentMs = performance.now();
     const answer = await ask(`/api/clients/${this.client}/frame${after < 0 ? "" : `?after=${after}`}`, { signal });
-    return answer.status === 204 ? after : this.#take(answer, null, sentMs);
+    return answer.status === 204 ? after : this.#process(answer, null, sentMs);
   }
 
-  async #take(answer, takenMs, sentMs) {
+  async #process(answer, takenMs, sentMs) {
     const header = answer.headers.get("X-Arview-Answer");
     const pose = header ? JSON.parse(header) : await answer.json();
-    // Of a station's picture it is not known how long the request waited for it: the round trip is that of a phone's.
+    // The round trip can only be measured for a phone: a request for a station's frame waits for an unknown time.
     if (takenMs !== null) this.rttMs = Math.max(0, performance.now() - sentMs - pose.server_ms);
     if (header) {
       const picture = await createImageBitmap(await answer.blob());

@@ -1,13 +1,13 @@
-// The stamp: a strip of black and white cells below a picture that says which frame it is.
-// The layout is that of src/arview/live/stamp.py: 20 bits id, 13 width, 13 height, 2 quarter turns, 16 CRC.
+// The stamp: a strip of black and white cells below a picture that encodes the id and size of the frame.
+// The layout is that of src/arview/live/stream/stamp.py: 20 bits id, 13 width, 13 height, 2 quarter turns, 16 CRC.
 
 export const FRAME_IDS = 1 << 20;
 const CELLS = 32, ROWS = 2;
 
-/** Rows of the strip below a picture of this width. */
+/** Height of the strip below a picture of this width, rows. */
 export const stripHeight = (width) => 2 * Math.ceil(width / 64);
 
-/** Whether frame id `a` was counted after `b`; ids wrap around. */
+/** Whether frame id `a` is newer than `b`; ids wrap around. */
 export const isNewer = (a, b) => a !== b && ((a - b) & (FRAME_IDS - 1)) < FRAME_IDS / 2;
 
 /** CRC-16/CCITT-FALSE of bytes. */
@@ -22,7 +22,7 @@ export function crc16(bytes) {
 
 /** The 64 bits of a stamp {id, width, height, turns}, row after row. */
 export function stampBits({ id, width, height, turns }) {
-  // 48 bits fit into a number exactly, but not into its 32-bit operators.
+  // 48 bits fit into a number exactly, but bitwise operators are limited to 32 bits.
   let value = ((id * 2 ** 13 + width) * 2 ** 13 + height) * 4 + turns;
   const bytes = new Uint8Array(8);
   for (let i = 5; i >= 0; i--, value = Math.floor(value / 256)) bytes[i] = value % 256;
@@ -49,7 +49,7 @@ export function drawStrip(context, stamp) {
 const SAMPLED_PX = 4;
 let reader = null;
 
-/** The stamp {id, width, height, turns} of a received frame (a video, canvas or bitmap); null when it is not sure. */
+/** The stamp {id, width, height, turns} of a received frame (a video, canvas or bitmap); null when it cannot be read. */
 export function readStamp(source, width, height) {
   if (!reader) {
     const canvas = document.createElement("canvas");

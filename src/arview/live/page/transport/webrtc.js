@@ -1,4 +1,4 @@
-// Transport by WebRTC: the camera goes up, poses come by a data channel, pictures of the server come as video.
+// Transport by WebRTC: the page sends its camera and receives poses by a data channel and pictures as video.
 
 import { CANVAS_OPTIONS } from "../graphics.js";
 import { ask, join, leave } from "./api.js";
@@ -8,7 +8,7 @@ import { drawStrip, readStamp, stripHeight } from "./stamp.js";
 const GATHER_MS = 1500, CONNECT_MS = 9000, SILENT_MS = 5000, RTT_EVERY_MS = 2000;
 const BITRATE = 8_000_000;
 
-/** The network does not let WebRTC through, or the browser has none. */
+/** The network blocks WebRTC, or the browser does not support it. */
 export class NoWebrtc extends Error {}
 
 export class WebrtcLink {
@@ -19,21 +19,21 @@ export class WebrtcLink {
   #ended = false;
 
   /**
-   * @param isPhone whether the camera goes up.
-   * @param video element for what the server sends.
-   * @param events {onPose, onStatus, onFrame(source, width, height, id, ms), onEnd(words)}
+   * @param isPhone whether this page sends its camera.
+   * @param video element for the video that the server sends.
+   * @param events {onPose, onStatus, onFrame(source, width, height, id, ms), onEnd(reason)}
    */
   constructor(isPhone, video, events) {
     Object.assign(this, { isPhone, video, events });
   }
 
-  /** Connect; raises NoWebrtc or a Refusal. */
+  /** Connect; throws NoWebrtc or a Refusal. */
   async open(mode, signal) {
-    if (!globalThis.RTCPeerConnection) throw new NoWebrtc("this browser has no WebRTC");
+    if (!globalThis.RTCPeerConnection) throw new NoWebrtc("this browser does not support WebRTC");
     const peer = (this.peer = new RTCPeerConnection({ iceServers: [] }));
     try {
       const channel = peer.createDataChannel("arview", { ordered: false, maxRetransmits: 0 });
-      channel.addEventListener("message", (event) => this.#take(JSON.parse(event.data)));
+      channel.addEventListener("message", (event) => this.#process(JSON.parse(event.data)));
       channel.addEventListener("close", () => this.#end("the connection was closed"));
       this.#addVideo(peer);
       await peer.setLocalDescription(await peer.createOffer());
@@ -46,19 +46,19 @@ export class WebrtcLink {
     } catch (error) {
       this.close();
       if (error.code === "bad_offer" || error instanceof DOMException && error.name !== "AbortError") {
-        throw new NoWebrtc(`this browser and the station find no common WebRTC: ${error.message}`);
+        throw new NoWebrtc(`the browser and the station cannot agree on WebRTC: ${error.message}`);
       }
       throw error;
     }
     peer.addEventListener("connectionstatechange", () => {
-      if (["failed", "closed"].includes(peer.connectionState)) this.#end("the connection broke");
+      if (["failed", "closed"].includes(peer.connectionState)) this.#end("the connection was lost");
     });
-    this.#heardMs = performance.now();
+    this.#receivedMs = performance.now();
     this.#timer = setInterval(() => this.#watch(), RTT_EVERY_MS);
     return this;
   }
 
-  /** Send a picture of the camera. */
+  /** Send a frame of the camera. */
   send(frame) {
     const { context } = this, { canvas } = context, height = frame.height + stripHeight(frame.width);
     if (canvas.width !== frame.width || canvas.height !== height) {
@@ -83,7 +83,7 @@ export class WebrtcLink {
   }
 
   #timer = 0;
-  #heardMs = 0;
+  #receivedMs = 0;
   #stopWatching = () => {};
 
   #addVideo(peer) {
@@ -93,7 +93,7 @@ export class WebrtcLink {
       this.context = canvas.getContext("2d", CANVAS_OPTIONS);
       const byHand = "requestFrame" in (globalThis.CanvasCaptureMediaStreamTrack?.prototype ?? {});
       [this.track] = (byHand ? canvas.captureStream(0) : canvas.captureStream()).getVideoTracks();
-      this.track.contentHint = "detail"; // rather fewer pictures than smaller ones
+      this.track.contentHint = "detail"; // prefer fewer frames to smaller ones
       const { sender } = peer.addTransceiver(this.track, { direction: "sendrecv" });
       const parameters = sender.getParameters();
       parameters.degradationPreference = "maintain-resolution";
@@ -118,21 +118,21 @@ export class WebrtcLink {
     if (stamp) this.events.onFrame(video, width, height - stripHeight(width), stamp.id, moment);
   }
 
-  #take(document) {
-    this.#heardMs = performance.now();
+  #process(document) {
+    this.#receivedMs = performance.now();
     if (document.type === "pose") this.events.onPose(document);
     else if (document.type === "status") this.events.onStatus(document);
   }
 
   async #watch() {
-    if (performance.now() - this.#heardMs > SILENT_MS) {
-      // The server says something every second; ask by another way before giving up.
+    if (performance.now() - this.#receivedMs > SILENT_MS) {
+      // The server sends a message every second; try HTTP before giving up.
       try {
         this.events.onStatus(await (await ask(`/api/clients/${this.client}/status`)).json());
       } catch (error) {
         return this.#end(error.message);
       }
-      return this.#end("nothing comes through the connection any more");
+      return this.#end("no more data arrives through the connection");
     }
     const report = await this.peer.getStats().catch(() => []);
     for (const entry of report.values?.() ?? []) {
@@ -142,10 +142,10 @@ export class WebrtcLink {
     }
   }
 
-  #end(words) {
+  #end(reason) {
     if (this.#ended) return;
     this.close();
-    this.events.onEnd(words);
+    this.events.onEnd(reason);
   }
 }
 
@@ -171,7 +171,7 @@ function connected(peer, channel) {
     peer.addEventListener("connectionstatechange", () => {
       if (peer.connectionState !== "failed") return;
       clearTimeout(timer);
-      reject(new NoWebrtc("this network does not let WebRTC through"));
+      reject(new NoWebrtc("this network blocks WebRTC"));
     });
   });
 }
