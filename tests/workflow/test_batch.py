@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from arview.cli import main
 from arview.errors import InputError
 from arview.inspection import Inspection, Provenance, load_inspection, save_inspection
-from arview.workflow.batch import BatchOptions, JobResult, Work, carry_out, run_batch
+from arview.workflow.batch import BatchOptions, JobResult, Work, run_batch, run_job
 from arview.workflow.job import InspectJob
 from arview.workflow.jobs_file import JOBS_FILE_EXAMPLE, BatchJob, load_jobs
 from helpers.inspections import CREATED, deviation
@@ -70,7 +70,7 @@ def tries(folder: Path) -> dict[str, list[str]]:
 
 
 def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
-    serial = [carry_out(one, LIGHT) for one in batch(tmp_path / "in", str(tmp_path / "serial"))]
+    serial = [run_job(one, LIGHT) for one in batch(tmp_path / "in", str(tmp_path / "serial"))]
     assert [one.verdict for one in serial] == ["pass"] * 5 + ["undecided"] + ["fail"] * 6
     for path in (tmp_path / "in").glob("*.tries"):
         path.unlink()
@@ -108,12 +108,12 @@ def test_what_kills_every_worker_stops_only_itself(tmp_path: Path) -> None:
 def test_done_again_only_where_something_changed(tmp_path: Path) -> None:
     jobs = batch(tmp_path / "in", str(tmp_path / "out"), 3)
     for one in jobs:
-        assert not carry_out(one, LIGHT).is_kept
-    assert all(carry_out(one, LIGHT).is_kept for one in jobs)
+        assert not run_job(one, LIGHT).is_kept
+    assert all(run_job(one, LIGHT).is_kept for one in jobs)
     np.save(tmp_path / "in" / "P-00.npy", np.full((5, 3), 2.0))
     (tmp_path / "out" / "P-01" / "inspection.json").write_text("{}")
     (tmp_path / "out" / "P-02" / "result.json").write_text("half a fi")
-    again = [carry_out(one, LIGHT) for one in jobs]
+    again = [run_job(one, LIGHT) for one in jobs]
     assert [one.is_kept for one in again] == [False, False, False]
     assert [one.verdict for one in again] == ["fail", "pass", "pass"]
 
@@ -122,15 +122,15 @@ def test_results_on_shared_storage(tmp_path: Path) -> None:
     place = f"file://{tmp_path}/bucket"
     inputs = batch(tmp_path / "in", place, 2)
     jobs = [BatchJob(o.name, InspectJob(**{**vars(o.job), "photos": f"file://{o.job.photos}"}), o.out) for o in inputs]
-    first = [carry_out(one, LIGHT) for one in jobs]
+    first = [run_job(one, LIGHT) for one in jobs]
     assert [one.verdict for one in first] == ["pass", "pass"]
     for one in jobs:
         folder = tmp_path / "bucket" / one.name
         assert sorted(path.name for path in folder.iterdir()) == ["inspection.json", "result.json"]
         assert json.loads((folder / "result.json").read_text())["files"] == ["inspection.json"]
-    assert all(carry_out(one, LIGHT).is_kept for one in jobs)
+    assert all(run_job(one, LIGHT).is_kept for one in jobs)
     gone = BatchJob("x", InspectJob("part.toml", f"file://{tmp_path}/none.npy"), f"{place}/x")
-    assert carry_out(gone, LIGHT) == JobResult("x", "error", f"file://{tmp_path}/none.npy: no such file or folder",
+    assert run_job(gone, LIGHT) == JobResult("x", "error", f"file://{tmp_path}/none.npy: no such file or folder",
                                                f"{place}/x")  # fmt: skip
 
 

@@ -23,8 +23,8 @@ from arview.history import HistoryStore
 from arview.inspection import Inspection, Verdict, load_inspection
 from arview.reconstruction.intake import Intake
 from arview.reconstruction.run import Reconstruction
-from arview.workflow.clock import STEPS, Clock, Moment, clock_text
-from arview.workflow.lock import alone
+from arview.workflow.lock import exclusive_access
+from arview.workflow.progress import STEPS, ProgressEstimate, ProgressEstimator, time_text
 from helpers.cad_files import box
 from helpers.inspections import deviation, inspection, not_measured
 from helpers.video_files import numbered, write_clip
@@ -219,7 +219,7 @@ def test_the_film_goes_with_the_measurement(bench: Bench) -> None:
 
 
 def test_two_do_not_work_in_one_folder(bench: Bench) -> None:
-    with alone(bench.folder / "out", ".lock", waits=False):
+    with exclusive_access(bench.folder / "out", ".lock", waits=False):
         found = bench.inspect()
     assert found.exit_code == 64 and "another arview works there" in found.stderr and not bench.did
     assert bench.inspect().exit_code == 0
@@ -247,10 +247,10 @@ def test_a_pdf_that_cannot_be_made_is_a_warning(bench: Bench, monkeypatch: pytes
     assert "measure" in record and "report" not in record  # it is tried again when the libraries are there
 
 
-def _clock(**options: Any) -> tuple[Clock, list[Moment], Callable[[float], None]]:
+def _clock(**options: Any) -> tuple[ProgressEstimator, list[ProgressEstimate], Callable[[float], None]]:
     now = [0.0]
-    moments: list[Moment] = []
-    clock = Clock(moments.append, now=lambda: now[0], **options)
+    moments: list[ProgressEstimate] = []
+    clock = ProgressEstimator(moments.append, now=lambda: now[0], **options)
     return clock, moments, lambda seconds: now.__setitem__(0, now[0] + seconds)
 
 
@@ -262,10 +262,10 @@ def test_the_clock_tells_the_time_left(speed: float) -> None:
     for name, cost in STEPS:
         names = [f"{name} {i} of 4" for i in (1, 2, 3, 4)] if name == "depth maps" else [name]
         for each in names:
-            clock.tell(each, 0, 10)
+            clock.update(each, 0, 10)
             for done in range(1, 11):
                 wait(speed * cost / 10 / len(names))
-                clock.tell(each, done, 10)
+                clock.update(each, done, 10)
                 now = moments[-1]
                 if now.left_s is not None:
                     told += 1
@@ -278,18 +278,19 @@ def test_the_clock_tells_the_time_left(speed: float) -> None:
 
 def test_steps_that_are_passed_over_count_for_nothing() -> None:
     clock, moments, wait = _clock(has_film=False, has_pdf=False, has_video_frames=False)
-    clock.tell("photos", 24, 24)
+    clock.update("photos", 24, 24)
     wait(5.0)
-    clock.tell("components", 8, 16)  # the reconstruction was there
+    clock.update("components", 8, 16)  # the reconstruction was there
     costs = dict(STEPS)
     ahead = sum(cost for name, cost in STEPS[[name for name, _ in STEPS].index("components"):]
                 if name not in ("film", "PDF"))  # fmt: skip
     expected = (costs["photos"] + 0.5 * costs["components"]) / (costs["photos"] + ahead)
     assert moments[-1].share == pytest.approx(expected)
-    clock.tell("something new", 1, 2)
+    clock.update("something new", 1, 2)
     assert moments[-1].share == pytest.approx(expected) and moments[-1].step == "something new"
     assert (
-        clock_text(Moment("x", 0.5, 65.4, 124.6)) == "1:05, 2:05 left" and clock_text(Moment("x", 0, 0, None)) == "0:00"
+        time_text(ProgressEstimate("x", 0.5, 65.4, 124.6)) == "1:05, 2:05 left"
+        and time_text(ProgressEstimate("x", 0, 0, None)) == "0:00"
     )
 
 

@@ -156,12 +156,12 @@ def line_bar(has_film: bool, is_from_video: bool, has_pdf: bool) -> Iterator[Pro
     """Show one bar for all stages, with the time left, if stderr is a terminal."""
     from tqdm import tqdm
 
-    from arview.workflow.clock import Clock, Moment, clock_text
+    from arview.workflow.progress import ProgressEstimate, ProgressEstimator, time_text
 
     with tqdm(total=100.0, disable=None, leave=False, bar_format="{desc} {percentage:3.0f} % |{bar}|") as bar:
 
-        def show(moment: Moment) -> None:
-            bar.set_description_str(f"{moment.step:18}{clock_text(moment):>18}", refresh=False)
+        def show(moment: ProgressEstimate) -> None:
+            bar.set_description_str(f"{moment.step:18}{time_text(moment):>18}", refresh=False)
             bar.update(100.0 * moment.share - bar.n)
 
-        yield Clock(show, is_from_video, has_film, has_pdf).tell
+        yield ProgressEstimator(show, is_from_video, has_film, has_pdf).update

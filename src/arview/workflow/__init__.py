@@ -1,1 +1,1 @@
-"""The whole line: photos and a video of one part → verdict, report and film; and many parts at once."""
+"""The whole workflow: from photos and a video of one part to verdict, report and film; and many parts at once."""

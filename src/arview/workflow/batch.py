@@ -1,8 +1,8 @@
-"""Many parts at once with Dask: each job is done by some worker, and its results are in its folder or nowhere.
+"""Batches: many inspections at once with Dask.
 
-A job writes its results where they belong and, when they are complete, ``result.json`` with the hash of everything
-that they depend on. So a job that is run again (its worker died, the batch was interrupted, the file grew) sees that it
-is done; and a worker has nothing in memory that could be lost with it.
+A job writes its results to their destination and then ``result.json``, which holds a hash of everything that the
+results depend on. A job that is run again, because its worker died, the batch was interrupted or the jobs file has
+grown, finds this file and is skipped. Workers keep nothing in memory that would be lost with them.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 from arview import __version__
 from arview.core.stage_cache import write_json
 from arview.errors import ArviewError, CannotMeasureError, InputError, MismatchError, MissingDependencyError
-from arview.workflow.jobs_file import PLACES, BatchJob
-from arview.workflow.lock import alone
-from arview.workflow.storage import fetched, is_url, read, sent
+from arview.workflow.jobs_file import LOCATION_FIELDS, BatchJob
+from arview.workflow.lock import exclusive_access
+from arview.workflow.storage import download, is_url, read, upload
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -30,20 +30,21 @@ if TYPE_CHECKING:
     from arview.workflow.job import InspectJob
 
 RESULT = "result.json"
+"""Name of the file that marks the results of a job as complete."""
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """What became of a job.
+    """The outcome of a job.
 
     Attributes:
-        name: of the job.
-        verdict: pass, fail, undecided, not_measured; ``error`` where an input is bad or the work broke off.
-        text: the counts, or why there is no verdict.
-        out: where the results are.
-        key: hash of all that the results depend on; empty for errors.
-        inspection_sha256: of ``inspection.json``; empty where there is none.
-        is_kept: an earlier run had done it.
+        name: name of the job.
+        verdict: pass, fail, undecided or not_measured; ``error`` when an input is invalid or the job failed.
+        text: summary of the verdicts, or why there is no verdict.
+        out: folder or URL of the results.
+        key: hash of everything that the results depend on; empty for errors.
+        inspection_sha256: hash of ``inspection.json``; empty when there is none.
+        is_kept: whether the result is that of an earlier run.
     """
 
     name: str
@@ -59,22 +60,22 @@ class JobResult:
 class BatchOptions:
     """How a batch is run."""
 
-    scheduler: str | None = None  # tcp://host:port of a running one; None starts workers on this machine
-    workers: int = 0  # of this machine; 0: as many as cores and memory allow
-    memory_limit: str = "4GB"  # per job; a reconstruction of 24 photos of 2 Mpx takes 2.4 GB
-    retries: int = 2  # of a job that broke off by something that may pass: storage, memory, a dead worker
-    connect_s: float = 15.0  # how long a scheduler may take to answer
-    scratch: str | None = None  # folder for what is fetched from URLs; None: the system's for temporary files
+    scheduler: str | None = None  # tcp://host:port of a running scheduler; None starts workers on this machine
+    workers: int = 0  # number of workers on this machine; 0: as many as cores and memory allow
+    memory_limit: str = "4GB"  # memory of a worker; a reconstruction of 24 photos of 2 Mpx needs 2.4 GB
+    retries: int = 2  # attempts after failures that may be temporary: storage, memory, a dead worker
+    connect_s: float = 15.0  # time in which a scheduler must answer
+    scratch: str | None = None  # folder for downloaded files; None: that of the system for temporary files
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a job does, so that it can be another one in tests.
+    """The functions that a job consists of; tests replace them.
 
     Attributes:
-        key: hash of all that the results depend on.
-        inspect: does it into a folder and returns verdict and text; raises ArviewError.
-        files: names of the results, of which those that are there are kept.
+        key: returns a hash of everything that the results depend on.
+        inspect: writes the results to a folder and returns verdict and text; raises ArviewError.
+        files: names of the possible results.
     """
 
     key: Callable[[InspectJob, Path], str]
@@ -105,41 +106,42 @@ INSPECTION = Work(
 )  # fmt: skip
 
 
-def carry_out(job: BatchJob, work: Work = INSPECTION, scratch: str | None = None) -> JobResult:
-    """Do one job, here, unless it is done: this is what a worker runs.
+def run_job(job: BatchJob, work: Work = INSPECTION, scratch: str | None = None) -> JobResult:
+    """Run one job in this process, unless its results exist. This is the function that workers run.
 
-    With a local folder for the results the stages work in it, and one that was interrupted goes on where it was. With
-    a URL the job works in a scratch folder and sends its results when they are complete.
+    With a local folder for the results the stages work in it, and an interrupted job resumes. With a URL the job works
+    in a scratch folder and uploads its results when they are complete.
 
     Raises:
-        OutputError, OSError: storage that may be there again later; a bad input is a result, not an exception.
+        OutputError, OSError: a failure of the storage, which may be temporary. An invalid input is returned as a
+            result with the verdict ``error``.
     """
     with tempfile.TemporaryDirectory(prefix="arview-", dir=scratch) as temporary:
         try:
             local = _local(job.job, Path(temporary) / "in")
             if is_url(job.out):
-                return _done(job, local, Path(temporary) / "out", work)
-            with alone(Path(job.out), ".job.lock", waits=True):
-                return _done(job, local, Path(job.out), work)
+                return _run(job, local, Path(temporary) / "out", work)
+            with exclusive_access(Path(job.out), ".job.lock", waits=True):
+                return _run(job, local, Path(job.out), work)
         except (InputError, MismatchError, MissingDependencyError) as error:
             return JobResult(job.name, "error", str(error), job.out)
 
 
 def _local(job: InspectJob, folder: Path) -> InspectJob:
-    """The job with all that it names by URL fetched."""
-    for name in PLACES:
-        place = getattr(job, name)
-        if place is not None and is_url(place):
-            values: dict[str, Any] = {name: str(fetched(place, folder / name))}
+    """The job with all inputs that are URLs downloaded to a folder."""
+    for name in LOCATION_FIELDS:
+        location = getattr(job, name)
+        if location is not None and is_url(location):
+            values: dict[str, Any] = {name: str(download(location, folder / name))}
             job = replace(job, **values)
     return job
 
 
-def _done(job: BatchJob, local: InspectJob, folder: Path, work: Work) -> JobResult:
+def _run(job: BatchJob, local: InspectJob, folder: Path, work: Work) -> JobResult:
     key = work.key(local, folder)
-    known = finished(job, key)
-    if known is not None:
-        return known
+    earlier = finished(job, key)
+    if earlier is not None:
+        return earlier
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RESULT).unlink(missing_ok=True)
     verdict, text = work.inspect(local, folder)
@@ -149,12 +151,12 @@ def _done(job: BatchJob, local: InspectJob, folder: Path, work: Work) -> JobResu
     result = JobResult(job.name, verdict, text, job.out, key, digest)
     write_json(folder / RESULT, {**asdict(result), "files": files, "version": __version__})
     if is_url(job.out):
-        sent(folder, [*files, RESULT], job.out)
+        upload(folder, [*files, RESULT], job.out)
     return result
 
 
 def finished(job: BatchJob, key: str) -> JobResult | None:
-    """The result that is there already, when it was made with this key and its inspection is as it was left."""
+    """The result of an earlier run if it has this key and its inspection is unchanged, else None."""
     content = read(f"{job.out}/{RESULT}")
     if content is None:
         return None
@@ -174,17 +176,17 @@ def run_batch(
     jobs: Sequence[BatchJob], options: BatchOptions | None = None, work: Work = INSPECTION,
     started: Callable[[str, int], None] | None = None, progress: Callable[[JobResult], None] | None = None,
 ) -> list[JobResult]:  # fmt: skip
-    """Do all jobs and return what became of them, in their order.
+    """Run all jobs and return their results in the order of the jobs.
 
-    A job whose worker dies is given to another, and one that fails by storage or memory is tried again, as often as the
-    options say. Neither stops the others. Ctrl-C keeps what is finished.
+    A job whose worker dies is given to another worker, and a job that fails because of storage or memory is retried,
+    as often as the options allow. The other jobs continue. Ctrl-C keeps finished results.
 
     Args:
-        jobs: what is to be done.
-        options: where.
-        work: what a job does.
-        started: called with the link of the dashboard and the number of workers.
-        progress: called with each result as it comes.
+        jobs: the jobs.
+        options: workers and limits.
+        work: what a job consists of.
+        started: called with the URL of the dashboard and the number of workers.
+        progress: called with each result as it arrives.
 
     Raises:
         InputError: the scheduler cannot be reached, or has no workers.
@@ -200,11 +202,11 @@ def run_batch(
         workers = client.nthreads()
         if started is not None:
             started(client.dashboard_link, len(workers))
-        if options.scheduler is None and len(workers) > 1:  # they share the cores; elsewhere each has its own
+        if options.scheduler is None and len(workers) > 1:  # they share the cores of this machine
             threads = max(1, (os.cpu_count() or 1) // len(workers))
             jobs = [one if one.job.threads else replace(one, job=replace(one.job, threads=threads)) for one in jobs]
         futures = {
-            client.submit(carry_out, one, work, options.scratch, key=f"arview-{one.name}", pure=False,
+            client.submit(run_job, one, work, options.scratch, key=f"arview-{one.name}", pure=False,
                           retries=options.retries): one
             for one in jobs
         }  # fmt: skip
@@ -222,7 +224,7 @@ def run_batch(
 
 
 def _result(job: BatchJob, future: Any, retries: int) -> JobResult:
-    """Of a future that is done, or what broke it off, in one line."""
+    """The result of a finished future; an exception becomes a result with a message of one line."""
     from distributed import KilledWorker
 
     error = future.exception()
@@ -231,7 +233,7 @@ def _result(job: BatchJob, future: Any, retries: int) -> JobResult:
         return found
     if isinstance(error, KilledWorker):
         workers = f"{retries + 1} workers" if retries else "its worker"
-        text = f"{workers} died of it; it needs more memory than a worker has (--memory-limit), or crashes a library"
+        text = f"{workers} died; the job needs more memory than a worker has (--memory-limit), or a library crashes"
     elif isinstance(error, ArviewError):
         text = str(error)
     else:
@@ -241,7 +243,7 @@ def _result(job: BatchJob, future: Any, retries: int) -> JobResult:
 
 @contextmanager
 def _client(options: BatchOptions, count: int) -> Iterator[Client]:
-    """A client of the scheduler, or of workers of our own on this machine, one job at a time each."""
+    """A client of the scheduler, or of a local cluster whose workers run one job at a time."""
     import dask
     from distributed import Client, LocalCluster
 
@@ -249,7 +251,7 @@ def _client(options: BatchOptions, count: int) -> Iterator[Client]:
         "distributed.scheduler.allowed-failures": options.retries,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.target": False,
-        "distributed.worker.memory.pause": False,  # a job that waits for memory which only it holds would wait forever
+        "distributed.worker.memory.pause": False,  # a paused job would wait forever for memory that it holds itself
         "distributed.comm.timeouts.connect": f"{options.connect_s} s",
     }
     with dask.config.set(settings):
@@ -257,7 +259,7 @@ def _client(options: BatchOptions, count: int) -> Iterator[Client]:
             try:
                 client = Client(options.scheduler, timeout=f"{options.connect_s} s")
             except (OSError, ValueError, TimeoutError) as error:
-                raise InputError(f"{options.scheduler}: no Dask scheduler answers there ({error})") from error
+                raise InputError(f"{options.scheduler}: no Dask scheduler answers ({error})") from error
             with client:
                 if not client.nthreads():
                     raise InputError(
@@ -278,7 +280,11 @@ def _client(options: BatchOptions, count: int) -> Iterator[Client]:
 
 
 def default_workers(memory_limit: str) -> int:
-    """As many jobs at once as fit into the memory, with two cores for each: stages use both."""
+    """Number of jobs that fit into the memory, with two cores for each because the stages use both.
+
+    Raises:
+        InputError: the memory limit is no size.
+    """
     from dask.utils import parse_bytes
     from distributed.system import MEMORY_LIMIT
 
@@ -290,5 +296,5 @@ def default_workers(memory_limit: str) -> int:
 
 
 def failures(results: Sequence[JobResult]) -> list[JobResult]:
-    """Those without a verdict."""
+    """The results without a verdict."""
     return [one for one in results if one.verdict in ("error", "not_measured")]

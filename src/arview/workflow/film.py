@@ -1,4 +1,4 @@
-"""The film: a video with the ghost and the measured errors of each component."""
+"""The film: the video with the overlay of the model and the measured deviations of each component."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from arview.video import VideoSink, open_source
 
 
 def camera_of_video(video: str, spec: str | None, of_photos: Camera | None, is_from_video: bool) -> tuple[Camera, str]:
-    """Camera of a video's frames, and a warning or nothing.
+    """Intrinsics of the frames of a video, and a warning or an empty text.
 
     Args:
-        video: its file.
+        video: the video.
         spec: camera file, ``fov:DEG`` or None.
-        of_photos: that of the photos, or None.
-        is_from_video: the photos are frames of this video.
+        of_photos: intrinsics of the photos, or None.
+        is_from_video: whether the photos are frames of this video.
 
     Raises:
         InputError, MismatchError: the camera file cannot be used for this video.
@@ -34,11 +34,11 @@ def camera_of_video(video: str, spec: str | None, of_photos: Camera | None, is_f
         if spec is not None:
             return load_camera(spec, width, height, video, frames.quarter_turns_clockwise), ""
     if of_photos is not None and abs(of_photos.width * height - of_photos.height * width) <= max(width, height):
-        warning = "the video's camera is taken to be that of the photos; if it is not, give --video-camera"
+        warning = "the video is assumed to have the camera of the photos; if it does not, give --video-camera"
         return of_photos.scaled(width, height), "" if is_from_video else warning
     guessed = guess_camera(width, height)
     return guessed, (
-        f"the video's camera is guessed, focal length {guessed.fx:.0f} px: ghosts may be off; give --video-camera"
+        f"the video's camera is guessed, focal length {guessed.fx:.0f} px: the overlay may be off; give --video-camera"
     )
 
 
@@ -46,18 +46,18 @@ def make_film(
     video: str, part: Part, camera: Camera, inspection: Inspection, film: Path, poses: Path,
     progress: StepProgress,
 ) -> str:  # fmt: skip
-    """Follow the part through a video, draw what was measured, and say in how many frames it was followed.
+    """Track the part through a video and draw the inspection; returns in how many frames the part was tracked.
 
-    Both files appear complete or not at all, on Ctrl-C too.
+    Both files are written atomically, also when Ctrl-C interrupts.
 
     Args:
-        video: file.
-        part: what is in it.
-        camera: of its frames.
-        inspection: what is drawn.
-        film: file to write, .mp4.
-        poses: file to write, a JSON line a frame.
-        progress: called with (frames done, frames in all).
+        video: the video.
+        part: the part that it shows.
+        camera: intrinsics of its frames.
+        inspection: measured deviations to draw.
+        film: video file to write, .mp4.
+        poses: file to write with a line of JSON for each frame.
+        progress: called with (frames done, total number of frames).
 
     Raises:
         InputError: the video cannot be read.
@@ -84,10 +84,10 @@ def make_film(
         for made in unfinished:
             with suppress(OSError):
                 made.unlink(missing_ok=True)
-    seen = sum(summary.states.get(state, 0) for state in ("tracked", "critical"))
-    notes = [f"the part followed in {seen} of {summary.frames} frames"]
+    tracked = sum(summary.states.get(state, 0) for state in ("tracked", "critical"))
+    notes = [f"the part was tracked in {tracked} of {summary.frames} frames"]
     if summary.ended_reason:
         notes.append(summary.ended_reason)
-    if seen == 0:
+    if tracked == 0:
         notes.append(annotation.reasons_text(next(iter(summary.reasons.values()), {})))
     return "; ".join(note for note in notes if note)

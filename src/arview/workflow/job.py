@@ -1,4 +1,4 @@
-"""What is to be inspected: the inputs of one part, as plain values that a file and another process can hold."""
+"""Inspection jobs: the inputs of one part as plain values, which can be written to a file or sent to a process."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class InspectJob:
-    """One inspection. Paths are texts, so that it can be written to a file; None where a field is not given.
+    """One inspection. Paths are texts, so that a job can be written to a file; None where a field is not given.
 
     Attributes:
         part: part file or CAD file.
-        photos: folder or glob; None takes the sharp frames of ``video``.
-        video: is annotated with what was measured; None makes no film.
-        serial: of the specimen; None leaves that of the part file.
-        camera: calibrated camera of the photos, or ``fov:DEG``; of the video where that has its photos.
-        video_camera: camera of the video; None: that of the photos where the shape of the picture is the same, else
-            a guess.
-        scale_file: boards, tags, scale bars and rig in view (TOML).
-        unit: of the CAD, where the file does not say.
+        photos: folder or glob of the photos; None: the sharp frames of ``video``.
+        video: video that is annotated with the measured deviations; None: no film.
+        serial: serial number of the part; None: that of the part file.
+        camera: calibrated camera of the photos, or ``fov:DEG``; of the video when the photos are its frames.
+        video_camera: camera of the video; None: that of the photos if the aspect ratio is the same, else a guess.
+        scale_file: TOML file with the boards, tags, scale bars and camera rig.
+        unit: length unit of the CAD file if it does not specify one.
     """
 
     part: str
@@ -29,20 +28,20 @@ class InspectJob:
     video_camera: str | None = None
     scale_file: str | None = None
     unit: str | None = None
-    tolerance_mm: float | None = None  # of components for which the part file has none
-    guard: float = 1.0  # share of U kept from the tolerance; 1: ISO 14253-1
-    max_frames: int = 60  # of a video, taken as photos
+    tolerance_mm: float | None = None  # tolerance of components without one in the part file
+    guard: float = 1.0  # fraction of U by which the tolerance is reduced; 1: ISO 14253-1
+    max_frames: int = 60  # frames of a video that are used as photos
     seed: int = 0  # the same seed gives the same result
-    threads: int = 0  # 0: all cores
-    device: str = "auto"  # of dense matching
+    threads: int = 0  # threads of the reconstruction; 0: all cores
+    device: str = "auto"  # device of dense matching
     makes_pdf: bool = True
 
     @property
     def photo_source(self) -> str:
-        """Where the photos come from: the folder, or the video."""
+        """The source of the photos: their folder, or the video."""
         return self.photos or self.video or ""
 
     @property
     def is_from_video(self) -> bool:
-        """True when the photos are frames of the video."""
+        """Whether the photos are frames of the video."""
         return not self.photos

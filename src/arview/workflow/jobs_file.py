@@ -1,4 +1,4 @@
-"""JOBS.toml: which parts are to be inspected, and where the results go."""
+"""The jobs file (TOML): the parts of a batch and the destination of their results."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ from typing import Any
 
 from arview.errors import InputError
 from arview.workflow.job import InspectJob
-from arview.workflow.storage import is_url, joined
+from arview.workflow.storage import is_url, join_location
 
 JOBS_FILE_EXAMPLE = """\
-# Inspections of many parts. Paths are relative to this file, or URLs that fsspec knows (s3://bucket/…, gs://…, sftp://…).
-out = "results"                # a folder for each job below it
+# Inspections of many parts. Paths are relative to this file, or URLs of fsspec (s3://bucket/…, gs://…, sftp://…).
+out = "results"                # contains a folder for each job
 
-[defaults]                     # for jobs that do not say otherwise: any field of a job
+[defaults]                     # default values: any field of a job
 part = "part.toml"
 # tolerance_mm, guard, camera, video_camera, scale_file, unit, max_frames, seed, device, makes_pdf
 
 [[job]]
-serial = "PL-0417"             # the name of its folder too, unless there is a name
+serial = "PL-0417"             # also the name of its folder, unless a name is given
 photos = "photos/PL-0417"
 
 [[job]]
-name = "PL-0418_second_look"
+name = "PL-0418_repeat"
 serial = "PL-0418"
 photos = "photos/PL-0418b"
 video = "films/PL-0418.mp4"
 """
-"""A complete file; what `arview batch --help` shows."""
+"""A complete jobs file, shown by `arview batch --help`."""
 
-PLACES = ("part", "photos", "video", "camera", "video_camera", "scale_file")
+LOCATION_FIELDS = ("part", "photos", "video", "camera", "video_camera", "scale_file")
 _KINDS = {"tolerance_mm": float, "guard": float, "max_frames": int, "seed": int, "threads": int, "makes_pdf": bool}
 _NAME = re.compile(r"[\w][\w.+-]*")
 
 
 @dataclass(frozen=True)
 class BatchJob:
-    """One inspection of a batch: its name, what is inspected, and the folder or URL of its results."""
+    """One inspection of a batch: its name, its inputs, and the folder or URL of its results."""
 
     name: str
     job: InspectJob
@@ -47,10 +47,10 @@ class BatchJob:
 
 
 def load_jobs(path: str | Path) -> tuple[BatchJob, ...]:
-    """The jobs of a file, with names that differ.
+    """Read the jobs of a file; their names are unique.
 
     Raises:
-        InputError: no such file, no TOML, or an entry that cannot be; the message names it.
+        InputError: the file cannot be read, is not TOML, or has an invalid entry, which the message names.
     """
     path = Path(path)
     try:
@@ -79,8 +79,8 @@ def load_jobs(path: str | Path) -> tuple[BatchJob, ...]:
         if not isinstance(name, str) or not _NAME.fullmatch(name):
             raise InputError(f"{place}: name {name!r}: expected a serial or name of letters, digits and . _ + -")
         if name in jobs:
-            raise InputError(f"{place}: {name!r} is there already; give each its own name")
-        jobs[name] = BatchJob(name, _job(values, path.parent, place), joined(_placed(out, path.parent), name))
+            raise InputError(f"{place}: {name!r} occurs twice; names must be unique")
+        jobs[name] = BatchJob(name, _job(values, path.parent, place), join_location(_placed(out, path.parent), name))
     return tuple(jobs.values())
 
 
@@ -96,13 +96,13 @@ def _job(values: dict[str, Any], base: Path, place: str) -> InspectJob:
             raise InputError(
                 f"{place}: {key}: {value!r}, expected {'a number' if kind in (int, float) else kind.__name__}"
             )
-        if key in PLACES and not (key.endswith("camera") and value.startswith("fov:")):
+        if key in LOCATION_FIELDS and not (key.endswith("camera") and value.startswith("fov:")):
             values[key] = _placed(value, base)
     return InspectJob(**values)
 
 
 def _placed(text: str, base: Path) -> str:
-    """A path relative to the file as an absolute one; a URL as it is."""
+    """A path relative to the jobs file as an absolute path; a URL is returned unchanged."""
     return text if is_url(text) else str((base / text).resolve())
 
 

@@ -1,4 +1,4 @@
-"""One process at a time in a folder."""
+"""Locks that give one process at a time access to a folder."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from arview.errors import InputError, OutputError
 
 
 @contextmanager
-def alone(folder: Path, name: str, waits: bool) -> Iterator[None]:
-    """Hold a lock on a folder, which is made when missing; a process that dies leaves it free.
+def exclusive_access(folder: Path, name: str, waits: bool) -> Iterator[None]:
+    """Hold a lock on a folder, which is created if needed; the lock of a process that dies is released.
 
     Args:
-        folder: what is locked.
-        name: of the lock's file, which stays.
-        waits: until the folder is free; else it is an error when it is not.
+        folder: the folder to lock.
+        name: name of the lock file, which is not removed.
+        waits: wait until the folder is free instead of raising an error.
 
     Raises:
-        InputError: another process works there.
-        OutputError: the folder cannot be made or written to.
+        InputError: another process holds the lock.
+        OutputError: the folder cannot be created or written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -32,5 +32,7 @@ def alone(folder: Path, name: str, waits: bool) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InputError(f"{folder}: another arview works there; wait for it or give another folder") from None
+            raise InputError(
+                f"{folder}: another arview process is using this folder; wait for it or give another folder"
+            ) from None
         yield

@@ -1,4 +1,4 @@
-"""The inputs of a job, read and checked before the work begins; what its results depend on, as a hash."""
+"""Reading and checking of the inputs of a job, and hashes of everything that its results depend on."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from arview.workflow.job import InspectJob
 
 @dataclass(frozen=True)
 class Prepared:
-    """A job whose inputs were read and found usable."""
+    """A job with its inputs, which are checked, and the options of its stages."""
 
     job: InspectJob
     part: Part
@@ -33,11 +33,11 @@ class Prepared:
 
 
 def prepare(job: InspectJob, folder: Path) -> Prepared:
-    """Read and check everything that can be checked before the work begins.
+    """Read the inputs and check everything that can be checked before the work starts.
 
     Args:
-        job: what is wanted.
-        folder: for the results.
+        job: the job.
+        folder: folder of the results.
 
     Raises:
         InputError, MismatchError: an input is missing or unusable, or does not belong to the others.
@@ -70,7 +70,7 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
 
 
 def _check_cameras(job: InspectJob) -> None:
-    """Open the video once, and read the cameras as far as they can be without a photo."""
+    """Open the video once, and read the cameras as far as that is possible without a photo."""
     if job.video:
         with open_source(job.video) as frames:
             if frames.is_live:
@@ -78,14 +78,14 @@ def _check_cameras(job: InspectJob) -> None:
             if job.video_camera is not None:
                 load_camera(job.video_camera, frames.width, frames.height, job.video, frames.quarter_turns_clockwise)
     elif job.video_camera:
-        raise InputError("a camera of the video is given, but no video")
+        raise InputError("a camera of the video is given without a video")
     if job.camera:
         is_angle = job.camera.startswith("fov:")
         load_camera(job.camera, *((1000, 1000) if is_angle else (None, None)))
 
 
 def measurement_key(prepared: Prepared) -> str:
-    """A hash of all that the measurement depends on, by content: the same wherever the files lie."""
+    """A hash of everything that the measurement depends on, by content and independent of paths."""
     job, part, options = prepared.job, prepared.part, prepared.measure
     source = Path(job.photo_source)
     photos = [source] if source.is_file() else photo_paths(job.photo_source)[0]
@@ -98,12 +98,12 @@ def measurement_key(prepared: Prepared) -> str:
 
 
 def job_key(prepared: Prepared) -> str:
-    """A hash of all that the results depend on: the measurement, the film and the kinds of files."""
+    """A hash of everything that the results depend on: measurement, film and kinds of files."""
     job = prepared.job
     video = content_key([Path(job.video)]) if job.video else None
     return key_of(measurement_key(prepared), video, _content(job.video_camera), job.makes_pdf)
 
 
 def _content(spec: str | None) -> str | None:
-    """The content of a file, or the text itself where it is none."""
+    """A hash of the content of a file, or the text itself if it is not a file."""
     return content_key([Path(spec)]) if spec and Path(spec).is_file() else spec

@@ -1,11 +1,11 @@
-"""One line from photos and a video to the verdict: reconstruct → measure → report → film, each done once.
+"""The workflow from photos and a video to the verdict: reconstruct → measure → report → film, each done once.
 
-| file | of |
+| file | content |
 |---|---|
-| those of ``arview.reconstruction.run`` | photos → poses → mm → cloud |
+| those of ``arview.reconstruction.run`` | camera poses, scale and cloud |
 | ``inspection.json``, ``inspection_distances/`` | the measurement; the cloud coloured by its distance to the CAD |
 | ``report.html``, ``report.pdf`` | the report |
-| ``annotated.mp4``, ``poses.jsonl`` | the video with what was measured, and its poses |
+| ``annotated.mp4``, ``poses.jsonl`` | the video with the measured deviations, and its poses |
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.reconstruction.run import Reconstruction, reconstruct
 from arview.workflow.film import camera_of_video, make_film
 from arview.workflow.job import InspectJob
-from arview.workflow.lock import alone
+from arview.workflow.lock import exclusive_access
 from arview.workflow.prepare import Prepared, measurement_key, prepare
 
 RESULTS = (
@@ -39,7 +39,14 @@ _RECONSTRUCTION = {"photos": "photos", "sparse": "camera poses", "scale": "scale
 
 @dataclass(frozen=True)
 class StageRecord:
-    """A stage of a run: ``state`` is ``done``, ``kept`` (of an earlier run) or ``left out``; ``note`` says more."""
+    """A stage of a run.
+
+    Attributes:
+        name: name of the stage.
+        state: ``done``, ``kept`` (the result of an earlier run is used) or ``left out``.
+        seconds: duration.
+        note: details.
+    """
 
     name: str
     state: str
@@ -49,15 +56,15 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an inspection found.
+    """The result of an inspection.
 
     Attributes:
-        folder: where its files are.
-        inspection: what was measured.
-        stages: in their order.
-        files: the results, those for people first.
-        warnings: in words, what speaks against the result or is missing of it.
-        peak_memory_mb: of this process, up to the end.
+        folder: folder of its files.
+        inspection: measured deviations and verdicts.
+        stages: the stages in their order.
+        files: the result files, those for people first.
+        warnings: doubts about the result, and what is missing from it.
+        peak_memory_mb: peak memory of this process.
     """
 
     folder: Path
@@ -69,60 +76,60 @@ class Outcome:
 
     @property
     def verdict(self) -> Verdict:
-        """Of the whole part."""
+        """Verdict of the whole part."""
         return overall_verdict(self.inspection)
 
     @property
     def sentence(self) -> str:
-        """The counts in words."""
+        """Summary of the verdicts of the components."""
         return verdict_sentence(self.inspection)
 
 
 def inspect_part(
     job: InspectJob, folder: str | Path, progress: Progress | None = None, starts_over: bool = False
 ) -> Outcome:
-    """Inspect one part; stages that an earlier run finished in ``folder`` with the same inputs are not done again.
+    """Inspect one part; stages that an earlier run finished in ``folder`` with the same inputs are skipped.
 
     Args:
-        job: what is to be inspected.
-        folder: where everything is written; made when missing.
-        progress: called with (what, done, total), see `arview.workflow.clock`.
-        starts_over: forget what an earlier run left in the folder.
+        job: the inputs.
+        folder: folder of all results; created if needed.
+        progress: called with (step, done, total), see `arview.workflow.progress`.
+        starts_over: ignore the results of earlier runs.
 
     Raises:
-        CannotMeasureError: photos that do not fit together, do not show the part, or contradict its CAD.
-        InputError, MismatchError: an input is missing, unusable, or does not belong to the others; another process
-            works in the folder.
+        CannotMeasureError: the photos do not fit together, do not show the part, or contradict its CAD.
+        InputError, MismatchError: an input is missing, unusable, or does not belong to the others; or another process
+            uses the folder.
         OutputError: the folder cannot be written to.
-        MissingDependencyError: a library is missing; the PDF alone is left out with a warning.
+        MissingDependencyError: a library is missing. If only the PDF needs it, there is a warning instead.
     """
     folder = Path(folder)
     prepared = prepare(job, folder)
-    with alone(folder, ".lock", waits=False):
-        return _Line(prepared, folder, progress or (lambda what, done, total: None)).all(starts_over)
+    with exclusive_access(folder, ".lock", waits=False):
+        return _Run(prepared, folder, progress or (lambda what, done, total: None)).execute(starts_over)
 
 
-class _Line:
-    """One run: what it works on, and what it has come to."""
+class _Run:
+    """One run: its inputs, and the stages and warnings so far."""
 
-    def __init__(self, prepared: Prepared, folder: Path, tell: Progress) -> None:
-        self.prepared, self.folder, self.tell = prepared, folder, tell
+    def __init__(self, prepared: Prepared, folder: Path, progress: Progress) -> None:
+        self.prepared, self.folder, self.progress = prepared, folder, progress
         self.stages = Stages(folder)
         self.records: list[StageRecord] = []
         self.warnings: list[str] = []
 
-    def all(self, starts_over: bool) -> Outcome:
-        """The stages in their order."""
+    def execute(self, starts_over: bool) -> Outcome:
+        """Run the stages in their order."""
         key = measurement_key(self.prepared)
         if starts_over or not self.stages.is_finished("inputs", key):
-            # Results of other inputs go before anything can fail: what lies in the folder is always of these.
+            # Results of other inputs are removed first, so that the folder never mixes results of different inputs.
             for name in RESULTS:
                 (self.folder / name).unlink(missing_ok=True)
             self.stages.restart("inputs")
         self.stages.finish("inputs", key)
-        found = self._reconstructed(starts_over)
-        self.stages = Stages(self.folder)  # as the reconstruction left them
-        inspection = self._measured(key)
+        found = self._reconstruct(starts_over)
+        self.stages = Stages(self.folder)  # the reconstruction has changed its file
+        inspection = self._measure(key)
         self._report()
         self._film(found, inspection)
         return Outcome(
@@ -131,11 +138,11 @@ class _Line:
             tuple(dict.fromkeys([*self.warnings, *inspection.warnings])), _peak_memory_mb(),
         )  # fmt: skip
 
-    def _reconstructed(self, starts_over: bool) -> Reconstruction:
+    def _reconstruct(self, starts_over: bool) -> Reconstruction:
         prepared, job = self.prepared, self.prepared.job
         options = replace(prepared.reconstruct, starts_over=starts_over)
         with _measuring():
-            found = reconstruct(job.photo_source, self.folder, prepared.part, job.camera, options, self.tell)
+            found = reconstruct(job.photo_source, self.folder, prepared.part, job.camera, options, self.progress)
         for name, title in _RECONSTRUCTION.items():
             state = "done" if name in found.seconds else "kept"
             self.records.append(StageRecord(title, state, found.seconds.get(name, 0.0), _about(found, name)))
@@ -143,7 +150,7 @@ class _Line:
         self.warnings += found.coverage.advice if found.coverage is not None else ()
         return found
 
-    def _measured(self, inputs: str) -> Inspection:
+    def _measure(self, inputs: str) -> Inspection:
         part, path = self.prepared.part, self.folder / "inspection.json"
 
         def work() -> str:
@@ -151,7 +158,7 @@ class _Line:
             from arview.measurement.run import measure
 
             with _measuring():
-                inspection = measure(read_folder(self.folder), part, self.prepared.measure, self.tell)
+                inspection = measure(read_folder(self.folder), part, self.prepared.measure, self.progress)
             save_inspection(inspection, path)
             return ""
 
@@ -168,10 +175,10 @@ class _Line:
             from arview.report import make_report
 
             try:
-                evidence = make_report(source, html, pdf if wants_pdf else None, part, progress=self.tell)
+                evidence = make_report(source, html, pdf if wants_pdf else None, part, progress=self.progress)
             except MissingDependencyError as error:
                 self.warnings.append(f"no PDF: {error}")
-                evidence = make_report(source, html, None, part, progress=self.tell)
+                evidence = make_report(source, html, None, part, progress=self.progress)
             self.warnings += evidence.absent.values()
             return "HTML and PDF" if pdf.is_file() else "HTML"
 
@@ -197,9 +204,9 @@ class _Line:
             self._once(
                 "film", "film", key, [film, poses],
                 lambda: make_film(video, part, camera, inspection, film, poses,
-                                  lambda done, total: self.tell("film", done, total)),
+                                  lambda done, total: self.progress("film", done, total)),
             )  # fmt: skip
-        except (InputError, MismatchError) as error:  # the measurement stands by itself
+        except (InputError, MismatchError) as error:  # the measurement is valid without the film
             for old in (film, poses):
                 old.unlink(missing_ok=True)
             self.records.append(StageRecord("film", "left out", note=str(error)))
@@ -207,7 +214,7 @@ class _Line:
                 self.warnings.append(f"no film: {error}")
 
     def _once(self, name: str, title: str, key: str, files: Sequence[Path], work: Callable[[], str]) -> None:
-        """Do the work, unless it was done with this key and its files are as it left them."""
+        """Do the work unless it was done with this key and its files are unchanged."""
         if self.stages.is_finished(name, f"{key} {content_key(files)}") and all(path.is_file() for path in files):
             self.records.append(StageRecord(title, "kept"))
             return
@@ -221,7 +228,7 @@ class _Line:
 
 @contextmanager
 def _measuring() -> Iterator[None]:
-    """Inputs were looked at before: what is wrong with them now is that they cannot be measured."""
+    """Turn input errors into CannotMeasureError: the inputs are valid, so that they cannot be measured."""
     try:
         yield
     except (InputError, MismatchError) as error:
@@ -229,7 +236,7 @@ def _measuring() -> Iterator[None]:
 
 
 def _about(found: Reconstruction, stage: str) -> str:
-    """What a stage of the reconstruction found, in a few words."""
+    """Summary of a stage of the reconstruction."""
     sparse, scale, quality = found.sparse, found.scale, found.quality
     if stage == "photos":
         left_out = f", {len(found.intake.rejected)} left out" if found.intake.rejected else ""
@@ -246,6 +253,6 @@ def _about(found: Reconstruction, stage: str) -> str:
 
 
 def _peak_memory_mb() -> float:
-    """The most this process has held in memory so far."""
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most / (1024.0**2 if sys.platform == "darwin" else 1024.0)
+    """Peak resident memory of this process so far, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)

@@ -1,4 +1,4 @@
-"""Folders and files on shared storage, by URL: all that fsspec knows (s3, gs, abfs, sftp, http, file, …)."""
+"""Files and folders on shared storage, by URL, through fsspec (s3, gs, abfs, sftp, http, file, …)."""
 
 from __future__ import annotations
 
@@ -13,17 +13,22 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 
 
 def is_url(text: str) -> bool:
-    """True for ``scheme://…``."""
+    """Whether a text has the form ``scheme://…``."""
     return _URL.match(text) is not None
 
 
-def joined(place: str, name: str) -> str:
-    """A name below a folder or URL."""
-    return f"{place.rstrip('/')}/{name}"
+def join_location(location: str, name: str) -> str:
+    """The path or URL of a name below a folder or URL."""
+    return f"{location.rstrip('/')}/{name}"
 
 
-def fetched(source: str, folder: Path) -> Path:
-    """A file, or a folder with all below it, from a URL into a local folder; raises InputError when it is not there."""
+def download(source: str, folder: Path) -> Path:
+    """Copy a file, or a folder with its content, from a URL into a local folder; returns the local path.
+
+    Raises:
+        InputError: there is no such file or folder.
+        OutputError: the storage cannot be read.
+    """
     system, path = _opened(source)
     target = folder / path.rstrip("/").rsplit("/", 1)[-1]
     try:
@@ -37,42 +42,50 @@ def fetched(source: str, folder: Path) -> Path:
             system.get_file(path, str(target))
     except InputError:
         raise
-    except Exception as error:  # every kind of storage has errors of its own
+    except Exception as error:  # every kind of storage raises its own exceptions
         raise OutputError(f"{source}: cannot be read ({error})") from error
     return target
 
 
-def read(place: str) -> bytes | None:
-    """The content of a file by path or URL; None when there is none."""
-    system, path = _opened(place)
+def read(location: str) -> bytes | None:
+    """The content of a file by path or URL; None if it does not exist.
+
+    Raises:
+        OutputError: the storage cannot be read.
+    """
+    system, path = _opened(location)
     try:
         return bytes(system.cat_file(path)) if system.isfile(path) else None
     except Exception as error:
-        raise OutputError(f"{place}: cannot be read ({error})") from error
+        raise OutputError(f"{location}: cannot be read ({error})") from error
 
 
-def sent(folder: Path, names: Iterable[str], place: str) -> None:
-    """Put files of a local folder below a URL, in this order: the last one says that the others are there."""
-    system, path = _opened(place)
+def upload(folder: Path, names: Iterable[str], location: str) -> None:
+    """Copy files of a local folder below a URL, in the given order, so that the last one can mark completeness.
+
+    Raises:
+        OutputError: the storage cannot be written to.
+    """
+    system, path = _opened(location)
     try:
         for name in names:
             target = f"{path.rstrip('/')}/{name}"
             system.makedirs(target.rsplit("/", 1)[0], exist_ok=True)
             system.put_file(str(folder / name), target)
     except Exception as error:
-        raise OutputError(f"{place}: cannot be written to ({error})") from error
+        raise OutputError(f"{location}: cannot be written to ({error})") from error
 
 
-def _opened(place: str) -> tuple[Any, str]:
-    """File system and path of a URL or a path."""
+def _opened(location: str) -> tuple[Any, str]:
+    """The file system and the path in it of a path or URL."""
     try:
         import fsspec
     except ImportError as error:
         raise MissingDependencyError("storage by URL needs fsspec: pip install 'arview[batch]'") from error
     try:
-        system, path = fsspec.url_to_fs(place)
+        system, path = fsspec.url_to_fs(location)
     except ImportError as error:  # fsspec says which package a kind of storage needs
-        raise MissingDependencyError(f"{place}: {error}") from error
+        raise MissingDependencyError(f"{location}: {error}") from error
     except ValueError as error:
-        raise InputError(f"{place}: {error}") from error
+        raise InputError(f"{location}: {error}") from error
     return system, str(path)

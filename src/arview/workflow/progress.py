@@ -1,4 +1,4 @@
-"""How far a whole inspection is, and how long it will still take."""
+"""Progress of a whole inspection and its remaining time."""
 
 from __future__ import annotations
 
@@ -32,12 +32,19 @@ STEPS: tuple[tuple[str, float], ...] = (
     ("PDF", 5.0),
     ("film", 12.0),
 )
-"""Steps in their order, as the stages call them, and what they take of each other's time (24 photos, two cores)."""
+"""Steps in their order, named as the stages report them, and their relative durations (24 photos, two cores)."""
 
 
 @dataclass(frozen=True)
-class Moment:
-    """How far the work is: the step, ``share`` of all (0 to 1), seconds passed and, once it can be told, left."""
+class ProgressEstimate:
+    """The progress at one time.
+
+    Attributes:
+        step: the current step.
+        share: fraction of the whole work that is done, 0 to 1.
+        passed_s: time since the start.
+        left_s: estimated remaining time; None while it cannot be estimated.
+    """
 
     step: str
     share: float
@@ -45,15 +52,20 @@ class Moment:
     left_s: float | None
 
 
-class Clock:
-    """Turns what the stages report, each with its own counts, into one share of all.
+class ProgressEstimator:
+    """Combines the reports of the stages, each with its own counts, into the progress of the whole.
 
-    Steps that are passed over, as they were done before, count for nothing. The time left follows from the time that
-    the share so far has taken.
+    Steps that are skipped, because an earlier run finished them, do not count. The remaining time is extrapolated from
+    the time that the work so far has taken.
+
+    Args:
+        show: called with each estimate.
+        has_video_frames, has_film, has_pdf: whether these steps belong to the run.
+        now: clock, seconds.
     """
 
     def __init__(
-        self, show: Callable[[Moment], None], has_video_frames: bool = True, has_film: bool = True,
+        self, show: Callable[[ProgressEstimate], None], has_video_frames: bool = True, has_film: bool = True,
         has_pdf: bool = True, now: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         left_out = {"frames": not has_video_frames, "film": not has_film, "PDF": not has_pdf}
@@ -63,8 +75,8 @@ class Clock:
         self._done: dict[int, float] = {}  # share of each step that has reported
         self._at = -1
 
-    def tell(self, what: str, done: int, total: int) -> None:
-        """What a stage reports: its step, and how much of it."""
+    def update(self, what: str, done: int, total: int) -> None:
+        """Report progress of a stage: the name of its step, and how many of its parts are done."""
         at = self._index(what)
         if at is not None:
             share = min(done / total, 1.0) if total > 0 else 0.0
@@ -76,26 +88,26 @@ class Clock:
                     self._done[earlier] = 1.0
             self._done[at] = max(share, self._done.get(at, 0.0))
             self._at = max(at, self._at)
-        self._show(self.moment(what))
+        self._show(self.estimate(what))
 
-    def moment(self, step: str) -> Moment:
-        """The state now."""
+    def estimate(self, step: str) -> ProgressEstimate:
+        """The present progress."""
         done = sum(self._steps[i][1] * share for i, share in self._done.items())
-        ahead = sum(cost for i, (_, cost) in enumerate(self._steps) if i > self._at or i in self._done)
+        total = sum(cost for i, (_, cost) in enumerate(self._steps) if i > self._at or i in self._done)
         passed = self._now() - self._began
-        share = done / ahead if ahead > 0 else 0.0
+        share = done / total if total > 0 else 0.0
         left = passed * (1.0 - share) / share if share > 0.02 and passed > 1.0 else None
-        return Moment(step, share, passed, left)
+        return ProgressEstimate(step, share, passed, left)
 
     def _index(self, what: str) -> int | None:
         return next((i for i, (name, _) in enumerate(self._steps)
                      if what == name or (name == "depth maps" and what.startswith(name))), None)  # fmt: skip
 
 
-def clock_text(moment: Moment) -> str:
-    """``1:05, 0:50 left``: minutes and seconds passed and left."""
-    left = "" if moment.left_s is None else f", {_minutes(moment.left_s)} left"
-    return f"{_minutes(moment.passed_s)}{left}"
+def time_text(estimate: ProgressEstimate) -> str:
+    """Elapsed and remaining minutes and seconds, as in ``1:05, 0:50 left``."""
+    left = "" if estimate.left_s is None else f", {_minutes(estimate.left_s)} left"
+    return f"{_minutes(estimate.passed_s)}{left}"
 
 
 def _minutes(seconds: float) -> str:
