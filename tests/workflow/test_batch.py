@@ -138,7 +138,7 @@ def test_the_example_is_a_file_of_jobs(tmp_path: Path) -> None:
     path = tmp_path / "jobs.toml"
     path.write_text(JOBS_FILE_EXAMPLE)
     first, second = load_jobs(path)
-    assert (first.name, second.name) == ("PL-0417", "PL-0418_second_look")
+    assert (first.name, second.name) == ("PL-0417", "PL-0418_repeat")
     assert first.job.part == str(tmp_path / "part.toml") and first.out == str(tmp_path / "results" / "PL-0417")
     assert second.job.video == str(tmp_path / "films" / "PL-0418.mp4") and second.job.serial == "PL-0418"
 
@@ -152,7 +152,7 @@ def test_the_example_is_a_file_of_jobs(tmp_path: Path) -> None:
         ('out = "o"\n[[job]]\nserial = "a"\npart = "p"', "job 1: give photos"),
         ('out = "o"\n[[job]]\nserial = "../a"\npart = "p"\nphotos = "p"', "name '../a'"),
         ('out = "o"\n[[job]]\nserial = "a"\npart = "p"\nphotos = "p"\n[[job]]\nserial = "a"\npart = "p"\nphotos = "p"',
-         "job 2: 'a' is there already"),
+         "job 2: 'a' occurs twice"),
         ('out = "o"\n[[job]]\nserial = "a"\npart = "p"\nphotos = "p"\ntolerance = 1', "unknown tolerance"),
         ('out = "o"\n[[job]]\nserial = "a"\npart = "p"\nphotos = "p"\ntolerance_mm = "1"', "tolerance_mm: '1'"),
         ("out = ", "not valid TOML"),

@@ -221,7 +221,7 @@ def test_the_film_goes_with_the_measurement(bench: Bench) -> None:
 def test_two_do_not_work_in_one_folder(bench: Bench) -> None:
     with exclusive_access(bench.folder / "out", ".lock", waits=False):
         found = bench.inspect()
-    assert found.exit_code == 64 and "another arview works there" in found.stderr and not bench.did
+    assert found.exit_code == 64 and "another arview process is using this folder" in found.stderr and not bench.did
     assert bench.inspect().exit_code == 0
 
 
