@@ -22,7 +22,7 @@ from arview.assembly.presence_net import (
 )
 from arview.cad.model import Model
 from arview.detection.features.edge_net import EdgeNet
-from arview.detection.scoring.pose_verifier import BAND_PX, CHANNELS, LINES
+from arview.detection.scoring.crops import BAND_PX, CROP_CHANNELS, RESPONSE_CHANNELS
 from arview.geometry import Array, apply
 from arview.refinement.projection import intrinsics_of
 from arview.refinement.view_model import PartView
@@ -113,7 +113,7 @@ def test_network_inputs_have_their_shape() -> None:
     assert len(found) >= 4
     for crop in found:
         seen, both = network_input(crop)
-        assert seen.shape == (CHANNELS + LINES, SIDE_PX, SIDE_PX) and both.shape == (GLOBALS,)
+        assert seen.shape == (CROP_CHANNELS + RESPONSE_CHANNELS, SIDE_PX, SIDE_PX) and both.shape == (GLOBALS,)
         assert np.isfinite(seen).all() and np.isfinite(both).all()
 
 

@@ -15,13 +15,13 @@ from arview.detection.scoring.contour_verifier import (
     CHANNELS,
     COLUMNS,
     OUTLINE_ROWS,
-    RAW,
+    RAW_CHANNELS,
     ROWS,
     STEP_PX,
     ContourVerifier,
     contour_profiles,
-    picture_step,
-    shown,
+    network_input,
+    profile_step,
 )
 from arview.geometry import Array, rigid
 from arview.refinement.view_model import PartView
@@ -60,7 +60,7 @@ def nearer(share: float) -> Array:
 
 def edge_offsets_px(cut: NDArray[np.uint8]) -> Array:
     """Where along each row of the outline that is all in the picture the colours change most."""
-    steps = shown(cut, 80.0)[0][RAW, :OUTLINE_ROWS]
+    steps = network_input(cut, 80.0)[0][RAW_CHANNELS, :OUTLINE_ROWS]
     return STEP_PX * (steps[(cut[3, :OUTLINE_ROWS] > 0).all(axis=1)].argmax(axis=1) - MIDDLE)
 
 
@@ -96,14 +96,14 @@ def test_nothing_is_cut_outside_the_picture() -> None:
     assert not half_out[:, ~seen].any()
     behind = rigid(TRUTH[:3, :3], -TRUTH[:3, 3])
     assert not contour_profiles(picture(), PART, behind).any()
-    seen_behind, told = shown(contour_profiles(picture(), PART, behind), 80.0)
+    seen_behind, told = network_input(contour_profiles(picture(), PART, behind), 80.0)
     assert np.isfinite(seen_behind).all() and np.isfinite(told).all()
 
 
 def test_large_pictures_are_cut_as_the_line_network_sees_them() -> None:
     large = cv2.resize(picture().image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
     twice = ImagePyramid(large, CAMERA.scaled(1280, 960), 12, EdgeNet())
-    assert (picture_step(picture()), picture_step(twice)) == (0, -4)
+    assert (profile_step(picture()), profile_step(twice)) == (0, -4)
     one, other = (contour_profiles(seen, PART, TRUTH)[:3].astype(int) for seen in (picture(), twice))
     assert np.abs(one - other).mean() < 4.0
 
@@ -112,10 +112,10 @@ def test_what_is_shown_knows_no_brightness() -> None:
     cut = contour_profiles(picture(), PART, TRUTH)
     dark = cut.copy()
     dark[:3] = cut[:3] // 2
-    (seen, told), (seen_dark, told_dark) = shown(cut, 80.0), shown(dark, 80.0)
+    (seen, told), (seen_dark, told_dark) = network_input(cut, 80.0), network_input(dark, 80.0)
     assert seen.shape == (CHANNELS, ROWS, COLUMNS)
     assert np.abs(seen - seen_dark)[:3].mean() < 0.15
-    assert np.abs(seen - seen_dark)[RAW].mean() < 0.05
+    assert np.abs(seen - seen_dark)[RAW_CHANNELS].mean() < 0.05
     assert told_dark[1] < told[1] - 0.2
 
 

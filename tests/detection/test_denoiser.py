@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.detection.features import denoiser
-from arview.detection.features.denoiser import LEAST_NOISE, Denoiser, noise_level
+from arview.detection.features.denoiser import Denoiser, DenoiserOptions, noise_level
 from arview.detection.search.local_search import LocalSearch
 from helpers.synthetic import CAMERA, assembly_views, background, pose_from
 from helpers.synthetic import picture as drawn
@@ -95,7 +94,7 @@ def test_pictures_of_little_noise_stay_as_they_are() -> None:
     image = cv2.GaussianBlur(drawn(POSE, noise=0.0), (0, 0), 0.7)
     for noise in (0.0, 1.5):
         grainy = noisy(image, noise)
-        assert noise_level(grainy) < LEAST_NOISE
+        assert noise_level(grainy) < DenoiserOptions().min_noise
         assert network().denoise(grainy) is grainy
 
 
@@ -106,12 +105,11 @@ def test_any_size_is_cleaned(size: tuple[int, int]) -> None:
     assert np.std(clean.astype(float)) < 11.0
 
 
-def test_bands_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_leave_no_seams() -> None:
     image = noisy(drawn(POSE, noise=0.0), 12.0)
-    assert image.shape[0] == CAMERA.height <= denoiser.BAND_ROWS
+    assert image.shape[0] == CAMERA.height <= DenoiserOptions().band_rows
     whole = network().denoise(image)
-    monkeypatch.setattr(denoiser, "BAND_ROWS", 96)
-    banded = network().denoise(image)
+    banded = Denoiser(DenoiserOptions(band_rows=96)).denoise(image)
     assert np.max(np.abs(banded.astype(int) - whole)) <= 1
 
 

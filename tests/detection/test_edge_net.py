@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from arview.detection.features.edge_net import (
-    INSIDE,
-    LONGEST_SIDE_PX,
+    MAX_SIDE_PX,
+    SOLID_CHANNEL,
     EdgeNet,
     halve_responses,
     resize_responses,
@@ -71,12 +71,12 @@ def test_it_hardly_answers_to_noise() -> None:
     noise = np.clip(110 + 14 * rng.standard_normal((480, 640, 3)), 0, 255).astype(np.uint8)
     seen = network().predict(noise)
     assert np.mean(seen[:ORIENTATIONS].max(axis=0) > 128) < 0.01
-    assert np.mean(seen[INSIDE] > 128) < 0.01
+    assert np.mean(seen[SOLID_CHANNEL] > 128) < 0.01
 
 
 @pytest.mark.parametrize("noise", [3.0, 9.0, 16.0])
 def test_it_sees_where_the_solid_is(noise: float) -> None:
-    seen = network().predict(drawn(POSE, noise=noise))[INSIDE]
+    seen = network().predict(drawn(POSE, noise=noise))[SOLID_CHANNEL]
     vertices, faces, _ = assembly().mesh
     c = CAMERA.scaled(seen.shape[1], seen.shape[0])
     _, face_ids = rasterise(apply(POSE, vertices), faces, c.fx, c.fy, c.cx, c.cy, c.width, c.height)
@@ -123,7 +123,7 @@ def test_smaller_maps_keep_the_strongest_of_four() -> None:
 @pytest.mark.parametrize(("height", "width"), [(480, 640), (257, 331), (720, 1280), (40, 30)])
 def test_pictures_of_any_size_are_taken(height: int, width: int) -> None:
     seen = network().predict(background(1, width, height))
-    share = min(1.0, LONGEST_SIDE_PX / max(height, width))
+    share = min(1.0, MAX_SIDE_PX / max(height, width))
     assert abs(seen.shape[1] - share * height / 2) <= 1 and abs(seen.shape[2] - share * width / 2) <= 1
     assert resize_responses(seen, 50, 40, 1).shape == (8, 40, 50)
 
@@ -150,4 +150,4 @@ def test_a_picture_mixes_both_in_its_maps_and_without_a_network_has_gradients_on
     assert not plain.edge_responses().maps.any()
     np.testing.assert_array_equal(lined.without_edge_net.maps(-4)[0], by_gradients)
     np.testing.assert_array_equal(lined.maps(-4)[0], mixed)  # as it was
-    assert lined.edge_responses().maps.any() and lined.gradients(-4).lines.any()
+    assert lined.edge_responses().maps.any() and lined.level(-4).edge_responses.any()

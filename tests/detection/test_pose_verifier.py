@@ -11,17 +11,19 @@ from numpy.typing import NDArray
 
 from arview.detection.features.edge_net import EdgeNet
 from arview.detection.features.image_pyramid import ImagePyramid
-from arview.detection.scoring.pose_verifier import (
+from arview.detection.scoring.crops import (
     BAND_PX,
-    CHANNELS,
-    PLAIN,
-    RADIUS_PX,
-    SIDE_PX,
-    PoseVerifier,
+    CROP_CHANNELS,
+    CROP_RADIUS_PX,
+    CROP_SIDE_PX,
+    PLAIN_CHANNELS,
+    SHADING,
+    PoseCrop,
     append_gradients,
     normalise_colours,
     pose_crop,
 )
+from arview.detection.scoring.pose_verifier import PoseVerifier
 from arview.geometry import Array, apply
 from arview.refinement.view_model import PartView
 from arview.rendering.rasterizer import rasterise
@@ -56,10 +58,10 @@ def scores(seen: ImagePyramid, poses: Array) -> Array:
 
 def shown(pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """The picture around a pose, and what is drawn there."""
-    return looked_at(picture(), pose)[:2]
+    return crop_at(picture(), pose)[:2]
 
 
-def looked_at(seen: ImagePyramid, pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
+def crop_at(seen: ImagePyramid, pose: Array) -> PoseCrop:
     return pose_crop(seen, PART, pose, float(seen.radii_px(PART.views.diameter_mm, pose[None])[0]))
 
 
@@ -122,7 +124,7 @@ def test_the_surface_that_is_shown_is_that_of_the_mesh() -> None:
 
 
 def test_the_lines_that_are_shown_lie_where_the_outline_is_and_solids_where_the_part_is() -> None:
-    _, drawn_part, seen = looked_at(picture(), TRUTH)
+    _, drawn_part, seen = crop_at(picture(), TRUTH)
     strongest, along, solids = seen.astype(float) / 255.0
     is_inside = around_truth(rendered()[1] >= 0) > 0.5
     at_outline = np.abs(drawn_part[0]) < 1.0 / BAND_PX
@@ -135,7 +137,7 @@ def test_the_lines_that_are_shown_lie_where_the_outline_is_and_solids_where_the_
 
 
 def test_without_a_line_network_no_lines_are_shown() -> None:
-    assert not looked_at(ImagePyramid(picture().image, CAMERA, 12), TRUTH)[2].any()
+    assert not crop_at(ImagePyramid(picture().image, CAMERA, 12), TRUTH).responses.any()
 
 
 def rendered() -> tuple[Array, NDArray[np.int32]]:
@@ -148,9 +150,11 @@ def rendered() -> tuple[Array, NDArray[np.int32]]:
 
 def around_truth(values: Array) -> Array:
     """What the picture (H,W) has around the true pose, (S,S)."""
-    zoom = RADIUS_PX / (0.5 * (CAMERA.fx + CAMERA.fy) * 0.5 * PART.views.diameter_mm / np.linalg.norm(TRUTH[:3, 3]))
+    zoom = CROP_RADIUS_PX / (
+        0.5 * (CAMERA.fx + CAMERA.fy) * 0.5 * PART.views.diameter_mm / np.linalg.norm(TRUTH[:3, 3])
+    )
     center = CAMERA.project(TRUTH[None, :3, 3])[0]
-    columns, rows = np.meshgrid(*[(np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1)) / zoom + c for c in center])
+    columns, rows = np.meshgrid(*[(np.arange(CROP_SIDE_PX) - 0.5 * (CROP_SIDE_PX - 1)) / zoom + c for c in center])
     maps = columns.astype(np.float32), rows.astype(np.float32)
     return np.asarray(cv2.remap(values.astype(np.float32), *maps, cv2.INTER_LINEAR))
 
@@ -163,7 +167,7 @@ def shaded(strength: float, noise: float) -> tuple[Array, float]:
     grays = 60.0 + strength * light + rng.normal(0.0, noise, light.shape)
     pixels[..., :3] = np.clip(grays, 0, 255)[..., None]
     seen, explained = append_gradients(normalise_colours(pixels, drawn_part)[0])
-    return seen[PLAIN + 4 :], float(explained)
+    return seen[SHADING:], float(explained)
 
 
 def test_the_brightness_that_a_light_gives_the_surface_is_explained_and_noise_is_not() -> None:
@@ -186,8 +190,8 @@ def test_a_pose_outside_the_picture_is_scored_without_a_picture() -> None:
     aside[0, 3] += 2000.0
     plain, contrast = normalise_colours(*shown(aside))
     seen, explained = append_gradients(plain)
-    assert seen.shape == (CHANNELS, SIDE_PX, SIDE_PX)
-    assert not seen[:4].any() and not seen[PLAIN:].any()
+    assert seen.shape == (CROP_CHANNELS, CROP_SIDE_PX, CROP_SIDE_PX)
+    assert not seen[:4].any() and not seen[PLAIN_CHANNELS:].any()
     assert explained == 0.0
     assert contrast < 0.01
     assert scores(picture(), aside[None])[0] < scores(picture(), TRUTH[None])[0]

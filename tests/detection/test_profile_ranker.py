@@ -10,16 +10,16 @@ from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.profile_ranker import (
     FINE,
     INNER_LINES,
+    IS_SEEN,
     OUTLINE_LINES,
     PLACES,
     RADII_PX,
     REACH_PX,
     ROUGH,
-    SEEN,
     STRETCHES,
+    ProfileRanker,
     describe_poses,
-    judge,
-    network,
+    ranker_layers,
 )
 from arview.geometry import Array, exp_so3, rigid
 from arview.guideviews import GuideViewSet
@@ -54,7 +54,7 @@ def elsewhere(count: int) -> Array:
 
 
 def scores(seen: ImagePyramid, poses: Array, networks: tuple[str, ...]) -> Array:
-    return judge(seen, PART, poses, np.full(len(poses), 12.0), networks)
+    return ProfileRanker(PART, networks).scores(seen, poses, np.full(len(poses), 12.0))
 
 
 @NETWORKS
@@ -78,8 +78,8 @@ def test_the_kernel_scores_as_numpy_does(networks: tuple[str, ...]) -> None:
     expected = np.zeros(len(poses))
     for name in networks:
         lines, both = describe_poses(seen, PART, poses, np.full(len(poses), 12.0), RADII_PX[name])
-        net = network(name)
-        counts = lines[..., SEEN : SEEN + 1]
+        net = ranker_layers(name)
+        counts = lines[..., IS_SEEN : IS_SEEN + 1]
         hidden = np.maximum(lines @ net.first + net.first_bias, 0)
         hidden = np.maximum(hidden @ net.second + net.second_bias, 0) * counts
         outline, inner = np.split(hidden, [OUTLINE_LINES], axis=1)
@@ -107,12 +107,12 @@ def test_it_is_shown_the_lines_of_the_line_network_and_where_that_sees_solids() 
     seen = picture()
     lines, _ = describe_poses(seen, PART, TRUTH[None], np.full(1, 12.0), RADII_PX["rough"])
     outline = lines[0, :OUTLINE_LINES]
-    assert (outline[:, SEEN] == 1.0).all()
-    alike, inside = np.split(outline[:, SEEN + 2 :].mean(axis=0), 2)
+    assert (outline[:, IS_SEEN] == 1.0).all()
+    alike, inside = np.split(outline[:, IS_SEEN + 2 :].mean(axis=0), 2)
     assert len(alike) == len(inside) == PLACES
     # A line there, no other beside it; solid on the inner side only.
     assert alike[REACH_PX - 1 : REACH_PX + 2].max() > 0.6 > 4.0 * alike[-3:].mean()
     assert inside[:3].mean() > 0.6 and inside[-3:].mean() < 0.3
     without = ImagePyramid(seen.image, CAMERA, 12)
     lines, _ = describe_poses(without, PART, TRUTH[None], np.full(1, 12.0), RADII_PX["rough"])
-    assert not lines[0, :, SEEN + 2 :].any()
+    assert not lines[0, :, IS_SEEN + 2 :].any()

@@ -15,30 +15,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.detection.confidence import (
-    VERIFIED_EVIDENCE,
-    VERIFIED_JUDGEMENT,
-    VERIFIED_LINES,
-)
+from arview.detection.confidence import confidence_weights
 from arview.detection.scoring.contour_verifier import (
     CHANNELS,
     COLUMNS,
-    GLOBALS,
+    CONTOUR_SCALARS,
     OUTLINE_ROWS,
     ROWS,
-    shown,
+    network_input,
 )
 from contour_examples import Stripped
 from networks.net2net import torch_with_onnx
 from networks.score_nets import Design, Shown, fit, fit_score_network, scored, telling_loss, together
 from profile_ranker_examples import read_examples
 
-DESIGN = Design("strips", (CHANNELS, ROWS, COLUMNS), GLOBALS, (24, 24, 48, 48, 64), deepened=(3,), rate=2e-3)
+DESIGN = Design("strips", (CHANNELS, ROWS, COLUMNS), CONTOUR_SCALARS, (24, 24, 48, 48, 64), deepened=(3,), rate=2e-3)
 PICTURES, POSES = 8, 12
 """A step looks at so many poses of so many pictures."""
 LISTWISE_WEIGHT = 0.5
 """Beside telling right from wrong in all pictures, the right pose of each is to be told from its others."""
-OTHERS = (1.0, VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES)
+OTHERS = (1.0, *confidence_weights().verified[:3])
 """What else is known counts so at first: the network is to say what is missing."""
 DECAY = 2e-2
 UNSURE = 0.3
@@ -108,7 +104,9 @@ def _inputs(one: Stripped, index: Sequence[int], rng: np.random.Generator | None
     strips = one.strips[list(index)]
     if rng is not None:
         strips = altered(strips, rng)
-    seen, told = zip(*(shown(raw, float(one.radii_px[k])) for raw, k in zip(strips, index, strict=True)), strict=True)
+    seen, told = zip(
+        *(network_input(raw, float(one.radii_px[k])) for raw, k in zip(strips, index, strict=True)), strict=True
+    )
     return np.stack(seen), np.stack(told)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from arview.detection.features.denoiser import SHOWN_MEAN, SHOWN_RANGE
+from arview.detection.features.denoiser import INPUT_MEAN, INPUT_SCALE
 from edge_net_examples import read_lined_pictures
 from edge_net_fitting import compressed, with_flat_things
 from networks.layers import write_picture_network
@@ -91,11 +91,11 @@ def _stacked(pairs: Sequence[Pair], torch: Any) -> tuple[Any, Any]:
 
 
 def _as_shown(picture: Any) -> Any:
-    return (picture - SHOWN_MEAN) / SHOWN_RANGE
+    return (picture - INPUT_MEAN) / INPUT_SCALE
 
 
 def _cleaned(shown: Any, said: Any, torch: Any) -> Any:
-    return shown + SHOWN_RANGE * torch.nn.functional.pixel_shuffle(said, 2)
+    return shown + INPUT_SCALE * torch.nn.functional.pixel_shuffle(said, 2)
 
 
 def _pair(image: NDArray[np.uint8], rng: np.random.Generator, noise: float | None = None) -> Pair:

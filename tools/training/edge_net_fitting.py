@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.detection.features.denoiser import Denoiser
-from arview.detection.features.edge_net import CONTRAST, SHRINK
+from arview.detection.features.edge_net import INPUT_SCALE, SHRINK
 from arview.detection.features.response_maps import ORIENTATIONS
 from edge_net_examples import FINE, LinedPicture, read_lined_pictures
 from networks.layers import normalised, residual, write_picture_network
@@ -144,7 +144,7 @@ def _example(picture: LinedPicture, rng: np.random.Generator) -> tuple[NDArray[n
         shown, truth = shown[::-1], truth[TURNED["mirrored"], ::-1]
     if rng.random() < 0.5:
         shown, truth = shown.swapaxes(0, 1), truth[TURNED["transposed"]].swapaxes(1, 2)
-    as_shown = (shown.astype(np.float32) - np.float32(shown.mean())) / np.float32(CONTRAST)
+    as_shown = (shown.astype(np.float32) - np.float32(shown.mean())) / np.float32(INPUT_SCALE)
     return np.ascontiguousarray(as_shown.transpose(2, 0, 1)), np.ascontiguousarray(truth)
 
 

@@ -85,9 +85,10 @@ def twins_of(
     right = right[right | ~near]
     if not right.any() or right.all():
         return []
-    pixels, drawn, lines = pair_crops(picture, local.refiner.part, [h.cam_from_body for h in kept])
+    crops = pair_crops(picture, local.refiner.part, [h.cam_from_body for h in kept])
+    drawn, lines = np.stack([crop.drawn for crop in crops]), np.stack([crop.responses for crop in crops])
     logits = np.array([h.logit_without_contour for h in kept])
-    return [Twins(seed, pixels, np.round(127.0 * drawn).astype(np.int8), lines, logits, right)]
+    return [Twins(seed, crops[0].pixels, np.round(127.0 * drawn).astype(np.int8), lines, logits, right)]
 
 
 def _turned(detector: Detector, truth: Array, rng: np.random.Generator) -> list[Array]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.detection.scoring.pair_comparator import SHOWN, SIDE_PX
+from arview.detection.scoring.pair_comparator import PAIR_CHANNELS, PAIR_SIDE_PX
 from networks.layers import exported, halving, normalised, write
 from networks.net2net import torch_with_onnx
 from networks.score_nets import fit
@@ -70,20 +70,22 @@ def fit_twins(folder: Path, epochs: int) -> None:
     network.eval()
     _report(network, left, torch)
     example = {
-        "seen": torch.zeros(3, SHOWN, SIDE_PX, SIDE_PX), "one": torch.tensor([0, 1]), "other": torch.tensor([2, 2])
-    }  # fmt: skip
+        "seen": torch.zeros(3, PAIR_CHANNELS, PAIR_SIDE_PX, PAIR_SIDE_PX),
+        "one": torch.tensor([0, 1]),
+        "other": torch.tensor([2, 2]),
+    }
     varying = {"seen": {0: "poses"}, **{name: {0: "pairs"} for name in ("one", "other", "lead")}}
     write(exported(network, example, "lead", varying, torch), folder / "twins.onnx")
 
 
 def twin_network(torch: Any) -> Any:
-    """A network that is shown poses (N,SHOWN,S,S), and says of pairs of them (P,) how likely it is the one."""
+    """A network that is shown poses (N,PAIR_CHANNELS,S,S), and says of pairs of them (P,) how likely it is the one."""
     nn = torch.nn
 
     class _TwinNetwork(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
-            self.alone = nn.Sequential(*halving(SHOWN, WIDTHS, (), torch))
+            self.alone = nn.Sequential(*halving(PAIR_CHANNELS, WIDTHS, (), torch))
             self.register_buffer("least_apart", torch.tensor(LEAST_APART).reshape(4, 1, 1))
             first, second, third = PAIR_WIDTHS
             self.paired = nn.Sequential(

@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.detection.scoring.pose_verifier import (
-    CHANNELS,
-    GLOBALS,
-    LINES,
-    MEANS,
-    PLAIN,
-    SIDE_PX,
+from arview.detection.scoring.crops import (
+    CROP_CHANNELS,
+    CROP_SIDE_PX,
+    NORMAL_X,
+    NORMAL_Y,
+    PLAIN_CHANNELS,
+    RESPONSE_CHANNELS,
     append_gradients,
     normalise_colours,
-    overall,
 )
-from arview.detection.scoring.score_net import DOWNWARD, RIGHTWARD, mirrored
+from arview.detection.scoring.pose_verifier import KNOWN_MEANS, POSE_SCALARS, pose_scalars
+from arview.detection.scoring.score_net import mirrored
 from networks.net2net import torch_with_onnx
 from networks.score_nets import Design, Shown, fit, fit_score_network, scored, telling_loss, together
 from pair_examples import Twins
@@ -29,7 +29,12 @@ from presence_net_examples import Looked
 from profile_ranker_examples import Looks, read_examples
 
 DESIGN = Design(
-    "verifier", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (24, 24, 48, 48, 96, 128), deepened=(3, 5), rate=2e-3
+    "verifier",
+    (CROP_CHANNELS + RESPONSE_CHANNELS, CROP_SIDE_PX, CROP_SIDE_PX),
+    POSE_SCALARS,
+    (24, 24, 48, 48, 96, 128),
+    deepened=(3, 5),
+    rate=2e-3,
 )
 PICTURES, POSES = 6, 20
 """A step looks at so many poses of so many pictures, a third of them right where there are any."""
@@ -102,8 +107,8 @@ def _inputs(look: Looks, index: Sequence[int], rng: np.random.Generator | None =
     both = []
     for k, contrast, share in zip(index, contrasts, explained, strict=True):
         # What is known of refined poses only is the mean for the others.
-        known = look.known[k] if look.is_refined[k] else MEANS
-        both.append(overall(float(look.radii_px[k]), contrast, known, share))
+        known = look.known[k] if look.is_refined[k] else KNOWN_MEANS
+        both.append(pose_scalars(float(look.radii_px[k]), contrast, known, share))
     return shown, np.stack(both)
 
 
@@ -118,24 +123,24 @@ def network_input(
     seen = np.concatenate([np.stack(plain), lines], axis=1)
     if rng is not None:
         seen = augmented(seen, rng)
-    shown, explained = zip(*map(append_gradients, np.ascontiguousarray(seen[:, :PLAIN])), strict=True)
-    return np.concatenate([np.stack(shown), seen[:, PLAIN:]], axis=1), list(contrasts), list(explained)
+    shown, explained = zip(*map(append_gradients, np.ascontiguousarray(seen[:, :PLAIN_CHANNELS])), strict=True)
+    return np.concatenate([np.stack(shown), seen[:, PLAIN_CHANNELS:]], axis=1), list(contrasts), list(explained)
 
 
 def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """The poses of one picture mirrored, turned, recoloured, shaded, blurred, noisier, or with something in front.
 
-    What follows the plain channels, see `PLAIN`, is mirrored, turned and hidden too, or weaker: on materials that it
+    What follows the plain channels is mirrored, turned and hidden too, or weaker: on materials that it
     does not know the line network is sure of little.
     """
     if rng.random() < 0.5:
         seen = mirrored(seen)
     if rng.random() < 0.5:
         seen = seen[..., ::-1, :].copy()
-        seen[:, DOWNWARD] *= -1.0
+        seen[:, NORMAL_Y] *= -1.0
     if rng.random() < 0.5:
         seen = seen.swapaxes(2, 3).copy()
-        seen[:, [RIGHTWARD, DOWNWARD]] = seen[:, [DOWNWARD, RIGHTWARD]]
+        seen[:, [NORMAL_X, NORMAL_Y]] = seen[:, [NORMAL_Y, NORMAL_X]]
     seen = np.concatenate([seen[:, rng.permutation(3)], seen[:, 3:]], axis=1)
     if rng.random() < 0.25:
         share = rng.uniform(0.5, 1.0)
@@ -155,8 +160,8 @@ def augmented(seen: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np
         width, height = rng.integers(side // 10, side // 3, 2)
         left, top = rng.integers(0, side - width), rng.integers(0, side - height)
         seen[:, :3, top : top + height, left : left + width] = rng.normal(size=(1, 3, 1, 1))
-        seen[:, PLAIN:, top : top + height, left : left + width] = 0.0
-    for channels in (slice(PLAIN, None), slice(PLAIN + LINES - 1, None)):
+        seen[:, PLAIN_CHANNELS:, top : top + height, left : left + width] = 0.0
+    for channels in (slice(PLAIN_CHANNELS, None), slice(PLAIN_CHANNELS + RESPONSE_CHANNELS - 1, None)):
         if rng.random() < UNSURE:
             seen[:, channels] *= rng.uniform(0.0, 1.0)
     return np.ascontiguousarray(seen)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.presence_net import GLOBALS, SIDE_PX, global_inputs
-from arview.detection.scoring.pose_verifier import CHANNELS, LINES
+from arview.detection.scoring.crops import CROP_CHANNELS, RESPONSE_CHANNELS
 from networks.net2net import torch_with_onnx
 from networks.score_nets import Design, Shown, fit, fit_score_network, scored, together
 from pose_verifier_fitting import network_input
@@ -18,7 +18,12 @@ from presence_net_examples import Looked
 from profile_ranker_examples import read_examples
 
 DESIGN = Design(
-    "components", (CHANNELS + LINES, SIDE_PX, SIDE_PX), GLOBALS, (24, 24, 48, 48, 64, 64), deepened=(3, 5), rate=2e-3
+    "components",
+    (CROP_CHANNELS + RESPONSE_CHANNELS, SIDE_PX, SIDE_PX),
+    GLOBALS,
+    (24, 24, 48, 48, 64, 64),
+    deepened=(3, 5),
+    rate=2e-3,
 )
 BATCH = 128
 DECAY = 2e-2

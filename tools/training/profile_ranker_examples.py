@@ -17,7 +17,7 @@ from arview.core.atomic import replacing
 from arview.detection import Detector
 from arview.detection.detector import DetectorOptions
 from arview.detection.features.image_pyramid import ImagePyramid
-from arview.detection.scoring.pose_verifier import pose_crop
+from arview.detection.scoring.crops import pose_crop
 from arview.detection.scoring.profile_ranker import RADII_PX, describe_poses
 from arview.detection.search.global_search import WIDE, PoseCandidate, SearchBudget
 from arview.detection.search.local_search import Hypothesis

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from arview.core.atomic import replacing
 from arview.detection.scoring.profile_ranker import (
     FEATURES,
-    GLOBALS,
+    IS_SEEN,
     OUTLINE_LINES,
-    SEEN,
+    RANKER_SCALARS,
     STRETCHES,
-    Network,
+    RankerLayers,
+    ranker_layers,
 )
-from arview.detection.scoring.profile_ranker import network as in_use_network
 from arview.errors import InputError
 from networks.net2net import GONE_ON
 from profile_ranker_examples import Group, read_examples
@@ -56,7 +56,7 @@ def fit_networks(folder: Path, epochs: int, is_anew: bool = True) -> None:
         weight = _fit(networks, *of_stage, epochs, rate, torch)
         print(f"{stage}: weight of the hand-made evidence {weight:.2f}")
         for name, network in networks.items():
-            for field, layer in zip(Network._fields[::2], network.layers(), strict=True):
+            for field, layer in zip(RankerLayers._fields[::2], network.layers(), strict=True):
                 stored[f"{name}_{field}"] = layer.weight.detach().numpy().T.copy()
                 stored[f"{name}_{field}_bias"] = layer.bias.detach().numpy().copy()
     with replacing(folder / "judge.npz") as file:
@@ -119,7 +119,7 @@ def _fit(
 def _as_in_use(name: str, torch: Any) -> Any:
     """One of the networks as it is in use."""
     network = _network(torch)
-    stored = in_use_network(name)
+    stored = ranker_layers(name)
     with torch.no_grad():
         for layer, weight, bias in zip(network.layers(), stored[::2], stored[1::2], strict=True):
             layer.weight.copy_(torch.from_numpy(weight.T.copy()))
@@ -135,14 +135,14 @@ def _network(torch: Any) -> Any:
         def __init__(self) -> None:
             super().__init__()
             self.first, self.second = nn.Linear(FEATURES, WIDTH), nn.Linear(WIDTH, WIDTH)
-            self.third, self.last = nn.Linear(3 * WIDTH + GLOBALS, LAST_WIDTH), nn.Linear(LAST_WIDTH, 1)
+            self.third, self.last = nn.Linear(3 * WIDTH + RANKER_SCALARS, LAST_WIDTH), nn.Linear(LAST_WIDTH, 1)
             self.dropout = nn.Dropout(DROPPED)
 
         def layers(self) -> tuple[Any, ...]:
             return self.first, self.second, self.third, self.last
 
         def forward(self, lines: Any, both: Any) -> Any:
-            seen = lines[..., SEEN : SEEN + 1]
+            seen = lines[..., IS_SEEN : IS_SEEN + 1]
             hidden = torch.relu(self.second(torch.relu(self.first(lines)))) * seen
             outline, counts = hidden[:, :OUTLINE_LINES], seen[:, :OUTLINE_LINES]
             inner = hidden[:, OUTLINE_LINES:].sum(1) / (seen[:, OUTLINE_LINES:].sum(1) + 1.0)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from arview.assembly.placements import Placements, Swap
 from arview.assembly.presence_net import ComponentCrop, PartImage, PresenceNet, component_crops
-from arview.detection.scoring.pose_verifier import BAND_PX
+from arview.detection.scoring.crops import BAND_PX
 from arview.geometry import Array
 from arview.guideviews.surface import Surface
 

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.detection.scoring.pose_verifier import (
+from arview.detection.scoring.crops import (
     BAND_PX,
-    DRAWN,
+    DRAWN_CHANNELS,
     append_edge_responses,
     append_gradients,
     crop_edge_responses,
@@ -87,8 +87,8 @@ class ComponentCrop:
         index: of the component.
         pixels: (S,S,4) uint8, RGB and 255 inside the picture.
         drawn: (6,S,S) float32: distance to the component's visible outline (-1 inside, 1 outside); drawn edges; of the
-            whole part the normal and the depth, see `pose_verifier.DRAWN`.
-        edge_responses: (3,S,S) uint8 of the edge network, see `pose_verifier.LINES`.
+            whole part the normal and the depth, see `crops`.
+        edge_responses: (3,S,S) uint8 of the edge network, see `crops.RESPONSE_CHANNELS`.
         size_px: larger side of the component in the picture.
     """
 
@@ -111,10 +111,11 @@ class PresenceNet:
 
 
 def network_input(crop: ComponentCrop) -> NetworkInput:
-    """The network's inputs: (CHANNELS + LINES,S,S) and (GLOBALS,)."""
+    """The network's inputs: (CROP_CHANNELS + RESPONSE_CHANNELS,S,S) and (GLOBALS,)."""
     plain, contrast = normalise_colours(crop.pixels, crop.drawn)
     channels, explained = append_gradients(plain)
-    return append_edge_responses(channels, crop.edge_responses), global_inputs(crop.size_px, contrast, explained)
+    scalars = global_inputs(crop.size_px, contrast, explained)
+    return NetworkInput(append_edge_responses(channels, crop.edge_responses), scalars)
 
 
 def global_inputs(
@@ -175,7 +176,7 @@ def _crop(
         return None
     corner = np.round(0.5 * (low + high) - 0.5 * (side - 1)).astype(int)
     zoom = SIDE_PX / side
-    drawn = np.empty((DRAWN, SIDE_PX, SIDE_PX), dtype=np.float32)
+    drawn = np.empty((DRAWN_CHANNELS, SIDE_PX, SIDE_PX), dtype=np.float32)
     face_ids = np.empty((SIDE_PX, SIDE_PX), dtype=np.int32)
     place = cam_from_body[:3, 3]
     origin = focal_px * place[:2] / place[2] + principal_px + displaced

@@ -1,117 +1,238 @@
-"""Probability that a pose which was found without history is right, from all that speaks for it."""
+"""Probability that a pose found without history is right.
+
+Three linear models share the weights file ``pose_confidence.json``: a logit of the edge and colour evidence, a score
+that ranks the hypotheses of one image, and a logistic regression for the probability of the best of them. They were
+fitted as conditional logistic regressions (McFadden, "Conditional logit analysis of qualitative choice behavior", 1974)
+and as a logistic regression with non-negative weights.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 from arview.refinement.evidence import PoseEvidence
-
-
-def evidence_features(evidence: PoseEvidence, lines: float, radius_px: float) -> tuple[float, ...]:
-    """What speaks for a pose that was found without history, for `evidence_logit`."""
-    share = min(0.5, evidence.inner_share)
-    colours = max(evidence.region_support, 0.0) * min(evidence.region_information / 0.2, 1.0)
-    return (
-        (1.0 - share) * evidence.contour_support,
-        (1.0 - share) * evidence.sharpness,
-        share * evidence.inner_support,
-        (1.0 - share) * colours,
-        math.log(lines),
-        (1.0 - share) * evidence.contour_support * evidence.sharpness,
-        share * evidence.inner_support * evidence.contour_support,
-        -evidence.scatter_px,
-        math.log(max(radius_px, 5.0) / 50.0),
-    )
-
-
-LOGIT_WEIGHTS = (2.61, 0.30, 5.90, 4.13, 0.73, 2.00, 11.22, 2.68, 3.11)
-LOGIT_BIAS = -10.0
-"""For comparing hypotheses of one picture: conditional logistic regression (McFadden 1974) with weights that may not
-be negative, on the hypotheses of the detector in 194 semi-synthetic and recorded frames, halved."""
-EVIDENCE_WEIGHT = 0.82
-"""Of that beside what the judge says, fitted together with it."""
-VERIFIED_EVIDENCE, VERIFIED_JUDGEMENT, VERIFIED_LINES = 0.67, 0.48, 4.5
-"""Of evidence, judge, and what the line network sees along a pose's lines, beside what the verifier says: fitted as
-above on 761 pictures of 53 random solids in which right and wrong poses compete."""
-VERIFIED_STRIPS = 1.0
-"""And of what strips say: the likeliest, all others as they are, in 464 pictures of 26 random solids on which they were
-not fitted; it is hardly less likely from 0.8 to 1.3."""
-LEAST_VERIFIED = -4.0
-"""Less than this the verifier does not say: on materials that it does not know it denies right poses, too."""
-FOUND_LINES = 6.2
-FOUND_WEIGHTS = (0.59, 0.07, 0.02, 0.60, 0.09, 0.39, 1.38, 3.37, 2.63)
-FOUND_BIAS = -4.24
-"""For the probability, in which lines count so much beside the verifier: logistic regression with weights that may not
-be negative, on the best hypotheses of the search in 504 pictures of 31 other solids where these were right and in 371
-without the part, many in crowds of others; on 198 frames of the recordings and 299 photos of others, which count twice;
-and on 1,000 photos and pictures of other parts for the semi-synthetic shapes and the recorded parts, which count half.
-As fitted the bias would be 1.25 higher: of 1,001 further such pictures 12 would be taken for the part, with it and all
-four searches 3 are, and of another 1,001 none. What the view shows is the strongest term beside the verifier: without
-it 9 were taken for the part."""
-LARGEST_HERE, LARGEST_ELSEWHERE = 6.0, 4.0
-"""Larger leads say no more."""
-LEAST_SHOWN, MOST_SHOWN = -0.5, 0.3
-"""Nor does a view that shows fewer or more lines than the usual one by these logarithms. With -0.75 as the least,
-the back of a plate is taken for another plate less often, but right ones from behind are found less often: no gain."""
-SMALL_PX = 60.0
-"""Parts of less than this half diameter fit by chance the more often the smaller they are."""
+from arview.weights import load_weights
 
 
 @dataclass(frozen=True)
-class Margins:
-    """Margins of a hypothesis' logit over the best ones for other poses at the same place and elsewhere.
+class ConfidenceOptions:
+    """Limits on the terms of the probability.
 
-    The right pose stands out; of many that fit by chance one is hardly better than the next. Infinite without rivals.
+    Attributes:
+        min_verifier_score: lower bound on the verifier score, which can reject right poses on unknown materials.
+        max_nearby_margin: upper bound on the margin over other poses at the same place.
+        max_distant_margin: upper bound on the margin over poses at other places.
+        min_view_richness, max_view_richness: bounds on the log ratio of distinct lines in the view to the usual number.
+        small_radius_px: half diameter below which a part counts as small; small parts fit clutter more often.
     """
 
-    here: float
-    elsewhere: float
+    min_verifier_score: float = -4.0
+    max_nearby_margin: float = 6.0
+    max_distant_margin: float = 4.0
+    min_view_richness: float = -0.5
+    max_view_richness: float = 0.3
+    small_radius_px: float = 60.0
 
 
-def evidence_logit(evidence: PoseEvidence, lines: float, radius_px: float) -> float:
-    """By how much one of many hypotheses of a picture is likelier than another.
+CONFIDENCE = ConfidenceOptions()
+"""The options that the weights were fitted with."""
+
+
+class EvidenceFeatures(NamedTuple):
+    """Features of the evidence for one pose, or the weights of these features.
+
+    Attributes:
+        contour_support: outline points supported beyond chance, by the share of the outline.
+        sharpness: sharpness of the outline, by the share of the outline.
+        inner_support: design edges supported beyond chance, by their share.
+        colours: region support by its information, by the share of the outline.
+        log_view_lines: logarithm of the distinct lines that the view shows.
+        contour_and_sharpness: product of contour support and sharpness, by the share of the outline.
+        inner_and_contour: product of inner and contour support, by the share of design edges.
+        negative_scatter_px: negative mean distance of the supporting steps from the outline.
+        log_size: logarithm of the half diameter relative to 50 px.
+    """
+
+    contour_support: float
+    sharpness: float
+    inner_support: float
+    colours: float
+    log_view_lines: float
+    contour_and_sharpness: float
+    inner_and_contour: float
+    negative_scatter_px: float
+    log_size: float
+
+
+class ConfidenceTerms(NamedTuple):
+    """Terms of the probability of a hypothesis, or the weights of these terms.
+
+    Attributes:
+        appearance: verifier score and edge responses, see `appearance_score`.
+        evidence: logit of the evidence, see `evidence_logit`.
+        profile: score of the profile rankers.
+        contour: score of the contour verifier.
+        nearby_margin, distant_margin: bounded margins over competing hypotheses, see `Margins`.
+        is_alone: 1 where neither margin is below the bound of the nearby one.
+        view_richness: bounded log ratio of distinct lines in the view to the usual number of the part.
+        log_size: logarithm of the half diameter relative to `ConfidenceOptions.small_radius_px`, at most 0.
+    """
+
+    appearance: float
+    evidence: float
+    profile: float
+    contour: float
+    nearby_margin: float
+    distant_margin: float
+    is_alone: float
+    view_richness: float
+    log_size: float
+
+
+class RankingWeights(NamedTuple):
+    """Weights beside the verifier score when verified hypotheses of one image are ranked."""
+
+    evidence: float
+    profile: float
+    edge_response: float
+    contour: float
+
+
+class ConfidenceWeights(NamedTuple):
+    """All fitted weights.
+
+    Attributes:
+        evidence, evidence_bias: of `evidence_logit`.
+        unverified_evidence: of the evidence logit beside the profile score, before verification.
+        verified: of the ranking after verification.
+        probability, probability_bias: of `pose_probability`.
+        appearance_edge_response: of the edge response beside the verifier score in `appearance_score`.
+    """
+
+    evidence: EvidenceFeatures
+    evidence_bias: float
+    unverified_evidence: float
+    verified: RankingWeights
+    probability: ConfidenceTerms
+    probability_bias: float
+    appearance_edge_response: float
+
+
+@cache
+def confidence_weights() -> ConfidenceWeights:
+    """The fitted weights of ``pose_confidence.json``."""
+    groups = load_weights("pose_confidence")
+    evidence, probability = groups["evidence"], groups["probability"]
+    evidence_bias, probability_bias = evidence.pop("bias"), probability.pop("bias")
+    edge_response = probability.pop("edge_response")
+    return ConfidenceWeights(
+        evidence=EvidenceFeatures(**evidence),
+        evidence_bias=evidence_bias,
+        unverified_evidence=groups["unverified"]["evidence"],
+        verified=RankingWeights(**groups["verified"]),
+        probability=ConfidenceTerms(**probability),
+        probability_bias=probability_bias,
+        appearance_edge_response=edge_response,
+    )
+
+
+class Margins(NamedTuple):
+    """Differences of logits between a hypothesis and its best competitors; infinite where there is none.
+
+    Attributes:
+        nearby: over the best other pose at the same place.
+        distant: over the best pose at another place.
+    """
+
+    nearby: float
+    distant: float
+
+
+def evidence_features(evidence: PoseEvidence, view_lines: float, radius_px: float) -> EvidenceFeatures:
+    """Features of the evidence for one pose; see `evidence_logit` for the arguments."""
+    share = min(0.5, evidence.inner_share)
+    colours = max(evidence.region_support, 0.0) * min(evidence.region_information / 0.2, 1.0)
+    return EvidenceFeatures(
+        contour_support=(1.0 - share) * evidence.contour_support,
+        sharpness=(1.0 - share) * evidence.sharpness,
+        inner_support=share * evidence.inner_support,
+        colours=(1.0 - share) * colours,
+        log_view_lines=math.log(view_lines),
+        contour_and_sharpness=(1.0 - share) * evidence.contour_support * evidence.sharpness,
+        inner_and_contour=share * evidence.inner_support * evidence.contour_support,
+        negative_scatter_px=-evidence.scatter_px,
+        log_size=math.log(max(radius_px, 5.0) / 50.0),
+    )
+
+
+def evidence_logit(evidence: PoseEvidence, view_lines: float, radius_px: float) -> float:
+    """Log odds of a hypothesis by its evidence alone; differences compare the hypotheses of one image.
 
     Args:
-        evidence: of the hypothesis.
-        lines: distinct lines that its view shows, see `view_lines`.
-        radius_px: half the part's diameter in the picture: small ones fit by chance more often.
+        evidence: edge and colour evidence at the pose.
+        view_lines: distinct lines that the view shows, see `guideviews.uniqueness.view_lines`.
+        radius_px: half the part's diameter in the image; small parts fit clutter more often.
     """
-    return LOGIT_BIAS + _weighted(LOGIT_WEIGHTS, evidence_features(evidence, lines, radius_px))
+    weights = confidence_weights()
+    return weights.evidence_bias + _weighted(weights.evidence, evidence_features(evidence, view_lines, radius_px))
+
+
+def appearance_score(verifier_score: float, edge_response: float, options: ConfidenceOptions = CONFIDENCE) -> float:
+    """What the learned models predict from the image around a pose, as one term of the probability.
+
+    Args:
+        verifier_score: of the pose verifier.
+        edge_response: mean edge response along the part's lines, 0–1.
+        options: its lower bound on the verifier score.
+    """
+    bounded = max(verifier_score, options.min_verifier_score)
+    return bounded + confidence_weights().appearance_edge_response * edge_response
 
 
 def confidence_terms(
-    seen: float,
-    evidence_logit: float,
-    profile_score: float,
-    strips: float,
-    leads: Margins,
-    shown: float,
+    appearance: float,
+    evidence: float,
+    profile: float,
+    contour: float,
+    margins: Margins,
+    relative_lines: float,
     radius_px: float,
-) -> tuple[float, ...]:
-    """What speaks for the best hypothesis of a picture, for `pose_probability`.
+    options: ConfidenceOptions = CONFIDENCE,
+) -> ConfidenceTerms:
+    """Terms of the probability of the best hypothesis of an image.
 
     Args:
-        seen: what verifier and line network see there, see `Hypothesis`; on parts unlike those that they know the next
-            two are the surer ones.
-        evidence_logit: see `evidence_logit`.
-        profile_score: see `judge`.
-        strips: see `ContourVerifier`.
-        leads: over other hypotheses.
-        shown: distinct lines that its view shows, against what the part's views show in the (geometric) mean. A plain
-            view fits by chance where no other does: of 82 likely poses without the part half were among the plainest
-            eighth of views, of 702 right ones a fourteenth.
-        radius_px: half the part's diameter in the picture.
+        appearance: see `appearance_score`.
+        evidence: see `evidence_logit`; more reliable than ``appearance`` on parts unlike the training solids.
+        profile: score of the profile rankers.
+        contour: score of the contour verifier.
+        margins: over other hypotheses; a right pose stands out, poses that fit by chance come in groups.
+        relative_lines: distinct lines in the view relative to the geometric mean over the part's views; plain views
+            fit clutter by chance more often than others.
+        radius_px: half the part's diameter in the image.
+        options: bounds of the terms.
     """
-    here, elsewhere = min(leads.here, LARGEST_HERE), min(leads.elsewhere, LARGEST_ELSEWHERE)
-    is_alone = float(min(leads.here, leads.elsewhere) >= LARGEST_HERE)
-    rich, small = min(max(math.log(shown), LEAST_SHOWN), MOST_SHOWN), min(math.log(max(radius_px, 1.0) / SMALL_PX), 0.0)
-    return seen, evidence_logit, profile_score, strips, here, elsewhere, is_alone, rich, small
+    o = options
+    return ConfidenceTerms(
+        appearance=appearance,
+        evidence=evidence,
+        profile=profile,
+        contour=contour,
+        nearby_margin=min(margins.nearby, o.max_nearby_margin),
+        distant_margin=min(margins.distant, o.max_distant_margin),
+        is_alone=float(min(margins.nearby, margins.distant) >= o.max_nearby_margin),
+        view_richness=min(max(math.log(relative_lines), o.min_view_richness), o.max_view_richness),
+        log_size=min(math.log(max(radius_px, 1.0) / o.small_radius_px), 0.0),
+    )
 
 
-def pose_probability(terms: tuple[float, ...]) -> float:
-    """Probability that the best hypothesis of a picture is right, by its `confidence_terms`."""
-    total = FOUND_BIAS + _weighted(FOUND_WEIGHTS, terms)
+def pose_probability(terms: ConfidenceTerms) -> float:
+    """Probability that the best hypothesis of an image is right."""
+    weights = confidence_weights()
+    total = weights.probability_bias + _weighted(weights.probability, terms)
     return 1.0 / (1.0 + math.exp(-min(max(total, -50.0), 50.0)))
 
 

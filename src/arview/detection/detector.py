@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.parallel import pool
-from arview.detection.confidence import Margins, confidence_terms, pose_probability
+from arview.detection.confidence import ConfidenceTerms, Margins, confidence_terms, pose_probability
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pair_comparator import PairComparator
 from arview.detection.search.global_search import (
@@ -221,7 +221,7 @@ class Detector:
         """Probability that each of several hypotheses, best first, is right: see `pose_probability`."""
         return [pose_probability(self.terms(h, hypotheses[k + 1 :])) for k, h in enumerate(hypotheses)]
 
-    def terms(self, best: Hypothesis, others: list[Hypothesis]) -> tuple[float, ...]:
+    def terms(self, best: Hypothesis, others: list[Hypothesis]) -> ConfidenceTerms:
         """What speaks for a hypothesis before others, see `confidence_terms`."""
         leads, shown = self.margins(best, others), best.view_lines / self.local.mean_view_lines
         return confidence_terms(

@@ -1,13 +1,15 @@
-"""A small convolutional network that sees where lines of a part may run in a picture, and in which direction.
+"""A small convolutional network that predicts where edges of solids run in an image, and in which direction.
 
-Gradients respond to noise, to the texture of what lies around and to shadows as they do to the part. The network, shown
-a whole neighbourhood, answers to what looks like the outline or an edge of a solid, as learned edge detectors do (Xie &
-Tu, "Holistically-Nested Edge Detection", ICCV 2015); the layout is that of Ronneberger et al., "U-Net" (MICCAI 2015),
-but that levels are added. It knows nothing of a part: it was fitted to random solids before photos, see
-``tools/training/fit.py``.
+Gradients respond to noise, background texture and shadows as much as to the part. The network sees a neighbourhood and
+responds to what looks like the outline or an edge of a solid, as learned edge detectors do (Xie & Tu,
+"Holistically-Nested Edge Detection", ICCV 2015). Its layout is that of Ronneberger et al., "U-Net" (MICCAI 2015), with
+skip connections that add instead of concatenate. It is not specific to a part: it was trained on random solids before
+photos, see ``tools/training/fit.py``.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -21,84 +23,102 @@ from arview.refinement.kernels import nearest_view
 from arview.refinement.projection import project_lines
 from arview.weights import load_network
 
-LONGEST_SIDE_PX = 640
-"""Larger pictures are shrunk to this. In pictures of this size it was fitted to half diameters of 30 to 300 px."""
+MAX_SIDE_PX = 640
+"""Longer side of the images that the network was trained on; larger images are reduced to this."""
 SHRINK = 2
-"""The network's maps are so many times smaller than what it is shown."""
+"""Factor by which the predicted maps are smaller than the input."""
 CELL_PX = 32
-"""It takes pictures of multiples of this."""
-AROUND_PX, CLEAR_SHARE, LEAST_CLEAR = 49, 0.9, 0.15
-"""Answers count relative to such a share of the strongest one this near (side of a square of the maps, smoothed), if
-that is not weaker than the last."""
-INSIDE = ORIENTATIONS
-"""Of its maps that which says where solids are."""
-CONTRAST = 64.0
-"""Grey levels less their mean are shown in units of this."""
+"""The network takes images whose sides are multiples of this."""
+SOLID_CHANNEL = ORIENTATIONS
+"""Index of the predicted map that says where solids are; the maps before it are edge responses by orientation."""
+INPUT_SCALE = 64.0
+"""Grey levels that the input is divided by after its mean is subtracted."""
+
+
+@dataclass(frozen=True)
+class EdgeNetOptions:
+    """Local normalisation of the edge responses.
+
+    Attributes:
+        neighbourhood_px: side of the square of map pixels over which the strongest response is taken and smoothed.
+        reference_share: share of the strongest response nearby that becomes a full response.
+        min_reference: lower bound on that reference, so that weak responses to clutter stay weak.
+    """
+
+    neighbourhood_px: int = 49
+    reference_share: float = 0.9
+    min_reference: float = 0.15
 
 
 class EdgeNet:
-    """The network; threads may share it."""
+    """The edge network; threads may share it."""
 
-    def __init__(self) -> None:
+    def __init__(self, options: EdgeNetOptions | None = None) -> None:
+        self.options = options or EdgeNetOptions()
         self._network = load_network("edge_net.onnx")
 
     def predict(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """How likely each place of an RGB picture (H,W,3) is on a line of each orientation, and on a solid.
+        """Edge responses by orientation and solidness of an RGB image (H,W,3).
 
-        Where it is sure of few lines, as of materials that it does not know or before some textures, its answers are
-        brought up to those elsewhere.
+        Edge responses are normalised by the strongest ones nearby, because the network responds weakly to unknown
+        materials and before some textures.
 
         Returns:
-            (9,h,w) 0–255, the orientations and `INSIDE`, of half the picture's size, or of half of `LONGEST_SIDE_PX`.
+            (9,h,w) 0–255: `ORIENTATIONS` edge maps and `SOLID_CHANNEL`, at half the size of the image after its longer
+            side is reduced to `MAX_SIDE_PX`.
         """
+        o = self.options
         height, width = image.shape[:2]
-        share = min(1.0, LONGEST_SIDE_PX / max(height, width))
+        share = min(1.0, MAX_SIDE_PX / max(height, width))
         if share < 1.0:
             image = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
             height, width = image.shape[:2]
         mean = sum(cv2.mean(image)[:3]) / 3.0
         image = padded_to_multiple(image, CELL_PX)
-        answers = self._network(picture=cv2.dnn.blobFromImage(image, 1.0 / CONTRAST, mean=(mean, mean, mean)))
-        seen = answers[0, :, : -(-height // SHRINK), : -(-width // SHRINK)]
-        lines = seen[:INSIDE]
-        around = cv2.dilate(lines.max(axis=0), np.ones((AROUND_PX, AROUND_PX), dtype=np.uint8))
-        clear = np.maximum(CLEAR_SHARE * cv2.blur(around, (AROUND_PX // 2, AROUND_PX // 2)), LEAST_CLEAR)
-        np.minimum(lines / clear, 1.0, out=lines)
-        return np.asarray(np.round(255.0 * seen).astype(np.uint8))
+        predicted = self._network(picture=cv2.dnn.blobFromImage(image, 1.0 / INPUT_SCALE, mean=(mean, mean, mean)))
+        maps = predicted[0, :, : -(-height // SHRINK), : -(-width // SHRINK)]
+        edges = maps[:SOLID_CHANNEL]
+        side = o.neighbourhood_px
+        strongest = cv2.dilate(edges.max(axis=0), np.ones((side, side), dtype=np.uint8))
+        reference = np.maximum(o.reference_share * cv2.blur(strongest, (side // 2, side // 2)), o.min_reference)
+        np.minimum(edges / reference, 1.0, out=edges)
+        return np.asarray(np.round(255.0 * maps).astype(np.uint8))
 
 
-def halve_responses(lines: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-    """Maps (9,h,w), and again at half the size and so on as long as that is even; the strongest of four pixels."""
-    levels = [lines]
+def halve_responses(maps: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    """Pyramid of maps (9,h,w): each level has half the size and the maxima of 2×2 pixels, down to an odd size."""
+    levels = [maps]
     block = np.ones((2, 2), dtype=np.uint8)
     while levels[-1].shape[1] % 2 == 0 and levels[-1].shape[2] % 2 == 0:
-        # Each place has the strongest of itself and of what is above and to the left of it.
+        # The dilation takes the maximum of a pixel and those above and to the left of it.
         levels.append(np.stack([cv2.dilate(plane, block)[1::2, 1::2] for plane in levels[-1]]))
     return levels
 
 
-def resize_responses(lines: NDArray[np.uint8], width: int, height: int, spread_px: int) -> NDArray[np.uint8]:
-    """Maps (8,H,W) of lines from `EdgeNet.predict`; the strongest of the pixels that one stands for, and spread."""
-    lines = lines[:ORIENTATIONS]
-    shrunk = lines.shape[2] / width
+def resize_responses(maps: NDArray[np.uint8], width: int, height: int, spread_px: int) -> NDArray[np.uint8]:
+    """Edge responses (8,height,width) from `EdgeNet.predict`: maxima of merged pixels, dilated by ``spread_px``."""
+    maps = maps[:ORIENTATIONS]
+    shrunk = maps.shape[2] / width
     side = max(1, int(shrunk + 0.5))
     merged = np.ones((side, side), dtype=np.uint8)
     spread = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * spread_px + 1, 2 * spread_px + 1))
-    way = cv2.INTER_AREA if shrunk > 1.6 else cv2.INTER_LINEAR
-    sized = np.empty((len(lines), height, width), dtype=np.uint8)
-    for plane, out in zip(lines, sized, strict=True):
+    interpolation = cv2.INTER_AREA if shrunk > 1.6 else cv2.INTER_LINEAR
+    sized = np.empty((len(maps), height, width), dtype=np.uint8)
+    for plane, out in zip(maps, sized, strict=True):
         strongest = cv2.dilate(plane, merged) if side > 1 else plane
-        cv2.dilate(cv2.resize(strongest, (width, height), interpolation=way), spread, dst=out)
+        cv2.dilate(cv2.resize(strongest, (width, height), interpolation=interpolation), spread, dst=out)
     return sized
 
 
 @kernel
 def mean_edge_response(maps, part, pose, intrinsics, step_mm):  # type: ignore[no-untyped-def]
-    """Mean answer 0–1 of the network under the outline and the design edges of a part; these count half at most.
+    """Mean edge response 0–1 under the outline and the design edges of a part, which weigh at most half.
 
     Args:
-        maps: (8,H,W) uint8, see `EdgeResponses`; intrinsics: (10,) that belong to them.
-        part: arrays of all guide views, see `PartView.arrays`; pose: (4,4) ``cam_from_body``.
+        maps: (8,H,W) uint8, see `EdgeResponses`.
+        part: arrays of all guide views, see `PartView.arrays`.
+        pose: (4,4) ``cam_from_body``.
+        intrinsics: (10,) of the maps.
         step_mm: length over which directions are projected.
     """
     directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part

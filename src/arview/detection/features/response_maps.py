@@ -1,9 +1,9 @@
-"""Response maps of a picture by edge orientation, and the scores of poses on them.
+"""Response maps of an image by edge orientation, and the scores of poses on them.
 
-After Hinterstoisser et al., "Gradient Response Maps for Real-Time Detection of Textureless Objects" (PAMI 2012): a map
-for each of eight orientations, spread so that small errors of a pose do not matter. Own here: responses are
-normalised by the local contrast and cleared of what all orientations share, so that texture and clutter, which answer
-to everything, do not win.
+After Hinterstoisser et al., "Gradient Response Maps for Real-Time Detection of Textureless Objects" (PAMI 2012): one
+map for each of eight orientations, dilated so that small errors of a pose do not matter. In addition, responses are
+normalised by the local contrast, and a share of their mean over all orientations is subtracted, because texture and
+clutter respond at every orientation.
 """
 
 from __future__ import annotations
@@ -21,18 +21,23 @@ from arview.refinement.projection import project_lines
 Plane = NDArray[np.float32]
 
 ORIENTATIONS = 8
-"""Bins over 180°."""
-
-
-COMMON = 0.5
-"""Share of the mean of all orientations that is taken from each: clutter answers to all of them."""
+"""Orientation bins over 180°."""
+MEAN_SHARE = 0.5
+"""Share of the mean over all orientations that is subtracted from each map."""
 
 
 def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int, pool: int = 1) -> NDArray[np.uint8]:
-    """(8, H + 2 pad, W + 2 pad) uint8 responses of an RGB or gray picture, 255 = a clear edge of that orientation.
+    """Edge responses of an image by orientation; 255 is a clear edge.
 
-    With ``pool`` the maps are so many times smaller than the picture; each of their pixels has the strongest edge of
-    those it stands for: fine lines that lie close keep their directions. ``spread_px`` is in pixels of the maps.
+    Args:
+        image: (H,W,3) RGB or (H,W) grey, uint8.
+        spread_px: radius of the dilation, in pixels of the maps.
+        pad_px: empty border of the maps.
+        pool: factor by which the maps are smaller than the image. Each of their pixels holds the maximum of its block,
+            so that close fine lines keep their orientations.
+
+    Returns:
+        (8, H / pool + 2 pad_px, W / pool + 2 pad_px) uint8.
     """
     _, x, y, magnitude = colour_gradients(image)
     phase = cv2.phase(x, y, angleInDegrees=False)
@@ -43,11 +48,11 @@ def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int, pool: i
     kernel = cv2.getStructuringElement(shape, (2 * spread_px + 1, 2 * spread_px + 1))
     for plane in own:
         cv2.dilate(plane, kernel, dst=plane)
-    return np.asarray(_without_common(own, pad_px))
+    return np.asarray(_subtract_mean(own, pad_px))
 
 
 def colour_gradients(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Plane, Plane, Plane]:
-    """The smoothed picture, the gradient x, y of each pixel's strongest channel and its size, see `_strongest`."""
+    """The smoothed image, and x, y and magnitude of each pixel's strongest gradient; see `_strongest`."""
     smooth = cv2.GaussianBlur(image, (3, 3), 0)
     planes = cv2.split(smooth)
     gx = np.stack([cv2.Sobel(plane, cv2.CV_16S, 1, 0, ksize=3) for plane in planes])
@@ -58,7 +63,7 @@ def colour_gradients(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Plane
 
 @kernel
 def _strongest(gx, gy):  # type: ignore[no-untyped-def]
-    """Gradient (H,W) of the channel with the strongest one (Dalal & Triggs 2005), and its magnitude in grey levels."""
+    """Gradient (H,W) of each pixel's strongest channel (Dalal & Triggs, CVPR 2005), and its size in grey levels."""
     channels, height, width = gx.shape
     x = np.empty((height, width), dtype=np.float32)
     y = np.empty((height, width), dtype=np.float32)
@@ -83,9 +88,16 @@ def _strongest(gx, gy):  # type: ignore[no-untyped-def]
 
 @kernel
 def _oriented(phase, magnitude, around, peak, pool):  # type: ignore[no-untyped-def]
-    """(8, H / pool, W / pool) strength of thin edges by orientation, relative to the contrast around.
+    """Strength of thin edges by orientation (8, H / pool, W / pool), relative to the contrast around them.
 
-    An edge between two orientations counts for both. ``phase`` (H,W) rad, 0 to 2π.
+    An edge between two orientations counts for both.
+
+    Args:
+        phase: (H,W) direction of the gradient in rad, 0 to 2π.
+        magnitude: (H,W) of the gradient.
+        around: (H,W) mean magnitude of the neighbourhood.
+        peak: (H,W) maximum of the 3×3 neighbourhood.
+        pool: see `response_maps`.
     """
     rows, columns = magnitude.shape[0] // pool, magnitude.shape[1] // pool
     own = np.zeros((ORIENTATIONS, rows, columns), dtype=np.uint8)
@@ -93,7 +105,7 @@ def _oriented(phase, magnitude, around, peak, pool):  # type: ignore[no-untyped-
     places = np.empty(columns * pool, dtype=np.int32)
     for y in range(rows * pool):
         row = y // pool
-        # Thin: only a maximum of the neighbourhood in some direction says where the edge is.
+        # Thinning: only pixels near the maximum of their neighbourhood lie on the edge.
         count = 0
         for x in range(columns * pool):
             m = magnitude[y, x]
@@ -116,42 +128,42 @@ def _oriented(phase, magnitude, around, peak, pool):  # type: ignore[no-untyped-
 
 
 @kernel
-def _without_common(spread, pad):  # type: ignore[no-untyped-def]
-    """What an orientation has beyond a share of the mean of all, stretched and padded by zeros."""
+def _subtract_mean(spread, pad):  # type: ignore[no-untyped-def]
+    """Responses beyond a share of their mean over all orientations, rescaled and padded with zeros."""
     count, height, width = spread.shape
     maps = np.zeros((count, height + 2 * pad, width + 2 * pad), dtype=np.uint8)
-    common = np.empty(width, dtype=np.int32)
-    # In integers: COMMON · mean is sum · COMMON / count; the stretch makes up for what is taken.
-    part = np.int32(COMMON * 256 / count)
-    stretch = np.int32(256 * (1.0 + 0.6 * COMMON))
+    total = np.empty(width, dtype=np.int32)
+    # In integers: MEAN_SHARE · mean is sum · MEAN_SHARE / count; the stretch compensates for the subtraction.
+    part = np.int32(MEAN_SHARE * 256 / count)
+    stretch = np.int32(256 * (1.0 + 0.6 * MEAN_SHARE))
     for y in range(height):
-        common[:] = 0
+        total[:] = 0
         for o in range(count):
             line = spread[o, y]
             for x in range(width):
-                common[x] += np.int32(line[x])
+                total[x] += np.int32(line[x])
         for x in range(width):
-            common[x] = np.int32(common[x] * part) >> np.int32(8)
+            total[x] = np.int32(total[x] * part) >> np.int32(8)
         for o in range(count):
-            # Slices and 32 bits throughout, or the loop is not done several pixels at a time.
+            # Slices and 32-bit integers throughout, so that the loop is vectorised.
             line, out = spread[o, y], maps[o, y + pad, pad : pad + width]
             for x in range(width):
-                value = np.int32((np.int32(line[x]) - common[x]) * stretch) >> np.int32(8)
+                value = np.int32((np.int32(line[x]) - total[x]) * stretch) >> np.int32(8)
                 out[x] = np.uint8(min(max(value, np.int32(0)), np.int32(255)))
     return maps
 
 
 def orientation_bins(normals_px: Array) -> NDArray[np.uint8]:
-    """Orientation bin (N,) of image normals (N,2); the gradient of an edge runs along its normal."""
+    """Orientation bins (N,) of image normals (N,2); the gradient of an edge points along its normal."""
     position = np.arctan2(normals_px[:, 1], normals_px[:, 0]) / np.pi * ORIENTATIONS
     return (np.round(position).astype(np.intp) % ORIENTATIONS).astype(np.uint8)
 
 
 @kernel
-def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, room):  # type: ignore[no-untyped-def]
-    """Project a guide view's outline and design edges; returns the number of points.
+def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, points):  # type: ignore[no-untyped-def]
+    """Project a guide view's outline and design edges, and return the number of points.
 
-    ``room`` (3,N) int64 becomes their columns, rows and orientation bins; see `score_around` for the rest.
+    ``points`` (3,N) int64 receives their columns, rows and orientation bins; see `score_around` for the rest.
     """
     _, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
     count = 0
@@ -166,7 +178,7 @@ def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_co
         else:
             first, last = e_start[view], e_start[view + 1]
             stride = max(1, (last - first) // (2 * edge_count))
-            limit = room.shape[1]
+            limit = points.shape[1]
             px, normals, depths = project_lines(
                 e_points[first:last:stride], e_tangents[first:last:stride], True, pose, intrinsics, step_mm
             )
@@ -177,10 +189,10 @@ def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_co
                     continue
             if depths[i] <= 0 or count >= limit:
                 continue
-            room[0, count] = int(np.round(px[i, 0]))
-            room[1, count] = int(np.round(px[i, 1]))
+            points[0, count] = int(np.round(px[i, 0]))
+            points[1, count] = int(np.round(px[i, 1]))
             turn = np.arctan2(normals[i, 1], normals[i, 0]) / np.pi * ORIENTATIONS
-            room[2, count] = int(np.round(turn)) % ORIENTATIONS
+            points[2, count] = int(np.round(turn)) % ORIENTATIONS
             count += 1
     return count
 
@@ -192,25 +204,25 @@ def score_around(  # type: ignore[no-untyped-def]
     """Score poses around one pose by the responses under their projected outline and design edges.
 
     Args:
-        maps: (8,H,W) from `response_maps`, padded.
+        maps: (8,H,W) of `response_maps`, padded.
         part: arrays of all guide views, see `PartView.arrays`.
-        cam_from_body: (4,4) the pose to search around.
-        intrinsics: (10,) of the picture that the maps were made from, padding included.
+        cam_from_body: (4,4) pose to search around.
+        intrinsics: (10,) of the maps, padding included.
         step_mm: length over which directions are projected.
-        turns: (R,3,3) rotations about the part's centre, applied on the camera's side.
+        turns: (R,3,3) rotations about the part's centre, in camera axes.
         stretches: (D,) factors of the distance.
-        shift_px, shift_step: every turned and stretched pose is tried at shifts of ± shift_px.
-        contour_count, edge_count: about so many points are looked at.
+        shift_px, shift_step: range and step of the image shifts at which each rotated and moved pose is scored.
+        contour_count, edge_count: approximate numbers of outline and design-edge points.
 
     Returns:
-        scores (R·D,) 0–1 and poses (R·D,4,4), the best shift applied.
+        Scores (R·D,) 0–1 and poses (R·D,4,4) with the best shift applied.
     """
     total = turns.shape[0] * stretches.shape[0]
     scores = np.zeros(total)
     poses = np.zeros((total, 4, 4))
     steps = 2 * (shift_px // shift_step) + 1
     sums = np.empty((steps, steps), dtype=np.int32)
-    room = np.empty((3, contour_count + edge_count + 64), dtype=np.int64)
+    points = np.empty((3, contour_count + edge_count + 64), dtype=np.int64)
     for t in range(turns.shape[0]):
         pose = cam_from_body.copy()
         for i in range(3):
@@ -226,10 +238,10 @@ def score_around(  # type: ignore[no-untyped-def]
             for i in range(3):
                 pose[i, 3] = cam_from_body[i, 3] * stretches[d]
             poses[index] = pose
-            count = collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, room)
+            count = collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, points)
             if count < 16:
                 continue
-            best, best_dx, best_dy = best_shift(maps, room, count, shift_px, shift_step, sums)
+            best, best_dx, best_dy = best_shift(maps, points, count, shift_px, shift_step, sums)
             scores[index] = best / (255.0 * count)
             poses[index, 0, 3] += best_dx * pose[2, 3] / intrinsics[0]
             poses[index, 1, 3] += best_dy * pose[2, 3] / intrinsics[1]
@@ -237,25 +249,25 @@ def score_around(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def best_shift(maps, room, count, shift_px, shift_step, sums):  # type: ignore[no-untyped-def]
+def best_shift(maps, points, count, shift_px, shift_step, sums):  # type: ignore[no-untyped-def]
     """Highest sum of responses under the first ``count`` points over all shifts, and that shift dx, dy in px.
 
-    ``room`` holds the points, see `collect_points`; ``sums`` (S,S) int32 is room to work in. Points that a shift moves
-    outside the maps add nothing.
+    ``points`` is as `collect_points` fills it; ``sums`` (S,S) int32 is a work buffer. Points that a shift moves outside
+    the maps add nothing.
     """
     height, width = maps.shape[1], maps.shape[2]
     steps = sums.shape[0]
     reach = shift_px // shift_step * shift_step
     sums[:] = 0
     for i in range(count):
-        x0 = room[0, i] - reach
-        y0 = room[1, i] - reach
-        plane = maps[room[2, i]]
+        x0 = points[0, i] - reach
+        y0 = points[1, i] - reach
+        plane = maps[points[2, i]]
         if x0 >= 0 and y0 >= 0 and x0 + 2 * reach < width and y0 + 2 * reach < height:
             for sy in range(steps):
                 line = plane[y0 + sy * shift_step]
                 for sx in range(steps):
-                    # An unsigned index spares the test for counting from the end.
+                    # An unsigned index avoids the check for negative indices.
                     sums[sy, sx] += line[np.uint64(x0 + sx * shift_step)]
         else:
             for sy in range(steps):

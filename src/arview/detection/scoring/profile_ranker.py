@@ -1,14 +1,12 @@
-"""A judge of poses: what is seen across the part's lines, weighed by small networks.
+"""Profile ranker: small networks that rank poses by profiles of the image across the part's lines.
 
-The mean response under an outline says how much edge there is, not what it looks like: whether it is one clean edge or
-one of many, whether other edges cross it, whether the part is of one colour along it and its surroundings are not, and
-whether a whole stretch of the outline has nothing. All that is in the profiles across the lines, of gradients, of
-colours, and of what the line network sees. The same few weights look at each line's profile; the means over the outline
-and over the design edges, and the least of any stretch of the outline, make the score (after Qi et al., "PointNet",
-CVPR 2017). The weights know nothing of a part: they were fitted on random solids before photos, see
-``tools/training/fit.py``, by which of a picture's poses is the right one (Cao et al., "Learning to rank: from pairwise
-approach to listwise approach", ICML 2007). There are three: for rough poses, and two for refined ones, which look at
-the part at two sizes.
+The mean response under an outline says how much edge there is, not whether it is one clean edge, whether others cross
+it, whether colours change there, or whether a whole stretch of it is missing. Profiles of gradients, colours and edge
+responses across each line show all this. The same weights describe every profile; their means over outline and design
+edges and the minimum over stretches of the outline make the score (after Qi et al., "PointNet", CVPR 2017). The
+networks are not specific to a part: they were trained on random solids before photos, see ``tools/training/fit.py``, by
+which of an image's poses is right (Cao et al., "Learning to rank: from pairwise approach to listwise approach", ICML
+2007). There is one for rough poses and two for refined poses, which see the part at two sizes.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
-from arview.detection.features.edge_net import INSIDE
+from arview.detection.features.edge_net import SOLID_CHANNEL
 from arview.detection.features.image_pyramid import ImagePyramid, steps_to
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
@@ -31,37 +29,47 @@ from arview.refinement.view_model import PartView
 from arview.weights import load_arrays
 
 ROUGH, FINE = ("rough",), ("fine", "close")
-"""The networks for rough and for refined poses."""
+"""Names of the networks for rough and for refined poses."""
 RADII_PX = {"rough": 48.0, "fine": 48.0, "close": 96.0}
-"""Half the part's diameter in the pictures that each looks at; nothing is enlarged."""
+"""Half the part's diameter in the images that each network sees; images are never enlarged."""
 OUTLINE_LINES, INNER_LINES = 48, 32
-"""At most so many lines across the outline and across the design edges inside are looked at."""
+"""Maximum numbers of lines across the outline and across the design edges inside it."""
 STRETCHES = 8
-"""Parts of the outline, one after the other."""
+"""Consecutive stretches into which the lines of the outline are divided."""
 REACH_PX = 6
-"""Profiles reach so far to both sides."""
+"""Reach of a profile to either side of its edge."""
 PLACES = 2 * REACH_PX + 1
+"""Samples of a profile."""
+GRADIENT_NORMAL, GRADIENT_TANGENT = 0, PLACES
+"""First features of the gradients along the profile and across it, relative to their mean."""
+WIDTHS = 2 * PLACES
+"""First of two features: widths of part and background along the profile."""
+COLOUR_DIFFERENCES = WIDTHS + 2
+"""First of three features: colour difference between both sides, of the inside from the part's mean, and of the outside
+from it."""
+IS_SEEN, IS_DESIGN_EDGE = WIDTHS + 5, WIDTHS + 6
+"""Features that are 1 for a profile in the image, and for one across a design edge."""
+EDGE_RESPONSE, SOLID_RESPONSE = WIDTHS + 7, WIDTHS + 7 + PLACES
+"""First features of the responses to edges of this orientation and to solids."""
 FEATURES = 4 * PLACES + 7
-"""Of each line: gradients along and across it at each place, widths of the part and of the background along it,
-differences of colour (between both sides, inside from the part's mean, outside from it), 1, 1 if a design edge; what
-the line network says at each place of lines like this one and of solids."""
-SEEN = 2 * PLACES + 5
-"""The feature that is 1."""
-GLOBALS = 6
-"""Of the pose: mean gradient, size, share of the outline in the picture, design edges, length of the outline, lines."""
-WIDEST_PX, SIZE_PX = 16.0, 48.0
-HALF_STEP, HALF_COLOUR = 10.0, 40.0
-"""Grey levels: the unit of the mean gradient; the difference of colours that counts half."""
-MOST = np.float32(1e30)
-"""More than any mean; fast arithmetic knows no infinity."""
+"""Features of a profile."""
+RANKER_SCALARS = 6
+"""Features of a pose: mean gradient, size, share of the outline in the image, number of design edges, length of the
+outline, distinct lines."""
+MAX_WIDTH_PX, REFERENCE_RADIUS_PX = 16.0, 48.0
+"""Largest width that is distinguished; half diameter relative to which sizes are given."""
+REFERENCE_GRADIENT, HALF_COLOUR = 10.0, 40.0
+"""Grey levels: unit of the mean gradient; colour difference that gives a feature of one half."""
+UPPER_BOUND = np.float32(1e30)
+"""Larger than any mean; infinity is undefined under fast arithmetic."""
 SIDE_PX = 2
-"""The sides of a line begin so far from it."""
-LONGEST, LINES_WEIGHT = 400, 0.3
-"""ViewOutlines of more points count as such of so many; what brings the logarithm of the lines to the others' size."""
+"""Distance from the edge at which the sides of a profile begin."""
+MAX_OUTLINE_POINTS, LOG_LINES_WEIGHT = 400, 0.3
+"""Outline length that is distinguished at most; factor that brings the logarithm of the lines to the others' scale."""
 
 
-class Network(NamedTuple):
-    """Weights (in, out) and biases (out,) of its layers, float32: two for each line, two for all together."""
+class RankerLayers(NamedTuple):
+    """Weights (in, out) and biases (out,) float32: two layers for each profile, two for the pooled features."""
 
     first: NDArray[np.float32]
     first_bias: NDArray[np.float32]
@@ -73,63 +81,95 @@ class Network(NamedTuple):
     last_bias: NDArray[np.float32]
 
 
+class SampledLines(NamedTuple):
+    """Evenly spread lines of the view nearest to a pose; the rows of outline and design edges have fixed places.
+
+    Attributes:
+        points, directions: (L,3) float32. Outline rows begin at 0, rows of design edges at the maximum number of
+            outline rows; directions are normals of the outline and tangents of design edges.
+        runs: (outline rows,2) mm that the normal stays on the part and on the background.
+        outline_count, inner_count: numbers of rows used.
+        outline_length: points of the whole outline.
+    """
+
+    points: NDArray[np.float32]
+    directions: NDArray[np.float32]
+    runs: NDArray[np.float32]
+    outline_count: int
+    inner_count: int
+    outline_length: int
+
+
 @cache
-def network(name: str) -> Network:
-    """A network as fitted."""
+def ranker_layers(name: str) -> RankerLayers:
+    """The layers of the network ``rough``, ``fine`` or ``close``."""
     stored = load_arrays("profile_ranker.npz")
-    return Network(*(stored[f"{name}_{field}"] for field in Network._fields))
+    return RankerLayers(*(stored[f"{name}_{field}"] for field in RankerLayers._fields))
 
 
-def judge(
-    picture: ImagePyramid, part: PartView, poses: Array, view_lines: Array, networks: tuple[str, ...] = ROUGH
-) -> Array:
-    """How much likelier than others each of a picture's poses is: differences are log odds.
+class ProfileRanker:
+    """Ranker of the poses of one part.
 
     Args:
-        picture, part: what is looked for, and where.
-        poses: (N,4,4) ``cam_from_body``.
-        view_lines: (N,) distinct lines that the views at them show.
-        networks: whose scores are added.
-
-    Returns:
-        (N,) scores.
+        part: of the poses.
+        networks: names of the networks whose scores are added, see `ROUGH` and `FINE`.
     """
-    looks = [(name, step, some) for name in networks for step, some in _looks(picture, part, poses, RADII_PX[name])]
-    list(pool().map(picture.gradients, {step for _, step, _ in looks}))
 
-    def score(look: tuple[str, int, NDArray[np.intp]]) -> Array:
-        name, step, some = look
-        return np.asarray(
-            score_profiles(
-                picture.gradients(step), part.distinct, poses[some], np.log(view_lines[some]), part.views.diameter_mm,
-                network(name),
-            )
-        )  # fmt: skip
+    def __init__(self, part: PartView, networks: tuple[str, ...] = ROUGH) -> None:
+        self._part = part
+        self._networks = networks
 
-    total = np.zeros(len(poses))
-    for (_, _, some), scores in zip(looks, pool().map(score, looks), strict=True):
-        total[some] += scores
-    return total
+    def scores(self, pyramid: ImagePyramid, poses: Array, view_lines: Array) -> Array:
+        """Scores (N,) of the poses of one image; their differences are log odds.
+
+        Args:
+            pyramid: of the image.
+            poses: (N,4,4) ``cam_from_body``.
+            view_lines: (N,) distinct lines that the views at the poses show.
+        """
+        part = self._part
+        batches = [
+            (name, step, some)
+            for name in self._networks
+            for step, some in _batches(pyramid, part, poses, RADII_PX[name])
+        ]
+        list(pool().map(pyramid.level, {step for _, step, _ in batches}))
+
+        def score(batch: tuple[str, int, NDArray[np.intp]]) -> Array:
+            name, step, some = batch
+            return np.asarray(
+                score_profiles(
+                    pyramid.level(step), part.distinct, poses[some], np.log(view_lines[some]), part.views.diameter_mm,
+                    ranker_layers(name),
+                )
+            )  # fmt: skip
+
+        total = np.zeros(len(poses))
+        for (_, _, some), scores in zip(batches, pool().map(score, batches), strict=True):
+            total[some] += scores
+        return total
 
 
 def describe_poses(
-    picture: ImagePyramid, part: PartView, poses: Array, view_lines: Array, radius_px: float
+    pyramid: ImagePyramid, part: PartView, poses: Array, view_lines: Array, radius_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What a network is shown of poses, to fit it: (N, lines, FEATURES) and (N, GLOBALS); see `judge`."""
-    lines = np.empty((len(poses), OUTLINE_LINES + INNER_LINES, FEATURES), dtype=np.float32)
-    both = np.empty((len(poses), GLOBALS), dtype=np.float32)
-    for step, some in _looks(picture, part, poses, radius_px):
+    """Features of poses for training a network: (N, lines, FEATURES) and (N, RANKER_SCALARS); see `ProfileRanker`."""
+    profiles = np.empty((len(poses), OUTLINE_LINES + INNER_LINES, FEATURES), dtype=np.float32)
+    scalars = np.empty((len(poses), RANKER_SCALARS), dtype=np.float32)
+    for step, some in _batches(pyramid, part, poses, radius_px):
         for k in some:
             describe_profiles(
-                picture.gradients(step), part.distinct, poses[k], np.log(view_lines[k]), part.views.diameter_mm,
-                lines[k], both[k],
+                pyramid.level(step), part.distinct, poses[k], np.log(view_lines[k]), part.views.diameter_mm,
+                profiles[k], scalars[k],
             )  # fmt: skip
-    return lines, both
+    return profiles, scalars
 
 
-def _looks(picture: ImagePyramid, part: PartView, poses: Array, radius_px: float) -> list[tuple[int, NDArray[np.intp]]]:
-    """Scale steps with the poses to be looked at there, in halves."""
-    steps = steps_to(radius_px, picture.radii_px(part.views.diameter_mm, poses))
+def _batches(
+    pyramid: ImagePyramid, part: PartView, poses: Array, radius_px: float
+) -> list[tuple[int, NDArray[np.intp]]]:
+    """Scale steps with the indices of the poses to be scored there, in halves for the threads."""
+    steps = steps_to(radius_px, pyramid.radii_px(part.views.diameter_mm, poses))
     halves = [
         (int(step), some) for step in np.unique(steps) for some in np.array_split(np.flatnonzero(steps == step), 2)
     ]
@@ -137,26 +177,35 @@ def _looks(picture: ImagePyramid, part: PartView, poses: Array, radius_px: float
 
 
 @kernel(fastmath=True)
-def score_profiles(gradients, part, poses, log_lines, diameter_mm, weights):  # type: ignore[no-untyped-def]
-    """Scores (N,), see `judge`; ``part`` as in `PartView.arrays`, ``weights`` a `Network`."""
-    first, first_bias, second, second_bias, third, third_bias, last, last_bias = weights
+def score_profiles(level, part, poses, log_lines, diameter_mm, layers):  # type: ignore[no-untyped-def]
+    """Scores (N,) of poses; see `ProfileRanker.scores`.
+
+    Args:
+        level: `PyramidLevel` of the image.
+        part: arrays of all guide views, see `PartView.arrays`.
+        poses: (N,4,4) ``cam_from_body``.
+        log_lines: (N,) logarithm of the distinct lines.
+        diameter_mm: of the part.
+        layers: `RankerLayers` of one network.
+    """
+    first, first_bias, second, second_bias, third, third_bias, last, last_bias = layers
     zero = np.float32(0.0)
     width = second.shape[1]
-    lines = np.empty((OUTLINE_LINES + INNER_LINES, FEATURES), dtype=np.float32)
-    pooled = np.empty(3 * width + GLOBALS, dtype=np.float32)
+    profiles = np.empty((OUTLINE_LINES + INNER_LINES, FEATURES), dtype=np.float32)
+    pooled = np.empty(3 * width + RANKER_SCALARS, dtype=np.float32)
     stretch = np.empty(width, dtype=np.float32)
     scores = np.empty(poses.shape[0])
     for n in range(poses.shape[0]):
-        describe_profiles(gradients, part, poses[n], log_lines[n], diameter_mm, lines, pooled[3 * width :])
-        hidden = np.maximum(np.dot(lines, first) + first_bias, zero)
+        describe_profiles(level, part, poses[n], log_lines[n], diameter_mm, profiles, pooled[3 * width :])
+        hidden = np.maximum(np.dot(profiles, first) + first_bias, zero)
         hidden = np.maximum(np.dot(hidden, second) + second_bias, zero)
         pooled[: 2 * width] = zero
-        pooled[2 * width : 3 * width] = MOST
+        pooled[2 * width : 3 * width] = UPPER_BOUND
         counts = np.zeros(2, dtype=np.float32)
         stretch[:] = zero
         count = np.float32(0.5)
         for i in range(OUTLINE_LINES + INNER_LINES):
-            if lines[i, SEEN] > zero:
+            if profiles[i, IS_SEEN] > zero:
                 group = 0 if i < OUTLINE_LINES else 1
                 counts[group] += np.float32(1.0)
                 count += np.float32(1.0)
@@ -175,19 +224,47 @@ def score_profiles(gradients, part, poses, log_lines, diameter_mm, weights):  # 
 
 
 @kernel(fastmath=True)
-def describe_profiles(gradients, part, pose, log_lines, diameter_mm, lines, both):  # type: ignore[no-untyped-def]
-    """Write what the network is shown of a pose to ``lines`` (L, FEATURES) and ``both`` (GLOBALS,), float32.
+def describe_profiles(level, part, pose, log_lines, diameter_mm, profiles, scalars):  # type: ignore[no-untyped-def]
+    """Write the features of a pose to ``profiles`` (L, FEATURES) and ``scalars`` (RANKER_SCALARS,), float32.
 
-    Lines outside the picture are all zero.
+    Profiles outside the image are all zero.
     """
-    gx, gy, colours, answers, intrinsics = gradients
+    lines = sample_lines(part, pose, OUTLINE_LINES, INNER_LINES)
+    profiles[:] = np.float32(0.0)
+    sides = np.zeros((profiles.shape[0], 2, 3))
+    mean_colour = np.zeros(3)
+    step, seen = _sample_profiles(level, lines, pose, 0.01 * diameter_mm, profiles, sides, mean_colour)
+    _compare_sides(sides, mean_colour, step, profiles)
+    distance_mm = np.sqrt(pose[0, 3] ** 2 + pose[1, 3] ** 2 + pose[2, 3] ** 2)
+    scalars[0] = np.log(step / REFERENCE_GRADIENT)
+    scalars[1] = np.log(level.intrinsics[0] * 0.5 * diameter_mm / distance_mm / REFERENCE_RADIUS_PX)
+    scalars[2] = seen / max(lines.outline_count, 1)
+    scalars[3] = lines.inner_count / INNER_LINES
+    scalars[4] = min(lines.outline_length, MAX_OUTLINE_POINTS) / MAX_OUTLINE_POINTS
+    scalars[5] = LOG_LINES_WEIGHT * log_lines
+
+
+@kernel(fastmath=True)
+def _sample_profiles(level, lines, pose, step_mm, profiles, sides, mean_colour):  # type: ignore[no-untyped-def]
+    """Sample gradients and responses across all lines, and the colours of their sides.
+
+    Args:
+        level: `PyramidLevel` of the image.
+        lines: `SampledLines` of the pose.
+        pose: (4,4) ``cam_from_body``.
+        step_mm: length over which directions are projected.
+        profiles: (L, FEATURES) float32, zero before; receives all features but the colour differences.
+        sides: (L,2,3), zero before; receives the mean colours inside and outside, or -1 first where a side is missing.
+        mean_colour: (3,), zero before; receives the mean colour inside the outline.
+
+    Returns:
+        The mean gradient plus 1, and the number of outline profiles in the image.
+    """
+    gx, gy, colours, responses, intrinsics = level
     height, width = gx.shape
-    rows, columns = answers.shape[1:]
+    rows, columns = responses.shape[1:]
     shrunk = columns / width
-    along = 2 * PLACES
-    answered = SEEN + 2
-    points, directions, runs, outline, inner, length = sample_lines(part, pose, OUTLINE_LINES, INNER_LINES)
-    step_mm = 0.01 * diameter_mm
+    points, directions, runs, outline, inner, _ = lines
     outline_px, outline_normals, outline_depths = project_lines(
         points[:outline], directions[:outline], False, pose, intrinsics, step_mm
     )
@@ -195,9 +272,6 @@ def describe_profiles(gradients, part, pose, log_lines, diameter_mm, lines, both
         points[OUTLINE_LINES : OUTLINE_LINES + inner], directions[OUTLINE_LINES : OUTLINE_LINES + inner], True, pose,
         intrinsics, step_mm,
     )  # fmt: skip
-    lines[:] = np.float32(0.0)
-    sides = np.zeros((lines.shape[0], 2, 3))
-    mean = np.zeros(3)
     total, places, seen, coloured = 0.0, 0, 0, 0
     for i in range(outline + inner):
         is_inner = i >= outline
@@ -210,13 +284,13 @@ def describe_profiles(gradients, part, pose, log_lines, diameter_mm, lines, both
         depth = inner_depths[k] if is_inner else outline_depths[k]
         if depth <= 0.0 or not (0 <= int(np.floor(u + 0.5)) < width and 0 <= int(np.floor(v + 0.5)) < height):
             continue
-        line = lines[slot]
-        line[SEEN] = 1.0
-        line[SEEN + 1] = 1.0 if is_inner else 0.0
-        turn = int(np.round(np.arctan2(nv, nu) / np.pi * INSIDE)) % INSIDE
+        line = profiles[slot]
+        line[IS_SEEN] = 1.0
+        line[IS_DESIGN_EDGE] = 1.0 if is_inner else 0.0
+        turn = int(np.round(np.arctan2(nv, nu) / np.pi * SOLID_CHANNEL)) % SOLID_CHANNEL
         for side in range(2):
-            run_px = WIDEST_PX if is_inner else min(WIDEST_PX, runs[i, side] * intrinsics[0] / depth)
-            line[along + side] = run_px / WIDEST_PX
+            run_px = MAX_WIDTH_PX if is_inner else min(MAX_WIDTH_PX, runs[i, side] * intrinsics[0] / depth)
+            line[WIDTHS + side] = run_px / MAX_WIDTH_PX
         counts = np.zeros(2)
         for t in range(-REACH_PX, REACH_PX + 1):
             x, y = int(np.floor(u + t * nu + 0.5)), int(np.floor(v + t * nv + 0.5))
@@ -224,11 +298,11 @@ def describe_profiles(gradients, part, pose, log_lines, diameter_mm, lines, both
                 continue
             a = abs(gx[y, x] * nu + gy[y, x] * nv)
             b = abs(gx[y, x] * nv - gy[y, x] * nu)
-            line[REACH_PX + t] = a
-            line[PLACES + REACH_PX + t] = b
+            line[GRADIENT_NORMAL + REACH_PX + t] = a
+            line[GRADIENT_TANGENT + REACH_PX + t] = b
             row, column = min(int((y + 0.5) * shrunk), rows - 1), min(int((x + 0.5) * shrunk), columns - 1)
-            line[answered + REACH_PX + t] = answers[turn, row, column] / np.float32(255.0)
-            line[answered + PLACES + REACH_PX + t] = answers[INSIDE, row, column] / np.float32(255.0)
+            line[EDGE_RESPONSE + REACH_PX + t] = responses[turn, row, column] / np.float32(255.0)
+            line[SOLID_RESPONSE + REACH_PX + t] = responses[SOLID_CHANNEL, row, column] / np.float32(255.0)
             total += a + b
             places += 1
             if abs(t) >= SIDE_PX:
@@ -243,16 +317,21 @@ def describe_profiles(gradients, part, pose, log_lines, diameter_mm, lines, both
             seen += 1
             if counts[0] > 0.0:
                 coloured += 1
-                mean += sides[slot, 0]
+                mean_colour += sides[slot, 0]
         if min(counts[0], counts[1]) == 0.0:
             sides[slot, 0, 0] = -1.0
-    mean /= max(coloured, 1)
-    step = total / max(places, 1) + 1.0
-    for slot in range(lines.shape[0]):
-        line = lines[slot]
-        if line[SEEN] == 0.0:
+    mean_colour /= max(coloured, 1)
+    return total / max(places, 1) + 1.0, seen
+
+
+@kernel(fastmath=True)
+def _compare_sides(sides, mean_colour, step, profiles):  # type: ignore[no-untyped-def]
+    """Make gradients relative to their mean ``step``, and write the colour differences; see `_sample_profiles`."""
+    for slot in range(profiles.shape[0]):
+        line = profiles[slot]
+        if line[IS_SEEN] == 0.0:
             continue
-        for t in range(along):
+        for t in range(WIDTHS):
             line[t] = line[t] / (line[t] + step)
         if sides[slot, 0, 0] < 0.0:
             continue
@@ -260,43 +339,40 @@ def describe_profiles(gradients, part, pose, log_lines, diameter_mm, lines, both
             square = 0.0
             for c in range(3):
                 inside, outside = sides[slot, 0, c], sides[slot, 1, c]
-                square += ((inside - outside) if k == 0 else (inside - mean[c]) if k == 1 else (outside - mean[c])) ** 2
-            line[along + 2 + k] = np.sqrt(square) / (np.sqrt(square) + HALF_COLOUR)
-    distance_mm = np.sqrt(pose[0, 3] ** 2 + pose[1, 3] ** 2 + pose[2, 3] ** 2)
-    both[0] = np.log(step / HALF_STEP)
-    both[1] = np.log(intrinsics[0] * 0.5 * diameter_mm / distance_mm / SIZE_PX)
-    both[2] = seen / max(outline, 1)
-    both[3] = inner / INNER_LINES
-    both[4] = min(length, LONGEST) / LONGEST
-    both[5] = LINES_WEIGHT * log_lines
+                difference = (
+                    (inside - outside)
+                    if k == 0
+                    else (inside - mean_colour[c])
+                    if k == 1
+                    else (outside - mean_colour[c])
+                )
+                square += difference**2
+            line[COLOUR_DIFFERENCES + k] = np.sqrt(square) / (np.sqrt(square) + HALF_COLOUR)
 
 
 @kernel
-def sample_lines(part, pose, most_outline, most_inner):  # type: ignore[no-untyped-def]
-    """Evenly spread lines of the nearest view: points and directions (L,3), runs (L,2), how many are of the outline.
-
-    The last two: how many are design edges, which begin at ``most_outline``; how many points the outline has in all.
-    """
-    directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
-    view = nearest_view(directions, pose)
-    points = np.empty((most_outline + most_inner, 3), dtype=np.float32)
-    across = np.empty((most_outline + most_inner, 3), dtype=np.float32)
-    runs = np.empty((most_outline, 2), dtype=np.float32)
+def sample_lines(part, pose, max_outline, max_inner):  # type: ignore[no-untyped-def]
+    """`SampledLines` of the view nearest to a pose, with at most so many rows of outline and of design edges."""
+    view_directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
+    view = nearest_view(view_directions, pose)
+    points = np.empty((max_outline + max_inner, 3), dtype=np.float32)
+    directions = np.empty((max_outline + max_inner, 3), dtype=np.float32)
+    runs = np.empty((max_outline, 2), dtype=np.float32)
     first, length = c_start[view], c_start[view + 1] - c_start[view]
-    outline = min(most_outline, length)
+    outline = min(max_outline, length)
     for i in range(outline):
         k = first + (i * length) // outline
-        points[i], across[i], runs[i] = c_points[k], c_normals[k], c_runs[k]
+        points[i], directions[i], runs[i] = c_points[k], c_normals[k], c_runs[k]
     design = 0
     for k in range(e_start[view], e_start[view + 1]):
         design += int((e_kinds[k] & EDGE_CONTOUR) == 0 and (e_kinds[k] & EDGE_SHARP) > 0)
     inner, passed = 0, 0
-    wanted = min(most_inner, design)
+    wanted = min(max_inner, design)
     for k in range(e_start[view], e_start[view + 1]):
         if (e_kinds[k] & EDGE_CONTOUR) > 0 or (e_kinds[k] & EDGE_SHARP) == 0:
             continue
         if inner < wanted and passed * wanted >= inner * design:
-            points[most_outline + inner], across[most_outline + inner] = e_points[k], e_tangents[k]
+            points[max_outline + inner], directions[max_outline + inner] = e_points[k], e_tangents[k]
             inner += 1
         passed += 1
-    return points, across, runs, outline, inner, length
+    return SampledLines(points, directions, runs, outline, inner, length)

@@ -24,7 +24,7 @@ from arview.detection.features.image_pyramid import (
     ImagePyramid,
     step_for,
 )
-from arview.detection.scoring.profile_ranker import judge
+from arview.detection.scoring.profile_ranker import ProfileRanker
 from arview.detection.search.pattern_search import search_outlines
 from arview.detection.search.template_bank import (
     GROUPS,
@@ -236,6 +236,7 @@ class GlobalSearch:
         self._diameter_mm = views.diameter_mm
         self._focal_px = 0.5 * (camera.fx + camera.fy)
         self._part = part
+        self._ranker = ProfileRanker(part)
         self.outlines = make_outlines(views, part.model_from_body, POINTS)
         # Scale steps of the templates, large distances (large pictures) first.
         low, high = views.view_range.distance_mm
@@ -267,7 +268,7 @@ class GlobalSearch:
 
     def rank(self, picture: ImagePyramid, likely: CandidatePoses, effort: SearchBudget = QUICK) -> list[PoseCandidate]:
         """The starts among likely poses, best first."""
-        scores = judge(picture, self._part, likely.poses, likely.lines) + RESPONSE_WORTH * likely.responses
+        scores = self._ranker.scores(picture, likely.poses, likely.lines) + RESPONSE_WORTH * likely.responses
         best = np.argsort(-scores, kind="stable")[: effort.starts]
         return [PoseCandidate(float(scores[k]), likely.poses[k]) for k in best]
 
@@ -276,7 +277,7 @@ class GlobalSearch:
         scales = self._steps[:: effort.scale_step]
         if not effort.use_edge_net:
             picture = picture.without_edge_net
-        picture.make(scales)
+        picture.make_maps(scales)
         phases = list(pool().map(lambda step: decimate(picture.maps(step)[0], GRID_PX), scales))
         count = len(next(iter(self.banks.values())).bins)
         halves = [0, count // 2, count]
@@ -383,7 +384,7 @@ class GlobalSearch:
         for step in np.unique(matches.steps):
             group = np.flatnonzero(matches.steps == step)
             jobs += [(min(0, step + growth.steps_up), part) for part in np.array_split(group, 2)]
-        picture.make([step for step, _ in jobs])
+        picture.make_maps([step for step, _ in jobs])
 
         def improve(job: tuple[int, NDArray[np.intp]]) -> TemplateMatches:
             step, index = job

@@ -17,22 +17,13 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.parallel import pool
-from arview.detection.confidence import (
-    EVIDENCE_WEIGHT,
-    FOUND_LINES,
-    LEAST_VERIFIED,
-    VERIFIED_EVIDENCE,
-    VERIFIED_JUDGEMENT,
-    VERIFIED_LINES,
-    VERIFIED_STRIPS,
-    evidence_logit,
-)
+from arview.detection.confidence import appearance_score, confidence_weights, evidence_logit
 from arview.detection.features.denoiser import Denoiser
 from arview.detection.features.edge_net import EdgeNet, mean_edge_response
 from arview.detection.features.image_pyramid import ImagePyramid, step_for
 from arview.detection.scoring.contour_verifier import ContourVerifier
 from arview.detection.scoring.pose_verifier import PoseVerifier
-from arview.detection.scoring.profile_ranker import FINE, judge
+from arview.detection.scoring.profile_ranker import FINE, ProfileRanker
 from arview.detection.search.global_search import QUICK, PoseCandidate, weighed
 from arview.detection.search.pattern_search import search_poses
 from arview.detection.search.template_bank import ViewLineCounts, select_distinct
@@ -133,20 +124,21 @@ class Hypothesis:
     @property
     def appearance_score(self) -> float:
         """What verifier and line network say of it, once verified: for `pose_probability`."""
-        return max(self.verifier_score or 0.0, LEAST_VERIFIED) + FOUND_LINES * self.edge_response
+        return appearance_score(self.verifier_score or 0.0, self.edge_response)
 
     @property
     def logit(self) -> float:
         """For comparing the hypotheses of one picture, either all verified or none."""
         if self.verifier_score is not None:
-            return self.logit_without_contour + VERIFIED_STRIPS * self.contour_score
-        return EVIDENCE_WEIGHT * self.evidence_logit + self.profile_score
+            return self.logit_without_contour + confidence_weights().verified.contour * self.contour_score
+        return confidence_weights().unverified_evidence * self.evidence_logit + self.profile_score
 
     @property
     def logit_without_contour(self) -> float:
         """The same of a verified one, for comparing twins: their outlines are the same, what differs is chance."""
-        others = VERIFIED_EVIDENCE * self.evidence_logit + VERIFIED_JUDGEMENT * self.profile_score
-        return (self.verifier_score or 0.0) + others + VERIFIED_LINES * self.edge_response
+        weights = confidence_weights().verified
+        others = weights.evidence * self.evidence_logit + weights.profile * self.profile_score
+        return (self.verifier_score or 0.0) + others + weights.edge_response * self.edge_response
 
 
 @dataclass(frozen=True)
@@ -197,6 +189,8 @@ class LocalSearch:
         self._reach_mm = reach_mm
         self._line_network = EdgeNet()
         self._denoiser = Denoiser()
+        self._rough_ranker = ProfileRanker(self.refiner.part)
+        self._fine_ranker = ProfileRanker(self.refiner.part, FINE)
         self._verifier = PoseVerifier(self.refiner.part)
         self._strips = ContourVerifier(self.refiner.part)
         self._shown_lines = ViewLineCounts(views)
@@ -235,7 +229,7 @@ class LocalSearch:
             radius_px = float(picture.radii_px(self.views.diameter_mm, candidate.cam_from_body[None])[0])
             step = min(0, round(step_for(radius_px, level.magnification * self.options.radius_px)))
             by_step.setdefault(step, []).append(candidate)
-        picture.make(list(by_step))
+        picture.make_maps(list(by_step))
         jobs = []
         for step, group in by_step.items():
             size = max(2, -(-len(group) // 4))
@@ -259,7 +253,7 @@ class LocalSearch:
         if not len(poses):
             return []
         lines = np.array([self.view_lines(pose) for pose in poses])
-        scores = judge(picture, self.refiner.part, poses, lines) + CLIMBED_WORTH * weighed(responses, lines)
+        scores = self._rough_ranker.scores(picture, poses, lines) + CLIMBED_WORTH * weighed(responses, lines)
         scores += BEFORE_WORTH * before
         order = np.argsort(-scores, kind="stable")
         scores, poses = scores[order], poses[order]
@@ -345,7 +339,7 @@ class LocalSearch:
         refined = list(pool().map(refine, ways))
         poses = np.array([pose for pose, _ in refined]).reshape(-1, 4, 4)
         lines = np.array([self.view_lines(pose) for pose in poses])
-        judgements = judge(picture, self.refiner.part, poses, lines, FINE)
+        judgements = self._fine_ranker.scores(picture, poses, lines)
         return [
             Hypothesis(pose, evidence, float(profile_score), float(shown), self.refiner.radius_px(pose))
             for (pose, evidence), profile_score, shown in zip(refined, judgements, lines, strict=True)
