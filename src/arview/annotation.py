@@ -106,6 +106,7 @@ def annotate(
     overlay: Overlay | None = None,
     sink: Sink | None = None,
     poses_path: str | Path | None = None,
+    *,
     progress: Callable[[int, Pose], None] | None = None,
     start_s: float | None = None,
     end_s: float | None = None,

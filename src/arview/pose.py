@@ -57,6 +57,12 @@ class Pose:
     alternatives: tuple[Array, ...] = ()
     guide_cam_from_model: Array | None = None
 
+    def __repr__(self) -> str:
+        if self.cam_from_model is None:
+            return f"<Pose {self.index}: {self.state}>"
+        x, y, z = self.cam_from_model[:3, 3]
+        return f"<Pose {self.index}: {self.state}, quality {self.quality:.2f}, at {x:.1f}, {y:.1f}, {z:.1f} mm>"
+
     @property
     def remark(self) -> str:
         """Text for a status line: the reason, or, of a tracked part, the components not verified yet."""

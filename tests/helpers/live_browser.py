@@ -47,7 +47,7 @@ def frames(width: int, height: int) -> list[Image]:
 def plain_frames(width: int, height: int, stride: int, count: int) -> list[Image]:
     """(H,W,3) frames of the clip; their middle, if the shape is another."""
     left, shown = _crop(width, height)
-    source = open_source(CLIP, START, START + stride * count, stride)
+    source = open_source(CLIP, start=START, end=START + stride * count, stride=stride)
     return [
         cv2.resize(frame.image[:, left : left + shown], (width, height), interpolation=cv2.INTER_AREA)
         for frame in source

@@ -28,7 +28,7 @@ CENTER_IN_MODEL = np.array([0.0, 0.0, 26.0])
 @cache
 def frames() -> list[Image]:
     """(360,640,3) frames of the clip in which the part is in full view."""
-    source = open_source(CLIP, START, START + COUNT * STRIDE, STRIDE)
+    source = open_source(CLIP, start=START, end=START + COUNT * STRIDE, stride=STRIDE)
     return [cv2.resize(frame.image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in source]
 
 

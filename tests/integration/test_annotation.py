@@ -74,7 +74,7 @@ def test_video_and_poses_hold_every_frame_in_order(tmp_path: Path) -> None:
     done: list[tuple[int, int]] = []
     sink = VideoSink(tmp_path / "out.mp4", 160, 120, 10.0)
     summary = annotate(
-        source, Walk(), Mark(), sink, tmp_path / "poses.jsonl", lambda n, pose: done.append((n, pose.index))
+        source, Walk(), Mark(), sink, tmp_path / "poses.jsonl", progress=lambda n, pose: done.append((n, pose.index))
     )
     assert (summary.frames, summary.skipped, summary.is_interrupted) == (12, 2, False)
     assert summary.states == {"tracked": 9, "lost": 3}

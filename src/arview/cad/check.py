@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import NoneType
 from typing import Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from arview.cad.part import ComponentSettings, Part
 from arview.cad.symmetry import FoundSymmetry, Symmetry, find_symmetries
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
+from arview.core.checks import check_type
 from arview.geometry import Array, exp_so3
 
 Severity = Literal["problem", "warning", "note"]
@@ -148,6 +150,8 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
 
     Nothing here is an error; a part with problems can be used where they do not matter.
     """
+    check_type(part, Part, "check_part: part")
+    check_type(camera, (Camera, NoneType), "check_part: camera")
     is_guessed = camera is None
     camera = GUESSED_CAMERA if camera is None else camera
     view_range = part.effective_view_range

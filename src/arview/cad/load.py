@@ -20,6 +20,7 @@ from arview.cad.model import Component, Model, make_model
 from arview.cad.obj import read_obj
 from arview.cad.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names, unit_in_mm
 from arview.cad.threemf import read_3mf
+from arview.core.checks import PATH, check_type
 from arview.errors import InputError, MissingDependencyError
 from arview.geometry import Array
 
@@ -38,9 +39,10 @@ class LoadedCad:
 
 
 def load_model(
-    path: str | Path, unit: str | None = None, tol_linear_mm: float = 0.1, tol_angular_deg: float = 10.0
+    path: str | Path, unit: str | None = None, *, tol_linear_mm: float = 0.1, tol_angular_deg: float = 10.0
 ) -> Model:
     """Model of a STEP, glTF, OBJ, STL, PLY or 3MF file; see load_cad, which also returns the remarks."""
+    check_type(path, PATH, "load_model: path")
     return load_cad(path, unit, tol_linear_mm, tol_angular_deg).model
 
 

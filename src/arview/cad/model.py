@@ -28,6 +28,9 @@ class Component:
     faces: NDArray[np.int32]
     color: tuple[float, float, float] = (0.6, 0.6, 0.62)
 
+    def __repr__(self) -> str:
+        return f"<Component {self.name}: {len(self.faces):,} faces>"
+
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices_in_model, dtype=np.float64)
         faces = np.ascontiguousarray(self.faces, dtype=np.int32)
@@ -69,6 +72,11 @@ class Model:
         if len(set(names)) != len(names):
             twice = sorted({name for name in names if names.count(name) > 1})
             raise InputError(f"model {self.name!r}: component names are not unique: {', '.join(twice)}")
+
+    def __repr__(self) -> str:
+        faces = sum(len(component.faces) for component in self.components)
+        count = len(self.components)
+        return f"<Model {self.name}: {count} component{'s' * (count != 1)}, {faces:,} faces, {self.diameter_mm:.0f} mm>"
 
     @cached_property
     def mesh(self) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:

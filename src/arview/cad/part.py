@@ -99,6 +99,10 @@ class Part:
     serial: str | None = None
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        serial = f" {self.serial}" if self.serial else ""
+        return f"<Part {self.name}{serial}: {len(self.model.components)} components, {len(self.inspected)} inspected>"
+
     def component_settings(self, name: str) -> ComponentSettings:
         """Settings of a component; raises InputError with the closest names when there is none."""
         for settings in self.settings:

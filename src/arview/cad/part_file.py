@@ -24,6 +24,7 @@ from arview.cad.raw import UNIT_MM
 from arview.cad.symmetry import Symmetry
 from arview.cad.toml_table import TomlTable
 from arview.cad.view_range import ViewRange
+from arview.core.checks import PATH, check_type
 from arview.errors import InputError
 
 ROLES = ("base", "inspect", "ignore")
@@ -126,6 +127,7 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
         InputError: missing or broken file, unknown key, wrong type or value, a component that the CAD does
             not have; and everything that load_cad raises.
     """
+    check_type(path, PATH, "load_part: path")
     path = find_part_file(path)
     if path.suffix.lower() != ".toml":
         cad = load_cad(path, unit)

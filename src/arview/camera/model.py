@@ -54,6 +54,11 @@ class Camera:
         if self.fx <= 0 or self.fy <= 0:
             raise InputError(f"camera: focal length fx={self.fx} fy={self.fy} px is not positive")
 
+    def __repr__(self) -> str:
+        distortion = "distorted" if self.is_distorted else "no distortion"
+        focal, center = f"f {self.fx:.1f}, {self.fy:.1f} px", f"centre {self.cx:.1f}, {self.cy:.1f} px"
+        return f"<Camera {self.width}×{self.height}: {focal}, {center}, {distortion}>"
+
     @property
     def matrix(self) -> Array:
         """(3,3) calibration matrix K, px."""

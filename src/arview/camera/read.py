@@ -21,6 +21,7 @@ import numpy as np
 from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, focal_length_px, read_exif
 from arview.camera.model import COLMAP_HALF_PX, Camera
 from arview.camera.profiles import find_profile
+from arview.core.checks import PATH, check_type
 from arview.errors import ArviewError, InputError, MismatchError, OutputError
 
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "cam_K", "K", "k", "mtx")
@@ -53,6 +54,7 @@ def load_camera(
     spec: str | Path,
     width: int | None = None,
     height: int | None = None,
+    *,
     source: str | Path | None = None,
     quarter_turns_clockwise: int = 0,
 ) -> Camera:
@@ -72,6 +74,7 @@ def load_camera(
         InputError: the file is missing, cannot be read, has no known format or holds impossible values.
         MismatchError: the file is for frames of another aspect ratio.
     """
+    check_type(spec, PATH, "load_camera: spec")
     text = str(spec)
     if text.startswith("fov:"):
         return _camera_from_fov(text, width, height)

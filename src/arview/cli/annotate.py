@@ -165,7 +165,7 @@ def annotate(
     outputs = _check_outputs(output, poses_path, learned_path, inputs)
     first = start if isinstance(start, int) else None
     last = end if isinstance(end, int) else None
-    with open_source(source, first, last, stride, fps) as frames:
+    with open_source(source, start=first, end=last, stride=stride, fps=fps) as frames:
         camera = camera_for(frames, camera_spec, source)
         session = _make_session(part, camera, views_path, renderer, modalities, guide_name, first_pose)
         if outputs.learned is not None and outputs.learned.exists():
@@ -235,7 +235,7 @@ def _make_session(
     if views is None:
         with progress_bar("guide views") as progress:
             views = cached_guide_views(
-                part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress
+                part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress=progress
             )
     return TrackingSession(
         views,

@@ -260,7 +260,9 @@ def camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
     from arview.camera.read import guess_camera, load_camera
 
     if spec is not None:
-        return load_camera(spec, frames.width, frames.height, source, frames.quarter_turns_clockwise)
+        return load_camera(
+            spec, frames.width, frames.height, source=source, quarter_turns_clockwise=frames.quarter_turns_clockwise
+        )
     camera = guess_camera(frames.width, frames.height)
     say(
         f"WARNING: no --camera given: GUESSING a focal length of {camera.fx:.0f} px (1.2 × the longer side)"

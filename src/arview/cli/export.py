@@ -84,7 +84,7 @@ def export(
     if {"html", "pdf"} & set(targets):
         from arview.report import make_report
 
-        evidence = make_report(source, targets.get("html"), targets.get("pdf"), part, folder, photos)
+        evidence = make_report(source, targets.get("html"), targets.get("pdf"), part, folder=folder, photos=photos)
         for reason in evidence.absent.values():
             say(f"left out: {reason}")
     for target in targets.values():

@@ -44,7 +44,9 @@ def guideviews(
     model = loaded.model.only([component]) if component else loaded.model
     began = time.perf_counter()
     with progress_bar("guide views") as progress:
-        views = make_guide_views(model, loaded.effective_view_range, GuideViewOptions(renderer=renderer), progress)
+        views = make_guide_views(
+            model, loaded.effective_view_range, GuideViewOptions(renderer=renderer), progress=progress
+        )
     views.save(path)
     seconds = time.perf_counter() - began
     size_mb = path.stat().st_size / 1e6

@@ -114,7 +114,7 @@ def inspect(
 
         HistoryStore(store).close()  # a store that cannot be used is reported now, not after the measurement
     with line_bar(video is not None, photos is None, not no_pdf) as progress:
-        outcome = inspect_part(job, output, progress, force)
+        outcome = inspect_part(job, output, progress=progress, starts_over=force)
     print_outcome(outcome)
     if store is not None:
         from arview.history import HistoryStore

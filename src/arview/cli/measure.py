@@ -122,7 +122,7 @@ def measure(
     )
     reconstruction = read_cloud(cloud_path or "") if folder is None else read_folder(folder, photos, "cloud" in methods)
     with stage_bar() as progress:
-        inspection = run.measure(reconstruction, part, options, progress)
+        inspection = run.measure(reconstruction, part, options, progress=progress)
     save_inspection(inspection, target)
     _print(inspection, target)
     click.get_current_context().exit(exit_code_of(overall_verdict(inspection).value))

@@ -116,7 +116,7 @@ def reconstruct(
         starts_over=force,
     )
     with stage_bar() as progress:
-        result = run.reconstruct(source, folder, part, camera, options, progress)
+        result = run.reconstruct(source, folder, part, camera, options, progress=progress)
     _print(result, part is not None)
 
 

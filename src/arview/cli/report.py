@@ -56,7 +56,7 @@ def report(
     paper = None if pdf is None else output_path(pdf, [*inputs, html])
     part = None if part_path is None else load_part(part_path, unit)
     with stage_bar() as progress:
-        evidence = make_report(source, html, paper, part, folder, photos, progress=progress)
+        evidence = make_report(source, html, paper, part, folder=folder, photos=photos, progress=progress)
     for reason in evidence.absent.values():
         say(f"left out: {reason}")
     for path in (html, paper):

@@ -1,10 +1,11 @@
-"""Stages of a run that write into a folder: finished ones are not done again."""
+"""Stages of a run that write into a folder: finished stages are not repeated."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Iterable
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,14 @@ _FILE = "stages.json"
 
 
 class Stages:
-    """Which stages of a run are finished in a folder, and from what input.
+    """The finished stages of a run in a folder, with a key for the input of each.
 
-    A stage's key is made of its options and of the key of the stage before, so that a change of anything
-    repeats the stages that depend on it and no others.
+    The key of a stage is made from its options and the key of the stage before, so that a change repeats the stages
+    that depend on it and no others.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Raises OutputError when the folder cannot be made or written to."""
+        """Raises OutputError if the folder cannot be made."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -31,20 +32,20 @@ class Stages:
         self._finished = self._read()
 
     def is_finished(self, name: str, key: str) -> bool:
-        """True when the stage was finished with this key."""
+        """True if the stage was finished with this key."""
         return self._finished.get(name) == key
 
     def key(self, name: str) -> str | None:
-        """The key that a stage was finished with, or None."""
+        """The key with which a stage was finished, or None."""
         return self._finished.get(name)
 
     def finish(self, name: str, key: str) -> None:
-        """Note that a stage is finished. Call it when the stage's files are complete."""
+        """Record that a stage is finished. To be called when its files are complete."""
         self._finished[name] = key
         write_json(self.folder / _FILE, self._finished)
 
     def restart(self, name: str) -> None:
-        """Note that a stage's files are no longer to be relied on. Call it before they are touched."""
+        """Record that the files of a stage are invalid. To be called before they are changed."""
         if self._finished.pop(name, None) is not None:
             write_json(self.folder / _FILE, self._finished)
 
@@ -57,12 +58,26 @@ class Stages:
 
 
 def key_of(*parts: Any) -> str:
-    """A short hash of values with a stable ``repr`` (numbers, texts, frozen options)."""
-    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+    """A short hash of numbers, texts, and tuples, lists, dictionaries and dataclasses of them."""
+    return hashlib.sha256(_full_repr(parts).encode()).hexdigest()[:16]
+
+
+def _full_repr(value: Any) -> str:
+    """Like ``repr``, but of a dataclass always all its fields, also where the class has a shorter ``__repr__``."""
+    if is_dataclass(value) and not isinstance(value, type):
+        shown = [f"{one.name}={_full_repr(getattr(value, one.name))}" for one in fields(value) if one.repr]
+        return f"{type(value).__qualname__}({', '.join(shown)})"
+    if type(value) is tuple:
+        return f"({', '.join(map(_full_repr, value))}{',' * (len(value) == 1)})"
+    if type(value) is list:
+        return f"[{', '.join(map(_full_repr, value))}]"
+    if type(value) is dict:
+        return "{" + ", ".join(f"{_full_repr(key)}: {_full_repr(one)}" for key, one in value.items()) + "}"
+    return repr(value)
 
 
 def content_key(paths: Iterable[Path]) -> str:
-    """A short hash of the names and the content of files, wherever they lie; of unreadable ones, the name alone."""
+    """A short hash of the names and contents of files, whatever their folders; an unreadable file counts by name."""
     digest = hashlib.sha256()
     for path in paths:
         digest.update(path.name.encode())

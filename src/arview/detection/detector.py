@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.checks import check_type
 from arview.core.parallel import pool
 from arview.detection.confidence import ConfidenceTerms, Margins, confidence_terms, pose_probability
 from arview.detection.features.image_pyramid import ImagePyramid
@@ -141,6 +142,8 @@ class Detector:
         *,
         local: LocalSearch | None = None,
     ) -> None:
+        check_type(views, GuideViewSet, "Detector: views")
+        check_type(camera, Camera, "Detector: camera")
         self.options = o = options or options_for(views)
         self.views = views
         self.camera = camera

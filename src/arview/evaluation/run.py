@@ -152,7 +152,7 @@ def scene_guide_views(
     """Guide views for a scene, cached: over the part's declared range, else over what covers its poses."""
     part = scene.part
     view_range = part.view_range or covering_range(scene.poses, part.model.center_in_model)
-    return cached_guide_views(part.model, view_range, options, progress)
+    return cached_guide_views(part.model, view_range, options, progress=progress)
 
 
 def evaluate_scene(

@@ -27,6 +27,7 @@ def cached_guide_views(
     model: Model,
     view_range: ViewRange,
     options: GuideViewOptions | None = None,
+    *,
     progress: StepProgress | None = None,
 ) -> GuideViewSet:
     """The set from the cache, or made now and put there; see `make_guide_views` for arguments and errors.
@@ -40,7 +41,7 @@ def cached_guide_views(
             return load_guide_views(path, model)
         except ArviewError:
             pass
-    views = make_guide_views(model, view_range, options, progress)
+    views = make_guide_views(model, view_range, options, progress=progress)
     try:
         views.save(path)
     except ArviewError:

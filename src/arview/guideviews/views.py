@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
+from arview.core.checks import PATH, check_type
 from arview.core.progress import StepProgress
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array
@@ -104,6 +105,9 @@ class GuideViewSet:
     directions: Array
     arrays: dict[str, NDArray[Any]] = field(repr=False)
 
+    def __repr__(self) -> str:
+        return f"<GuideViewSet {self.model_name}: {len(self)} views, {self.diameter_mm:.0f} mm>"
+
     def __len__(self) -> int:
         return len(self.poses)
 
@@ -144,7 +148,7 @@ class GuideViewSet:
         eye = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3]
         return int(np.argmax(self.directions @ (eye - self.center_in_model)))
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the set to one file, atomically.
 
         Raises:
@@ -162,16 +166,18 @@ class GuideViewSet:
             "center_in_model": self.center_in_model.tolist(),
             "diameter_mm": self.diameter_mm,
         }  # fmt: skip
-        write_arrays(path, meta, {"poses": self.poses, "directions": self.directions, **self.arrays})
+        write_arrays(Path(path), meta, {"poses": self.poses, "directions": self.directions, **self.arrays})
 
 
-def load_guide_views(path: Path, model: Model | None = None) -> GuideViewSet:
+def load_guide_views(path: str | Path, model: Model | None = None) -> GuideViewSet:
     """Load a set, whose arrays are memory-mapped.
 
     Raises:
         InputError: the file is missing, is not a set, is damaged, or has another format version.
         MismatchError: the set was rendered from another model than the one given.
     """
+    check_type(path, PATH, "load_guide_views: path")
+    path = Path(path)
     meta, arrays = read_arrays(path)
     if meta.get("format_version") != FORMAT_VERSION:
         raise InputError(
@@ -235,6 +241,7 @@ def make_guide_views(
     model: Model,
     view_range: ViewRange,
     options: GuideViewOptions | None = None,
+    *,
     progress: StepProgress | None = None,
 ) -> GuideViewSet:
     """Render the guide views of a model over a range, and extract their features.
@@ -249,6 +256,8 @@ def make_guide_views(
         MissingDependencyError: the renderer is pyrender, and its GL library is missing.
         InputError: the range puts the camera inside the part.
     """
+    check_type(model, Model, "make_guide_views: model")
+    check_type(view_range, ViewRange, "make_guide_views: view_range")
     options = options or GuideViewOptions()
     if view_range.distance_mm[1] <= 0.5 * model.diameter_mm:
         raise InputError(

@@ -15,6 +15,7 @@ import jsonschema
 
 from arview.cad.model import Model
 from arview.core.atomic import replacing
+from arview.core.checks import PATH, check_type
 from arview.errors import InputError, MismatchError, OutputError
 from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport, from_json, to_json
 from arview.inspection.record import (
@@ -39,6 +40,7 @@ def load_inspection(path: str | Path, model: Model | None = None) -> Inspection:
             one line that names the place in the file (``components[2].distance_mm``).
         MismatchError: made against another model than ``model``.
     """
+    check_type(path, PATH, "load_inspection: path")
     path = Path(path)
     document = _read_json(path)
     try:
@@ -62,6 +64,7 @@ def save_inspection(inspection: Inspection, path: str | Path) -> None:
     Raises:
         OutputError: the folder is missing, read-only or full.
     """
+    check_type(inspection, Inspection, "save_inspection: inspection")
     path = Path(path)
     text = json.dumps(_to_document(inspection), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     try:

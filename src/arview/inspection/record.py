@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
@@ -202,6 +203,11 @@ class Inspection:
             if component.name in seen:
                 raise InputError(f"components[{index}].name: {component.name!r} appears twice")
             seen.add(component.name)
+
+    def __repr__(self) -> str:
+        counts = Counter(component.verdict.value.replace("_", " ") for component in self.components)
+        found = ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
+        return f"<Inspection {f'{self.part} {self.serial}'.rstrip()}: {found}>"
 
     def find(self, name: str) -> ComponentDeviation | None:
         """The entry of the component of that name, or None when it was not inspected."""

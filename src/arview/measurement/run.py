@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import scipy.linalg  # noqa: F401  its BLAS is loaded before threads are limited
@@ -13,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from arview.cad.model import Model
 from arview.cad.part import Part
+from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
@@ -24,7 +26,7 @@ from arview.measurement.datums.equations import DatumEquations, move_equations
 from arview.measurement.datums.in_cloud import measure_datums_in_cloud
 from arview.measurement.datums.in_photos import measure_datums_in_photos
 from arview.measurement.datums.planes import base_plane
-from arview.measurement.folder import MetricReconstruction, in_model_frame
+from arview.measurement.folder import MetricReconstruction, in_model_frame, read_folder
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.photo import PhotoViews, load_views, measure_components_in_photos
 from arview.measurement.records import (
@@ -40,13 +42,13 @@ from arview.reconstruction.scale.cad import base_names
 
 
 def measure(
-    reconstruction: MetricReconstruction, part: Part, options: MeasureOptions | None = None,
-    progress: Progress | None = None,
+    reconstruction: MetricReconstruction | str | Path, part: Part, options: MeasureOptions | None = None,
+    *, progress: Progress | None = None,
 ) -> Inspection:  # fmt: skip
     """Where every inspected component stands in the datum frame, with its uncertainty and verdict.
 
     Args:
-        reconstruction: see `read_folder`.
+        reconstruction: from `read_folder` or `read_cloud`, or the folder of `arview reconstruct`.
         part: CAD, roles, tolerances, datums.
         options: see there.
         progress: called with (what, done, total).
@@ -55,6 +57,10 @@ def measure(
         InputError: the reconstruction contradicts the CAD; a datum is not covered; nothing to inspect.
         OutputError: the distance map cannot be written.
     """
+    check_type(reconstruction, (MetricReconstruction, *PATH), "measure: reconstruction")
+    check_type(part, Part, "measure: part")
+    if isinstance(reconstruction, str | Path):
+        reconstruction = read_folder(reconstruction)
     # The threads are ours: those of BLAS, on matrices of some hundred rows, would only wait for each other.
     with threadpool_limits(1, "blas"):
         return _measure(reconstruction, part, options or MeasureOptions(), progress or (lambda what, done, total: None))

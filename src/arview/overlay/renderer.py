@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from datetime import datetime
+from types import NoneType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.core.checks import check_type
 from arview.errors import MismatchError
 from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Inspection, Verdict
@@ -53,6 +55,9 @@ class OverlayRenderer:
         inspection: Inspection | None = None,
         options: OverlayOptions | None = None,
     ) -> None:
+        check_type(model, Model, "OverlayRenderer: model")
+        check_type(camera, Camera, "OverlayRenderer: camera")
+        check_type(inspection, (Inspection, NoneType), "OverlayRenderer: inspection")
         if inspection is not None:
             inspection.check_model(model)
         self.model, self.camera, self.inspection = model, camera, inspection

@@ -19,6 +19,7 @@ import json
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal
 
 import numpy as np
@@ -26,6 +27,7 @@ import numpy as np
 from arview import __version__
 from arview.cad import Part
 from arview.core.atomic import replacing
+from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of, write_json
 from arview.errors import InputError, OutputError
@@ -94,6 +96,7 @@ def reconstruct(
     part: Part | None = None,
     camera: str | None = None,
     options: ReconstructOptions | None = None,
+    *,
     progress: Progress | None = None,
 ) -> Reconstruction:
     """Reconstruct what the photos show.
@@ -113,6 +116,9 @@ def reconstruct(
         MismatchError: the camera does not fit the photos.
         OutputError: the folder cannot be written to.
     """
+    check_type(source, PATH, "reconstruct: source")
+    check_type(folder, PATH, "reconstruct: folder")
+    check_type(part, (Part, NoneType), "reconstruct: part")
     run = _Run(Path(folder), part, options or ReconstructOptions(), progress or (lambda what, done, total: None))
     return run.all(source, camera)
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from arview.cad.part import Part
 from arview.core.atomic import replacing
+from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.report.evidence import Evidence, gather
@@ -19,7 +21,7 @@ PANGO_INSTALL_COMMAND = (
 
 def make_report(
     inspection: str | Path, html: str | Path | None = None, pdf: str | Path | None = None, part: Part | None = None,
-    folder: str | Path | None = None, photos: str | Path | None = None, options: ReportOptions | None = None,
+    *, folder: str | Path | None = None, photos: str | Path | None = None, options: ReportOptions | None = None,
     progress: Progress | None = None,
 ) -> Evidence:  # fmt: skip
     """Write the report of an inspection as one HTML file without links to elsewhere, as PDF, or both.
@@ -42,6 +44,8 @@ def make_report(
         MissingDependencyError: the PDF needs libraries that are not installed.
         OutputError: a file cannot be written.
     """
+    check_type(inspection, PATH, "make_report: inspection")
+    check_type(part, (Part, NoneType), "make_report: part")
     if html is None and pdf is None:
         raise InputError("report: name a file to write, HTML or PDF")
     tell = progress or (lambda what, done, total: None)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from arview.assembly.monitor import AssemblyMonitor
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.core.checks import check_type
 from arview.detection.detector import (
     Detection,
     Detector,
@@ -111,6 +112,9 @@ class TrackingSession:
         initial_cam_from_model: Array | None = None,
         guide_cam_from_model: Array | None = None,
     ) -> None:
+        check_type(views, GuideViewSet, "TrackingSession: views")
+        check_type(camera, Camera, "TrackingSession: camera")
+        check_type(model, Model, "TrackingSession: model")
         self.options = options or SessionOptions()
         if views.model_hash != model.source_hash:
             raise MismatchError(
@@ -139,6 +143,9 @@ class TrackingSession:
         self.components = AssemblyMonitor(views, camera, model)
         self.appearance_memory = AppearanceMemory(views, camera)
         self.reset()
+
+    def __repr__(self) -> str:
+        return f"<TrackingSession {self._views.model_name}: {self.state}, {len(self._views)} views, {self.camera!r}>"
 
     @property
     def detector(self) -> Detector:

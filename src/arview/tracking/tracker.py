@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from types import NoneType
 from typing import NamedTuple, Protocol
 
 import cv2
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.core.checks import check_type
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
@@ -202,6 +204,9 @@ class Tracker:
         recheck: PoseRecheck | None = None,
         part: PartView | None = None,
     ) -> None:
+        check_type(views, GuideViewSet, "Tracker: views")
+        check_type(camera, Camera, "Tracker: camera")
+        check_type(model, (Model, NoneType), "Tracker: model")
         self.options = options or TrackerOptions()
         self.camera = camera
         self.refiner = PoseRefiner(part or PartView(views), camera, self.options)

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 from arview.camera.exif import PHOTO_SUFFIXES
+from arview.core.checks import PATH, check_type
 from arview.errors import InputError
 from arview.video.files import PictureSource, VideoFileSource, picture_paths, sorted_naturally
 from arview.video.live import CameraGrabber, LiveSource, UrlGrabber
@@ -18,6 +19,7 @@ _URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
 
 def open_source(
     spec: str | Path,
+    *,
     start: int | None = None,
     end: int | None = None,
     stride: int = 1,
@@ -39,6 +41,7 @@ def open_source(
     Raises:
         InputError: nothing there, or nothing that can be read; the message says what and what to do.
     """
+    check_type(spec, PATH, "open_source: spec")
     wanted = FrameRange(start or 0, end, stride)
     text = str(spec)
     if not 0 < fps < float("inf"):

@@ -32,7 +32,9 @@ def camera_of_video(video: str, spec: str | None, of_photos: Camera | None, is_f
     with open_source(video) as frames:
         width, height = frames.width, frames.height
         if spec is not None:
-            return load_camera(spec, width, height, video, frames.quarter_turns_clockwise), ""
+            return load_camera(
+                spec, width, height, source=video, quarter_turns_clockwise=frames.quarter_turns_clockwise
+            ), ""
     if of_photos is not None and abs(of_photos.width * height - of_photos.height * width) <= max(width, height):
         warning = "the video is assumed to have the camera of the photos; if it does not, give --video-camera"
         return of_photos.scaled(width, height), "" if is_from_video else warning
@@ -74,7 +76,7 @@ def make_film(
                 OverlayRenderer(part.model, camera, inspection),
                 VideoSink(unfinished[0], frames.width, frames.height, frames.fps, frames),
                 unfinished[1],
-                lambda done, pose: progress(done, total),
+                progress=lambda done, pose: progress(done, total),
             )
         if summary.is_interrupted:
             raise KeyboardInterrupt

@@ -76,7 +76,13 @@ def _check_cameras(job: InspectJob) -> None:
             if frames.is_live:
                 raise InputError(f"{job.video}: is a live source; record a video first and give its file")
             if job.video_camera is not None:
-                load_camera(job.video_camera, frames.width, frames.height, job.video, frames.quarter_turns_clockwise)
+                load_camera(
+                    job.video_camera,
+                    frames.width,
+                    frames.height,
+                    source=job.video,
+                    quarter_turns_clockwise=frames.quarter_turns_clockwise,
+                )
     elif job.video_camera:
         raise InputError("a camera of the video is given without a video")
     if job.camera:

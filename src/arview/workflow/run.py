@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from arview import __version__
+from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of
 from arview.errors import CannotMeasureError, InputError, MismatchError, MissingDependencyError
@@ -86,7 +87,7 @@ class Outcome:
 
 
 def inspect_part(
-    job: InspectJob, folder: str | Path, progress: Progress | None = None, starts_over: bool = False
+    job: InspectJob, folder: str | Path, *, progress: Progress | None = None, starts_over: bool = False
 ) -> Outcome:
     """Inspect one part; stages that an earlier run finished in ``folder`` with the same inputs are skipped.
 
@@ -103,6 +104,8 @@ def inspect_part(
         OutputError: the folder cannot be written to.
         MissingDependencyError: a library is missing. If only the PDF needs it, there is a warning instead.
     """
+    check_type(job, InspectJob, "inspect_part: job")
+    check_type(folder, PATH, "inspect_part: folder")
     folder = Path(folder)
     prepared = prepare(job, folder)
     with exclusive_access(folder, ".lock", waits=False):
@@ -142,7 +145,7 @@ class _Run:
         prepared, job = self.prepared, self.prepared.job
         options = replace(prepared.reconstruct, starts_over=starts_over)
         with _measuring():
-            found = reconstruct(job.photo_source, self.folder, prepared.part, job.camera, options, self.progress)
+            found = reconstruct(job.photo_source, self.folder, prepared.part, job.camera, options, progress=self.progress)
         for name, title in _RECONSTRUCTION.items():
             state = "done" if name in found.seconds else "kept"
             self.records.append(StageRecord(title, state, found.seconds.get(name, 0.0), _about(found, name)))
@@ -158,7 +161,7 @@ class _Run:
             from arview.measurement.run import measure
 
             with _measuring():
-                inspection = measure(read_folder(self.folder), part, self.prepared.measure, self.progress)
+                inspection = measure(read_folder(self.folder), part, self.prepared.measure, progress=self.progress)
             save_inspection(inspection, path)
             return ""
 

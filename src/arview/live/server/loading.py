@@ -39,7 +39,7 @@ def load_subject(
     if views_path is not None:
         views = load_guide_views(Path(views_path), part.model)
     else:
-        views = cached_guide_views(part.model, part.effective_view_range, view_options, progress)
+        views = cached_guide_views(part.model, part.effective_view_range, view_options, progress=progress)
     subject = Subject(part, views, options)
     if options.is_phone:
         subject.camera(options.width, options.height)

@@ -112,7 +112,7 @@ class Subject:
         """
         spec, source = self.options.camera, self.options.source
         if spec is not None:
-            return load_camera(spec, width, height, source, quarter_turns_clockwise)
+            return load_camera(spec, width, height, source=source, quarter_turns_clockwise=quarter_turns_clockwise)
         if self.options.is_phone:
             return load_camera(PHONE_FOV, width, height)
         return guess_camera(width, height)

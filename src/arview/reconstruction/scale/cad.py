@@ -169,7 +169,7 @@ def find_cad(
     for view_range in search_ranges(part, [photo.camera for photo in photos], options.spans):
         views = cached_guide_views(
             part.model, view_range, GuideViewOptions(subdivisions=options.subdivisions),
-            lambda done, total: progress("guide views", done, total) if progress else None,
+            progress=lambda done, total: progress("guide views", done, total) if progress else None,
         )  # fmt: skip
         votes, turns, reason = _search(photos, order, read, views, options, progress)
         if votes:
