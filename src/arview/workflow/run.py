@@ -145,7 +145,9 @@ class _Run:
         prepared, job = self.prepared, self.prepared.job
         options = replace(prepared.reconstruct, starts_over=starts_over)
         with _measuring():
-            found = reconstruct(job.photo_source, self.folder, prepared.part, job.camera, options, progress=self.progress)
+            found = reconstruct(
+                job.photo_source, self.folder, prepared.part, job.camera, options, progress=self.progress
+            )
         for name, title in _RECONSTRUCTION.items():
             state = "done" if name in found.seconds else "kept"
             self.records.append(StageRecord(title, state, found.seconds.get(name, 0.0), _about(found, name)))
