@@ -245,5 +245,5 @@ def wait(condition: Callable[[], Any], timeout_s: float = 60.0) -> Any:
     ends_s = time.monotonic() + timeout_s
     while not (value := condition()):
         assert time.monotonic() < ends_s, "it did not happen in time"
-        time.sleep(0.05)
+        time.sleep(0.01)
     return value

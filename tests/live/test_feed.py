@@ -111,12 +111,15 @@ def test_a_slow_tracker_takes_the_newest_frame_and_counts_the_others(closing: Ca
     feed = closing(feed_of(Scripted(pause_s=0.2)))
     tracked: list[TrackedFrame] = []
     feed.listen(tracked.append)
+    late_s = 0.0  # by which this machine, busy with other tests, wakes a thread that slept
     for number in range(60):
         feed.put(frame(number))
+        began_s = time.monotonic()
         time.sleep(1 / 30)
+        late_s = max(late_s, time.monotonic() - began_s - 1 / 30)
     wait(lambda: tracked and tracked[-1].frame.frame_id == 59)
     ages_s = [one.done_s - one.arrived_s for one in tracked]
-    assert max(ages_s) < 0.2 + 0.2 + 0.1
+    assert max(ages_s) < 0.2 + 0.2 + 0.1 + 4.0 * late_s
     assert 7 <= len(tracked) <= 14
     assert feed.received == 60 and feed.dropped == 60 - len(tracked) == tracked[-1].dropped
     ids = [one.frame.frame_id for one in tracked]
@@ -138,6 +141,7 @@ def test_an_error_inside_the_tracker_is_told_and_tracking_begins_anew(closing: C
     feed = closing(feed_of(subject))
     for number in range(5):
         feed.put(frame(number))
+        wait(lambda number=number: feed.failures or (feed.newest is not None and feed.newest.frame.frame_id == number))
         time.sleep(0.05)
     wait(lambda: feed.newest is not None and feed.newest.frame.frame_id == 4)
     assert subject.sessions == 2 and feed.failures == 1
@@ -262,7 +266,8 @@ def test_recording_fits_in_pictures_of_another_shape(tmp_path: Path, closing: Ca
     recorder = Recorder(feed, FrameAnnotator(subject), tmp_path / "out.mp4")
     for number in range(8):
         feed.put(frame(200, (120, 160) if number < 4 else (160, 120)))
-        time.sleep(0.06)
+        wait(lambda number=number: feed.newest is not None and feed.newest.serial >= number)
+        time.sleep(0.1)
     assert recorder.stop()
     shown = [one.image for one in open_source(tmp_path / "out.mp4")]
     assert 4 <= len(shown) <= 8 and all(image.shape == (120, 160, 3) for image in shown)
@@ -286,6 +291,7 @@ def test_a_recording_that_cannot_be_written_is_told_and_harms_nobody(
     wait(lambda: feed.newest is not None and feed.newest.frame.frame_id == 2)
     recordings.start(feed, FrameAnnotator(subject))
     feed.put(frame(3))
+    wait(lambda: feed.newest is not None and feed.newest.frame.frame_id == 3)
     time.sleep(0.2)
     recordings.stop_all()
     (path,) = [recordings.path(number) for number in recordings.finished]
@@ -300,6 +306,7 @@ def test_a_recording_ends_before_the_disk_is_full(
     feed = closing(feed_of(subject))
     recorder = Recorder(feed, FrameAnnotator(subject), tmp_path / "out.mp4", RecordingOptions(check_interval_s=0.0))
     feed.put(frame(1))
+    wait(lambda: feed.newest is not None and feed.newest.frame.frame_id == 1)
     time.sleep(0.2)
     monkeypatch.setattr(recorder, "_options", RecordingOptions(check_interval_s=0.0, min_free_bytes=1 << 60))
     feed.put(frame(2))
