@@ -13,11 +13,11 @@ import pytest
 from click.testing import CliRunner
 from scipy.stats import binom
 
-from arview.acceptance.conformity import UHeld, parse_limit, record_of, verify
+from arview.acceptance.conformity import UncertaintyCheck, parse_limit, record_of, verify
 from arview.acceptance.lengths import (
     KnownLength,
     Mark,
-    Measured,
+    MeasuredMarks,
     read_known,
     read_measured,
 )
@@ -31,14 +31,16 @@ RNG_PLACES = np.random.default_rng(7).uniform(-150.0, 150.0, (16, 3))
 NAMES = [f"post_{k}" for k in range(16)]
 
 
-def measured(rng: np.random.Generator, std_mm: float, stated_mm: float | None = None, scale: float = 0.0) -> Measured:
+def measured(
+    rng: np.random.Generator, std_mm: float, stated_mm: float | None = None, scale: float = 0.0
+) -> MeasuredMarks:
     """The places with errors of a size, and what is said of it."""
     stated = std_mm if stated_mm is None else stated_mm
     marks = {
         name: Mark((1.0 + scale) * place + rng.normal(0.0, std_mm, 3), stated**2 * np.eye(3))
         for name, place in zip(NAMES, RNG_PLACES, strict=True)
     }
-    return Measured("points", marks, {}, 0.0, {})
+    return MeasuredMarks("points", marks, {}, 0.0, {})
 
 
 KNOWN = [
@@ -54,7 +56,7 @@ APART = KNOWN[:0] + [
 
 def test_errors_and_limits() -> None:
     places = {"a": [0.0, 0, 0], "b": [100.059, 0, 0], "c": [0, 200.0, 0]}
-    points = Measured("p", {k: Mark(np.array(v), 0.02**2 * np.eye(3)) for k, v in places.items()}, {}, 0.0, {})
+    points = MeasuredMarks("p", {k: Mark(np.array(v), 0.02**2 * np.eye(3)) for k, v in places.items()}, {}, 0.0, {})
     known = [KnownLength("a", "b", 100.0, 0.02), KnownLength("a", "c", 200.12, 0.01), KnownLength("a", "d", 5.0)]
     test = verify(points, known, "k", parse_limit("0.05 + L/5000"))
     first, second = test.lengths
@@ -92,10 +94,10 @@ def test_an_honest_u_is_believed_and_others_are_not() -> None:
     wide = 0
     for seed in range(25):
         rng = np.random.default_rng(seed)
-        wrong["honest"] += verify(measured(rng, 0.02), KNOWN, "k").u_held is UHeld.NOT_HELD
-        wrong["half"] += verify(measured(rng, 0.02, stated_mm=0.01), KNOWN, "k").u_held is UHeld.NOT_HELD
-        wrong["scale"] += verify(measured(rng, 0.02, scale=5e-4), KNOWN, "k").u_held is UHeld.NOT_HELD
-        wide += verify(measured(rng, 0.02, stated_mm=0.06), KNOWN, "k").u_held is UHeld.WIDE
+        wrong["honest"] += verify(measured(rng, 0.02), KNOWN, "k").u_held is UncertaintyCheck.NOT_HELD
+        wrong["half"] += verify(measured(rng, 0.02, stated_mm=0.01), KNOWN, "k").u_held is UncertaintyCheck.NOT_HELD
+        wrong["scale"] += verify(measured(rng, 0.02, scale=5e-4), KNOWN, "k").u_held is UncertaintyCheck.NOT_HELD
+        wide += verify(measured(rng, 0.02, stated_mm=0.06), KNOWN, "k").u_held is UncertaintyCheck.WIDE
     assert wrong["honest"] <= 4  # 2.5 % are expected
     assert wrong["half"] >= 22
     assert wrong["scale"] >= 17
@@ -108,7 +110,7 @@ def test_shared_marks_widen_the_range() -> None:
     assert test.is_shared
     assert test.expected[0] < low
     known_scale = replace(measured(np.random.default_rng(0), 0.02, scale=5e-4), scale_std=5e-4)
-    assert verify(known_scale, KNOWN, "k").u_held is not UHeld.NOT_HELD
+    assert verify(known_scale, KNOWN, "k").u_held is not UncertaintyCheck.NOT_HELD
 
 
 # --- files -----------------------------------------------------------------------------------------------
@@ -194,15 +196,15 @@ def test_the_command(tmp_path: Path) -> None:
     [
         ("name,x,y,z\na,0,0,0\n", None, "a length needs two"),
         ("name,x,y\na,0,0\n", None, "column 'z' is missing"),
-        ("name,x,y,z\na,0,0,0\na,1,0,0\n", None, "line 3: the name 'a' is there twice"),
+        ("name,x,y,z\na,0,0,0\na,1,0,0\n", None, "line 3: the name 'a' is not unique"),
         ("name,x,y,z\na,0,nan,0\nb,1,0,0\n", None, "line 2: y = 'nan'"),
         (None, "[[length]]\nbetween = ['a', 'a']\nmm = 5\n", "expected two different marks"),
         (None, "[[length]]\nbetween = ['a', 'b']\nmm = -5\n", "mm = -5"),
         (None, "[[length]]\nbetween = ['a', 'b']\nmm = 5\nU = 1\n", "unknown key 'U'"),
         (None, "[[length]]\nbetween = ['x', 'y']\nmm = 5\n", "none of its 1 lengths was measured"),
-        (None, "name = 'empty'\n", "holds no length"),
+        (None, "name = 'empty'\n", "contains no length"),
         (None, "[[length]\n", "neither TOML nor JSON"),
-        (None, '{"K": 1}', "holds no 'truth'"),
+        (None, '{"K": 1}', "has no 'truth'"),
     ],
 )
 def test_bad_files_are_one_line(points: str | None, known: str | None, expected: str, tmp_path: Path) -> None:

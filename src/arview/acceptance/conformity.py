@@ -1,4 +1,4 @@
-"""Errors of lengths against the maximum permissible error, and whether the stated U held."""
+"""Conformity of measured lengths: errors against the maximum permissible error and against the stated uncertainty."""
 
 from __future__ import annotations
 
@@ -10,39 +10,54 @@ from typing import Any
 
 import numpy as np
 
-from arview.acceptance.lengths import K, KnownLength, Measured, covariance_of_lengths
+from arview.acceptance.lengths import K, KnownLength, MeasuredMarks, covariance_of_lengths
 from arview.errors import InputError
 from arview.inspection import Verdict
 from arview.measurement.uncertainty.decision import decide
 
 FULL_TEST = 35
-"""VDI/VDE 2634 part 1 asks for seven measuring lines with five lengths each."""
+"""Number of lengths that VDI/VDE 2634 part 1 requires: seven measuring lines with five lengths each."""
 COVERAGE = 0.9545
-"""Of U with k = 2 and normal errors."""
-_DRAWS = 1000
-_WIDE = 0.5
-"""Root mean square of error over standard uncertainty, below which U is called wide."""
+"""Coverage of U with k = 2 for normally distributed errors."""
+
+
+@dataclass(frozen=True)
+class ConformityOptions:
+    """Options of the check of the stated uncertainty."""
+
+    max_draws: int = 1000  # simulated tests for the range of the number of errors within U
+    min_draws: int = 200
+    max_values: int = 500_000  # simulated errors in all, which bounds the draws for many lengths
+    interval: float = 0.95  # share of the tests that the range of this number holds
+    quantiles: tuple[float, float] = (0.025, 0.975)  # ends of that range in the simulation
+    wide_ratio: float = 0.5  # ratio of rms error to standard uncertainty below which U is called wide
 
 
 @dataclass(frozen=True)
 class PermissibleError:
-    """E = A + L/K, at most B; mm. VDI/VDE 2634 part 1 states the limit of a system so."""
+    """The maximum permissible error E = A + L/K, at most B, in mm, as VDI/VDE 2634 part 1 states it.
+
+    Attributes:
+        constant_mm: A.
+        per_length: 1/K.
+        max_mm: B.
+    """
 
     constant_mm: float
     per_length: float = 0.0
-    most_mm: float = float("inf")
+    max_mm: float = float("inf")
 
     def at(self, length_mm: float) -> float:
-        """The limit at a length."""
-        return min(self.constant_mm + self.per_length * length_mm, self.most_mm)
+        """The limit for a length, mm."""
+        return min(self.constant_mm + self.per_length * length_mm, self.max_mm)
 
     def __str__(self) -> str:
         text = f"{self.constant_mm:g}" + (f" + L/{1.0 / self.per_length:g}" if self.per_length else "")
-        return text + (f" ≤ {self.most_mm:g}" if np.isfinite(self.most_mm) else "") + " mm"
+        return text + (f" ≤ {self.max_mm:g}" if np.isfinite(self.max_mm) else "") + " mm"
 
 
-class UHeld(StrEnum):
-    """What the errors say of the stated U."""
+class UncertaintyCheck(StrEnum):
+    """Result of the comparison of the errors with the stated U."""
 
     HELD = "held"
     WIDE = "held, rather wide"
@@ -52,15 +67,15 @@ class UHeld(StrEnum):
 
 @dataclass(frozen=True)
 class LengthResult:
-    """One length.
+    """The result for one length.
 
     Attributes:
-        known: as calibrated.
-        measured_mm, error_mm: measured, and measured minus known.
-        uncertainty_mm: U (k = 2) of the measured one; None when not stated.
+        known: calibrated length.
+        measured_mm, error_mm: measured length, and measured minus known length.
+        uncertainty_mm: U (k = 2) of the measured length; None when not stated.
         limit_mm: maximum permissible error; None when none is given.
-        verdict: by ISO 14253-1 with the U of the known length.
-        is_within_u: whether the error is within both uncertainties together; None when U is not stated.
+        verdict: verdict after ISO 14253-1 with the U of the known length.
+        is_within_u: whether the error is within the combined U of both lengths; None when U is not stated.
     """
 
     known: KnownLength
@@ -74,19 +89,19 @@ class LengthResult:
 
 @dataclass(frozen=True)
 class Verification:
-    """The test.
+    """The result of an acceptance test.
 
     Attributes:
-        measured, reference: labels.
+        measured, reference: labels of the measured and the known lengths.
         limit: maximum permissible error, or None.
-        lengths: in the order of the known ones.
-        left_out: by length, why it was not measured.
-        within: lengths whose error is within U; expected: ends of the range that holds 95 % of such counts if U is
-            right.
-        is_shared: lengths share marks, so that the range is simulated; else it is binomial.
-        ratio: root mean square of error over standard uncertainty, 1 when U is right; None when not stated.
-        u_held: what that means.
-        verdict: of the whole.
+        lengths: results in the order of the known lengths.
+        left_out: reasons why lengths were not measured, by length.
+        within: number of lengths whose error is within U.
+        expected: range that holds 95 % of such numbers if U is correct.
+        is_shared: whether lengths share marks, so that the range is simulated; else it is binomial.
+        ratio: rms of error over standard uncertainty, 1 if U is correct; None when U is not stated.
+        u_held: whether the stated U held.
+        verdict: overall verdict.
     """
 
     measured: str
@@ -98,41 +113,53 @@ class Verification:
     expected: tuple[int, int]
     is_shared: bool
     ratio: float | None
-    u_held: UHeld
+    u_held: UncertaintyCheck
     verdict: Verdict
 
     @property
     def largest(self) -> LengthResult:
-        """The length with the largest error, against its limit where there is one."""
+        """The length with the largest error, relative to its limit if there is one."""
         return max(self.lengths, key=lambda one: abs(one.error_mm) / (one.limit_mm or 1.0))
 
 
 def parse_limit(text: str) -> PermissibleError:
-    """``A``, ``A+L/K`` or ``A+L/K<=B`` in mm, e.g. ``0.05+L/10000``. Raises InputError."""
+    """Parse a limit of the form ``A``, ``A+L/K`` or ``A+L/K<=B`` in mm, e.g. ``0.05+L/10000``.
+
+    Raises:
+        InputError: the text has another form, or the limit is zero.
+    """
     number = r"(\d+(?:\.\d*)?|\.\d+)"
     match = re.fullmatch(rf"{number}(?:\+L/{number})?(?:<={number})?", text.replace(" ", ""), re.IGNORECASE)
     if match is None:
         raise InputError(f"maximum permissible error {text!r}: expected A, A+L/K or A+L/K<=B in mm, e.g. 0.05+L/10000")
-    constant, per, most = (None if value is None else float(value) for value in match.groups())
-    if per == 0.0 or (not constant and not per) or most == 0.0:
-        raise InputError(f"maximum permissible error {text!r}: must be above zero")
-    return PermissibleError(constant or 0.0, 0.0 if per is None else 1.0 / per, float("inf") if most is None else most)
+    constant, per, highest = (None if value is None else float(value) for value in match.groups())
+    if per == 0.0 or (not constant and not per) or highest == 0.0:
+        raise InputError(f"maximum permissible error {text!r}: must be greater than zero")
+    return PermissibleError(
+        constant or 0.0, 0.0 if per is None else 1.0 / per, float("inf") if highest is None else highest
+    )
 
 
 def verify(
-    measured: Measured, known: Sequence[KnownLength], reference: str, limit: PermissibleError | None = None
+    measured: MeasuredMarks,
+    known: Sequence[KnownLength],
+    reference: str,
+    limit: PermissibleError | None = None,
+    options: ConformityOptions | None = None,
 ) -> Verification:
-    """Known lengths against measured ones.
+    """Compare measured with known lengths.
 
     Args:
-        measured: places of marks.
-        known: lengths between them; those whose marks were not measured are left out, with the reason.
+        measured: measured positions of marks.
+        known: known lengths between them; those whose marks were not measured are listed with the reason.
         reference: label of the known lengths.
-        limit: maximum permissible error; without it only U is judged.
+        limit: maximum permissible error; without it only U is checked.
+        options: see `ConformityOptions`.
 
     Raises:
         InputError: none of the lengths was measured.
     """
+    options = options or ConformityOptions()
     used, left_out = [], {}
     for one in known:
         absent = [name for name in (one.first, one.second) if name not in measured.marks]
@@ -152,12 +179,18 @@ def verify(
     within = sum(one.is_within_u is True for one in results)
     marks = [name for one in used for name in (one.first, one.second)]
     is_shared = len(set(marks)) < len(marks) or measured.scale_std > 0.0
-    expected, ratio, held = (0, len(used)), None, UHeld.NOT_STATED
+    expected, ratio, held = (0, len(used)), None, UncertaintyCheck.NOT_STATED
     if covariance is not None:
         total = covariance + np.diag([(one.uncertainty_mm / K) ** 2 for one in used])
-        expected = _expected(total, is_shared)
+        expected = _expected(total, is_shared, options)
         ratio = float(np.sqrt(np.mean([one.error_mm**2 for one in results] / np.maximum(np.diag(total), 1e-18))))
-        held = UHeld.NOT_HELD if within < expected[0] else UHeld.WIDE if ratio < _WIDE else UHeld.HELD
+        held = (
+            UncertaintyCheck.NOT_HELD
+            if within < expected[0]
+            else UncertaintyCheck.WIDE
+            if ratio < options.wide_ratio
+            else UncertaintyCheck.HELD
+        )
     verdict = _verdict([one.verdict for one in results], held, limit is not None)
     return Verification(
         measured.label, reference, limit, tuple(results), left_out, within, expected, is_shared, ratio, held, verdict
@@ -165,7 +198,7 @@ def verify(
 
 
 def record_of(test: Verification) -> dict[str, Any]:
-    """The test as plain JSON values."""
+    """The test as a JSON document."""
     largest = test.largest
     return {
         "kind": "arview-verify",
@@ -202,7 +235,7 @@ def record_of(test: Verification) -> dict[str, Any]:
 
 
 def _result(
-    measured: Measured, known: KnownLength, std_mm: float | None, limit: PermissibleError | None
+    measured: MeasuredMarks, known: KnownLength, std_mm: float | None, limit: PermissibleError | None
 ) -> LengthResult:
     between = measured.marks[known.second].place - measured.marks[known.first].place
     length = float(np.linalg.norm(between))
@@ -213,26 +246,26 @@ def _result(
     return LengthResult(known, length, error, None if std_mm is None else K * std_mm, allowed, verdict, within)
 
 
-def _expected(covariance: Any, is_shared: bool) -> tuple[int, int]:
-    """Range of the number of errors within U that holds 95 % of all tests, if U is right."""
+def _expected(covariance: Any, is_shared: bool, options: ConformityOptions) -> tuple[int, int]:
+    """Range that holds 95 % of the numbers of errors within U if U is correct."""
     from scipy.stats import binom
 
     count = len(covariance)
     if not is_shared:
-        low, high = binom.interval(0.95, count, COVERAGE)
+        low, high = binom.interval(options.interval, count, COVERAGE)
         return int(low), int(high)
     values, vectors = np.linalg.eigh(covariance)
-    draws = min(_DRAWS, max(200, 500_000 // count))
+    draws = min(options.max_draws, max(options.min_draws, options.max_values // count))
     noise = np.random.default_rng(0).standard_normal((draws, count))
     errors = noise @ (np.sqrt(np.maximum(values, 0.0)) * vectors).T
     counts = np.sum(np.abs(errors) <= K * np.sqrt(np.diag(covariance)), axis=1)
-    low, high = np.quantile(counts, [0.025, 0.975], method="inverted_cdf")
+    low, high = np.quantile(counts, options.quantiles, method="inverted_cdf")
     return int(low), int(high)
 
 
-def _verdict(verdicts: Sequence[Verdict], held: UHeld, has_limit: bool) -> Verdict:
-    if held is UHeld.NOT_HELD or Verdict.FAIL in verdicts:
+def _verdict(verdicts: Sequence[Verdict], held: UncertaintyCheck, has_limit: bool) -> Verdict:
+    if held is UncertaintyCheck.NOT_HELD or Verdict.FAIL in verdicts:
         return Verdict.FAIL
-    if (not has_limit and held is UHeld.NOT_STATED) or (has_limit and Verdict.UNDECIDED in verdicts):
+    if (not has_limit and held is UncertaintyCheck.NOT_STATED) or (has_limit and Verdict.UNDECIDED in verdicts):
         return Verdict.UNDECIDED
     return Verdict.PASS

@@ -1,7 +1,8 @@
-"""Measured places and known lengths, from the files that hold them.
+"""Reading of measured positions and known lengths.
 
-Measured: an ``inspection.json`` (the middles of components), or a CSV of points. Known: the calibration certificate of
-an artefact as TOML or CSV, or the ``truth.json`` of a rendered sample, which knows the lengths exactly.
+Measured positions come from an ``inspection.json`` (centres of the components) or from a CSV file of points. Known
+lengths come from the calibration certificate of an artefact as TOML or CSV, or from the ``truth.json`` of a rendered
+sample, whose lengths are exact.
 """
 
 from __future__ import annotations
@@ -23,29 +24,29 @@ from arview.errors import InputError
 from arview.geometry import Array, apply, check_rigid
 
 K = 2.0
-"""Coverage factor of all U here."""
+"""Coverage factor of all expanded uncertainties U."""
 _ARTEFACT_KEYS = ("name", "certificate", "length")
 _LENGTH_KEYS = ("between", "mm", "U_mm")
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A measured place: (3,) mm, and its covariance (3,3), None when none was stated."""
+    """A measured position, (3,) mm, and its covariance, (3,3) mm²; None when it is not stated."""
 
     place: Array
     covariance: Array | None
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What was measured.
+class MeasuredMarks:
+    """Measured positions.
 
     Attributes:
-        label: the file.
-        marks: by name.
-        nominal: by name, where the middle of a component is in the CAD: what a rendered truth moves; may be empty.
-        scale_std: relative standard uncertainty of all lengths together.
-        absent: by name, why a component has no place.
+        label: name of the file.
+        marks: measured positions by name.
+        nominal: centres of the components in the CAD model by name, for the truth of a rendered sample; may be empty.
+        scale_std: relative standard uncertainty of the scale, which all lengths share.
+        absent: reasons why components have no position, by name.
     """
 
     label: str
@@ -57,7 +58,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class KnownLength:
-    """A length between two marks with its expanded uncertainty (k = 2), mm."""
+    """A known length between two marks with its expanded uncertainty (k = 2), mm."""
 
     first: str
     second: str
@@ -65,11 +66,11 @@ class KnownLength:
     uncertainty_mm: float = 0.0
 
 
-def read_measured(path: str | Path) -> Measured:
-    """Measured places of an ``inspection.json``, or of a CSV with the columns name, x, y, z and perhaps U_mm.
+def read_measured(path: str | Path) -> MeasuredMarks:
+    """Read measured positions from an ``inspection.json``, or a CSV file with columns name, x, y, z, optionally U_mm.
 
     Raises:
-        InputError: unreadable, of another kind, or without any measured place.
+        InputError: the file cannot be read, is of another kind, or has fewer than two measured positions.
     """
     path = Path(path)
     if path.is_dir():
@@ -79,19 +80,19 @@ def read_measured(path: str | Path) -> Measured:
     if len(measured.marks) < 2:
         why = "; ".join(f"{name}: {reason}" for name, reason in list(measured.absent.items())[:3])
         raise InputError(
-            f"{path}: {len(measured.marks)} places were measured, a length needs two" + (f" ({why})" if why else "")
+            f"{path}: {len(measured.marks)} positions were measured, a length needs two" + (f" ({why})" if why else "")
         )
     return measured
 
 
-def read_known(path: str | Path, measured: Measured) -> list[KnownLength]:
-    """Known lengths of a TOML or CSV file, or of a ``truth.json``: then between all measured components.
+def read_known(path: str | Path, measured: MeasuredMarks) -> list[KnownLength]:
+    """Read known lengths from a TOML or CSV file, or from a ``truth.json``: then between all measured components.
 
-    TOML has ``[[length]]`` with ``between = ["a", "b"]``, ``mm`` and perhaps ``U_mm`` (k = 2); CSV the columns from,
-    to, mm and perhaps U_mm.
+    A TOML file has tables ``[[length]]`` with ``between = ["a", "b"]``, ``mm`` and optionally ``U_mm`` (k = 2); a CSV
+    file has the columns from, to, mm and optionally U_mm.
 
     Raises:
-        InputError: unreadable, of another kind, twice the same length, or no length.
+        InputError: the file cannot be read, is of another kind, has a length twice, or has no length.
     """
     path = Path(path)
     text = _text_of(path)
@@ -105,20 +106,21 @@ def read_known(path: str | Path, measured: Measured) -> list[KnownLength]:
     else:
         lengths = _of_artefact(path, text)
     if not lengths:
-        raise InputError(f"{path}: holds no length; expected [[length]] with between, mm and U_mm")
+        raise InputError(f"{path}: contains no length; expected [[length]] with between, mm and U_mm")
     seen: set[frozenset[str]] = set()
     for one in lengths:
         pair = frozenset((one.first, one.second))
         if pair in seen:
-            raise InputError(f"{path}: the length from {one.first} to {one.second} is there twice")
+            raise InputError(f"{path}: the length from {one.first} to {one.second} occurs twice")
         seen.add(pair)
     return lengths
 
 
-def covariance_of_lengths(measured: Measured, pairs: Sequence[tuple[str, str]]) -> Array | None:
-    """(N,N) covariance of measured lengths, mm²; None when a place has none.
+def covariance_of_lengths(measured: MeasuredMarks, pairs: Sequence[tuple[str, str]]) -> Array | None:
+    """Covariance of measured lengths, (N,N) mm²; None when a position has no covariance.
 
-    Places err independently, lengths that share one do not; a wrong scale makes all of them wrong together.
+    Errors of positions are assumed independent. Lengths that share a position are correlated, and an error of the
+    scale affects all of them.
     """
     names = sorted({name for pair in pairs for name in pair})
     column = {name: 3 * k for k, name in enumerate(names)}
@@ -142,7 +144,7 @@ def covariance_of_lengths(measured: Measured, pairs: Sequence[tuple[str, str]]) 
 # --- measured --------------------------------------------------------------------------------------------
 
 
-def _of_inspection(path: Path) -> Measured:
+def _of_inspection(path: Path) -> MeasuredMarks:
     from arview.inspection import load_inspection
 
     inspection = load_inspection(path)
@@ -160,36 +162,36 @@ def _of_inspection(path: Path) -> Measured:
             continue
         covariance = None if one.details.covariance is None else np.array(one.details.covariance)[3:, 3:]
         marks[one.name] = Mark(nominal[one.name] + np.array(known), covariance)
-    # The datum frame's own scale error is in each covariance as a shift; as one factor of all it is here.
+    # Each covariance contains the scale error as a shift; here it is the common factor of all lengths.
     system = inspection.datum_system
     scale_std = (system.scale_std or 0.0) if system is not None else 0.0
-    return Measured(str(path), marks, nominal, scale_std, absent)
+    return MeasuredMarks(str(path), marks, nominal, scale_std, absent)
 
 
-def _of_points(path: Path, text: str) -> Measured:
+def _of_points(path: Path, text: str) -> MeasuredMarks:
     marks: dict[str, Mark] = {}
     for number, row in _rows(path, text, ("name", "x", "y", "z")):
         where = f"{path}: line {number}"
         name = str(row["name"] or "").strip()
         if not name or name in marks:
-            raise InputError(f"{where}: the name {name!r} is {'there twice' if name else 'empty'}")
+            raise InputError(f"{where}: the name {name!r} is {'not unique' if name else 'empty'}")
         place = np.array([_number(where, row[key], key) for key in "xyz"])
         u = row.get("U_mm")
-        std = None if u in (None, "") else _number(where, u, "U_mm", least=0.0) / K
+        std = None if u in (None, "") else _number(where, u, "U_mm", minimum=0.0) / K
         marks[name] = Mark(place, None if std is None else std**2 * np.eye(3))
-    return Measured(str(path), marks, {}, 0.0, {})
+    return MeasuredMarks(str(path), marks, {}, 0.0, {})
 
 
 # --- known -----------------------------------------------------------------------------------------------
 
 
-def _of_truth(path: Path, text: str, measured: Measured) -> list[KnownLength]:
+def _of_truth(path: Path, text: str, measured: MeasuredMarks) -> list[KnownLength]:
     try:
         truth = json.loads(text).get("truth")
     except ValueError as error:
         raise InputError(f"{path}: is not valid JSON ({error})") from error
     if not isinstance(truth, dict):
-        raise InputError(f"{path}: holds no 'truth'; give the truth.json of a sample, or a TOML file with [[length]]")
+        raise InputError(f"{path}: has no 'truth'; give the truth.json of a sample, or a TOML file with [[length]]")
     places: dict[str, Array] = {}
     for name in measured.marks:
         if name not in truth or name not in measured.nominal:
@@ -240,9 +242,9 @@ def _length(where: str, ends: tuple[Any, Any], mm: Any, uncertainty: Any) -> Kno
     first, second = (str(end if end is not None else "").strip() for end in ends)
     if not first or not second or first == second:
         raise InputError(f"{where}: from {first!r} to {second!r}: expected two different marks")
-    value = _number(where, mm, "mm", least=1e-6)
+    value = _number(where, mm, "mm", minimum=1e-6)
     return KnownLength(
-        first, second, value, 0.0 if uncertainty in (None, "") else _number(where, uncertainty, "U_mm", least=0.0)
+        first, second, value, 0.0 if uncertainty in (None, "") else _number(where, uncertainty, "U_mm", minimum=0.0)
     )
 
 
@@ -262,17 +264,19 @@ def _rows(path: Path, text: str, needed: Iterable[str]) -> list[tuple[int, Mappi
     reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
     missing = [name for name in needed if name not in (reader.fieldnames or ())]
     if missing:
-        raise InputError(f"{path}: the column {missing[0]!r} is missing; the first line must name the columns")
+        raise InputError(f"{path}: the column {missing[0]!r} is missing; the first line must contain the column names")
     return [(number, row) for number, row in enumerate(reader, 2) if any(row.values())]
 
 
-def _number(where: str, value: Any, key: str, least: float = -math.inf) -> float:
+def _number(where: str, value: Any, key: str, minimum: float = -math.inf) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError):
         number = math.nan
-    if not math.isfinite(number) or isinstance(value, bool) or number < least or abs(number) > 1e7:
-        raise InputError(f"{where}: {key} = {value!r}: expected a {'number' if least < 0 else 'positive number'} in mm")
+    if not math.isfinite(number) or isinstance(value, bool) or number < minimum or abs(number) > 1e7:
+        raise InputError(
+            f"{where}: {key} = {value!r}: expected a {'number' if minimum < 0 else 'positive number'} in mm"
+        )
     return number
 
 

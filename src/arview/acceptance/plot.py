@@ -1,4 +1,4 @@
-"""Errors over the length as a picture, with U, the maximum permissible error and the lengths that break it."""
+"""Plot of the errors over the length, with U and the maximum permissible error."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 
-from arview.acceptance.conformity import UHeld, Verification
+from arview.acceptance.conformity import UncertaintyCheck, Verification
 from arview.core.figures import INK, MUTED, figure
 from arview.errors import InputError
 from arview.inspection import Verdict
@@ -16,7 +16,11 @@ _COLORS = {Verdict.PASS: "#2b5c8a", Verdict.UNDECIDED: "#b7791f", Verdict.FAIL: 
 
 
 def draw(test: Verification, kind: str = "png") -> bytes:
-    """The test as a picture of a kind of FORMATS. Raises InputError for another kind."""
+    """Draw the test as a picture of one of FORMATS.
+
+    Raises:
+        InputError: another format.
+    """
     if kind not in FORMATS:
         raise InputError(f"plot: {kind!r}: expected one of {', '.join(FORMATS)}")
     known = np.array([one.known.mm for one in test.lengths])
@@ -43,7 +47,11 @@ def draw(test: Verification, kind: str = "png") -> bytes:
         axes.set_xlabel("known length, mm")
         axes.set_ylabel("measured minus known, mm")
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=5)
-        u = "" if test.u_held is UHeld.NOT_STATED else f"; U {test.u_held}: {test.within} of {len(errors)} within"
+        u = (
+            ""
+            if test.u_held is UncertaintyCheck.NOT_STATED
+            else f"; U {test.u_held}: {test.within} of {len(errors)} within"
+        )
         axes.set_title(f"{len(errors)} lengths: {test.verdict}{u}", loc="left", fontsize=11, color=INK)
         out = io.BytesIO()
         metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)

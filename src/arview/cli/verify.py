@@ -76,7 +76,7 @@ def verify(measured: str, known: str, mpe: str | None, output: str | None, plot:
 
 
 def _print(test: Verification, shows_all: bool) -> None:
-    from arview.acceptance.conformity import FULL_TEST, UHeld
+    from arview.acceptance.conformity import FULL_TEST, UncertaintyCheck
 
     for name, reason in list(test.left_out.items())[:_SHOWN]:
         say(f"left out {name}: {reason}")
@@ -97,7 +97,7 @@ def _print(test: Verification, shows_all: bool) -> None:
         f" {largest.known.mm:.1f} mm), {len(test.lengths)} lengths from {min(o.known.mm for o in test.lengths):.1f} to"
         f" {max(o.known.mm for o in test.lengths):.1f} mm"
     )
-    if test.u_held is UHeld.NOT_STATED:
+    if test.u_held is UncertaintyCheck.NOT_STATED:
         click.echo("U: not stated by what was measured")
     else:
         low, high = test.expected
