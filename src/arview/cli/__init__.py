@@ -19,6 +19,7 @@ from arview.cli import (
     report,
     study,
     verify,
+    warmup,
 )
 from arview.cli.common import main
 from arview.cli.exit_codes import ExitCode
@@ -41,4 +42,5 @@ __all__ = [
     "report",
     "study",
     "verify",
+    "warmup",
 ]

@@ -1,1 +1,1 @@
-"""Core: what every room may use and that knows nothing of parts or pictures of them."""
+"""Tools that any room may use: files, caches, threads, kernels, figures. They know nothing of parts or images."""

@@ -1,4 +1,4 @@
-"""Figures of matplotlib in one style, for reports and trends; nothing of matplotlib's own state is changed."""
+"""Matplotlib figures in one style, for reports and charts, without a change to matplotlib's global state."""
 
 from __future__ import annotations
 
@@ -33,15 +33,17 @@ _STYLE: dict[str, Any] = {
 def figure(
     height_in: float, width_in: float = 6.0, has_grid: bool = True, text_as_paths: bool = False, **options: Any
 ) -> Iterator[tuple[Any, Any]]:
-    """A figure and its axes, to be saved before the block ends.
+    """Make a figure and its axes, to be saved before the block ends.
 
     Args:
-        height_in, width_in: inches; a page makes them as wide as it likes.
-        has_grid: lines behind the data.
-        text_as_paths: of SVG: looks the same everywhere; else its letters are those of the page around it.
-        options: of ``Figure.subplots``.
+        height_in, width_in: size in inches; a page may scale the figure.
+        has_grid: draw a grid behind the data.
+        text_as_paths: draw the text of an SVG as paths, which look the same everywhere; else it takes the font of the page.
+        options: passed to ``Figure.subplots``.
     """
-    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # Inter is the page's font, not the system's
+    logging.getLogger("matplotlib.font_manager").setLevel(
+        logging.ERROR
+    )  # Inter is a font of the page, often missing on the system
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

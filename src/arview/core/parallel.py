@@ -1,4 +1,4 @@
-"""The threads that all searches share: their numba kernels release the interpreter."""
+"""The thread pool that all searches share. Threads help because the kernels release the interpreter lock."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from functools import lru_cache
 
 
 def thread_count() -> int:
-    """One per core up to four."""
+    """Threads of the pool: one per core, at most four."""
     return max(1, min(4, os.cpu_count() or 1))
 
 
 @lru_cache(maxsize=1)
 def pool() -> ThreadPoolExecutor:
-    """Shared threads; no job may wait for another job of theirs."""
+    """The shared pool. No job may wait for another job of the same pool, or both could wait forever."""
     return ThreadPoolExecutor(thread_count(), thread_name_prefix="search")

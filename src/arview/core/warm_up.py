@@ -1,6 +1,6 @@
-"""Compilation of all kernels ahead, with all cores, so that no command has to compile later.
+"""Compilation of all kernels in advance, on all cores, so that no command has to compile later.
 
-``kernel_signatures.json`` says with which types arview's commands and tests call each kernel. It is written by
+``kernel_signatures.json`` lists the argument types with which arview's commands and tests call each kernel. It is written by
 ``tools/kernel_signatures.py``.
 """
 
@@ -22,11 +22,11 @@ def warm_up(progress: StepProgress | None = None, processes: int | None = None) 
     """Compile every kernel for all recorded signatures into the user's cache folder.
 
     Args:
-        progress: told how many kernels are done, of how many.
-        processes: that compile at the same time; None: one for each core.
+        progress: called with (kernels done, kernels in all).
+        processes: number of processes; None means one per core.
 
     Returns:
-        How many signatures were compiled; the others were in the cache.
+        Number of signatures compiled; the others were in the cache.
     """
     prune_kernels()
     jobs = recorded_signatures()
@@ -48,7 +48,7 @@ def warm_up(progress: StepProgress | None = None, processes: int | None = None) 
 
 
 def compile_kernels(signatures_of: dict[str, list[Any]]) -> int:
-    """Compile kernels, ``module:name``, for their signatures; how many signatures were not in the cache.
+    """Compile kernels, given as ``module:name``, and return how many signatures were not in the cache.
 
     Raises:
         KeyError: no such kernel.
