@@ -38,12 +38,11 @@ def figure(
     Args:
         height_in, width_in: size in inches; a page may scale the figure.
         has_grid: draw a grid behind the data.
-        text_as_paths: draw the text of an SVG as paths, which look the same everywhere; else it takes the font of the page.
+        text_as_paths: draw the text of an SVG as paths, which look the same
+            everywhere; else it takes the font of the page.
         options: passed to ``Figure.subplots``.
     """
-    logging.getLogger("matplotlib.font_manager").setLevel(
-        logging.ERROR
-    )  # Inter is a font of the page, often missing on the system
+    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # Inter belongs to the page
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

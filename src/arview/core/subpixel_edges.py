@@ -91,7 +91,7 @@ def find_steps(gray, pixels, normals, reach_px, half_width_px, threshold):  # ty
 
 
 def choose_steps(offsets: Array, slopes: Array, spread_px: float, half_slope: float) -> tuple[Array, Array]:
-    """Offset (N,) px and signed slope (N,) of the best hypothesis per point, by strength and nearness; slope 0 = none."""
+    """Offset (N,) px and signed slope (N,) of the best hypothesis by strength and nearness; slope 0 means none."""
     strength = np.abs(slopes)
     score = strength / (strength + half_slope) * np.exp(-0.5 * (offsets / spread_px) ** 2)
     best = np.argmax(score, axis=1)

@@ -1,7 +1,7 @@
 """Compilation of all kernels in advance, on all cores, so that no command has to compile later.
 
-``kernel_signatures.json`` lists the argument types with which arview's commands and tests call each kernel. It is written by
-``tools/kernel_signatures.py``.
+``kernel_signatures.json`` lists the argument types with which arview's commands and tests call each kernel. It is
+written by ``tools/kernel_signatures.py``.
 """
 
 from __future__ import annotations
