@@ -219,7 +219,7 @@ def test_evaluate_prints_errors_and_writes_them(room: Path) -> None:
     result = run(*arguments)
     assert result.exit_code == 0, result.output
     # The session stays where it began and the truth moves 1 mm a frame.
-    assert "3 frames (3 tracked), 3 judged" in result.stdout
+    assert "3 frames (3 tracked), 3 evaluated" in result.stdout
     (scene,) = json.loads((room / "out.json").read_text())["scenes"]
     assert [frame["error"]["translation_mm"] for frame in scene["frames"]] == pytest.approx([0, 1, 2], abs=1e-9)
     assert scene["summary"]["errors"]["translation_mm"]["max"] == pytest.approx(2.0)

@@ -267,7 +267,7 @@ def test_bad_scene_is_refused_in_one_line(tmp_path: Path, how: str, message: str
 
 
 def test_no_scene_and_broken_picture(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no scene"):
+    with pytest.raises(InputError, match="contains no scene"):
         find_scenes(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         find_scenes(tmp_path / "none")
@@ -307,7 +307,7 @@ def test_evaluation_counts_lost_wrong_and_good_frames(tmp_path: Path, views: Gui
     result = evaluate_scene(scene, "truth", views=views, make_session=make_session)
     np.testing.assert_allclose(given[0], TRUTH)
     summary = result.summary
-    assert (summary.frames, summary.judged, summary.lost, summary.false_tracked) == (4, 4, 1, 1)
+    assert (summary.frames, summary.evaluated, summary.lost, summary.false_tracked) == (4, 4, 1, 1)
     assert summary.states == {"tracked": 3, "lost": 1}
     assert summary.errors["translation_mm"].median == pytest.approx(3.0)
     assert summary.errors["translation_mm"].max == pytest.approx(80.0)
@@ -318,12 +318,12 @@ def test_evaluation_counts_lost_wrong_and_good_frames(tmp_path: Path, views: Gui
     assert json.loads(json.dumps(result.to_dict()))["frames"][2]["cam_from_model"] is None
 
 
-def test_tracked_while_out_of_view_is_false_and_not_judged() -> None:
+def test_tracked_while_out_of_view_is_false_and_not_evaluated() -> None:
     pose = Pose(TRUTH, None, 0.9, TrackingState.TRACKED, 0.0, 0)
     error = PoseMeter(brick(), CAMERA).measure(TRUTH, TRUTH)
     gone = FrameResult(pose, error, True, True, 0.0, False, False)
     summary = summarise([gone])
-    assert (summary.judged, summary.lost, summary.false_tracked) == (0, 0, 1)
+    assert (summary.evaluated, summary.lost, summary.false_tracked) == (0, 0, 1)
     assert summary.within_5cm_5deg is None and not summary.errors
     searching = replace(gone, pose=replace(pose, cam_from_model=None, state=TrackingState.SEARCHING), error=None)
     assert summarise([searching]).false_tracked == 0

@@ -9,18 +9,18 @@ import pytest
 from scipy.spatial import cKDTree
 
 from arview.cad import Model
-from arview.evaluation.semisynthetic.random_solids import random_solid, random_twin
+from arview.evaluation.semisynthetic.random_solids import random_near_symmetric, random_solid
 
 SEEDS = range(30)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("made", [random_solid, random_twin])
+@pytest.mark.parametrize("made", [random_solid, random_near_symmetric])
 def test_a_solid_is_made_of_closed_bodies_of_a_parts_size(made: Callable[[int], Model], seed: int) -> None:
     try:
         solid = made(seed)
     except ValueError:
-        assert made is random_twin and seed in (21, 23)
+        assert made is random_near_symmetric and seed in (21, 23)
         return
     assert 60.0 < solid.diameter_mm < 350.0
     for component in solid.components:
@@ -46,7 +46,7 @@ def test_most_of_a_twin_half_a_turn_or_another_takes_onto_itself_but_not_all_of_
     seen = 0
     for seed in SEEDS:
         try:
-            solid = random_twin(seed)
+            solid = random_near_symmetric(seed)
         except ValueError:
             continue
         points = np.concatenate([c.vertices_in_model for c in solid.components])

@@ -31,13 +31,13 @@ from arview.evaluation.semisynthetic import (
     Job,
     SequenceFrame,
     SequenceOptions,
-    alike_poses,
     frames_without_part,
-    least_error,
+    indistinguishable_poses,
     look_alike_job,
     look_alikes,
     make_sequence,
     near_symmetries,
+    nearest_error,
     read_record,
     render_sequence,
     shape,
@@ -343,13 +343,13 @@ def test_a_notch_behind_something_tells_nothing() -> None:
     center = model.center_in_model
     above = look_at(center + np.array([100.0, 50.0, 550.0]), center, [0, 1.0, 0])
     in_view = ZBufferRenderer(model, CAMERA).render(above).depth_mm > 0
-    assert len(alike_poses(model, CAMERA, above, near, in_view)) == 1
+    assert len(indistinguishable_poses(model, CAMERA, above, near, in_view)) == 1
     # Something lies over the notch, at +X of the disc's rim, and over the next place that a twin's notch has.
     mask = in_view.astype(np.uint8)
     for angle in np.deg2rad([0.0, 60.0]):
         rim_px = CAMERA.project(apply(above, np.array([85.0 * np.cos(angle), 85.0 * np.sin(angle), 9.0])[None]))[0]
         cv2.circle(mask, (round(rim_px[0]), round(rim_px[1])), 30, 0, -1)
-    alike = alike_poses(model, CAMERA, above, near, mask > 0)
+    alike = indistinguishable_poses(model, CAMERA, above, near, mask > 0)
     # The places of the other twins' notches are seen to have none.
     assert len(alike) == 2
     assert np.rad2deg(rotation_angle_rad(alike[1][:3, :3], above[:3, :3])) == pytest.approx(60.0, abs=1e-4)
@@ -359,15 +359,15 @@ def test_sixths_of_the_flange_are_alike_only_where_the_notch_is_hidden() -> None
     model, near = shape("flange"), near_symmetries("flange")
     center = model.center_in_model
     above = look_at(center + np.array([100.0, 50.0, 550.0]), center, [0, 1.0, 0])
-    assert len(alike_poses(model, CAMERA, above, near)) == 1
+    assert len(indistinguishable_poses(model, CAMERA, above, near)) == 1
     # Exactly from the side opposite to the notch nothing but the rim and the hub is seen.
     aside = look_at(center + np.array([-700.0, 0.0, -22.0]), center, [0, 0, 1.0])
-    alike = alike_poses(model, CAMERA, aside, near)
+    alike = indistinguishable_poses(model, CAMERA, aside, near)
     assert len(alike) > 1
     meter = PoseMeter(model, CAMERA)
     estimate = alike[1]
     assert meter.measure(estimate, aside).rotation_deg > 50
-    assert least_error(meter, estimate, alike).rotation_deg == pytest.approx(0.0, abs=1e-6)
+    assert nearest_error(meter, estimate, alike).rotation_deg == pytest.approx(0.0, abs=1e-6)
 
 
 # --- Files ----------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from arview.evaluation.semisynthetic import CAMERA
 from arview.evaluation.semisynthetic.backgrounds import read_photo, surroundings
 from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.evaluation.semisynthetic.sequence import FILL_LIGHT, JOIN_BLUR_PX, KEY_LIGHT, paste
-from arview.evaluation.semisynthetic.shading import Light, ShadedModel, Surface
+from arview.evaluation.semisynthetic.shading import Light, Reflectance, ShadedModel
 from arview.evaluation.semisynthetic.solids import box
 from arview.geometry import Array, apply, rigid
 from arview.rendering.rasterizer import rasterise
@@ -205,9 +205,9 @@ def drawn_before(
     light = Light(toward, np.array([rng.uniform(0.25, 1.4), 0.25]), rng.uniform(0.15, 0.45), surroundings(photo))
     covers = []
     for solid, pose in placed:
-        surface = Surface()
+        surface = Reflectance()
         if rng.random() > PLAIN:
-            surface = Surface(*(rng.uniform(*of) for of in ((0.4, 0.95), (0.0, 0.7), (0.0, 0.45), (6.0, 60.0))))
+            surface = Reflectance(*(rng.uniform(*of) for of in ((0.4, 0.95), (0.0, 0.7), (0.0, 0.45), (6.0, 60.0))))
         layer = ShadedModel(solid, surface).draw(pose, CAMERA, light)
         cover = np.zeros((CAMERA.height, CAMERA.width), np.float32)
         covers.append(cover)

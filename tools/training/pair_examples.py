@@ -16,7 +16,7 @@ from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pair_comparator import pair_crops
 from arview.detection.search.global_search import QUICK
 from arview.detection.search.local_search import Hypothesis
-from arview.evaluation.semisynthetic.random_solids import random_solid, random_twin
+from arview.evaluation.semisynthetic.random_solids import random_near_symmetric, random_solid
 from arview.geometry import Array, exp_so3, log_so3, rigid, turned
 from profile_ranker_examples import REFINED_APART, REFINED_NEAR, is_near, pictures_of
 from seeded_files import still_to_make
@@ -60,7 +60,7 @@ def collect_twins(seeds: range, photos: Sequence[Path], folder: Path) -> None:
         rng = np.random.default_rng([seed, 6])
         examples = []
         for detector, image, truth in pictures_of(
-            seed, photos, (QUICK,), random_twin if seed % OTHER_EVERY else random_solid
+            seed, photos, (QUICK,), random_near_symmetric if seed % OTHER_EVERY else random_solid
         ):
             if truth is not None:
                 examples += twins_of(seed, detector, detector.local.pyramid(image), truth, rng)

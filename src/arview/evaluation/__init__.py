@@ -1,4 +1,4 @@
-"""Evaluation: recorded scenes with reference poses, and how far the tracker is from them."""
+"""Evaluation: recorded scenes with reference poses, and the errors of the tracker against them."""
 
 from arview.cad.viewpoint import viewpoint
 from arview.evaluation.bop import Scene, SceneFrame, find_scenes, load_scene

@@ -1,4 +1,4 @@
-"""Recorded scenes with poses, in the folder layout of the BOP benchmark (https://bop.felk.cvut.cz).
+"""Recorded scenes with poses, in the folder layout of the BOP benchmark (https://bop.felk.cvut.cz)::
 
 DATASET/models/obj_000001.ply (mm) or assembly.glb, models_info.json
 DATASET/test/000001/rgb/000000.png … (or gray/), scene_camera.json, scene_gt.json, scene_gt_info.json
@@ -38,9 +38,9 @@ class SceneFrame:
         path: of the picture.
         matrix: (3,3) calibration matrix of this picture, px.
         cam_from_model: (4,4) reference pose in mm, or None.
-        is_truth: the pose comes from scene_gt.json, not from a reference file.
-        visible: share of the part that can be seen, 0–1, or None where the scene does not say.
-        mask_path: of the picture of what can be seen of the part, or None.
+        is_truth: the pose is from scene_gt.json, not from a reference file.
+        visible: share of the part that is visible, 0–1, or None where the scene does not say.
+        mask_path: mask of the visible part, or None.
     """
 
     index: int
@@ -57,13 +57,13 @@ class Scene:
     """Pictures of one part with reference poses.
 
     Attributes:
-        name: dataset, and the scene's number where the dataset has several.
+        name: of the dataset, with the scene's number where the dataset has several.
         folder: of the scene.
-        part: the part file, or what the dataset's models folder says.
-        symmetric_poses: (4,4) ``model_from_model`` that models_info.json calls symmetric.
-        camera: of the first picture; the others are brought to it when read.
+        part: from the part file, or from the dataset's models folder.
+        symmetric_poses: (4,4) ``model_from_model`` declared symmetric in models_info.json.
+        camera: of the first picture; the others are warped to it when they are read.
         frames: in the order of their ids.
-        reference: file whose poses stand in where scene_gt.json has none, or None.
+        reference: file with poses of frames that scene_gt.json lacks, or None.
     """
 
     name: str
@@ -82,8 +82,8 @@ class Scene:
     def image(self, frame: SceneFrame) -> Image:
         """Picture (H,W,3) uint8 RGB of a frame, as `camera` would have taken it.
 
-        Data sets that crop each picture differently have another matrix per frame; between matrices of one
-        view point lies an affine map of the picture.
+        Datasets whose pictures are cropped differently have one matrix per frame; pictures of one viewpoint with
+        different matrices differ by an affine map.
 
         Raises:
             InputError: the picture cannot be read, or has another size than the first.
@@ -91,7 +91,7 @@ class Scene:
         return self._as_taken(_read_picture(frame.path), frame, frame.path)
 
     def mask(self, frame: SceneFrame) -> NDArray[np.bool_] | None:
-        """Where the part can be seen in a frame's `image`, (H,W); None where the scene does not say.
+        """Mask (H,W) of the visible part in a frame's `image`; None where the scene does not say.
 
         Raises:
             InputError: the mask cannot be read, or has another size than the pictures.
@@ -101,7 +101,7 @@ class Scene:
         return np.asarray(self._as_taken(_read_picture(frame.mask_path), frame, frame.mask_path)[..., 0] > 127)
 
     def _as_taken(self, image: Image, frame: SceneFrame, path: Path) -> Image:
-        """A picture that belongs to a frame, as `camera` would have taken it."""
+        """A picture or mask of a frame, as `camera` would have taken it."""
         if image.shape[:2] != (self.camera.height, self.camera.width):
             raise InputError(
                 f"{path}: is {image.shape[1]}×{image.shape[0]} px, the first picture of the scene is "
@@ -124,7 +124,7 @@ def find_scenes(path: str | Path) -> list[Path]:
         return [path]
     scenes = sorted(file.parent for file in path.glob("test/*/scene_camera.json"))
     if not scenes:
-        what = "holds no scene" if path.is_dir() else "no such folder"
+        what = "contains no scene" if path.is_dir() else "no such folder"
         raise InputError(
             f"{path}: {what}; give a BOP scene folder (with scene_camera.json) or its dataset folder "
             "(with test/000001/scene_camera.json)"
@@ -138,17 +138,17 @@ def load_scene(
     reference: str | Path | None = None,
     object_id: int | None = None,
 ) -> Scene:
-    """Read a scene; pictures are read later, one by one.
+    """Read a scene; its pictures are read later, one by one.
 
     Args:
-        folder: the scene's, as `find_scenes` gives it.
+        folder: of the scene, as `find_scenes` returns it.
         part: the part in it; None takes the dataset's ``models/assembly.glb`` or ``models/obj_*.ply``.
         reference: JSON file of poses, ``{"1": {"R": 9 row-major, "t_mm": 3}}``, for frames without one in
             scene_gt.json; None takes a ``peer_visp.json`` in the dataset's folder when there is one.
-        object_id: which object of a scene with several.
+        object_id: the object to follow in a scene with several.
 
     Raises:
-        InputError: a file is missing or broken, several objects and none chosen, no picture, no model.
+        InputError: a file is missing or broken; there are several objects and none is chosen; no picture or model.
     """
     folder = Path(folder)
     dataset = folder.resolve().parent.parent
@@ -221,7 +221,7 @@ def _pictures(folder: Path) -> dict[int, Path]:
         }
         if pictures:
             return pictures
-    raise InputError(f"{folder}: holds no numbered pictures in rgb/ or gray/")
+    raise InputError(f"{folder}: contains no numbered pictures in rgb/ or gray/")
 
 
 def _read_picture(path: Path) -> Image:
@@ -255,25 +255,25 @@ def _pose(entry: Any, rotation_key: str, translation_key: str, place: str) -> Ar
 
 
 def _choose_object(truths: dict[str, Any], object_id: int | None, path: Path) -> int | None:
-    """Id of the object to follow; None when the scene has no truth at all."""
+    """Id of the object to follow; None when the scene has no true poses."""
     try:
         found = sorted({int(entry["obj_id"]) for entries in truths.values() for entry in entries})
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: an entry has no obj_id") from error
     if object_id is not None:
         if found and object_id not in found:
-            raise InputError(f"{path}: holds no object {object_id}, only {', '.join(map(str, found))}")
+            raise InputError(f"{path}: contains no object {object_id}, only {', '.join(map(str, found))}")
         return object_id
     if len(found) > 1:
-        raise InputError(f"{path}: holds the objects {', '.join(map(str, found))}; choose one with --object")
+        raise InputError(f"{path}: contains the objects {', '.join(map(str, found))}; choose one with --object")
     return found[0] if found else None
 
 
 def _entry_of(entries: Any, object_id: int | None, place: str) -> int | None:
-    """Index of the object's entry in a frame, None when it is not in it."""
+    """Index of the object's entry in a frame; None when the frame does not have it."""
     found = [k for k, entry in enumerate(entries or []) if int(entry["obj_id"]) == object_id]
     if len(found) > 1:
-        raise InputError(f"{place}: holds object {object_id} {len(found)} times; only one can be followed")
+        raise InputError(f"{place}: contains object {object_id} {len(found)} times; only one can be followed")
     return found[0] if found else None
 
 
@@ -294,12 +294,12 @@ def _load_model_part(dataset: Path, object_id: int) -> Part:
         if mesh.is_file():
             return load_part(mesh, unit="mm")
     raise InputError(
-        f"{dataset}: holds neither models/assembly.glb nor models/obj_{object_id:06d}.ply; give --part PART"
+        f"{dataset}: contains neither models/assembly.glb nor models/obj_{object_id:06d}.ply; give --part PART"
     )
 
 
 def _model_symmetries(dataset: Path, object_id: int) -> tuple[tuple[Symmetry, ...], tuple[Array, ...]]:
-    """Free axes and discrete symmetries (4,4) that models_info.json declares."""
+    """Continuous symmetries and discrete ones (4,4) that models_info.json declares."""
     path = dataset / "models" / "models_info.json"
     info = _read_json_object(path).get(str(object_id), {}) if path.is_file() else {}
     free = []

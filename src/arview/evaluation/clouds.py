@@ -1,7 +1,7 @@
-"""How near a cloud is to the true surface, and how much of it is there.
+"""Accuracy and completeness of a point cloud against the true surface.
 
-Accuracy is the distance from each point of the cloud to the mesh, completeness the share of the surface that the
-photos show which has a point of the cloud nearby (Seitz 2006; Knapitsch 2017).
+Accuracy is the distance from each point of the cloud to the mesh. Completeness is the share of the surface visible in
+the photos that has a point of the cloud nearby (Seitz et al. 2006; Knapitsch et al. 2017).
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from arview.geometry import Array, apply
 from arview.rendering.rasterizer import rasterise
 
 _SPACING_MM = 0.5
-"""Of the samples of the mesh. Completeness is judged on them; distances are measured to the triangles."""
+"""Spacing of the mesh samples on which completeness is measured; distances are measured to the triangles."""
 _CANDIDATES = 6
-"""Triangles near a point to which its distance is measured: those of its nearest samples."""
+"""Triangles to which the distance of a point is measured: those of its nearest samples."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class CloudScore:
     """Distances in mm.
 
     Attributes:
-        points: of the cloud that were judged.
-        median_mm, p90_mm: of the distances to the mesh.
-        far: share of the points farther than ``far_mm`` from it: another object, or wrong.
+        points: points of the cloud that were measured.
+        median_mm, p90_mm: median and 90th percentile of the distances to the mesh.
+        far: share of the points farther than ``far_mm`` from the mesh: outliers, or another object.
         complete: share of the visible surface within ``near_mm`` of a point.
-        visible_mm2: area of the surface that enough photos show.
+        visible_mm2: area of the surface that enough photos show, mm².
     """
 
     points: int
@@ -44,10 +44,10 @@ class CloudScore:
 
 
 def distances_to_mesh(points: Array, vertices: Array, faces: NDArray[np.int32]) -> Array:
-    """(N,) distance of points (N,3) to a triangle mesh, same unit and frame.
+    """(N,) distances of points (N,3) to a triangle mesh, in the same unit and frame.
 
-    Exact where one of the triangles of the six nearest samples (0.5 apart) is the nearest, elsewhere off by no more
-    than a few micrometres.
+    Exact where the nearest triangle is among those of the six nearest samples (0.5 apart), elsewhere too large by no
+    more than a few micrometres.
     """
     from scipy.spatial import cKDTree
 
@@ -61,7 +61,7 @@ def distances_to_mesh(points: Array, vertices: Array, faces: NDArray[np.int32]) 
 
 
 def _distance_to_triangle(points: Array, triangles: Array) -> Array:
-    """(N,) distance of each point to its triangle (N,3,3): to the plane where its foot is inside, else to a side."""
+    """(N,) distance of each point to its triangle (N,3,3): to the plane if its foot is inside, else to a side."""
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
     above = np.abs(np.sum(normal * (points - triangles[:, 0]), axis=1)) / length
@@ -79,9 +79,9 @@ def _distance_to_triangle(points: Array, triangles: Array) -> Array:
 def sample_mesh(
     vertices: Array, faces: NDArray[np.int32], spacing: float, at_least: int = 0, seed: int = 0
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Points (N,3) spread at random over a mesh, one per ``spacing``² (evenly), and the triangle (N,) of each.
+    """Random points (N,3) on a mesh, about one per ``spacing``², and the triangle (N,) of each.
 
-    ``at_least`` so many more are put on every triangle, however small.
+    ``at_least`` further points are placed on every triangle, however small.
     """
     triangles = vertices[faces]
     area = 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
@@ -103,7 +103,7 @@ def views_of(
     cameras: Sequence[tuple[Camera, Array]],
     tolerance_mm: float = 0.3,
 ) -> NDArray[np.int64]:
-    """(N,) number of cameras (each with its ``cam_from_mesh``) that see points of a mesh, by z-buffer."""
+    """(N,) number of cameras, each with its ``cam_from_mesh`` (4,4), that see points of a mesh, by z-buffer."""
     seen = np.zeros(len(points), dtype=np.int64)
     for camera, cam_from_mesh in cameras:
         inverse_depth, _ = rasterise(
@@ -114,7 +114,7 @@ def views_of(
         pixels = camera.without_distortion().project(in_cam)
         inside = np.all((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1]), axis=1)
         u, v = np.round(pixels[inside]).astype(int).T
-        # Within a pixel the surface may be as much farther as it leans: the farthest of 3 × 3 pixels counts.
+        # A slanted surface has several depths within a pixel: the farthest of 3 × 3 pixels counts.
         around = np.stack([
             inverse_depth[np.clip(v + dv, 0, camera.height - 1), np.clip(u + du, 0, camera.width - 1)]
             for dv in (-1, 0, 1) for du in (-1, 0, 1)
@@ -130,7 +130,7 @@ def score_cloud(
     faces: NDArray[np.int32],
     cameras: Sequence[tuple[Camera, Array]],
     box: Array | None = None,
-    least_views: int = 2,
+    min_views: int = 2,
     near_mm: float = 0.5,
     far_mm: float = 2.0,
 ) -> CloudScore:
@@ -139,14 +139,14 @@ def score_cloud(
     Args:
         points: (N,3) of the cloud.
         vertices, faces: the true mesh.
-        cameras: each photo's camera and true ``cam_from_mesh`` (4,4): what they see is what can be complete.
-        box: (2,3) lowest and highest corner; what is outside is not judged, neither points (the table the part lies
-            on) nor surface.
-        least_views: photos that must see a piece of the surface.
-        near_mm: for completeness. far_mm: for ``far``.
+        cameras: of the photos, with their true ``cam_from_mesh`` (4,4); completeness refers to the surface they see.
+        box: (2,3) lowest and highest corner; points (such as the table's) and surface outside are ignored.
+        min_views: photos that must see a piece of the surface for it to count as visible.
+        near_mm: distance of completeness.
+        far_mm: distance of ``CloudScore.far``.
 
     Raises:
-        InputError: no points, or no surface that the photos see.
+        InputError: no points, or no surface visible in the photos.
     """
     from scipy.spatial import cKDTree
 
@@ -154,11 +154,11 @@ def score_cloud(
     if box is not None:
         points, samples = (p[np.all((p >= box[0]) & (p <= box[1]), axis=1)] for p in (points, samples))
     if len(points) == 0:
-        raise InputError("cloud: has no points to judge")
+        raise InputError("cloud: has no points to evaluate")
     distance = distances_to_mesh(points, vertices, faces)
-    visible = samples[views_of(samples, vertices, faces, cameras) >= least_views]
+    visible = samples[views_of(samples, vertices, faces, cameras) >= min_views]
     if len(visible) == 0:
-        raise InputError(f"cloud: no surface of the mesh is seen by {least_views} photos; do the poses belong to it?")
+        raise InputError(f"cloud: no surface of the mesh is seen by {min_views} photos; do the poses belong to it?")
     reach, _ = cKDTree(points).query(visible, distance_upper_bound=near_mm)
     return CloudScore(
         points=len(points),

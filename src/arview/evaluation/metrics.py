@@ -1,4 +1,4 @@
-"""How far an estimated pose is from the true one, in the figures that papers and users ask for."""
+"""Errors of an estimated pose against the true one, in the measures that papers and users ask for."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from arview.camera import Camera
 from arview.geometry import Array, apply, exp_so3, rigid, rotation_angle_rad, skew
 
 ADD_VERTICES = 2000
-_MOST_EQUIVALENTS = 128
-"""A rotation group larger than this (an icosahedron has 60) is a mistake in the declaration."""
+"""Vertices over which ADD is averaged."""
+_MAX_EQUIVALENTS = 128
+"""Largest rotation group; a larger one (an icosahedron has 60) is a mistake in the declaration."""
 
 
 class ViewFeaturesSource(Protocol):
@@ -26,15 +27,15 @@ class ViewFeaturesSource(Protocol):
 
 @dataclass(frozen=True)
 class PoseError:
-    """Differences of an estimated from a true pose.
+    """Errors of an estimated pose against a true one.
 
     Attributes:
-        translation_mm: distance between the two places of the centre of the model's bounding box. (The
-            centre and not the origin: an origin far from the part would turn rotation into translation.)
-        across_mm: its part across the line of sight to the true centre.
-        depth_mm: its part along it, positive when the estimate is too far away.
+        translation_mm: distance between the two positions of the centre of the model's bounding box. (The centre and
+            not the origin, because with an origin far from the part a rotation would count as translation.)
+        across_mm: its component across the line of sight to the true centre.
+        depth_mm: its component along the line of sight, positive when the estimate is too far away.
         rotation_deg: angle between the two orientations, 0–180.
-        add_mm: mean distance between the vertices at the two poses (ADD).
+        add_mm: mean distance between the vertices at the two poses (ADD; Hinterstoisser et al. 2012).
         contour_px: mean distance in the picture between the model's edges at the two poses; None when
             no edge can be projected.
         contour_median_px: median of the same.
@@ -54,13 +55,13 @@ class PoseError:
 
 
 class PoseMeter:
-    """Measures poses of one model in pictures of one camera.
+    """Measures the errors of poses of one model in pictures of one camera.
 
     Args:
         model: the part.
         camera: of the pictures.
         views: guide views of the model, whose edge points are projected; None leaves contour_px out.
-        symmetries: rotations of the part that change nothing: the true pose nearest to the estimate counts.
+        symmetries: rotations of the part that change nothing; of the equivalent true poses the nearest counts.
         symmetric_poses: (S,4,4) further ``model_from_model`` that change nothing (BOP's discrete ones).
     """
 
@@ -100,7 +101,7 @@ class PoseMeter:
         )
 
     def nearest_equivalent(self, estimate: Array, truth: Array) -> Array:
-        """The pose (4,4) least rotated against the estimate, of those that look the same as the true one."""
+        """Of the poses (4,4) equivalent to the true one, the one least rotated against the estimate."""
         candidates = [truth @ turn for turn in self._turns]
         candidates += [pose @ free_turn(symmetry, pose, estimate) for pose in candidates for symmetry in self._free]
         return min(candidates, key=lambda pose: rotation_angle_rad(pose, estimate))
@@ -118,17 +119,17 @@ class PoseMeter:
 
 
 def about(symmetry: Symmetry, angle_rad: float) -> Array:
-    """(4,4) ``model_from_model``: the turn about a symmetry's axis by an angle."""
+    """(4,4) ``model_from_model``: the rotation about a symmetry's axis by an angle."""
     rotation = exp_so3(np.array(symmetry.axis_in_model) * angle_rad)
     through = np.array(symmetry.through_in_model)
     return rigid(rotation, through - rotation @ through)
 
 
 def free_turn(symmetry: Symmetry, truth: Array, estimate: Array) -> Array:
-    """The turn (4,4) about a free axis that brings the true orientation nearest to the estimated one.
+    """The rotation (4,4) about a continuous symmetry's axis that brings the true orientation nearest to the estimate.
 
-    The trace of ``truthᵀ · estimate · turn(-angle)`` is a + b cos(angle) + c sin(angle), whose maximum is
-    exact.
+    The trace of ``truthᵀ · estimate · turn(-angle)`` is a + b cos(angle) + c sin(angle), whose maximum has a closed
+    form.
     """
     axis = np.array(symmetry.axis_in_model)
     relative = truth[:3, :3].T @ estimate[:3, :3]
@@ -139,14 +140,14 @@ def free_turn(symmetry: Symmetry, truth: Array, estimate: Array) -> Array:
 
 
 def symmetry_group(symmetries: tuple[Symmetry, ...], symmetric_poses: tuple[Array, ...] = ()) -> list[Array]:
-    """All turns (4,4) ``model_from_model`` that the declared ones make together, identity first."""
+    """The rotation group (4,4) ``model_from_model`` that the declared symmetries generate, identity first."""
     generators = [about(s, 2.0 * np.pi / s.order) for s in symmetries if s.order is not None]
     generators += [np.asarray(pose, dtype=np.float64) for pose in symmetric_poses]
     group = [np.eye(4)]
-    for known in group:  # grows while it is walked through
+    for known in group:  # grows during the iteration
         for generator in generators:
             turn = known @ generator
             is_new = all(rotation_angle_rad(turn, other) > 1e-3 for other in group)
-            if is_new and len(group) < _MOST_EQUIVALENTS:
+            if is_new and len(group) < _MAX_EQUIVALENTS:
                 group.append(turn)
     return group

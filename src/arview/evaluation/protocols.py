@@ -1,4 +1,4 @@
-"""How trackers and detectors are judged: tracking with resets, as RBOT does, and detection in single frames."""
+"""Evaluation protocols: tracking with resets, as in RBOT (Tjaden et al. 2018), and detection in single frames."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ from arview.tracking import Tracker
 from arview.tracking.pose_recheck import LocalSearchRecheck
 
 EQUAL_SIDES = 0.05
-"""Sides of a box that differ by less are taken for equal."""
+"""Relative difference up to which sides of a box are equal."""
 _DISTANCE_MARGIN = 0.05
+"""Share by which a range of distances is widened at both ends."""
 
 
 @dataclass(frozen=True)
 class Tally:
-    """Frames, and those among them whose pose is within 5 cm and 5°.
+    """Number of frames, and of those whose pose is within 5 cm and 5°.
 
     Attributes:
-        frames: how many were looked at.
-        right: how many of them are right.
-        ms: (N,) time of each, the first left out: it may hold the loading of compiled code.
-        left_open: how many others were called ambiguous, with a right pose among the alternatives.
+        frames: frames evaluated.
+        right: frames with a right pose.
+        ms: (N,) time of each frame without the first, which may include loading compiled code.
+        left_open: wrong frames that were called ambiguous, with a right pose among the alternatives.
     """
 
     frames: int = 0
@@ -44,7 +45,7 @@ class Tally:
 
     @property
     def share(self) -> float:
-        """Share of right frames, 0 without any frame."""
+        """Share of right frames; 0 without frames."""
         return self.right / self.frames if self.frames else 0.0
 
     def __add__(self, other: Tally) -> Tally:
@@ -57,9 +58,10 @@ class Tally:
 
 
 def full_sphere_range(nearest_mm: float, farthest_mm: float, ratio: float = 4.0) -> ViewRange:
-    """Every direction and roll, over distances that cover the given ones with 5 % to spare.
+    """All directions and rolls, over distances that cover the given ones with a margin of 5 %.
 
-    The distances are stretched, both ends alike, until the farthest is at least ``ratio`` times the nearest.
+    The range of distances is widened by the same factor at both ends until the farthest is at least ``ratio`` times
+    the nearest.
     """
     low, high = nearest_mm * (1.0 - _DISTANCE_MARGIN), farthest_mm * (1.0 + _DISTANCE_MARGIN)
     stretch = max(1.0, float(np.sqrt(ratio * low / high)))
@@ -67,7 +69,7 @@ def full_sphere_range(nearest_mm: float, farthest_mm: float, ratio: float = 4.0)
 
 
 def box_symmetries(model: Model) -> tuple[Symmetry, ...]:
-    """Rotations of the model's bounding box: half turns, and quarter turns where two sides are equal within 5 %."""
+    """Rotations of the model's bounding box: half turns, and quarter turns where two sides are equal to 5 %."""
     size = model.bounds_in_model[1] - model.bounds_in_model[0]
     x, y, z = model.center_in_model.tolist()
     found = []
@@ -78,16 +80,16 @@ def box_symmetries(model: Model) -> tuple[Symmetry, ...]:
     return tuple(found)
 
 
-def track_with_resets(scene: Scene, views: GuideViewSet, step: int = 1, most_frames: int | None = None) -> Tally:
-    """Track a scene from truth, and again from truth after every frame that is off by over 5 cm or 5° (RBOT).
+def track_with_resets(scene: Scene, views: GuideViewSet, step: int = 1, max_frames: int | None = None) -> Tally:
+    """Track a scene from the true pose, and restart from it after every frame that is off by over 5 cm or 5° (RBOT).
 
     Args:
-        scene: every frame has a pose.
+        scene: with a pose in every frame.
         views: guide views of its part.
-        step: every how manieth frame is shown to the tracker.
-        most_frames: look at no more of the scene than its first frames.
+        step: interval between the frames that are tracked.
+        max_frames: use only this many frames from the start of the scene.
     """
-    frames = scene.frames[:most_frames:step]
+    frames = scene.frames[:max_frames:step]
     tracker = Tracker(
         views, scene.camera, model=scene.part.model, recheck=LocalSearchRecheck(LocalSearch(views, scene.camera))
     )
@@ -112,7 +114,7 @@ def detect_in_frames(
     detector: Detector,
     error_of: Callable[[Array, SceneFrame], PoseError],
 ) -> Tally:
-    """Look for the part in single frames; the best detection counts.
+    """Detect the part in single frames; the best detection counts.
 
     Args:
         scene: of the frames.
@@ -137,7 +139,7 @@ def detect_in_frames(
 
 
 def spread_frames(scene: Scene, count: int) -> list[SceneFrame]:
-    """At most so many frames, evenly spread, of those that show at least half of the part and have a pose."""
+    """At most ``count`` frames, evenly spread over those that have a pose and show at least half of the part."""
     fit = [f for f in scene.frames if f.cam_from_model is not None and (f.visible is None or f.visible >= IN_VIEW)]
     chosen = np.unique(np.linspace(0, len(fit) - 1, min(count, len(fit))).round().astype(int))
     return [fit[k] for k in chosen]

@@ -1,4 +1,4 @@
-"""The range of viewpoints that covers given poses: what a scene without a declared range is searched in."""
+"""The range of viewpoints that covers given poses; used for scenes without a declared range."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from arview.errors import InputError
 from arview.geometry import Array
 
 DISTANCE_MARGIN = 0.2
-ANGLE_MARGIN = 0.2
-ANGLE_MARGIN_MIN_DEG = 15.0
+"""Share of the distance that is added at both ends."""
+ANGLE_MARGIN, MIN_ANGLE_MARGIN_DEG = 0.2, 15.0
+"""Share of an angle's span that is added at both ends, and its minimum."""
 POLE_DEG = 85.0
-"""From this elevation on azimuth and roll say the same, so both are left free."""
+"""From this elevation on azimuth and roll cannot be separated, so both are left free."""
 
 
 def covering_range(poses: list[Array], center_in_model: ArrayLike) -> ViewRange:
-    """Range that holds all poses (4,4) with a margin.
+    """Range that contains all poses (4,4) with a margin.
 
-    The margin is 20 % of the distance, and 20 % of the span of each angle but at least 15°. Azimuth and roll
-    are taken the short way round the circle.
+    The margin is 20 % of the distance, and 20 % of the span of each angle but at least 15°. Azimuth and roll take the
+    shortest arc of the circle.
 
     Raises:
         InputError: no pose is given.
@@ -46,12 +47,12 @@ def covering_range(poses: list[Array], center_in_model: ArrayLike) -> ViewRange:
 
 
 def _widened(low: float, high: float) -> tuple[float, float]:
-    margin = max(ANGLE_MARGIN * (high - low), ANGLE_MARGIN_MIN_DEG)
+    margin = max(ANGLE_MARGIN * (high - low), MIN_ANGLE_MARGIN_DEG)
     return low - margin, high + margin
 
 
 def shortest_arc(angles_deg: ArrayLike) -> tuple[float, float]:
-    """Smallest interval in deg that holds all angles modulo 360; it starts in [-180, 180)."""
+    """Smallest interval in deg that contains all angles modulo 360; it starts in [-180, 180)."""
     angles = np.sort((np.asarray(angles_deg, dtype=np.float64) + 180.0) % 360.0 - 180.0)
     gaps = np.diff(np.append(angles, angles[0] + 360.0))
     widest = int(np.argmax(gaps))

@@ -1,4 +1,4 @@
-"""What an evaluation says as text."""
+"""Result of an evaluation as text."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _FIGURES = (
 
 
 def format_result(result: SceneResult, per_frame: bool = False) -> str:
-    """Text of several lines for one scene, without a newline at its end."""
+    """Several lines of text for one scene, without a final newline."""
     summary = result.summary
     lines = [f"{result.scene}: from {result.init}; reference: {result.reference}"]
     if per_frame:
         lines += [_frame_line(frame) for frame in result.frames]
     states = ", ".join(f"{count} {state}" for state, count in sorted(summary.states.items()))
-    lines.append(f"  {summary.frames} frames ({states}), {summary.judged} judged")
+    lines.append(f"  {summary.frames} frames ({states}), {summary.evaluated} evaluated")
     lines.append(f"  lost {summary.lost}, false tracked {summary.false_tracked}{_shares(summary)}")
     if summary.errors:
         lines.append(f"  {'':<13}{'median':>9}{'p95':>9}{'max':>9}")

@@ -1,4 +1,4 @@
-"""evaluate_scene: track a part through a recorded scene and measure every frame against its reference."""
+"""evaluate_scene: track a part through a recorded scene and compare every frame with its reference pose."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from arview.tracking import SessionOptions, TrackingSession
 from arview.tracking.guide_pose import GUIDE_PREFIX, guide_pose
 
 COARSE = (50.0, 5.0)
-"""5 cm / 5°: beyond it a pose is wrong."""
+"""5 cm and 5°, in mm and degrees: a pose beyond is wrong."""
 FINE = (20.0, 2.0)
-"""2 cm / 2°."""
+"""2 cm and 2°, in mm and degrees."""
 IN_VIEW = 0.5
-"""Frames that show at least this share of the part are judged; with less, losing it is no fault."""
+"""Frames that show at least this share of the part are evaluated; with less, losing it is no error."""
 OUT_OF_VIEW = 0.02
-"""With less than this share in view, whoever says `tracked` is wrong."""
+"""With less than this share in view, the state `tracked` is an error."""
 
 
 @dataclass(frozen=True)
 class FrameResult:
-    """One frame: what the tracker said, and how wrong it was.
+    """One frame: the tracker's pose and its error.
 
     Attributes:
         pose: of the tracker.
-        error: against the reference; None without a pose or without a reference.
+        error: against the reference; None without a pose or a reference.
         has_reference, is_truth: whether there is a reference pose, and whether it is exact.
         visible: share of the part in view, or None when not known.
-        is_detection: the part was searched for in this frame, so that ``ms`` is a detection's.
-        is_first: its ``ms`` holds the loading of compiled code and does not count.
+        is_detection: the part was searched for in this frame, so ``ms`` is the time of a detection.
+        is_first: its ``ms`` includes loading compiled code and does not count.
     """
 
     pose: Pose
@@ -55,7 +55,7 @@ class FrameResult:
     is_first: bool
 
     @property
-    def is_judged(self) -> bool:
+    def is_evaluated(self) -> bool:
         """True when the part should be tracked: there is a reference, and enough of it is in view."""
         return self.has_reference and (self.visible is None or self.visible >= IN_VIEW)
 
@@ -86,7 +86,7 @@ class FrameResult:
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, 95th percentile and maximum of a figure over frames."""
+    """Median, 95th percentile and maximum of a quantity over frames."""
 
     median: float
     p95: float
@@ -95,24 +95,24 @@ class Spread:
 
 @dataclass(frozen=True)
 class Summary:
-    """A scene in figures.
+    """Errors and times of one scene.
 
-    Judged frames have a reference pose and at least half of the part in view (where the scene says how much).
-    Errors are taken over judged frames with a pose in the states `tracked` and `critical`; shares are of all
-    judged frames, so that a lost frame counts against them.
+    Evaluated frames have a reference pose and at least half of the part in view (where the scene says how much).
+    Errors are over evaluated frames with a pose in the states `tracked` and `critical`; shares are of all evaluated
+    frames, so that a lost frame lowers them.
 
     Attributes:
-        frames, judged: how many.
+        frames, evaluated: how many.
         states: frames by state.
-        lost: judged frames without a pose.
+        lost: evaluated frames without a pose.
         false_tracked: frames called `tracked` although the pose is off by 5 cm/5° or the part out of view.
-        errors: by name, see PoseError; depth_mm by its size.
-        within_5cm_5deg, within_2cm_2deg: shares; None when nothing is judged.
-        track_ms, detect_ms: time a frame, while tracking and while searching; the first frame is left out.
+        errors: by name, see PoseError; of depth_mm the absolute value.
+        within_5cm_5deg, within_2cm_2deg: shares; None when no frame is evaluated.
+        track_ms, detect_ms: time per frame while tracking and while searching, without the first frame.
     """
 
     frames: int
-    judged: int
+    evaluated: int
     states: dict[str, int]
     lost: int
     false_tracked: int
@@ -149,7 +149,7 @@ def scene_guide_views(
     options: GuideViewOptions | None = None,
     progress: StepProgress | None = None,
 ) -> GuideViewSet:
-    """Guide views for a scene, cached: over the part's declared range, else over what covers its poses."""
+    """Cached guide views for a scene, over the part's declared range or else the range that covers its poses."""
     part = scene.part
     view_range = part.view_range or covering_range(scene.poses, part.model.center_in_model)
     return cached_guide_views(part.model, view_range, options, progress=progress)
@@ -167,15 +167,15 @@ def evaluate_scene(
 
     Args:
         scene: see `load_scene`.
-        init: ``truth`` starts at the first frame with a reference pose, and from that pose; ``detect`` starts
-            at the first frame and finds the part; ``guide:NAME`` waits for it near a guide view.
+        init: ``truth`` starts from the reference pose of the first frame that has one; ``detect`` starts at the first
+            frame and detects the part; ``guide:NAME`` waits for the part near a guide view.
         options: of the session.
         views: guide views of the part; None makes them with `scene_guide_views`.
         progress: called with (frames done, frames in all).
-        make_session: makes the session from views, camera and first pose; None makes a TrackingSession.
+        make_session: makes the session from views, camera and first pose; None: a TrackingSession.
 
     Raises:
-        InputError: ``truth`` without any reference pose; no such guide view; a picture that cannot be read.
+        InputError: ``truth`` without a reference pose; no such guide view; a picture that cannot be read.
     """
     frames = scene.frames
     first_pose = None
@@ -247,29 +247,29 @@ def _reference_text(scene: Scene) -> str:
 
 
 def summarise(results: list[FrameResult]) -> Summary:
-    """Figures of a scene from its frames."""
-    judged = [result for result in results if result.is_judged]
+    """Summary of a scene from its frames."""
+    evaluated = [result for result in results if result.is_evaluated]
     trusted = (TrackingState.TRACKED, TrackingState.CRITICAL)
-    errors = [r.error for r in judged if r.error is not None and r.pose.state in trusted]
+    errors = [r.error for r in evaluated if r.error is not None and r.pose.state in trusted]
     names = ("translation_mm", "across_mm", "depth_mm", "rotation_deg", "add_mm", "contour_px")
     spreads = {name: spread([getattr(error, name) for error in errors]) for name in names}
     counted = [result for result in results if not result.is_first]
     return Summary(
         frames=len(results),
-        judged=len(judged),
+        evaluated=len(evaluated),
         states={str(state): count for state, count in Counter(r.pose.state for r in results).items()},
-        lost=sum(r.pose.cam_from_model is None or r.pose.state not in trusted for r in judged),
+        lost=sum(r.pose.cam_from_model is None or r.pose.state not in trusted for r in evaluated),
         false_tracked=sum(result.is_false_tracked for result in results),
         errors={name: value for name, value in spreads.items() if value is not None},
-        within_5cm_5deg=_share(errors, COARSE, len(judged)),
-        within_2cm_2deg=_share(errors, FINE, len(judged)),
+        within_5cm_5deg=_share(errors, COARSE, len(evaluated)),
+        within_2cm_2deg=_share(errors, FINE, len(evaluated)),
         track_ms=spread([r.pose.ms for r in counted if not r.is_detection]),
         detect_ms=spread([r.pose.ms for r in counted if r.is_detection]),
     )
 
 
 def spread(values: list[float | None]) -> Spread | None:
-    """Median, 95th percentile and maximum of the sizes of values; None when there are none."""
+    """Median, 95th percentile and maximum of absolute values; None when there are none."""
     known = np.abs([value for value in values if value is not None])
     if known.size == 0:
         return None

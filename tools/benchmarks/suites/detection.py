@@ -28,13 +28,13 @@ from arview.evaluation.semisynthetic import (
     LookAlike,
     SequenceOptions,
     Variant,
-    alike_poses,
     frames_without_part,
-    least_error,
+    indistinguishable_poses,
     look_alike_job,
     look_alikes,
     make_sequence,
     near_symmetries,
+    nearest_error,
     shape,
     shape_job,
 )
@@ -319,8 +319,8 @@ class _AlikeMeter:
 
     def __call__(self, estimate: Array, frame: SceneFrame) -> PoseError:
         mask = self._scene.mask(frame) if self._near else None
-        truths = alike_poses(self._scene.part.model, self._scene.camera, true_pose(frame), self._near, mask)
-        return least_error(self._meter, estimate, truths)
+        truths = indistinguishable_poses(self._scene.part.model, self._scene.camera, true_pose(frame), self._near, mask)
+        return nearest_error(self._meter, estimate, truths)
 
 
 def shape_views(model: Model) -> GuideViewSet:

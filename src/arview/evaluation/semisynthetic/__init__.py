@@ -1,6 +1,6 @@
 """Semi-synthetic sequences: CAD rendered along known trajectories over real photos, as BOP scenes."""
 
-from arview.evaluation.semisynthetic.ambiguity import alike_poses, least_error
+from arview.evaluation.semisynthetic.ambiguity import indistinguishable_poses, nearest_error
 from arview.evaluation.semisynthetic.backgrounds import photos_in
 from arview.evaluation.semisynthetic.look_alikes import LookAlike, look_alikes
 from arview.evaluation.semisynthetic.make import (
@@ -35,13 +35,13 @@ __all__ = [
     "SequenceOptions",
     "TrajectoryOptions",
     "Variant",
-    "alike_poses",
     "frames_without_part",
-    "least_error",
+    "indistinguishable_poses",
     "look_alike_job",
     "look_alikes",
     "make_sequence",
     "near_symmetries",
+    "nearest_error",
     "photos_in",
     "read_record",
     "render_sequence",

@@ -1,4 +1,6 @@
-"""Poses that a picture cannot tell apart, because what would tell them apart is not in view."""
+"""Poses of a near-symmetric part that one picture cannot distinguish, because the features that break the symmetry are
+not in view.
+"""
 
 from __future__ import annotations
 
@@ -14,35 +16,35 @@ from arview.geometry import Array
 from arview.guideviews.surface import Surface, differing, draw_surface
 from arview.rendering.renderers import ZBufferRenderer
 
-LEAST_PIXELS = 24
-"""Fewer pixels than these cannot tell two poses apart: a patch of about 5 × 5 px."""
+MIN_PIXELS = 24
+"""Changed pixels, a patch of about 5 × 5 px, that are needed to distinguish two poses."""
 IN_VIEW_PX = 8
-"""What lies so near to a pixel that shows the part is in view too, such as a notch in its outline; what lies farther
-from all of them is outside the picture or behind what is in front of the part."""
+"""Pixels this near to a visible pixel of the part are in view too, such as a notch in its outline; farther ones are
+outside the picture or occluded."""
 _DIFFERENT_DEPTH = 0.004
-"""Of the part's diameter: less depth between two surfaces makes no edge."""
+"""Smallest step in depth that makes an edge, in diameters of the part."""
 SIDE_PX, RADIUS_PX = 80, 35.0
-"""Side of the small picture in which looks are compared, and half the part's diameter in it."""
+"""Side of the small picture in which renderings are compared, and half the part's diameter in it."""
 OTHER_NORMAL, OTHER_DEPTH = 0.3, 0.05
-"""Parts of normals, and depths in half diameters, that differ by more show something else there."""
+"""Differences in a normal's components, and in depth in half diameters, above which a pixel has changed."""
 
 
-def alike_poses(
+def indistinguishable_poses(
     model: Model,
     camera: Camera,
     cam_from_model: Array,
     near_symmetries: tuple[Symmetry, ...],
     mask: NDArray[np.bool_] | None = None,
 ) -> tuple[Array, ...]:
-    """``cam_from_model`` (4,4) of all poses that look the same as one, itself first.
+    """``cam_from_model`` (4,4) of all poses that cannot be distinguished from one, itself first.
 
     Args:
         model: the part.
         camera: ideal, of the picture.
         cam_from_model: the true pose.
-        near_symmetries: rotations that all but small features of the part keep; a turn counts as long as fewer
-            than `LEAST_PIXELS` of the picture change in view.
-        mask: (H,W) where the part can be seen; None where nothing is in front of it.
+        near_symmetries: rotations under which all but small features of the part are symmetric; a rotation counts if
+            it changes fewer than `MIN_PIXELS` pixels in view.
+        mask: (H,W) of the visible part; None if nothing occludes it.
     """
     if not near_symmetries:
         return (cam_from_model,)
@@ -56,18 +58,18 @@ def alike_poses(
     alike = [cam_from_model]
     for turn in symmetry_group(near_symmetries)[1:]:
         turned = renderer.render(cam_from_model @ turn).depth_mm
-        if np.count_nonzero((np.abs(turned - truth) > limit_mm) & in_view) < LEAST_PIXELS:
+        if np.count_nonzero((np.abs(turned - truth) > limit_mm) & in_view) < MIN_PIXELS:
             alike.append(cam_from_model @ turn)
     return tuple(alike)
 
 
 def changed_share(surface: Surface, diameter_mm: float, cam_from_body: Array, true_cam_from_body: Array) -> float:
-    """Share of a part's pixels at a true pose that show something else at another pose, in a small picture.
+    """Share of a part's pixels at a true pose that change at another pose, in a small picture.
 
     Args:
         surface: of the part, about its centre.
         diameter_mm: of the part.
-        cam_from_body, true_cam_from_body: (4,4), with the part before the camera.
+        cam_from_body, true_cam_from_body: (4,4), with the part in front of the camera.
     """
     place = true_cam_from_body[:3, 3]
     focal_px = np.full(2, RADIUS_PX / (0.5 * diameter_mm) * place[2])
@@ -83,6 +85,6 @@ def changed_share(surface: Surface, diameter_mm: float, cam_from_body: Array, tr
     return int(np.count_nonzero(is_other)) / max(1, int(np.count_nonzero(true[2])))
 
 
-def least_error(meter: PoseMeter, estimate: Array, truths: tuple[Array, ...]) -> PoseError:
-    """Error of an estimate (4,4) against the one of several true poses that it is least turned against."""
+def nearest_error(meter: PoseMeter, estimate: Array, truths: tuple[Array, ...]) -> PoseError:
+    """Error of an estimate (4,4) against the one of several true poses that it is least rotated against."""
     return min((meter.measure(estimate, truth) for truth in truths), key=lambda error: error.rotation_deg)

@@ -1,4 +1,4 @@
-"""Real photos behind the part: where they come from, and crops that move over them as a hand would."""
+"""Real photos as backgrounds, and crops that move over them like a hand-held camera."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from arview.evaluation.bop import PICTURE_SUFFIXES
 from arview.evaluation.semisynthetic.trajectory import smooth_noise
 from arview.video import Image
 
-SMALLEST_SIDE_PX = 200
-"""Smaller pictures make poor backgrounds."""
+MIN_SIDE_PX = 200
+"""Smallest side of a background; smaller pictures are too coarse."""
 _CROP_SHARE = (0.72, 0.92)
-"""Width of the crop as a share of the widest that fits, from moment to moment."""
+"""Range of the crop's width, as a share of the widest that fits."""
 _TILT_DEG = 4.0
+"""Range of the crop's rotation."""
 
 
 def photos_in(folder: Path) -> list[Path]:
-    """All pictures below a folder, by name.
+    """All pictures below a folder, sorted by name.
 
     Raises:
         InputError: no such folder, or no picture in it.
@@ -31,7 +32,7 @@ def photos_in(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: no such folder of background photos")
     photos = sorted(p for p in folder.rglob("*") if p.suffix.lower() in PICTURE_SUFFIXES and p.is_file())
     if not photos:
-        raise InputError(f"{folder}: holds no photos ({' '.join(PICTURE_SUFFIXES)}); give another folder")
+        raise InputError(f"{folder}: contains no photos ({' '.join(PICTURE_SUFFIXES)}); give another folder")
     return photos
 
 
@@ -45,18 +46,16 @@ def read_photo(path: Path) -> Image:
     bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if bgr is None:
         raise InputError(f"{path}: cannot be read as a picture; take it out of the backgrounds")
-    if min(bgr.shape[:2]) < SMALLEST_SIDE_PX:
+    if min(bgr.shape[:2]) < MIN_SIDE_PX:
         size = f"{bgr.shape[1]}×{bgr.shape[0]}"
-        raise InputError(
-            f"{path}: {size} px is too small for a background; give photos of {SMALLEST_SIDE_PX} px or more"
-        )
+        raise InputError(f"{path}: {size} px is too small for a background; give photos of {MIN_SIDE_PX} px or more")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
 
 
 def moving_crops(
     photo: Image, width: int, height: int, count: int, rng: np.random.Generator, smooth_frames: float = 14.0
 ) -> Iterator[Image]:
-    """Crops (height,width,3) of a photo that wander, turn and zoom smoothly, as of a hand-held camera."""
+    """Crops (height,width,3) of a photo that move, rotate and zoom smoothly, like a hand-held camera."""
     photo = _shrunk(photo, width, height)
     noise = np.tanh(smooth_noise(count, 4, smooth_frames, rng))
     rows, columns = photo.shape[:2]
@@ -67,7 +66,7 @@ def moving_crops(
         scale = widest * (middle + half * zoom) / width
         angle = np.deg2rad(_TILT_DEG * tilt)
         linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        # What the turned crop reaches to on both sides must stay inside the photo.
+        # The rotated crop must stay inside the photo on all sides.
         reach = 0.5 * np.abs(linear) @ [width, height]
         free = np.maximum(0.5 * np.array([columns, rows]) - reach - 1.0, 0.0)
         center = 0.5 * np.array([columns - 1, rows - 1]) + free * [across, down]
@@ -79,14 +78,14 @@ def moving_crops(
 
 
 def surroundings(photo: Image) -> NDArray[np.float32]:
-    """(32,64,3) in 0–1: a photo bent round the scene, blurred: what a shiny part mirrors."""
+    """Environment map (32,64,3) in 0–1 for reflections: a blurred photo wrapped around the scene."""
     small = cv2.resize(photo, (32, 32), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
     round_about = np.concatenate([small, small[:, ::-1]], axis=1)
     return np.asarray(cv2.GaussianBlur(round_about, (0, 0), 1.2, borderType=cv2.BORDER_REFLECT_101))
 
 
 def _shrunk(photo: Image, width: int, height: int) -> Image:
-    """The photo made small enough that a crop takes hardly more of its pixels than the picture has."""
+    """The photo, shrunk so that a crop has hardly more pixels than the picture."""
     share = 1.25 * max(width / photo.shape[1], height / photo.shape[0]) / _CROP_SHARE[0]
     if share >= 1.0:
         return photo

@@ -1,4 +1,4 @@
-"""Look-alikes: assemblies that differ from their CAD in one thing, and by how much a picture shows it."""
+"""Look-alikes: assemblies with one fault against their CAD, and the share of a picture in which it shows."""
 
 from __future__ import annotations
 
@@ -17,22 +17,26 @@ from arview.rendering.renderers import ZBufferRenderer
 Fault = Literal["missing", "moved", "swapped"]
 
 MOVED_MM = 20.0
-LEAST_RATIO, MOST_RATIO = 1.15, 3.0
-"""Components are swapped whose boxes differ by so much: told apart, and yet to be mistaken."""
+"""Distance by which a component is displaced."""
+MIN_RATIO, MAX_RATIO = 1.15, 3.0
+"""Size ratios of components that are swapped: different, but similar enough to be confused."""
 _TOUCH_MM = 0.5
+"""Boxes may overlap by this much."""
 _DIRECTIONS = 16
+"""Directions in which a displacement is tried."""
 _DIFFERENT_DEPTH_MM = 1.0
+"""Depths that differ by more are different."""
 
 
 @dataclass(frozen=True)
 class LookAlike:
-    """An assembly with something wrong.
+    """An assembly with a fault.
 
     Attributes:
-        name: of the variant, for files: ``missing_post_1``, ``swapped_nut_1_rail_1``.
-        fault: what is wrong: a component missing, moved by 20 mm along its base, or two swapped.
-        components: names of those that are wrong.
-        model: what stands there instead of the CAD.
+        name: of the variant, for file names: ``missing_post_1``, ``swapped_nut_1_rail_1``.
+        fault: a component missing, displaced along its base, or two components swapped.
+        components: names of the faulty components.
+        model: of the faulty assembly.
     """
 
     name: str
@@ -42,11 +46,11 @@ class LookAlike:
 
 
 def look_alikes(model: Model, moved_mm: float = MOVED_MM) -> tuple[LookAlike, ...]:
-    """Look-alikes of an assembly: each component but the base missing, each moved, and pairs swapped.
+    """Look-alikes of an assembly: each component but the base missing, each displaced, and pairs swapped.
 
-    The base is the component with the largest box. Components move along its two longer sides, in a direction that
-    keeps them on the base and clear of the others; one that has no such direction is not moved. Those are swapped,
-    each but once, that are most alike and yet can be told apart, where both fit.
+    The base is the component with the largest box. Components are displaced along its two longer sides, in a direction
+    that keeps them on the base and clear of the others, if there is one. Pairs of the most similar sizes are swapped
+    where both fit, each component once.
 
     Raises:
         InputError: a model of one component.
@@ -66,7 +70,7 @@ def look_alikes(model: Model, moved_mm: float = MOVED_MM) -> tuple[LookAlike, ..
             found.append(LookAlike(f"moved_{part.name}", "moved", (part.name,), changed))
     swapped: set[str] = set()
     for one, other in sorted(combinations(others, 2), key=lambda pair: _size_ratio(*pair)):
-        if {one.name, other.name} & swapped or not LEAST_RATIO <= _size_ratio(one, other) <= MOST_RATIO:
+        if {one.name, other.name} & swapped or not MIN_RATIO <= _size_ratio(one, other) <= MAX_RATIO:
             continue
         foot = _foot(other, upright) - _foot(one, upright)
         there, here = _shifted(one, foot), _shifted(other, -foot)
@@ -79,7 +83,7 @@ def look_alikes(model: Model, moved_mm: float = MOVED_MM) -> tuple[LookAlike, ..
 
 
 def different_share(model: Model, other: Model, camera: Camera, cam_from_model: Array) -> float:
-    """Share of the picture of either model at a pose (4,4) that differs: in depth by over 1 mm, or in outline."""
+    """Share of the pixels of two models at a pose (4,4) that differ, in depth by over 1 mm or in outline."""
     one, two = (ZBufferRenderer(m, camera).render(cam_from_model).depth_mm for m in (model, other))
     seen = int(np.count_nonzero((one > 0) | (two > 0)))
     differs = int(np.count_nonzero(np.abs(one - two) > _DIFFERENT_DEPTH_MM))
@@ -96,7 +100,7 @@ def _shifted(component: Component, shift: Array) -> Component:
 
 
 def _foot(component: Component, upright: int) -> Array:
-    """Where it stands: the middle of its box, at the bottom."""
+    """Its foot (3,): the centre of the lower face of its box."""
     foot = component.bounds_in_model.mean(axis=0)
     foot[upright] = component.bounds_in_model[0, upright]
     return np.asarray(foot)
@@ -105,7 +109,7 @@ def _foot(component: Component, upright: int) -> Array:
 def _free_shift(
     part: Component, base: Component, others: list[Component], upright: int, moved_mm: float
 ) -> Array | None:
-    """Shift (3,) along the base that keeps a component on it and clear of the others; None when there is none."""
+    """Displacement (3,) along the base that keeps a component on it and clear of the others; None if there is none."""
     plane = [axis for axis in range(3) if axis != upright]
     for angle in np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False):
         shift = np.zeros(3)
@@ -126,6 +130,6 @@ def _is_clear(part: Component, others: list[Component]) -> bool:
 
 
 def _size_ratio(one: Component, other: Component) -> float:
-    """How much longer one box is than the other on the side where they differ most."""
+    """Ratio of the sides of two boxes in which they differ most."""
     a, b = np.ptp(one.bounds_in_model, axis=0), np.ptp(other.bounds_in_model, axis=0)
     return float(np.max(np.maximum(a, b) / np.maximum(np.minimum(a, b), 1e-3)))

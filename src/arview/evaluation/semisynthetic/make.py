@@ -1,4 +1,4 @@
-"""Whole data sets: which photo and which part in front go with a sequence, and whether it is made already."""
+"""Whole datasets: choosing the background and the occluder of a sequence, and reusing one that exists already."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from arview.evaluation.semisynthetic.trajectory import TrajectoryOptions, follow
 from arview.geometry import Array
 
 WALK_ROUND = TrajectoryOptions(turn_deg=4.0, step_mm=8.0, distance_mm=(450.0, 800.0))
-"""Motion of a camera that is led round an assembly, for look-alikes."""
+"""Motion of a camera that is moved around an assembly, for look-alikes."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class Job:
     """A sequence to be made.
 
     Attributes:
-        name: of the data set's folder.
+        name: of the dataset's folder.
         model: the CAD to be found.
         options: of the sequence.
         photos: backgrounds to choose from.
-        look_alike: what is drawn instead of the model, or None.
-        follow: scene whose camera and trajectory are taken, or None.
+        look_alike: rendered instead of the model, or None.
+        follow: scene whose camera and trajectory are used, or None.
         symmetries: rotations of the model that change nothing.
     """
 
@@ -59,12 +59,12 @@ class Job:
 
     @property
     def camera(self) -> Camera:
-        """RBOT's, or that of the followed scene."""
+        """The camera of RBOT, or of the followed scene."""
         return self.follow.camera.without_distortion() if self.follow else CAMERA
 
     @property
     def photo(self) -> Path:
-        """The background: another one for each variant, and for each shape as far as there are enough."""
+        """The background: a different one for each variant, and for each shape if there are enough."""
         order = generator(self.options.seed, "photos").permutation(len(self.photos))
         known = SHAPES.index(self.model.name) if self.model.name in SHAPES else len(SHAPES)
         place = len(VARIANTS) * known + VARIANTS.index(self.options.variant)
@@ -93,21 +93,21 @@ def look_alike_job(
     photos: tuple[Path, ...],
     follow: Scene | None = None,
 ) -> Job:
-    """A sequence of a look-alike, in which the model is to be looked for; the camera moves more slowly."""
+    """A sequence of a look-alike, in which the nominal model is tracked; the camera moves more slowly."""
     options = replace(options, motion=WALK_ROUND)
     name = f"{name}_{look_alike.name.replace('/', '-')}_{options.variant}"
     return Job(name, model, options, photos, look_alike, follow)
 
 
 def make_sequence(job: Job, folder: Path, progress: StepProgress | None = None) -> Path:
-    """Make a sequence and write it below a folder, unless it is there already; returns its own folder.
+    """Make a sequence and write it below a folder, unless it exists already; returns the sequence's folder.
 
     Raises:
-        InputError: no background, or one that cannot be read; a followed scene without poses.
+        InputError: there is no background, or one cannot be read; the followed scene has no poses.
         OutputError: see `write_dataset`.
     """
     if not job.photos:
-        raise InputError("no background photos are here; give a folder of photos with --backgrounds")
+        raise InputError("there are no background photos; give a folder of photos with --backgrounds")
     if job.follow is not None and not job.follow.poses:
         raise InputError(f"{job.follow.folder}: no frame has a pose to follow; give another --trajectory")
     target = folder / job.name
@@ -128,7 +128,7 @@ def make_sequence(job: Job, folder: Path, progress: StepProgress | None = None) 
 
 
 def read_record(dataset: Path) -> dict[str, Any]:
-    """What sequence.json says of a data set made here; empty when it says nothing."""
+    """Contents of sequence.json of a dataset made here; empty if there is none."""
     try:
         content = json.loads((dataset / RECORD_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -163,7 +163,7 @@ def _has_record(dataset: Path, record: dict[str, Any]) -> bool:
 
 @cache
 def _code_hash() -> str:
-    """Hash of the code that makes sequences, so that a changed arview does not take old ones."""
+    """Hash of the code that makes sequences, so that sequences made by other code are not reused."""
     package = Path(__file__).parent
     files = [*sorted(package.glob("*.py")), package.parent.parent / "rendering" / "rasterizer.py"]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

@@ -1,4 +1,4 @@
-"""Pictures that do not show a part: what a detector must stay silent on."""
+"""Pictures that do not show a part, in which a detector must find nothing."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.evaluation.semisynthetic.sequence import generator
 from arview.video import Image
 
-_SMALLEST_CROP = 0.45
+_MIN_CROP = 0.45
+"""Smallest crop, as a share of the largest that fits."""
 
 
 def frames_without_part(
     photos: Sequence[Path], scenes: Sequence[Scene], width: int, height: int, count: int, seed: int = 0
 ) -> Iterator[tuple[str, Image]]:
-    """Pictures (height,width,3) of other things, each with a word on where it is from.
+    """Pictures (height,width,3) of other things, each with its origin as text.
 
-    A third are whole photos, a third frames of other parts' scenes, the rest random crops of photos, mirrored
-    every other time; crops stand in where photos or scenes run out. No whole picture comes twice.
+    A third are whole photos, a third frames of other parts' scenes, and the rest random crops of photos, half of them
+    mirrored; where there are too few photos or scenes, crops replace them. No whole picture is used twice.
 
     Args:
         photos: none of which shows the part.
         scenes: none of which shows the part.
         width, height: of the pictures, px.
         count: how many.
-        seed: of order and crops.
+        seed: of the order and the crops.
     """
     rng = generator(seed, "without")
     whole = [photos[k] for k in rng.permutation(len(photos))]
@@ -46,7 +47,7 @@ def frames_without_part(
 
 
 def _fitted(image: Image, width: int, height: int) -> Image:
-    """The middle of a picture, as much as has the wanted aspect, at the wanted size."""
+    """The largest central crop of a picture with the wanted aspect ratio, at the wanted size."""
     rows, columns = image.shape[:2]
     scale = min(columns / width, rows / height)
     w, h = min(columns, round(scale * width)), min(rows, round(scale * height))
@@ -56,7 +57,7 @@ def _fitted(image: Image, width: int, height: int) -> Image:
 
 def _random_crop(image: Image, width: int, height: int, rng: np.random.Generator) -> Image:
     rows, columns = image.shape[:2]
-    scale = min(columns / width, rows / height) * rng.uniform(_SMALLEST_CROP, 1.0)
+    scale = min(columns / width, rows / height) * rng.uniform(_MIN_CROP, 1.0)
     w, h = int(scale * width), int(scale * height)
     top, left = int(rng.integers(rows - h + 1)), int(rng.integers(columns - w + 1))
     crop = image[top : top + h, left : left + w]

@@ -1,4 +1,4 @@
-"""Random solids of every kind, to fit on what holds for parts in general and for no part in particular."""
+"""Random solids of many kinds, for training networks that are not specific to any part."""
 
 from __future__ import annotations
 
@@ -25,19 +25,18 @@ Rng = np.random.Generator
 Color = tuple[float, float, float]
 Spot = tuple[float, float]
 HALF_SIZE_MM = (36.0, 85.0)
-"""About half the size of the solids."""
+"""Range of about half the size of the solids."""
 ONE_COLOUR = 0.5
-"""So many of them are of one colour."""
+"""Share of the solids that have one colour."""
 
 
 def random_solid(seed: int) -> Model:
-    """A random solid: a plate with things on it, a smooth body, a stepped prism, a turned part, a frame, or a part of
-    many small features.
+    """A random solid: a plate with features, a smooth body, a stepped prism, a turned part, a frame, or many features.
 
     The same seed gives the same solid.
 
     Raises:
-        ValueError: this seed's outlines cross each other; take another.
+        ValueError: outlines of this seed cross each other; use another.
     """
     rng = np.random.default_rng(seed)
     size = rng.uniform(*HALF_SIZE_MM)
@@ -47,13 +46,13 @@ def random_solid(seed: int) -> Model:
     return _model(f"random_{seed}", meshes, lambda: whole if is_one else _colour(rng))
 
 
-def random_twin(seed: int) -> Model:
-    """A random solid that some turns take onto itself but for a feature or two: a disc or a plate with things on it.
+def random_near_symmetric(seed: int) -> Model:
+    """A random solid that is symmetric under some rotations but for one or two features: a disc or a plate.
 
     The same seed gives the same solid.
 
     Raises:
-        ValueError: this seed's outlines cross each other; take another.
+        ValueError: outlines of this seed cross each other; use another.
     """
     rng = np.random.default_rng([seed, 1])
     size = rng.uniform(*HALF_SIZE_MM)
@@ -63,7 +62,7 @@ def random_twin(seed: int) -> Model:
 
 
 def _model(name: str, meshes: list[Mesh], colour: Callable[[], Color]) -> Model:
-    """Of bodies, each of the next colour."""
+    """A model of bodies, coloured in turn."""
     parts = [
         Component(f"body_{k}", vertices, faces.astype(np.int32), colour()) for k, (vertices, faces) in enumerate(meshes)
     ]
@@ -117,7 +116,7 @@ def _turned(size: float, rng: Rng) -> list[Mesh]:
         new = tube((0, 0), radius, inner, top, top + height) if is_tube else cylinder((0, 0), radius, top, top + height)
         meshes.append(new)
         top += height
-    # Things at one side: a body of revolution has no orientation.
+    # Features on one side, because a body of revolution has no orientation.
     return meshes + _things(1, 4, 0.5 * size, 0.5 * size, top * rng.uniform(0.2, 0.9), size, rng)
 
 
@@ -136,7 +135,7 @@ def _frame(size: float, rng: Rng) -> list[Mesh]:
 
 
 def _finned(size: float, rng: Rng) -> list[Mesh]:
-    """A slab with groups of small holes, thin ribs and pins: from afar, or from below, nearly plain."""
+    """A slab with groups of small holes, thin ribs and pins; from afar or from below it is nearly plain."""
     a, b, thick = size, size * rng.uniform(0.4, 1.0), size * rng.uniform(0.05, 0.35)
     holes: list[Loop] = []
     for x, y in [spot for _ in range(rng.integers(0, 4)) for spot in _spots(0.9 * a, 0.9 * b, size, rng)]:
@@ -175,7 +174,7 @@ def _studded(size: float, rng: Rng) -> list[Mesh]:
 
 
 def _even_disc(size: float, rng: Rng) -> list[Mesh]:
-    """A disc with holes and things in even rings and a hub, and what breaks its symmetry."""
+    """A disc with a hub and evenly spaced holes and features, and something that breaks its symmetry."""
     count = int(rng.choice((0, 2, 3, 4, 5, 6, 6, 8)))
     thick, angles = size * rng.uniform(0.06, 0.35), 2.0 * np.pi * (np.arange(count) + 0.5) / max(1, count)
     rim = circle((0, 0), size, 4 * int(rng.integers(1, 4)) if rng.random() < 0.2 else 180)
@@ -211,7 +210,7 @@ def _even_disc(size: float, rng: Rng) -> list[Mesh]:
 
 
 def _even_plate(size: float, rng: Rng) -> list[Mesh]:
-    """A plate that half a turn takes onto itself, with pairs of things and holes, and what breaks its symmetry."""
+    """A plate with pairs of features and holes, symmetric under half a turn but for something that breaks it."""
     a, b, thick = size, size * rng.uniform(0.3, 1.0), size * rng.uniform(0.06, 0.4)
     outline = rectangle((-a, -b), (a, b))
     breaks = rng.permutation(4)[: rng.integers(1, 3)]
@@ -239,7 +238,7 @@ def _even_plate(size: float, rng: Rng) -> list[Mesh]:
 def _uneven(
     spots: list[Spot], wide: float, is_one_missing: bool, is_one_other: bool, factors: tuple[float, float], rng: Rng
 ) -> list[tuple[Spot, float]]:
-    """Places and radii, all the same but that the first is missing, or else wider or narrower by one of two factors."""
+    """Centres and equal radii, of which the first may be missing, or wider or narrower by one of two factors."""
     if is_one_missing:
         return [(spot, wide) for spot in spots[1:]]
     first = wide * rng.choice(factors) if is_one_other and spots else wide
@@ -247,7 +246,7 @@ def _uneven(
 
 
 def _small_thing(place: float, low: float, size: float, rng: Rng) -> list[Mesh]:
-    """A small box or post on a plane at a distance from its middle."""
+    """A small box or post on a plane, at a distance from its centre."""
     wide, top = size * rng.uniform(0.04, 0.12), low + size * rng.uniform(0.03, 0.25)
     if rng.random() < 0.5:
         return [cylinder((place, 0.0), wide, low, top, 20)]
@@ -275,7 +274,7 @@ def _studs(reach_x: float, reach_y: float, low: float, size: float, rng: Rng) ->
 
 
 def _spots(reach_x: float, reach_y: float, size: float, rng: Rng) -> list[Spot]:
-    """Places in rows and columns, of which some lack."""
+    """Positions in rows and columns, of which some are left out."""
     pitch, columns, rows = size * rng.uniform(0.09, 0.2), rng.integers(1, 10), rng.integers(1, 5)
     x0, y0 = rng.uniform(-reach_x, reach_x), rng.uniform(-reach_y, reach_y)
     if rng.random() < 0.3:
@@ -288,10 +287,12 @@ def _spots(reach_x: float, reach_y: float, size: float, rng: Rng) -> list[Spot]:
     return spots
 
 
-def _things(fewest: int, below: int, reach_x: float, reach_y: float, low: float, size: float, rng: Rng) -> list[Mesh]:
-    """Boxes, posts, tubes, nuts, walls and odd prisms on a plane."""
+def _things(
+    low_count: int, end_count: int, reach_x: float, reach_y: float, low: float, size: float, rng: Rng
+) -> list[Mesh]:
+    """Boxes, posts, tubes, nuts, walls and irregular prisms on a plane."""
     made = []
-    for _ in range(rng.integers(fewest, below)):
+    for _ in range(rng.integers(low_count, end_count)):
         x, y = rng.uniform(-reach_x, reach_x), rng.uniform(-reach_y, reach_y)
         top, wide = low + size * rng.uniform(0.1, 0.7), size * rng.uniform(0.06, 0.22)
         deep, inner = wide * rng.uniform(0.3, 1.0), wide * rng.uniform(0.4, 0.8)
@@ -308,7 +309,7 @@ def _things(fewest: int, below: int, reach_x: float, reach_y: float, low: float,
 
 
 def _polygon(radius_x: float, radius_y: float, rng: Rng) -> Loop:
-    """A convex polygon of 4 to 8 corners on an ellipse that holds the middle."""
+    """A convex polygon of 4 to 8 corners on an ellipse, around its centre."""
     while True:
         angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, rng.integers(4, 9)))
         if np.max(np.diff(np.append(angles, angles[0] + 2.0 * np.pi))) < 2.4:
@@ -321,13 +322,13 @@ def _upside_down(meshes: list[Mesh]) -> list[Mesh]:
 
 
 def _turned_about(mesh: Mesh, rng: Rng) -> Mesh:
-    """The mesh turned by quarters about one of the axes."""
+    """The mesh rotated by quarter turns about one of the axes."""
     axis: Array = np.eye(3)[rng.integers(3)]
     return moved(mesh, rigid(exp_so3(0.5 * np.pi * rng.integers(4) * axis), np.zeros(3)))
 
 
 def _colour(rng: Rng) -> Color:
-    """Mostly greys, some soft and a few strong colours."""
+    """Mostly greys, some muted and a few strong colours."""
     kind = rng.random()
     if kind < 0.8:
         grey, tint = (rng.uniform(0.1, 0.75), 0.02) if kind < 0.5 else (rng.uniform(0.2, 0.7), 0.12)

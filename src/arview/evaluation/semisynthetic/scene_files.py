@@ -1,4 +1,4 @@
-"""A semi-synthetic sequence on disk: a BOP data set of one scene, written whole or not at all."""
+"""A semi-synthetic sequence on disk: a BOP dataset of one scene, written completely or not at all."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ def write_dataset(
     different_shares: list[float] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> None:
-    """Write models, pictures, masks and truth; an older data set of this kind at the same place is replaced.
+    """Write models, pictures, masks and true poses; an older dataset of this kind in the same folder is replaced.
 
     Args:
-        folder: of the data set, see `arview.evaluation.bop`.
-        model: the nominal CAD that is to be found in the pictures.
+        folder: of the dataset, see `arview.evaluation.bop`.
+        model: the nominal CAD, which is to be found in the pictures.
         camera: ideal.
         frames: in order.
         record: how it was made, for sequence.json.
         symmetries: (S,4,4) ``model_from_model`` that change nothing.
-        different_shares: of each frame, see `look_alikes.different_share`; None unless it is a look-alike's.
+        different_shares: of each frame, see `look_alikes.different_share`; None unless a look-alike is shown.
         progress: called with the number of frames done.
 
     Raises:
-        OutputError: the folder cannot be written to, or holds something else.
+        OutputError: the folder cannot be written to, or contains something else.
     """
     if folder.exists() and not (folder / RECORD_FILE).is_file():
-        raise OutputError(f"{folder}: exists and is no sequence made by arview; give another -o")
+        raise OutputError(f"{folder}: exists and is not a sequence made by arview; give another -o")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as temporary:
@@ -103,7 +103,7 @@ def _write_frames(
 
 
 def _write_models(folder: Path, model: Model, symmetries: tuple[Array, ...]) -> None:
-    """The CAD as named components (glTF, metres), and what BOP says of models."""
+    """The CAD as named components (glTF, metres), and BOP's information about models."""
     folder.mkdir(parents=True)
     (folder / "assembly.glb").write_bytes(model_as_glb(model))
     low, high = model.bounds_in_model
@@ -116,7 +116,7 @@ def _write_models(folder: Path, model: Model, symmetries: tuple[Array, ...]) -> 
 
 
 def model_as_glb(model: Model) -> bytes:
-    """A binary glTF file of a model's components, metres."""
+    """Binary glTF file of a model's components, in metres."""
     import trimesh
 
     scene = trimesh.Scene()

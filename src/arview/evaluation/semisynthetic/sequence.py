@@ -1,7 +1,7 @@
-"""A semi-synthetic sequence frame by frame: a rendered part on a real photo, with exact truth.
+"""A semi-synthetic sequence frame by frame: a rendered part in front of a real photo, with exact true poses.
 
-In the manner of the RBOT data set (Tjaden et al., "A Region-based Gauss-Newton Approach to Real-Time Monocular
-Multiple Object Tracking", TPAMI 2018): 640×512 px, f = 650 px, four variants on one trajectory.
+Modelled on the RBOT dataset (Tjaden et al., "A Region-based Gauss-Newton Approach to Real-Time Monocular
+Multiple Object Tracking", TPAMI 2018): 640×512 px, f = 650 px, four variants of one trajectory.
 """
 
 from __future__ import annotations
@@ -29,31 +29,31 @@ CAMERA = Camera(640, 512, 650.0, 650.0, 319.5, 255.5)
 
 KEY_LIGHT = np.array([-0.45, -0.72, -0.53])
 FILL_LIGHT = np.array([0.75, -0.10, -0.65])
-"""Directions towards the lights in the camera frame."""
+"""Directions towards the lights, in the camera frame."""
 LIGHT_PERIODS = np.array([70.0, 45.0, 31.0])
-"""Frames in which the moving light goes round, tilts, and waxes and wanes."""
+"""Periods, in frames, in which the moving light rotates, tilts, and varies in strength."""
 ORBIT_FRAMES = 60.0
-"""Frames in which the part in front goes round."""
+"""Frames in which the occluder circles the part once."""
 OCCLUDER_SHARE = 0.6
-"""Size of the part in front, as a share of the part's."""
+"""Size of the occluder, as a share of the part's."""
 JOIN_BLUR_PX = 0.6
-"""Deviation of the blur that the part's edges get: a lens's."""
+"""Standard deviation of the blur at the part's edges, like that of a lens."""
 EXPOSURES = 5
-"""Moments that motion blur is the mean of."""
+"""Moments over which motion blur is averaged."""
 
 
 @dataclass(frozen=True)
 class SequenceOptions:
-    """What a sequence is made of.
+    """Parameters of a sequence.
 
     Attributes:
-        variant: ``regular`` fixed light; ``light`` a moving light; ``noise`` the same with noise and blur;
-            ``occlusion`` the moving light with another part in front.
-        frames: how many.
-        seed: of everything random; the trajectory depends on the seed and the part's name alone.
-        sensor_noise: deviation in grey levels, all variants; ``noise`` adds its own.
-        noise, blur_px: deviations of the variant ``noise``, grey levels and px.
-        shutter: share of the time between frames that the shutter is open; 0: no motion blur.
+        variant: ``regular``: fixed light; ``light``: moving light; ``noise``: moving light, noise and blur;
+            ``occlusion``: moving light and an occluder.
+        frames: number of frames.
+        seed: of all random numbers; the trajectory depends only on the seed and the part's name.
+        sensor_noise: standard deviation in grey levels in all variants; ``noise`` adds its own.
+        noise, blur_px: standard deviations of the variant ``noise``, in grey levels and px.
+        shutter: share of the time between frames in which the shutter is open; 0: no motion blur.
         motion: of the part.
     """
 
@@ -69,14 +69,14 @@ class SequenceOptions:
 
 @dataclass(frozen=True)
 class SequenceFrame:
-    """A picture with its truth.
+    """A picture with its true pose and mask.
 
     Attributes:
         image: (H,W,3) uint8 RGB.
         cam_from_model: (4,4).
-        pixels: what the part covers, inside the picture or not, px.
-        pixels_in_picture: the same inside the picture.
-        mask: (H,W) float32, share of each pixel that is the part's and not hidden.
+        pixels: area that the part covers, also outside the picture, px.
+        pixels_in_picture: area inside the picture, px.
+        mask: (H,W) float32, share of each pixel that shows the part.
     """
 
     image: Image
@@ -87,17 +87,17 @@ class SequenceFrame:
 
     @property
     def visible(self) -> float:
-        """Share of the part that can be seen: neither hidden nor outside the picture."""
+        """Share of the part that is visible: neither occluded nor outside the picture."""
         return float(self.mask.sum()) / self.pixels if self.pixels > 0 else 0.0
 
 
 def generator(seed: int, *words: str) -> np.random.Generator:
-    """Random numbers of a seed for one purpose."""
+    """Random number generator of a seed, for one purpose."""
     return np.random.default_rng([seed, *(zlib.crc32(word.encode()) for word in words)])
 
 
 def trajectory(model: Model, options: SequenceOptions, camera: Camera = CAMERA, name: str = "") -> Array:
-    """``cam_from_model`` (frames,4,4) of a part in a sequence: the same in every variant, another for each name."""
+    """``cam_from_model`` (frames,4,4) of a part in a sequence: the same in all variants, different for each name."""
     rng = generator(options.seed, model.name, "trajectory", name)
     return random_trajectory(camera, model.center_in_model, model.diameter_mm, options.frames, rng, options.motion)
 
@@ -114,13 +114,13 @@ def render_sequence(
     """The frames of a sequence.
 
     Args:
-        model: what is drawn.
-        poses: (N,4,4) ``cam_from_model``, for instance of `trajectory`.
+        model: rendered.
+        poses: (N,4,4) ``cam_from_model``, for instance from `trajectory`.
         photo: (H,W,3) background.
-        options: variant, seed, noise; ``frames`` is not looked at.
+        options: variant, seed, noise; ``frames`` is not used.
         camera: ideal, of the pictures.
-        occluder: part in front, of the variant ``occlusion``.
-        name: of the sequence, for its random numbers; None takes the model's.
+        occluder: of the variant ``occlusion``.
+        name: of the sequence, for its random numbers; None: the model's.
     """
     rng = generator(options.seed, name or model.name, options.variant)
     crops = moving_crops(photo, camera.width, camera.height, len(poses), rng)
@@ -149,12 +149,12 @@ def render_sequence(
 
 @dataclass(frozen=True)
 class _Drawn:
-    """A part in the picture's frame.
+    """A rendered part in the picture.
 
     Attributes:
-        blurred_color, blurred_coverage: (H,W,3) colour times coverage and (H,W) coverage, as the lens blurs them.
-        coverage: (H,W) as it is.
-        pixels: its sum over the whole part, also outside the picture.
+        blurred_color, blurred_coverage: (H,W,3) colour times coverage and (H,W) coverage, blurred by the lens.
+        coverage: (H,W) without blur.
+        pixels: sum of the coverage of the whole part, also outside the picture.
     """
 
     blurred_color: NDArray[np.float32]
@@ -164,7 +164,7 @@ class _Drawn:
 
 
 def _drawn(part: ShadedModel, poses: list[Array], camera: Camera, light: Light) -> _Drawn:
-    """The mean of a part at the poses of one exposure."""
+    """Mean of the renderings of a part at the poses of one exposure."""
     shape = (camera.height, camera.width)
     both = np.zeros((*shape, 4), np.float32)
     coverage = np.zeros(shape, np.float32)
@@ -183,7 +183,7 @@ def _drawn(part: ShadedModel, poses: list[Array], camera: Camera, light: Light) 
 
 
 def paste(window: NDArray[np.float32], layer: Layer, picture: NDArray[np.float32]) -> None:
-    """Add a layer's window to the picture, as far as it lies inside."""
+    """Add the part of a layer's window that lies inside the picture."""
     height, width = picture.shape[:2]
     left, top = max(layer.left, 0), max(layer.top, 0)
     right, bottom = min(layer.left + window.shape[1], width), min(layer.top + window.shape[0], height)
@@ -193,7 +193,7 @@ def paste(window: NDArray[np.float32], layer: Layer, picture: NDArray[np.float32
 
 
 def _exposure(poses: Array, number: int, shutter: float) -> list[Array]:
-    """Poses (4,4) spread over the time that the shutter is open around a frame."""
+    """Poses (4,4) evenly spread over the exposure of a frame."""
     if shutter <= 0.0 or len(poses) < 2:
         return [poses[number]]
     before, after = poses[max(number - 1, 0)], poses[min(number + 1, len(poses) - 1)]
@@ -203,7 +203,7 @@ def _exposure(poses: Array, number: int, shutter: float) -> list[Array]:
 
 
 def _lights(variant: Variant, count: int, around: NDArray[np.float32], rng: np.random.Generator) -> Iterator[Light]:
-    """The light of each frame: fixed, or a key light that circles and waxes and wanes."""
+    """Light of each frame: fixed, or a key light that circles and varies in strength."""
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     key = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
     fill = FILL_LIGHT / np.linalg.norm(FILL_LIGHT)
@@ -217,13 +217,13 @@ def _lights(variant: Variant, count: int, around: NDArray[np.float32], rng: np.r
 
 
 def scaled(model: Model, factor: float) -> Model:
-    """The model grown or shrunk about its origin."""
+    """The model scaled about its origin."""
     components = [replace(c, vertices_in_model=factor * c.vertices_in_model) for c in model.components]
     return make_model(model.name, tuple(components))
 
 
 def occluder_poses(model: Model, poses: Array, occluder: Model, rng: np.random.Generator) -> Array:
-    """``cam_from_occluder`` (N,4,4): a second part that circles round the line of sight, in front of the first."""
+    """``cam_from_occluder`` (N,4,4) of a second part that circles the line of sight in front of the first."""
     count = len(poses)
     phase = rng.uniform(0.0, 2.0 * np.pi)
     spin = smooth_noise(count, 3, 20.0, rng)
@@ -233,7 +233,7 @@ def occluder_poses(model: Model, poses: Array, occluder: Model, rng: np.random.G
     for number, pose in enumerate(poses):
         center = apply(pose, model.center_in_model)
         distance = float(np.linalg.norm(center))
-        # Nearer by both radii, so that they never touch.
+        # Nearer by both radii, so that the parts never touch.
         near = max(distance - reach, 0.4 * distance)
         angle = 2.0 * np.pi * number / ORBIT_FRAMES + phase
         radius = (0.75 + 0.2 * np.tanh(swing[number])) * 0.5 * model.diameter_mm * near / distance

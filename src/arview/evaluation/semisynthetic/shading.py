@@ -1,7 +1,7 @@
-"""A textureless part lit like metal or paint: per-pixel normals, two lights, reflections of the surroundings.
+"""Rendering of a textureless part like metal or paint: per-pixel normals, two lights, reflections.
 
-Everything is drawn on a grid three times as fine as the picture and averaged, so that edges are right to a fraction
-of a pixel. Colours are linear in the picture's grey levels, as in RBOT: no tone curve is applied.
+The part is rendered at three times the picture's resolution and averaged, so that edges are exact to a fraction of a
+pixel. Colours are linear in the picture's grey levels, as in RBOT: no tone curve is applied.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from arview.geometry import Array, apply
 from arview.rendering.rasterizer import rasterise
 
 SUPERSAMPLING = 3
+"""Rendered samples per pixel in each direction."""
 SMOOTH_BELOW_DEG = 40.0
-"""Faces that meet at less than this are shaded as one round surface."""
-
-MOST_SATURATION = 0.35
+"""Faces that meet at a smaller angle are shaded as one smooth surface."""
+MAX_SATURATION = 0.35
 BRIGHTNESS = (0.3, 0.65)
-"""Colours of CAD are made to look like a real part's: at most so saturated, and so dark or bright."""
+"""Largest saturation, and range of brightness, to which CAD colours are limited, as those of real parts."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """What lights the part.
+    """Lights of the scene.
 
     Attributes:
-        toward_in_cam: (L,3) unit vectors to the lights.
-        strength: (L,) of each.
-        ambient: from all sides, most from above.
-        surroundings: (H,W,3) float32 in 0–1, latitude by longitude: what shiny surfaces mirror.
+        toward_in_cam: (L,3) unit vectors towards the lights.
+        strength: (L,) of each light.
+        ambient: light from all sides, strongest from above.
+        surroundings: (H,W,3) float32 in 0–1, environment map by latitude and longitude, for reflections.
     """
 
     toward_in_cam: Array
@@ -45,8 +45,8 @@ class Light:
 
 
 @dataclass(frozen=True)
-class Surface:
-    """How a part's surface answers to light: shares of diffuse light, highlights and mirroring, and gloss."""
+class Reflectance:
+    """Reflectance of a part: weights of diffuse light, highlights (Phong) and mirrored surroundings, and gloss."""
 
     diffuse: float = 0.75
     specular: float = 0.35
@@ -56,10 +56,10 @@ class Surface:
 
 @dataclass(frozen=True)
 class Layer:
-    """A part drawn alone.
+    """A part rendered alone.
 
     Attributes:
-        left, top: of the window in the picture, px; it may reach outside.
+        left, top: of the window in the picture, px; it may extend beyond the picture.
         color: (h,w,3) float32 in 0–1, multiplied by coverage.
         coverage: (h,w) float32, share of each pixel that the part covers.
     """
@@ -71,25 +71,25 @@ class Layer:
 
 
 class ShadedModel:
-    """A model made ready for drawing: normals at the corners of its faces, colours."""
+    """A model prepared for rendering: normals at the corners of its faces, and colours."""
 
-    def __init__(self, model: Model, surface: Surface | None = None) -> None:
+    def __init__(self, model: Model, reflectance: Reflectance | None = None) -> None:
         self.model = model
-        self.surface = surface or Surface()
+        self.reflectance = reflectance or Reflectance()
         self._vertices, self._faces, owners = model.mesh
         self._normals = corner_normals(self._vertices, self._faces, SMOOTH_BELOW_DEG)
         self._colors = muted(np.array([component.color for component in model.components]))[owners]
 
     def draw(self, cam_from_model: Array, camera: Camera, light: Light) -> Layer | None:
-        """The part at a pose (4,4), whole also where it lies outside the picture; None when it cannot be seen.
+        """Render the part at a pose (4,4), also beyond the picture's borders; None if it cannot be seen.
 
-        The camera is an ideal one.
+        The camera must be free of distortion.
         """
         points = apply(cam_from_model, self._vertices)
         if points[:, 2].min() < 1.0:
             return None
         pixels = camera.project(points)
-        # Two pixels around it for the blur; never more than the picture's size beyond its borders.
+        # Two pixels of margin for the blur; at most the picture's size beyond its borders.
         size = np.array([camera.width, camera.height])
         left, top = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 2, -size).tolist()
         right, bottom = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 3, 2 * size).tolist()
@@ -101,7 +101,7 @@ class ShadedModel:
             points, self._faces, fine.fx, fine.fy, fine.cx, fine.cy, n * (right - left), n * (bottom - top),
             origin=(n * left, n * top),
         )  # fmt: skip
-        s = self.surface
+        s = self.reflectance
         color = _shade(
             inverse_depth, face_ids, points, self._faces, self._normals @ cam_from_model[:3, :3].T, self._colors,
             np.array([fine.fx, fine.fy, fine.cx - n * left, fine.cy - n * top]),
@@ -120,17 +120,17 @@ class ShadedModel:
 
 
 def muted(colors: Array) -> Array:
-    """Colours (N,3) in 0–1 as metal or paint has them: neither vivid nor very dark or bright; hues stay."""
+    """Colours (N,3) in 0–1 limited in saturation and brightness, as of metal or paint; hues are kept."""
     colors = np.maximum(colors, 1e-3)
     value = colors.max(axis=1, keepdims=True)
     saturation = 1.0 - colors.min(axis=1, keepdims=True) / value
-    kept = np.minimum(1.0, MOST_SATURATION / np.maximum(saturation, 1e-6))
+    kept = np.minimum(1.0, MAX_SATURATION / np.maximum(saturation, 1e-6))
     pale = value - kept * (value - colors)
     return np.asarray(pale * np.clip(value, *BRIGHTNESS) / value)
 
 
 def corner_normals(vertices: Array, faces: NDArray[np.int32], smooth_below_deg: float) -> Array:
-    """(F,3,3) unit normals at the faces' corners: the mean of the faces around that meet at less than an angle."""
+    """(F,3,3) unit normals at the faces' corners: means over the adjacent faces that meet at less than an angle."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     doubled = np.cross(b - a, c - a)
     normals = doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-12)
@@ -181,7 +181,7 @@ def _shade(  # type: ignore[no-untyped-def]
             z = 1.0 / inverse_depth[r, col]
             x, y = (col - cx) / fx * z, (r - cy) / fy * z
             i, j, k = faces[face, 0], faces[face, 1], faces[face, 2]
-            # Weights of the corners: areas of the three triangles that the point makes, along the face's normal.
+            # Barycentric weights of the corners.
             e1x, e1y, e1z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
             e2x, e2y, e2z = points[k, 0] - points[i, 0], points[k, 1] - points[i, 1], points[k, 2] - points[i, 2]
             px, py, pz = x - points[i, 0], y - points[i, 1], z - points[i, 2]
@@ -205,7 +205,7 @@ def _shade(  # type: ignore[no-untyped-def]
                 length, facing = -length, -facing
             nx, ny, nz = nx / length, ny / length, nz / length
             rx, ry, rz = 2.0 * facing * nx - vx, 2.0 * facing * ny - vy, 2.0 * facing * nz - vz
-            # The camera's +Y is down: what looks up gets more of the light from all sides.
+            # The camera's +Y is down: surfaces that face up get more ambient light.
             matt = ambient * (0.75 - 0.25 * ny)
             shine = 0.0
             for s in range(toward.shape[0]):
@@ -215,7 +215,7 @@ def _shade(  # type: ignore[no-untyped-def]
                     along = rx * toward[s, 0] + ry * toward[s, 1] + rz * toward[s, 2]
                     if along > 0.0:
                         shine += specular * strength[s] * along**gloss
-            # Mirrored surroundings, more at grazing angles (Schlick's approximation).
+            # Reflected surroundings, stronger at grazing angles (Schlick's approximation).
             share = mirror * (0.4 + 0.6 * (1.0 - facing) ** 3)
             column = (np.arctan2(rx, rz) / (2.0 * np.pi) + 0.5) * map_width
             row = min(max((np.arcsin(min(max(ry, -1.0), 1.0)) / np.pi + 0.5) * map_height, 0.0), map_height - 1.001)
@@ -227,21 +227,21 @@ def _shade(  # type: ignore[no-untyped-def]
                 lower = (1.0 - fc) * surroundings[r1, c0, c] + fc * surroundings[r1, c1, c]
                 mirrored = (1.0 - fr) * upper + fr * lower
                 value = colors[face, c] * matt + share * mirrored + shine
-                # Bright tones bend towards white as a camera's do.
+                # Highlights roll off towards white, as in a camera.
                 out[r, col, c] = value if value < 0.8 else 1.0 - 0.2 * np.exp(-(value - 0.8) / 0.2)
     return out
 
 
 def _openness(inverse_depth: Array, seen: NDArray[np.float32], fine: Camera, diameter_mm: float) -> NDArray[np.float32]:
-    """(H,W) in 0.45–1: less light where the surface lies behind its surroundings in the picture.
+    """Ambient occlusion (H,W) in 0.45–1: less light where the surface lies behind its surroundings in the picture.
 
-    Unsharp masking of the depth buffer (Luft et al. 2006), which darkens inner corners and what stands behind.
+    Unsharp masking of the depth buffer (Luft et al. 2006), which darkens inner corners and recessed surfaces.
     """
     if not seen.any():
         return seen
     depth = np.where(seen > 0, 1.0 / np.maximum(inverse_depth, 1e-9), 0.0).astype(np.float32)
     sigma = max(2.0, 0.03 * diameter_mm * fine.fx * float(inverse_depth.max()))
-    # Smoothed on a coarser grid: the window is wide.
+    # Smoothed on a coarser grid, because the window is wide.
     shrink = max(1, int(sigma / 4.0))
     small = (max(1, depth.shape[1] // shrink), max(1, depth.shape[0] // shrink))
     parts = [cv2.resize(x, small, interpolation=cv2.INTER_AREA) for x in (depth, seen)]

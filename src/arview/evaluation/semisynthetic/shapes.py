@@ -1,4 +1,4 @@
-"""The test shapes: CAD made in code, each hard in its own way, 100–250 mm across."""
+"""The test shapes: CAD made in code, each difficult in its own way, 100–250 mm across."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ SAND: Color = (0.60, 0.54, 0.47)
 
 
 def shape(name: str) -> Model:
-    """The test shape of that name.
+    """The test shape of a name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such shape.
     """
     if name not in _MAKERS:
         raise InputError(f"shape {name!r} is not known; give one of {', '.join(SHAPES)}")
@@ -47,7 +47,7 @@ def shape(name: str) -> Model:
 
 
 def near_symmetries(name: str) -> tuple[Symmetry, ...]:
-    """Rotations that all but a small feature of a shape keeps: without the feature in view a pose cannot be told."""
+    """Rotations under which a shape is symmetric but for a small feature; without it in view the pose is ambiguous."""
     return NEAR_SYMMETRIES.get(name, ())
 
 
@@ -104,17 +104,17 @@ def bracket() -> Model:
     top = np.array([(second + length, 20), (second + length + 40, 20), (second + length + 62, 56)], dtype=float)
     top = np.concatenate([top, [(second + length + 62, 90), (second + length, 90)]])
     middle = first + length
-    strips = [
+    flats = [
         (foot, (circle((20, 22), 7.0), slot((50, 60), 34.0, 12.0), circle((58, 20), 5.0))),
         (web, (circle((middle + 32, 48), 16.0), circle((middle + 14, 78), 4.0))),
         (top, (circle((second + length + 30, 70), 6.0), circle((second + length + 26, 36), 4.0))),
     ]
-    mesh = sheet(strips, [(first, 90.0, radius), (second, -90.0, radius)], thick)
+    mesh = sheet(flats, [(first, 90.0, radius), (second, -90.0, radius)], thick)
     return _model("bracket", (("sheet", mesh, STEEL),))
 
 
 def flange() -> Model:
-    """Near-symmetric: a hub on a disc with 6 bolt holes, ⌀170 × 58 mm; a notch in the rim tells the sixths apart."""
+    """Near-symmetric: a hub on a disc with 6 bolt holes, ⌀170 × 58 mm; a notch in the rim breaks the symmetry."""
     angle = np.deg2rad(np.arange(360) - 90.0)
     rim = 85.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     # The notch: 12 mm wide and 9 mm deep at the disc's +X, between two bolt holes.

@@ -1,4 +1,4 @@
-"""Closed triangle meshes of plain solids: what the test shapes are put together from.
+"""Closed triangle meshes of simple solids, from which the test shapes are built.
 
 A `Mesh` is vertices (V,3) float64 in mm and faces (F,3) int64, counter-clockwise seen from outside.
 """
@@ -15,7 +15,8 @@ Mesh = tuple[Array, NDArray[np.int64]]
 Loop = Array
 """(N,2) corners of a closed polygon in mm, counter-clockwise."""
 
-_LARGEST_REFINEMENT = 7
+_MAX_HALVINGS = 7
+"""Times that a polygon's sides are halved at most."""
 
 
 def box(low: ArrayLike, high: ArrayLike) -> Mesh:
@@ -55,14 +56,17 @@ def slot(center: tuple[float, float], length: float, width: float, sides: int = 
 def triangulate(outline: Loop, holes: tuple[Loop, ...] = ()) -> tuple[Array, NDArray[np.int64]]:
     """Points (P,2) and triangles (T,3), counter-clockwise, of a polygon with holes.
 
-    Delaunay's triangulation holds every side of a polygon whose sides are short enough: they are halved until the
-    triangles inside cover just the polygon's area.
+    The Delaunay triangulation contains all sides of a polygon if they are short enough, so they are halved until the
+    triangles inside cover exactly the polygon's area.
+
+    Raises:
+        ValueError: the polygon crosses itself, or a hole crosses its outline.
     """
     from scipy.spatial import Delaunay
 
     loops = [np.asarray(loop, dtype=np.float64) for loop in (outline, *holes)]
     wanted = _area(loops[0]) - sum(_area(loop) for loop in loops[1:])
-    for _ in range(_LARGEST_REFINEMENT):
+    for _ in range(_MAX_HALVINGS):
         points = np.concatenate(loops)
         triangles = Delaunay(points).simplices.astype(np.int64)
         a, b, c = points[triangles].transpose(1, 0, 2)
@@ -95,29 +99,29 @@ def prism(outline: Loop, holes: tuple[Loop, ...], low: float, high: float) -> Me
     return thickened(*triangulate(outline, holes), low, high)
 
 
-def sheet(strips: list[tuple[Loop, tuple[Loop, ...]]], bends: list[tuple[float, float, float]], thick: float) -> Mesh:
+def sheet(flats: list[tuple[Loop, tuple[Loop, ...]]], bends: list[tuple[float, float, float]], thick: float) -> Mesh:
     """Bent sheet metal from its flat pattern.
 
     Args:
-        strips: flat pieces between the bends, polygons with holes in the pattern's (s, y), mm; pieces on both
-            sides of a bend end on its lines.
-        bends: (s, angle in deg, inner radius in mm) of each, in order; a bend takes the strip from s to
-            s + angle · (radius + thick / 2), and its sides there are those of the neighbouring pieces.
-        thick: of the sheet, mm.
+        flats: flat pieces between the bends, polygons with holes in the pattern's (s, y), mm; pieces on both sides
+            of a bend end on its lines.
+        bends: (s, angle in deg, inner radius in mm) of each, in order; a bend occupies the pattern from s to
+            s + angle · (radius + thick / 2); its sides continue those of the neighbouring pieces.
+        thick: thickness of the sheet, mm.
 
     Returns:
-        The sheet in (x, y, z): flat at z = 0 to ``thick`` before the first bend, positive angles bend upwards.
+        The sheet in (x, y, z): flat at z = 0 to ``thick`` before the first bend; positive angles bend upwards.
     """
     points, triangles = [], []
     offset = 0
-    for outline, holes in strips:
+    for outline, holes in flats:
         flat, faces = triangulate(outline, holes)
         points.append(flat)
         triangles.append(faces + offset)
         offset += len(flat)
     for s, angle_deg, radius in bends:
         length = np.deg2rad(abs(angle_deg)) * (radius + 0.5 * thick)
-        corners = np.concatenate([outline for outline, _ in strips])
+        corners = np.concatenate([outline for outline, _ in flats])
         steps = 9
         edges = [corners[np.abs(corners[:, 0] - end) < 1e-6, 1] for end in (s, s + length)]
         along = np.linspace(0.0, 1.0, steps)
@@ -146,7 +150,7 @@ def _bent(vertices: Array, bends: list[tuple[float, float, float]], thick: float
         forward = np.array([np.cos(heading), np.sin(heading)])
         normal = np.array([-np.sin(heading), np.cos(heading)])
         foot = start + (where - last) * forward
-        # The middle of the sheet runs on a circle whose centre lies on the side that it bends to.
+        # The middle surface of the sheet follows a circle whose centre lies on the side to which it bends.
         to_center = 0.5 * thick + sign * (radius + 0.5 * thick)
         center = foot + to_center * normal
         beyond = s > where + 1e-9
@@ -185,19 +189,19 @@ def lump(radii: Array, bumps: list[tuple[tuple[float, float, float], float, floa
 
 
 def moved(mesh: Mesh, model_from_mesh: Array) -> Mesh:
-    """The mesh at another place (4,4)."""
+    """The mesh moved by a rigid transform (4,4)."""
     return apply(model_from_mesh, mesh[0]), mesh[1]
 
 
 def joined(*meshes: Mesh) -> Mesh:
-    """Several bodies as one mesh; they touch or overlap, nothing is cut."""
+    """Several bodies as one mesh; they may touch or overlap, no boolean operation is made."""
     offsets = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
     faces = [faces + offset for (_, faces), offset in zip(meshes, offsets[:-1], strict=True)]
     return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)
 
 
 def _welded(points: Array, triangles: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """Points at one place made one."""
+    """Merge points at the same position."""
     _, first, inverse = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
     return points[first], inverse.ravel()[triangles].astype(np.int64)
 

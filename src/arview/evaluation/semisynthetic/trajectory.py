@@ -1,7 +1,7 @@
-"""Smooth random trajectories of a part in front of a camera, about as fast as those of the RBOT data set.
+"""Smooth random trajectories of a part in front of a camera, about as fast as those of the RBOT dataset.
 
-The speed, 7° and 15 mm from frame to frame, is our choice: what we recall Tian et al. ("Large-displacement 3D Object
-Tracking with Hybrid Non-local Optimization", ECCV 2022) to state of RBOT, and could not look up.
+The speed, 7° and 15 mm from frame to frame, is the one given for RBOT by Tian et al. ("Large-displacement 3D Object
+Tracking with Hybrid Non-local Optimization", ECCV 2022), quoted from memory.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from arview.geometry import Array, apply, exp_so3, orthonormalise, rigid
 
 @dataclass(frozen=True)
 class TrajectoryOptions:
-    """How a part moves.
+    """Motion of a part.
 
     Attributes:
         turn_deg, step_mm: mean rotation and translation from frame to frame.
-        distance_mm: nearest and farthest camera to centre.
-        smooth_frames: over which direction and speed change.
-        margin: how much of the part's radius may leave the picture at most, of its projected radius.
+        distance_mm: smallest and largest distance from the camera to the part's centre.
+        smooth_frames: frames over which direction and speed change.
+        margin: share of the part's projected radius that may leave the picture.
     """
 
     turn_deg: float = 7.0
@@ -41,10 +41,10 @@ def random_trajectory(
     rng: np.random.Generator,
     options: TrajectoryOptions | None = None,
 ) -> Array:
-    """``cam_from_model`` (count,4,4) of a part that tumbles about its centre and wanders through the picture.
+    """``cam_from_model`` (count,4,4) of a part that tumbles about its centre and moves through the picture.
 
-    The mean rotation and translation between neighbours are those of the options, but that a part too large to
-    move about in the picture moves less.
+    The mean rotation and translation from frame to frame are those of the options; a part too large to move that far
+    in the picture moves less.
     """
     o = options or TrajectoryOptions()
     rotations = _rotations(count, o, rng)
@@ -60,7 +60,7 @@ def followed_trajectory(poses: list[Array], center_of_poses: Array, center_in_mo
 
 
 def smooth_noise(count: int, width: int, smooth_frames: float, rng: np.random.Generator) -> Array:
-    """(count, width) noise of deviation 1 that changes over so many frames."""
+    """(count, width) noise of standard deviation 1, smoothed over a number of frames."""
     margin = int(np.ceil(4 * smooth_frames))
     noise = gaussian_filter1d(rng.normal(size=(count + 2 * margin, width)), smooth_frames, axis=0)
     # A Gaussian filter leaves 1 / sqrt(2 sqrt(pi) sigma) of the deviation of white noise.
@@ -68,13 +68,13 @@ def smooth_noise(count: int, width: int, smooth_frames: float, rng: np.random.Ge
 
 
 def _speeds(count: int, mean: float, smooth_frames: float, rng: np.random.Generator) -> Array:
-    """(count,) positive speeds, changing smoothly between about half and one and a half times their mean."""
+    """(count,) positive speeds that vary smoothly between about half and one and a half times their mean."""
     speeds = 1.0 + 0.5 * np.tanh(smooth_noise(count, 1, smooth_frames, rng)[:, 0])
     return np.asarray(speeds * mean / speeds.mean())
 
 
 def _rotations(count: int, o: TrajectoryOptions, rng: np.random.Generator) -> Array:
-    """(count,3,3): a random first orientation turned on about an axis that changes smoothly."""
+    """(count,3,3): a random first orientation, rotated about an axis that changes smoothly."""
     quaternion = rng.normal(size=4)
     angle = 2.0 * np.arccos(np.clip(quaternion[0] / np.linalg.norm(quaternion), -1.0, 1.0))
     first = exp_so3(angle * quaternion[1:] / np.linalg.norm(quaternion[1:]))
@@ -88,8 +88,8 @@ def _rotations(count: int, o: TrajectoryOptions, rng: np.random.Generator) -> Ar
 
 
 def _centers(camera: Camera, diameter_mm: float, count: int, o: TrajectoryOptions, rng: np.random.Generator) -> Array:
-    """(count,3) places of the part's centre in the camera frame, mm, evenly fast along a smooth curve."""
-    # A curve far longer than needed, sampled densely, then walked along at the wanted speed.
+    """(count,3) positions of the part's centre in the camera frame, mm, along a smooth curve."""
+    # A curve far longer than needed is sampled densely and then followed at the wanted speed.
     dense = 40 * count
     noise = np.tanh(0.9 * smooth_noise(dense, 3, 20.0 * o.smooth_frames, rng))
     low, high = np.log(o.distance_mm)
@@ -103,7 +103,7 @@ def _centers(camera: Camera, diameter_mm: float, count: int, o: TrajectoryOption
     centers = rays / np.linalg.norm(rays, axis=1, keepdims=True) * distance[:, None]
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centers, axis=0), axis=1))])
     steps = _speeds(count, o.step_mm, o.smooth_frames, rng)
-    # A curve shorter than the way is walked at what it allows.
+    # If the curve is too short, it is followed more slowly.
     walked = np.cumsum(steps) - steps[0]
     walked *= min(1.0, lengths[-1] / max(walked[-1], 1e-9))
     return np.stack([np.interp(walked, lengths, centers[:, k]) for k in range(3)], axis=1)
