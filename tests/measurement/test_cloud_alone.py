@@ -143,7 +143,7 @@ def test_a_scan_alone_against_truth(inspected: tuple[Inspection, Path, str, int]
     system = inspection.datum_system
     assert system is not None and [datum.locked for datum in system.datums] == ["rx ry tz", "tx ty", "rz"]
     assert {datum.method for datum in system.datums} == {"cloud"}
-    assert any("a cloud alone" in warning for warning in inspection.warnings)
+    assert any("a cloud without photos" in warning for warning in inspection.warnings)
 
 
 def test_foreign_object_and_distance_map(inspected: tuple[Inspection, Path, str, int]) -> None:
@@ -167,7 +167,7 @@ def test_clouds_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_cloud(tmp_path / "absent.ply")
     (tmp_path / "bad.ply").write_text("ply\nformat ascii 1.0\nend_header\n", encoding="utf-8")
-    with pytest.raises(InputError, match="is no PLY file with points"):
+    with pytest.raises(InputError, match="is not a PLY file with points"):
         read_cloud(tmp_path / "bad.ply")
     lines = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {n}" for n in "xyz"), "end_header"]
     (tmp_path / "two.ply").write_text("\n".join([*lines, "1 2 3", "4 5 6", ""]), encoding="utf-8")

@@ -19,18 +19,20 @@ from arview.measurement.datums.equations import (
 )
 from arview.measurement.types import Method, Move
 from arview.measurement.uncertainty.budget import (
-    PosePropagation,
     UncertaintyOptions,
     length_of,
     place,
-    shifts_from_poses,
     total_budget,
-    which_see,
 )
 from arview.measurement.uncertainty.combine import (
     agreements,
     combine,
     quantile_of_length,
+)
+from arview.measurement.uncertainty.pose_propagation import (
+    PosePropagation,
+    shifts_from_poses,
+    visibility,
 )
 from arview.measurement.uncertainty.rice import rice_density, rice_estimate, rice_mean
 from arview.reconstruction.types import PosedPhoto, SparseModel
@@ -303,10 +305,10 @@ def test_photos_see_the_side_that_faces_them() -> None:
     low, high = block.bounds_in_model
     middle = 0.5 * (low + high)
     top = np.array([[middle[0], middle[1], high[2]]])
-    assert which_see(top, np.array([[0.0, 0.0, 1.0]]), sparse, model).all()
-    assert not which_see(top - [0, 0, high[2]], np.array([[0.0, 0.0, -1.0]]), sparse, model).any()
+    assert visibility(top, np.array([[0.0, 0.0, 1.0]]), sparse, model).all()
+    assert not visibility(top - [0, 0, high[2]], np.array([[0.0, 0.0, -1.0]]), sparse, model).any()
     side = np.array([[high[0], middle[1], middle[2]]])
-    seen = which_see(side, np.array([[1.0, 0.0, 0.0]]), sparse, model)[0]
+    seen = visibility(side, np.array([[1.0, 0.0, 0.0]]), sparse, model)[0]
     ahead = np.array([p.centre_in_scan[0] > 150 for p in sparse.photos])
     assert 0 < ahead.sum() < len(ahead)
     assert seen.sum() >= 2 and not seen[~ahead].any()

@@ -1,4 +1,4 @@
-"""What an aligned cloud shows beside displacements: foreign objects, and its distances to the CAD."""
+"""What an aligned cloud shows besides displacements: foreign objects, and its distances to the CAD."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def inspect_cloud(
     cloud: DenseCloud, model: Model, alignment: Alignment, deviations: Sequence[ComponentDeviation],
     folder: Path | None = None,
 ) -> tuple[tuple[ForeignReport, ...], DistanceReport | None]:  # fmt: skip
-    """Foreign objects in a cloud of the rough frame, and its distances to the CAD in the datum frame.
+    """Find foreign objects in a cloud, and compute its distances to the CAD in the datum frame.
 
     Args:
-        cloud: mm, in the frame that ``alignment`` is of.
-        model: nominal.
-        alignment: datum frame.
-        deviations: of the components: foreign objects are looked for beside them where they were found.
+        cloud: in mm, in the rough frame of ``alignment``.
+        model: the nominal CAD.
+        alignment: the datum frame.
+        deviations: of the components; foreign objects are searched for beside their measured positions.
         folder: where ``distances.ply``, ``map.png`` and a histogram of each component are written; None: nowhere.
 
     Raises:
@@ -49,14 +49,14 @@ def inspect_cloud(
     try:
         found = find_foreign(aligned, model, places, unknown)
         distances = distance_map(aligned, model)
-    except InputError:  # nothing of the cloud is at the part: said of every component already
+    except InputError:  # no point of the cloud is near the part; every component's record says so already
         return (), None
     files = () if folder is None else write_distance_map(distances, model, folder)
     return tuple(_report(one) for one in found), DistanceReport(distances.reach_mm, distances.statistics, files)
 
 
 def write_distance_map(distances: DistanceMap, model: Model, folder: Path) -> tuple[str, ...]:
-    """Write the coloured cloud, its picture and the histograms; their names below the folder's parent.
+    """Write the coloured cloud, its picture and the histograms; their names relative to the folder's parent.
 
     Raises:
         OutputError: the folder cannot be written to.
@@ -64,7 +64,7 @@ def write_distance_map(distances: DistanceMap, model: Model, folder: Path) -> tu
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be made ({error.strerror or error})") from error
+        raise OutputError(f"{folder}: cannot be created ({error.strerror or error})") from error
     pictures = {"map.png": map_picture(distances), "histogram.png": histogram_picture(distances, model)}
     for row in distances.statistics[1:]:
         name = "".join(c if c.isalnum() or c in "-_" else "_" for c in row.name)

@@ -1,4 +1,4 @@
-"""What `arview reconstruct` left in its folder, as the measurement needs it."""
+"""Reading what `arview reconstruct` wrote, or a cloud alone, for the measurement."""
 
 from __future__ import annotations
 
@@ -17,12 +17,18 @@ from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleR
 from arview.reconstruction.types import DenseCloud, Photo, SparseModel
 
 _SCALE_STD = 1e-3
-"""Of a scale by the cloud's shape alone: it is off by 3e-4 where the scale is known; datums better it."""
+"""Relative standard deviation of a scale that follows from the shape of the cloud alone; datums improve it."""
 
 
 @dataclass(frozen=True)
 class MetricReconstruction:
-    """A reconstruction in mm in the rough frame of the CAD: poses and points, their scale, the cloud when there."""
+    """A reconstruction in mm in the rough frame of the CAD.
+
+    Attributes:
+        sparse: poses and points.
+        scale: the scale and what it comes from.
+        cloud: the dense cloud, or None.
+    """
 
     sparse: SparseModel
     scale: ScaleResult
@@ -30,15 +36,16 @@ class MetricReconstruction:
 
 
 def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud: bool = True) -> MetricReconstruction:
-    """The reconstruction in a folder of `arview reconstruct`.
+    """Read the reconstruction in a folder of `arview reconstruct`.
 
     Args:
         folder: what it wrote.
-        photos: folder of the photos, when they are no longer where they were.
+        photos: folder of the photos, if they have been moved.
         with_cloud: read the cloud too.
 
     Raises:
-        InputError: no such folder, stages that are missing, no scale or no CAD frame, photos that are not found.
+        InputError: the folder does not exist, stages are missing, there is no scale or no CAD frame, or photos are not
+            found.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -48,7 +55,7 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
     if scale.scale is None and not has_cloud:
         raise InputError(f"{folder}: lengths are in an arbitrary unit; reconstruct with --part, --board or --tag")
     if scale.model_from_scan is None and not has_cloud:
-        raise InputError(f"{folder}: the part was not found in the photos, there is no CAD frame: {scale.why_no_frame}")
+        raise InputError(f"{folder}: no CAD frame, because the part was not found in the photos: {scale.why_no_frame}")
     listed = [_photo(entry, folder, photos) for entry in _read(folder / "photos.json")["photos"]]
     try:
         sparse = sparse_model_of(read_reconstruction(folder / "sparse" / "model"), listed)
@@ -70,10 +77,10 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
 
 
 def read_cloud(path: str | Path) -> MetricReconstruction:
-    """A cloud alone, in mm, in any frame: a PLY file with or without normals.
+    """Read a cloud without photos, in mm, in any frame, from a PLY file with or without normals.
 
     Raises:
-        InputError: no PLY file, or no points in it.
+        InputError: the file is not PLY, or holds no points.
     """
     path = Path(path)
     if not path.is_file():
@@ -83,11 +90,12 @@ def read_cloud(path: str | Path) -> MetricReconstruction:
         (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none.astype(np.int32),
         np.zeros((0, 2)),
     )  # fmt: skip
-    scale = ScaleResult(1.0, None, None, None, (), (), "a cloud alone", Consistency(True, ""))
+    scale = ScaleResult(1.0, None, None, None, (), (), "a cloud without photos", Consistency(True, ""))
     return MetricReconstruction(empty, scale, _any_ply(path))
 
 
 def _any_ply(path: Path) -> DenseCloud:
+    """The cloud of a PLY file that arview or another program wrote."""
     from arview.reconstruction.dense import read_ply
 
     try:
@@ -102,8 +110,8 @@ def _any_ply(path: Path) -> DenseCloud:
         points = np.asarray(content["vertices"], dtype=np.float64).reshape(-1, 3)
         rows = content.get("metadata", {}).get("_ply_raw", {}).get("vertex", {}).get("data")
         names = getattr(getattr(rows, "dtype", None), "names", None) or ()
-    except Exception as error:  # whatever a broken file makes of the reader
-        raise InputError(f"{path}: is no PLY file with points ({error})") from error
+    except Exception as error:  # a damaged file may make the reader raise anything
+        raise InputError(f"{path}: is not a PLY file with points ({error})") from error
     has_normals = {"nx", "ny", "nz"} <= set(names)
     normals = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], axis=1) if has_normals else 0.0 * points
     count = len(points)
@@ -114,10 +122,11 @@ def _any_ply(path: Path) -> DenseCloud:
 
 
 def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricReconstruction:
-    """The reconstruction where the cloud's shape says that the CAD is; as it is when its frame is known.
+    """The reconstruction in the frame of the CAD, found from the cloud's shape; unchanged if its frame is known
+    already.
 
     Raises:
-        InputError: the part is not found in the cloud; the scale is unknown, and no two datums have a distance.
+        InputError: the part is not found in the cloud, or the scale is unknown and no two datums have a distance.
     """
     from arview.measurement.cloud.global_registration import find_model_in_cloud
 
@@ -126,7 +135,7 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
         return reconstruction
     if scale.scale is None and sum(d.feature in ("hole", "pin", "cylinder") for d in part.datums) < 2:
         raise InputError(
-            "cloud: lengths are in an arbitrary unit, and the part file has no two datums whose distance says the "
+            "cloud: lengths are in an arbitrary unit, and the part file has no two datums whose distance gives the "
             "scale; reconstruct with a board, a tag or a scale bar"
         )
     found = find_model_in_cloud(cloud, part.model, None if scale.scale is None else 1.0)
@@ -148,6 +157,7 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
 
 
 def _read(path: Path) -> Any:
+    """The content of a JSON file."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -159,12 +169,12 @@ def _read(path: Path) -> Any:
 
 
 def _photo(entry: dict[str, Any], folder: Path, photos: str | Path | None) -> Photo:
-    """A photo of photos.json, where it lies now; its camera is a placeholder for that of the sparse model."""
+    """A photo of ``photos.json`` where it is now; its camera is a placeholder until the sparse model is read."""
     name, width, height = entry["name"], int(entry["width"]), int(entry["height"])
     places = [Path(photos) / name] if photos is not None else [Path(entry.get("path", "")), folder / "frames" / name]
     path = next((place for place in places if place.is_file()), None)
     if path is None:
-        hint = "it is not there" if photos is not None else "say with --photos where the photos are"
+        hint = "it is not in this folder" if photos is not None else "give the folder of the photos with --photos"
         raise InputError(f"{places[0] if photos is not None else name}: photo not found; {hint}")
     camera = Camera(width, height, float(width), float(width), 0.5 * width, 0.5 * height)
     return Photo(name, path, width, height, entry["lens"], camera)

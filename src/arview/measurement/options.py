@@ -1,4 +1,4 @@
-"""Options of a measurement, and what all methods found of a component."""
+"""Options of a measurement, and the results of all methods for a component."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from arview.measurement.uncertainty.combine import CombinedMove, combine
 from arview.measurement.uncertainty.decision import DecisionOptions
 
 METHODS: tuple[Method, ...] = ("sweep", "edges", "cloud")
+"""All methods, in the order in which results are listed."""
 
 
 @dataclass(frozen=True)
 class MeasureOptions:
-    """Options of a measurement: those of its parts, and what is asked for."""
+    """Options of a measurement and of its parts."""
 
-    methods: tuple[Method, ...] = METHODS  # the cloud only where there is one
-    tolerance_mm: float | None = None  # of components for which the part file says nothing; None: not judged
+    methods: tuple[Method, ...] = METHODS  # methods to use; the cloud only where there is one
+    tolerance_mm: float | None = None  # for components without a tolerance in the part file; None: no verdict
     corrects_bias: bool = False  # decide on the most likely true distance instead of the measured one
-    uses_inconsistent: bool = False  # go on though the reconstruction does not have the CAD's shape
+    uses_inconsistent: bool = False  # continue though the reconstruction does not have the shape of the CAD
     maps_folder: Path | None = None  # where pictures and PLY of the distance map are written; None: nowhere
     photo: PhotoOptions = field(default_factory=PhotoOptions)
     datums: DatumOptions = field(default_factory=DatumOptions)
@@ -42,14 +43,14 @@ class MeasureOptions:
 
 @dataclass(frozen=True)
 class ComponentMeasurement:
-    """A component's results by all methods, before the datum frame."""
+    """Results of all methods for a component, before alignment to the datums."""
 
     moves: tuple[Move, ...]
     failures: tuple[NotMeasured, ...]
 
 
 def combined_of(measured: ComponentMeasurement) -> CombinedMove | None:
-    """The move that counts: sweep and edges together; the cloud's alone where neither could."""
+    """The combined move of sweep and edges, or of the cloud where neither of them could measure; None without any."""
     direct = [move for move in measured.moves if move.method != "cloud"]
     moves = direct or list(measured.moves)
     return combine(moves) if moves else None

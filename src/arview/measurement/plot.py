@@ -1,4 +1,4 @@
-"""Charts as pictures, drawn with OpenCV: lines, points and bars on linear or logarithmic axes."""
+"""Charts drawn with OpenCV: lines, points and bars on linear or logarithmic axes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from arview.geometry import Array
 
 Picture = NDArray[np.uint8]
 COLORS = ((31, 119, 180), (214, 84, 38), (44, 140, 60), (130, 90, 170), (120, 120, 120), (200, 160, 20))
+"""RGB colours of the series, in order."""
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _INK, _GRID = (40, 40, 40), (225, 225, 225)
 
 
 @dataclass
 class Chart:
-    """A chart that series are added to and that is then drawn.
+    """A chart to which series are added before it is drawn.
 
     Attributes:
-        title, x_label, y_label: ASCII.
-        is_log_x, is_log_y: logarithmic axes; values that are not positive are left out there.
+        title, x_label, y_label: ASCII only.
+        is_log_x, is_log_y: logarithmic axes; values that are not positive are left out.
     """
 
     title: str
@@ -40,7 +41,7 @@ class Chart:
     def add(
         self, x: ArrayLike, y: ArrayLike, label: str = "", kind: Literal["line", "points", "bars"] = "line"
     ) -> None:
-        """A series of values (N,) over places (N,), in the order of COLORS."""
+        """Add a series of values ``y`` (N,) at ``x`` (N,); series take the colours of COLORS in turn."""
         self._series.append((np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64), label, kind))
 
     def draw(self, width: int = 960, height: int = 600) -> Picture:
@@ -90,6 +91,7 @@ class Chart:
         return image
 
     def _range(self, axis: int, is_log: bool) -> tuple[float, float]:
+        """Lower and upper limit of an axis; logarithms on a logarithmic axis."""
         parts = [np.asarray(series[axis], dtype=np.float64) for series in self._series]
         if axis == 1 and any(series[3] == "bars" for series in self._series):
             parts.append(np.zeros(1))
@@ -105,7 +107,7 @@ class Chart:
 
 
 def save_picture(image: Picture, path: Path) -> None:
-    """Write (H,W,3) uint8 RGB as PNG. Raises OutputError."""
+    """Write a picture (H,W,3) uint8 RGB as PNG. Raises OutputError."""
     done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     try:
         with replacing(path) as file:
@@ -115,12 +117,12 @@ def save_picture(image: Picture, path: Path) -> None:
 
 
 def stack(pictures: Sequence[Picture]) -> Picture:
-    """Pictures of one width below each other."""
+    """Pictures of equal width, one below another."""
     return np.concatenate(list(pictures), axis=0)
 
 
 def _ticks(low: float, high: float, is_log: bool) -> list[tuple[float, str]]:
-    """Values of grid lines and their texts; limits are logarithms on a logarithmic axis."""
+    """Values and labels of grid lines; limits are logarithms on a logarithmic axis."""
     if is_log:
         step = max(1, int(np.ceil((high - low) / 8)))
         return [(10.0**k, f"1e{k}") for k in range(int(np.ceil(low)), int(np.floor(high)) + 1, step)]

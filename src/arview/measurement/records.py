@@ -1,4 +1,4 @@
-"""What was measured as the records of an inspection: components, datums, provenance."""
+"""Records of an inspection from the results of a measurement: components, datums, provenance."""
 
 from __future__ import annotations
 
@@ -30,23 +30,20 @@ from arview.measurement.datums.alignment import Alignment
 from arview.measurement.folder import MetricReconstruction
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.types import Move
-from arview.measurement.uncertainty.budget import (
-    Placement,
-    PosePropagation,
-    place,
-    relative_twists,
-)
+from arview.measurement.uncertainty.budget import Placement, place, relative_twists
 from arview.measurement.uncertainty.combine import Agreement, CombinedMove, agreements
 from arview.measurement.uncertainty.decision import decide, worst, zone_diameter_mm
+from arview.measurement.uncertainty.pose_propagation import PosePropagation
 
 _SOFTWARE = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "numba")
+"""Packages whose versions are recorded."""
 
 
 def component_record(
     name: str, measured: ComponentMeasurement, alignment: Alignment, poses: PosePropagation | None, part: Part,
     options: MeasureOptions,
 ) -> ComponentDeviation:  # fmt: skip
-    """Where a component stands in the datum frame, and the verdict."""
+    """Position of a component in the datum frame, with its verdict."""
     settings = part.component_settings(name)
     tolerance_mm = settings.position_tolerance_mm or options.tolerance_mm
     component = part.model.component(name)
@@ -96,7 +93,7 @@ def _verdict(
     placed: Placement, tolerance_mm: float | None, settings: ComponentSettings, options: MeasureOptions,
     notes: list[str],
 ) -> Verdict:  # fmt: skip
-    """Position and, where it has a tolerance, angle; what could not be determined cannot pass."""
+    """Verdict on the position and, where it has a tolerance, the angle; undetermined displacements cannot pass."""
     guard, distance, angle = options.decision.guard, placed.distance, placed.angle
     verdicts = []
     if distance is not None:
@@ -120,6 +117,7 @@ def _verdict(
 
 
 def _details(placed: Placement, together: CombinedMove, settings: ComponentSettings) -> Details:
+    """Details of a component's record."""
     rotation = exp_so3(placed.twist[:3])
     center, distance, angle = together.center_in_model, placed.distance, placed.angle
     return Details(
@@ -140,7 +138,7 @@ def _details(placed: Placement, together: CombinedMove, settings: ComponentSetti
 
 
 def _method_result(move: Move, alignment: Alignment) -> MethodResult:
-    """A method's own result in the datum frame."""
+    """Result of one method in the datum frame."""
     alone = CombinedMove(move.twist, {}, np.zeros((6, 6)), move.undetermined, move.radius_mm, move.center_in_model)
     twist = relative_twists(move.twist[None], alignment.move[None], alone, alignment)[0]
     std = np.sqrt(np.maximum(np.diag(move.covariance), 0.0))
@@ -156,7 +154,7 @@ def _method_result(move: Move, alignment: Alignment) -> MethodResult:
 
 
 def _axis(settings: ComponentSettings, placed: Placement, part: Part) -> Array:
-    """Axis that tilt is of and twist about: of symmetry, else the normal of the first datum plane, else +Z."""
+    """Axis for tilt and twist: that of symmetry, else the normal of the first datum plane, else +Z."""
     if settings.symmetry is not None:
         return np.array(settings.symmetry.axis_in_model)
     turns = [row[:3] / np.linalg.norm(row[:3]) for row in placed.undetermined if np.linalg.norm(row[:3]) > 0.95]
@@ -168,7 +166,7 @@ def _axis(settings: ComponentSettings, placed: Placement, part: Part) -> Array:
 
 
 def tilt_and_twist(placed: Placement, axis: Array) -> tuple[float | None, float | None]:
-    """Angle in degrees between a component's axis (3,) and where it should point, and turn about it; None if open."""
+    """Angle in degrees between a component's axis (3,) and its nominal direction, and rotation about it; or None."""
     if not placed.observable[:3].any():
         return None, None
     turns = placed.undetermined[:, :3]
@@ -182,20 +180,21 @@ def tilt_and_twist(placed: Placement, axis: Array) -> tuple[float | None, float 
 
 
 def _contradiction(pair: Agreement) -> str:
+    """Message about two methods that contradict each other."""
     return (
-        f"{pair.first} and {pair.second} differ by {pair.difference_mm:.3f} mm, more than the {pair.joint_mm:.3f} mm"
-        " that both allow"
+        f"{pair.first} and {pair.second} differ by {pair.difference_mm:.3f} mm, more than their uncertainties allow"
+        f" ({pair.joint_mm:.3f} mm)"
     )
 
 
 def datum_doubts(alignment: Alignment) -> list[str]:
-    """Datums that contradict those before them."""
+    """Messages about datums that contradict those before them."""
     doubts = []
     for result in alignment.datums:
         excess = np.sqrt(max(0.0, result.rest_mm**2 - result.residual_mm**2))
         if result.feature != "fit" and excess > max(0.1, result.residual_mm):
             doubts.append(
-                f"datum {result.label}: {excess:.2f} mm rms off the datums before it; is it where the CAD says?"
+                f"datum {result.label}: {excess:.2f} mm rms off the earlier datums; is the feature placed as in the CAD?"
             )
     return doubts
 
@@ -203,7 +202,7 @@ def datum_doubts(alignment: Alignment) -> list[str]:
 def datum_record(
     alignment: Alignment, part: Part, base: Sequence[str], reconstruction: MetricReconstruction
 ) -> DatumSystem:
-    """The frame of the deviations."""
+    """The datum system of an inspection."""
     components = {datum.label: datum.component for datum in part.datums}
     methods = dict.fromkeys(("plane", "point", "cylinder"), "sweep") | dict.fromkeys(("hole", "pin", "edge"), "edges")
     reports = tuple(
@@ -226,7 +225,7 @@ def datum_record(
 
 
 def provenance_of(reconstruction: MetricReconstruction, options: MeasureOptions, cpu_s: float) -> Provenance:
-    """What the numbers were made with."""
+    """Tool, versions, options and inputs of a measurement."""
     photos = reconstruction.sparse.photos
     used = [m for m in options.methods if m != "cloud" or reconstruction.cloud is not None]
     asked = {

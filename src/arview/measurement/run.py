@@ -36,8 +36,8 @@ from arview.measurement.records import (
     provenance_of,
 )
 from arview.measurement.types import Move, NotMeasured
-from arview.measurement.uncertainty.budget import PosePropagation
 from arview.measurement.uncertainty.combine import CombinedMove
+from arview.measurement.uncertainty.pose_propagation import PosePropagation
 from arview.reconstruction.scale.cad import base_names
 
 
@@ -45,23 +45,27 @@ def measure(
     reconstruction: MetricReconstruction | str | Path, part: Part, options: MeasureOptions | None = None,
     *, progress: Progress | None = None,
 ) -> Inspection:  # fmt: skip
-    """Where every inspected component stands in the datum frame, with its uncertainty and verdict.
+    """Measure every inspected component in the datum frame, with its uncertainty and verdict.
 
     Args:
         reconstruction: from `read_folder` or `read_cloud`, or the folder of `arview reconstruct`.
         part: CAD, roles, tolerances, datums.
-        options: see there.
+        options: see `MeasureOptions`.
         progress: called with (what, done, total).
 
     Raises:
-        InputError: the reconstruction contradicts the CAD; a datum is not covered; nothing to inspect.
+        InputError: the reconstruction contradicts the CAD, a datum is not covered, or there is nothing to inspect.
         OutputError: the distance map cannot be written.
     """
+<<<<<<< HEAD
     check_type(reconstruction, (MetricReconstruction, *PATH), "measure: reconstruction")
     check_type(part, Part, "measure: part")
     if isinstance(reconstruction, str | Path):
         reconstruction = read_folder(reconstruction)
     # The threads are ours: those of BLAS, on matrices of some hundred rows, would only wait for each other.
+=======
+    # One thread for BLAS: work is parallel over components, and the matrices have only some hundred rows.
+>>>>>>> 6b92833 (Measurement: docstrings and messages in plain English)
     with threadpool_limits(1, "blas"):
         return _measure(reconstruction, part, options or MeasureOptions(), progress or (lambda what, done, total: None))
 
@@ -69,22 +73,23 @@ def measure(
 def _measure(
     reconstruction: MetricReconstruction, part: Part, options: MeasureOptions, tell: Progress
 ) -> Inspection:  # fmt: skip
+    """The steps of `measure`, on the rough frame of the reconstruction."""
     began = time.process_time()
     warnings = list(reconstruction.scale.warnings)
     consistency = reconstruction.scale.consistency
     if not consistency.is_consistent:
         if not options.uses_inconsistent:
-            raise InputError(f"{consistency.reason}; take other photos (--anyway measures all the same)")
+            raise InputError(f"{consistency.reason}; take other photos, or measure nevertheless with --anyway")
         warnings.append(consistency.reason)
     base = base_names(part)
     names = [name for name in part.inspected if name not in base]
     if not names:
         raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
-    # Without the covariance of the poses: it is carried to the components relative to the datums below.
+    # The views get no covariance of the poses: it is propagated below, relative to the datums.
     reconstruction = in_model_frame(reconstruction, part)
     has_photos = bool(reconstruction.sparse.photos)
     if not has_photos and "cloud" not in options.methods:
-        raise InputError("a cloud alone can only be measured by the method cloud")
+        raise InputError("a cloud without photos can only be measured by the method 'cloud'")
     views = load_views(replace(reconstruction.sparse, pose_covariance=None), part.model) if has_photos else None
     results = measure_all(reconstruction, views, part, [*base, *names], options, tell)
     tell("datums", 0, 1)
@@ -92,9 +97,9 @@ def _measure(
     warnings += datum_doubts(alignment)
     poses = None
     if views is None:
-        warnings.append("a cloud alone: its scale and its bending are not known, they are not in U")
+        warnings.append("a cloud without photos: U does not include errors of its scale and its deformation")
     elif reconstruction.sparse.pose_covariance is None:
-        warnings.append("the covariance of the camera poses is unknown: it is not in U")
+        warnings.append("the covariance of the camera poses is unknown: U does not include it")
     else:
         poses = PosePropagation(reconstruction.sparse, part.model, alignment, base)
     deviations = []
@@ -124,7 +129,7 @@ def measure_all(
     reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, names: Sequence[str],
     options: MeasureOptions, tell: Progress,
 ) -> dict[str, ComponentMeasurement]:  # fmt: skip
-    """Every component by every method asked for, in the rough frame."""
+    """Measure every component by every requested method, in the rough frame."""
     found: dict[str, list[Move | NotMeasured]] = {name: [] for name in names}
     if views is not None and {"sweep", "edges"} & set(options.methods):
 
@@ -166,7 +171,9 @@ def align_to_datums(
     reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, base: Sequence[str],
     results: Mapping[str, ComponentMeasurement], options: MeasureOptions,
 ) -> Alignment:  # fmt: skip
-    """The datum frame of the part file; where it leaves something free, or without datums, the base's best fit."""
+    """The datum frame of the part file; directions that it leaves free, or all without datums, follow from the base's
+    fit.
+    """
     fitted = {}
     for name in [*base, *(datum.component for datum in part.datums)]:
         together = combined_of(results[name]) if name in results else None
@@ -182,7 +189,7 @@ def align_to_datums(
     rest = next((_rest_of_base(results[name], fitted[name], equations) for name in base if name in fitted), None)
     if rest is None and not equations:
         reasons = "; ".join(f.reason for name in base for f in results[name].failures)
-        raise InputError(f"{', '.join(base)}: could not be measured, there is no frame: {reasons}")
+        raise InputError(f"{', '.join(base)}: could not be measured, so there is no frame: {reasons}")
     holes = [datum for datum in part.datums if datum.feature in ("hole", "pin", "cylinder")]
     if part.datums:
         origin = np.array((holes or part.datums)[0].point_in_model)
@@ -198,7 +205,9 @@ def align_to_datums(
 def _plane_of_base(
     views: PhotoViews, model: Model, base: Sequence[str], options: MeasureOptions
 ) -> list[DatumEquations]:
-    """The base's large flat face, which is known better than the height of its edges; nothing where there is none."""
+    """Equations of the base's large flat face, whose height is known better than that of its edges; none without such a
+    face.
+    """
     component = model.component(base[0])
     plane = base_plane(component, views.centres.mean(axis=0) - component.bounds_in_model.mean(axis=0))
     if plane is None:
@@ -212,13 +221,14 @@ def _plane_of_base(
 
 
 def _rest_of_base(measured: ComponentMeasurement, fitted: Move, datums: Sequence[DatumEquations]) -> DatumEquations:
-    """The base's best fit; within a plane that is already known by its edges, as its narrow sides tell little."""
+    """Equations of the base's best fit; beside a datum plane only that by edges, because narrow sides tell little."""
     edges = [move for move in measured.moves if move.method == "edges"]
     is_flat = any(datum.feature == "plane" for datum in datums)
     return move_equations(fitted.component, edges[0] if edges and is_flat else fitted)[0]
 
 
 def _as_move(name: str, together: CombinedMove) -> Move:
+    """The combined move as that of one method."""
     covariance = np.sum([*together.covariances.values(), together.disagreement], axis=0)
     return Move(
         name, "sweep", together.center_in_model, together.twist, covariance, together.undetermined,
@@ -227,5 +237,6 @@ def _as_move(name: str, together: CombinedMove) -> Move:
 
 
 def _bounds(model: Model, names: Sequence[str]) -> Array:
+    """(2,3) common bounding box of some components, mm."""
     corners = np.concatenate([model.component(name).bounds_in_model for name in names])
     return np.stack([corners.min(axis=0), corners.max(axis=0)])

@@ -1,8 +1,8 @@
-"""What the ways of measuring hand to each other.
+"""Results that the methods of measurement share.
 
-Where a component stands is a *move*: the twist (rotation vector in rad, shift in mm), in the axes of the model frame
-and about the component's centre, that takes its nominal place to the measured one. Small moves add like vectors, and
-the shift is the displacement of the centre, which is the position error.
+The position of a component is a *move*: the twist (rotation vector in rad, translation in mm), in the axes of the model
+frame and about the component's centre, that takes its nominal position to the measured one. Small moves add like
+vectors, and the translation is the displacement of the centre, which is the position error.
 """
 
 from __future__ import annotations
@@ -17,25 +17,26 @@ from arview.errors import InputError
 from arview.geometry import Array, exp_so3, invert, rigid
 
 Method = Literal["sweep", "edges", "cloud"]
+"""Methods of measurement: the object-space sweep, edges in photos, and registration of the cloud."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """Move of a component by one method.
+    """Move of a component, measured by one method.
 
     Attributes:
         component: its name.
-        method: which way of measuring.
-        center_in_model: (3,) mm, the point the move is about: centre of the component's bounding box at nominal.
-        twist: (6,) rotation vector (rad) and shift (mm) in model axes; components along ``undetermined`` are zero.
-        covariance: (6,6) of ``twist``; along ``undetermined`` it holds nothing (zero).
-        undetermined: (K,6) orthonormal directions, after scaling rotations by ``radius_mm``, that the data or the
-            component's symmetry leave free; (0,6) when all is determined.
-        radius_mm: length that rotations are weighed with: half the diagonal of the component's bounding box.
-        used: number of measurements (samples, edge points, cloud points) that the fit rests on.
+        method: method of measurement.
+        center_in_model: (3,) mm, point about which it rotates: centre of the component's bounding box at nominal.
+        twist: (6,) rotation vector (rad) and translation (mm) in model axes; zero along ``undetermined``.
+        covariance: (6,6) of ``twist``, zero along ``undetermined``.
+        undetermined: (K,6) orthonormal directions, rotations multiplied by ``radius_mm``, that the data or the
+            component's symmetry leave free; (0,6) if everything is determined.
+        radius_mm: length that converts rotations to mm: half the diagonal of the component's bounding box.
+        used: number of measurements (samples, edge points, cloud points) that agree with the fit.
         residual_mm: robust standard deviation of their residuals.
-        support: 0–1, share of what should be seen that was.
-        notes: in words, what speaks against it.
+        support: 0–1, share of the expected measurements that were found.
+        notes: messages about what may be wrong.
     """
 
     component: str
@@ -56,7 +57,7 @@ class Move:
 
     @property
     def displacement_mm(self) -> Array:
-        """(3,) measured minus nominal place of the centre, model axes."""
+        """(3,) measured minus nominal position of the centre, in model axes."""
         return self.twist[3:]
 
     @property
@@ -67,18 +68,18 @@ class Move:
 
     @property
     def nominal_from_measured(self) -> Array:
-        """(4,4), the inverse: what would bring the component to its place."""
+        """(4,4) the inverse: the motion that would bring the component to its nominal position."""
         return invert(self.measured_from_nominal)
 
     @property
     def observable(self) -> NDArray[np.bool_]:
-        """(6,) which of rx ry rz tx ty tz, in model axes, no undetermined direction touches."""
+        """(6,) which of rx ry rz tx ty tz, in model axes, are orthogonal to all undetermined directions."""
         return np.asarray(~(np.abs(self.undetermined) > 0.05).any(axis=0))
 
 
 @dataclass(frozen=True)
 class NotMeasured:
-    """A component that a method could not measure, or found missing, and why in words."""
+    """A component that a method could not measure or found missing, with the reason as a message."""
 
     component: str
     method: Method

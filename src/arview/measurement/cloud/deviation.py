@@ -1,7 +1,7 @@
-"""Where components stand, from a dense cloud in the frame of the CAD: crop, registration, what is undetermined.
+"""Positions of components in a dense cloud in the frame of the CAD: cropping, registration, undetermined directions.
 
-The way of the dissertation (cloud and ICP), with the exact CAD surface instead of sampled points. Each component is
-registered twice: first all at their nominal places, then with the neighbours where they were found.
+Each component is registered to its exact CAD surface, twice: first with all others at their nominal positions, then
+with the neighbours where they were found.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ class CloudDeviationOptions:
     """Options of measuring components in a cloud.
 
     Attributes:
-        band_mm: how far from its nominal surface a component's points are looked for; larger displacements are not
-            found, much larger bands take in the neighbours.
-        grid_mm: cell of the grid that the cloud is averaged on: neighbouring points hold no more information.
-        joint_mm: points nearer to another component are left out: weld beads, and what belongs to that component.
-            Of a flat component at most a quarter of its height.
-        min_photos: a piece of surface counts as visible when so many photos see it; two make a point.
-        min_support: with less of its visible surface covered by points that fit, a component is not measured.
-        min_fitting: share of the points near it that must fit, or it is something else.
-        max_noise_mm: with a larger spread of the residuals the points are no surface of this component.
-        doubt_width_mm: width of the kernel in a second fit; what it changes is added to the covariance.
-        max_std_mm: moves known less well than this are undetermined.
-        missing_share: with less of the visible surface within the band of any point, there is no component.
+        band_mm: distance from its nominal surface within which a component's points are searched for; larger
+            displacements are not found, and much larger bands include the neighbours.
+        grid_mm: cell of the grid on which the cloud is averaged; neighbouring points hold no more information.
+        joint_mm: points nearer to another component are left out: weld beads, and points of that component. For a flat
+            component at most a quarter of its height.
+        min_photos: a piece of surface counts as visible when this many photos show it; two photos make a point.
+        min_support: share of its visible surface that fitting points must cover for a component to be measured.
+        min_fitting: share of the points near it that must fit; otherwise it is something else.
+        max_noise_mm: largest spread of the residuals for points that are a surface of this component.
+        doubt_width_mm: width of the kernel in a second fit, whose difference is added to the covariance.
+        max_std_mm: directions with a larger standard deviation are undetermined.
+        missing_share: a component is missing when a smaller share of its visible surface has a point within the band.
         min_points: of a component.
-        rival_cost: a second minimum whose cost is less than so many times the best one's is told in the notes.
-        registration: of the solver.
+        rival_cost: a second minimum is reported when its cost is less than this many times the best one's.
+        registration: options of the solver.
     """
 
     band_mm: float = 5.0
@@ -80,15 +80,16 @@ class CloudDeviationOptions:
 
 @dataclass(frozen=True)
 class CloudComponent:
-    """A component, what of it can be seen, and what is around it.
+    """A component with its surroundings, as it is measured in a cloud.
 
     Attributes:
         component, surface: at nominal.
-        others: the components within reach of it, or None.
-        samples: (S,3) evenly on what the photos can see of it; contact: (C,3) on where it touches others.
+        others: surface of the components within reach of it, or None.
+        samples: (S,3) even samples of what the photos can see of it.
+        contact: (C,3) samples where it touches others.
         usable_faces: (F,) faces that the photos can see.
-        spins: (K,6) moves about the centre, rotations scaled by ``radius_mm``, that change nothing about its shape.
-        joint_mm: see CloudDeviationOptions.
+        spins: (K,6) motions about the centre, rotations scaled by ``radius_mm``, that leave its shape unchanged.
+        joint_mm: see `CloudDeviationOptions`.
     """
 
     component: Component
@@ -102,7 +103,7 @@ class CloudComponent:
 
     @property
     def center(self) -> Array:
-        """(3,) middle of the bounding box, mm."""
+        """(3,) centre of the bounding box, mm."""
         return self.component.bounds_in_model.mean(axis=0)
 
     @property
@@ -119,15 +120,16 @@ def measure_components_in_cloud(
     options: CloudDeviationOptions | None = None,
     names: Sequence[str] | None = None,
 ) -> list[Move | NotMeasured]:
-    """Moves of the components to be inspected, in the order of the model.
+    """Measure the moves of the components to be inspected, in the order of the model.
 
     Args:
-        cloud: in the frame of the CAD, mm, after alignment to the datums.
-        model: nominal.
-        part: says what is inspected, and symmetries.
-        photos: with ``cam_from_scan`` in the same frame, for what could be seen; none: all but what touches others.
-        options: see CloudDeviationOptions.
-        names: of the components to measure; default: those to be inspected.
+        cloud: in mm, in the frame of the CAD, after alignment to the datums.
+        model: the nominal CAD.
+        part: roles and symmetries.
+        photos: with ``cam_from_scan`` in the same frame, for what is visible; without them everything counts as visible
+            that does not touch another component.
+        options: see `CloudDeviationOptions`.
+        names: components to measure; default: those to be inspected.
 
     Raises:
         InputError: the cloud is empty, far from the CAD, of another part, or mirrored.
@@ -137,7 +139,7 @@ def measure_components_in_cloud(
     points = prepare_cloud(cloud, box, o.grid_mm, o.min_points)
     check_belongs(points, model, o.band_mm)
     views = SurfaceVisibility(model, photos) if photos else None
-    # Threads of BLAS would wait for each other on matrices as small as these.
+    # One thread for BLAS: the matrices are small, and the work is parallel over components.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
         components = list(
             threads.map(lambda name: _cloud_component(name, model, part, views, o), names or part.inspected)
@@ -147,19 +149,21 @@ def measure_components_in_cloud(
 
         def again(index: int) -> Move | NotMeasured:
             c, found = components[index], first[index]
-            if not isinstance(found, Move) or not _is_crowded(c, model, first, o):
+            if not isinstance(found, Move) or not _has_moved_neighbour(c, model, first, o):
                 return found
             moved = replace(c, others=_around(c.component, model, places, o))
             return _measure(moved, points, found.nominal_from_measured, o)
 
         second = list(threads.map(again, range(len(components))))
         return list(
-            threads.map(lambda i: direction_names(second[i], components[i], components, points, o), range(len(second)))
+            threads.map(
+                lambda i: _with_swapped_name(second[i], components[i], components, points, o), range(len(second))
+            )
         )
 
 
 def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:
-    """Raises InputError when few points are near the CAD, or many more when the cloud is mirrored."""
+    """Raise InputError when few points are near the CAD, or many more when the cloud is mirrored."""
     vertices, faces, _ = model.mesh
     surface = MeshSurface(vertices, faces)
     few = points.points[:: max(1, len(points) // 6000)]
@@ -175,21 +179,22 @@ def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:
         mirrored = max(mirrored, share((few - center) * flip + center))
     if mirrored > as_is + 0.03 and 1.0 - mirrored < 0.5 * (1.0 - as_is):
         raise InputError(
-            f"cloud: {100 * mirrored:.0f} % of it lies on the CAD when mirrored, {100 * as_is:.0f} % as it is: it is "
-            "left-handed, or the CAD is"
+            f"cloud: {100 * mirrored:.0f} % of it lies on the CAD when mirrored, {100 * as_is:.0f} % as it is: the "
+            "cloud or the CAD is left-handed"
         )
     if as_is < 0.3:
         raise InputError(
-            f"cloud: only {100 * as_is:.0f} % of it is within {near:g} mm of the CAD: another part, a wrong scale, or "
-            "not aligned"
+            f"cloud: only {100 * as_is:.0f} % of it is within {near:g} mm of the CAD: it is of another part, has a "
+            "wrong scale, or is not aligned"
         )
 
 
 def spin_moves(component: Component, surface: MeshSurface, part: Part | None, min_information: float = 1e-4) -> Array:
-    """(K,6) orthonormal moves about the middle of a component's box that leave its shape as it is.
+    """(K,6) orthonormal motions about the centre of a component's bounding box that leave its shape unchanged.
 
-    Moves along which the whole surface slides in itself (Gelfand & Guibas, SGP 2004), and the continuous symmetry of
-    the part file. Rotations are scaled by half the diagonal of the box.
+    These are motions along which the whole surface slides within itself (Gelfand & Guibas, SGP 2004), and the
+    continuous
+    symmetry declared in the part file. Rotations are scaled by half the diagonal of the box.
     """
     center = component.bounds_in_model.mean(axis=0)
     radius_mm = 0.5 * float(np.linalg.norm(np.ptp(component.bounds_in_model, axis=0)))
@@ -212,6 +217,7 @@ def spin_moves(component: Component, surface: MeshSurface, part: Part | None, mi
 def _cloud_component(
     name: str, model: Model, part: Part | None, views: SurfaceVisibility | None, o: CloudDeviationOptions
 ) -> CloudComponent:  # fmt: skip
+    """A component with what the photos can see of it, and with its neighbours at nominal."""
     component = model.component(name)
     surface = MeshSurface(component.vertices_in_model, component.faces)
     others = _around(component, model, {}, o)
@@ -241,7 +247,7 @@ def _cloud_component(
 def _around(
     component: Component, model: Model, places: dict[str, Array], o: CloudDeviationOptions
 ) -> MeshSurface | None:
-    """The surface of the components near one, each at its place or nominal."""
+    """Surface of the components near one, each at its measured place or at nominal; None without neighbours."""
     reach = 2.0 * o.band_mm + o.joint_mm
     low, high = component.bounds_in_model[0] - reach, component.bounds_in_model[1] + reach
     vertices, faces, groups, offset = [], [], [], 0
@@ -261,8 +267,10 @@ def _around(
     return MeshSurface(np.concatenate(vertices), np.concatenate(faces), np.concatenate(groups))
 
 
-def _is_crowded(c: CloudComponent, model: Model, found: Sequence[Move | NotMeasured], o: CloudDeviationOptions) -> bool:
-    """Whether a neighbour stands so far from nominal that other points are left out on its account."""
+def _has_moved_neighbour(
+    c: CloudComponent, model: Model, found: Sequence[Move | NotMeasured], o: CloudDeviationOptions
+) -> bool:
+    """Whether a neighbour is displaced so far that different points must be left out because of it."""
     low, high = c.component.bounds_in_model
     for one in found:
         if not isinstance(one, Move) or one.component == c.component.name:
@@ -278,16 +286,16 @@ def _is_crowded(c: CloudComponent, model: Model, found: Sequence[Move | NotMeasu
 def _measure(
     c: CloudComponent, cloud: CloudPoints, start: Array | None, o: CloudDeviationOptions
 ) -> Move | NotMeasured:
-    """Move of one component, or why there is none; ``start`` is nominal_from_measured (4,4), None tries several."""
+    """Move of one component, or why there is none; ``start`` (4,4) is nominal_from_measured, None tries several."""
     name = c.component.name
     if len(c.samples) == 0:
-        return NotMeasured(name, "cloud", "none of its surface can be seen in the photos")
+        return NotMeasured(name, "cloud", "none of its surface is visible in the photos")
     near, own = _crop(c, cloud, o)
     missing = _missing(c, near, own, o)
     if missing is not None:
         return missing
     if len(own) < o.min_points:
-        return NotMeasured(name, "cloud", f"only {len(own)} points of it in the cloud; {o.min_points} are needed")
+        return NotMeasured(name, "cloud", f"only {len(own)} points of it are in the cloud; {o.min_points} are needed")
     try:
         fit = _register(c, own, start, o)
     except InputError as error:
@@ -306,7 +314,7 @@ def _measure(
 
 
 def _crop(c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions) -> tuple[CloudPoints, CloudPoints]:
-    """Points in the component's surroundings, and those that may be its own."""
+    """Points around the component, and those of them that may belong to it."""
     low, high = c.component.bounds_in_model[0] - o.band_mm, c.component.bounds_in_model[1] + o.band_mm
     near = cloud.only(np.all((cloud.points >= low) & (cloud.points <= high), axis=1))
     is_own = c.surface.closest(near.points, o.band_mm).faces >= 0
@@ -316,11 +324,11 @@ def _crop(c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions) -> tu
 
 
 def _missing(c: CloudComponent, near: CloudPoints, own: CloudPoints, o: CloudDeviationOptions) -> NotMeasured | None:
-    """The verdict missing, or not covered, when hardly any point is where the component should be."""
+    """The finding that the component is missing, or not covered, if hardly any point is near its place; else None."""
     if _covered(c.samples, own.points, o.band_mm) >= o.missing_share and len(own) >= o.min_points // 3:
         return None
     name = c.component.name
-    # Where it stands on others, those can only be seen when it is not there.
+    # The surfaces of others on which it stands are only visible when it is absent.
     behind = _covered(c.contact, near.points, max(1.0, 2.0 * o.grid_mm)) if len(c.contact) else 0.0
     if behind > 0.4:
         return NotMeasured(
@@ -343,14 +351,14 @@ def _covered(samples: Array, points: Array, reach_mm: float, fit: Registration |
 
 
 def _register(c: CloudComponent, own: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Registration:
-    """The component's points on its surface: undetermined moves are left out one after the other."""
+    """Register the component's points to its surface, excluding undetermined directions one after the other."""
     radius, scales = c.radius_mm, np.array([c.radius_mm] * 3 + [1.0] * 3)
     options = replace(o.registration, first_distance_mm=o.band_mm, min_points=min(o.min_points, 50))
     given: dict[str, Any] = {"center": c.center, "radius_mm": radius, "usable_faces": c.usable_faces}
     fixed = c.spins
     starts = _starts(c.center, radius, o.band_mm) if start is None else [start]
     for _ in range(6):
-        free = _rest(fixed) / scales
+        free = _orthogonal_complement(fixed) / scales
         fit = register_from_starts(
             own.points, c.surface, starts, normals=own.normals, point_weights=1.0 / own.sigma**2, options=options,
             free=free, **given,
@@ -363,7 +371,7 @@ def _register(c: CloudComponent, own: CloudPoints, start: Array | None, o: Cloud
         fixed = np.concatenate([fixed, unknown])
         if len(fixed) >= 6:
             raise InputError("registration: the points determine no move of it")
-    # What the choice of the kernel does to the result is part of what is not known.
+    # The influence of the kernel's width on the result is part of its uncertainty.
     wide = replace(options, min_width_mm=o.doubt_width_mm, noise_points=0)
     other = register_to_surface(
         own.points, c.surface, fit.surface_from_points, normals=own.normals, point_weights=1.0 / own.sigma**2,
@@ -374,7 +382,7 @@ def _register(c: CloudComponent, own: CloudPoints, start: Array | None, o: Cloud
 
 
 def _starts(center: Array, radius: float, band_mm: float) -> list[Array]:
-    """No move, and half the band along each axis with a turn about the next one, both ways."""
+    """Identity, and half the band along each axis combined with a rotation about the next one, both ways."""
     twists = [np.zeros(6)]
     for axis in range(3):
         for sign in (-1.0, 1.0):
@@ -384,8 +392,8 @@ def _starts(center: Array, radius: float, band_mm: float) -> list[Array]:
     return [move_about(center, twist) for twist in twists]
 
 
-def _rest(fixed: Array) -> Array:
-    """(6−K,6) orthonormal basis of the moves that are not fixed."""
+def _orthogonal_complement(fixed: Array) -> Array:
+    """(6−K,6) orthonormal basis of the directions orthogonal to ``fixed`` (K,6)."""
     if len(fixed) == 0:
         return np.eye(6)
     _, values, vectors = np.linalg.svd(fixed, full_matrices=True)
@@ -393,9 +401,9 @@ def _rest(fixed: Array) -> Array:
 
 
 def _move(c: CloudComponent, fit: Registration, support: float, o: CloudDeviationOptions) -> Move:
-    """The registration as a move, with what speaks against it."""
+    """The registration as a move, with notes about what may be wrong."""
     scales = np.array([c.radius_mm] * 3 + [1.0] * 3)
-    undetermined = _rest(fit.free)
+    undetermined = _orthogonal_complement(fit.free)
     determined = np.eye(6) - undetermined.T @ undetermined
     twist = determined @ (twist_about(c.center, invert(fit.surface_from_points)) * scales) / scales
     covariance = determined @ (fit.covariance * np.outer(scales, scales)) @ determined / np.outer(scales, scales)
@@ -405,11 +413,10 @@ def _move(c: CloudComponent, fit: Registration, support: float, o: CloudDeviatio
     if fit.runner_up is not None and fit.runner_up_cost is not None and fit.runner_up_cost < o.rival_cost:
         other = twist_about(c.center, invert(fit.runner_up))[3:]
         notes.append(
-            f"fits nearly as well {np.linalg.norm(other - twist[3:]):.2f} mm from there (cost × "
-            f"{fit.runner_up_cost:.2f})"
+            f"fits nearly as well {np.linalg.norm(other - twist[3:]):.2f} mm away (cost × {fit.runner_up_cost:.2f})"
         )
     if np.linalg.norm(twist[3:]) > 0.9 * o.band_mm:
-        notes.append(f"at the end of the band of {o.band_mm:g} mm that was searched")
+        notes.append(f"at the limit of the searched band of {o.band_mm:g} mm")
     if support < 0.6:
         notes.append(f"only {100 * support:.0f} % of its visible surface is in the cloud")
     return Move(
@@ -419,11 +426,11 @@ def _move(c: CloudComponent, fit: Registration, support: float, o: CloudDeviatio
     )  # fmt: skip
 
 
-def direction_names(
+def _with_swapped_name(
     found: Move | NotMeasured, c: CloudComponent, all_of_them: Sequence[CloudComponent], cloud: CloudPoints,
     o: CloudDeviationOptions,
 ) -> Move | NotMeasured:  # fmt: skip
-    """A component that did not fit, with the name of another whose shape does: the two were swapped."""
+    """Add to a component that did not fit the name of another one whose shape does: the two may be swapped."""
     if isinstance(found, Move) or found.is_missing or "shape" not in found.reason or c.others is None:
         return found
     foot = c.others.closest(c.center[None]).points[0]
@@ -445,6 +452,7 @@ def direction_names(
 
 
 def _same_shape(a: CloudComponent, b: CloudComponent) -> bool:
+    """Whether two components have equal bounding boxes and areas."""
     sizes = [np.sort(np.ptp(c.component.bounds_in_model, axis=0)) for c in (a, b)]
     return (
         bool(np.allclose(sizes[0], sizes[1], atol=0.1))

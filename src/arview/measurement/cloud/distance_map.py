@@ -1,4 +1,4 @@
-"""Signed distances of a cloud to the CAD: per component and whole, as numbers, coloured PLY and pictures."""
+"""Signed distances of a cloud to the CAD, in all and by component: statistics, coloured PLY and pictures."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ from arview.measurement.plot import Chart, Picture
 from arview.reconstruction.types import DenseCloud
 
 _BINS = 400
+"""Bins of the histogram from which the width at half maximum is taken."""
 _WHOLE = "all"
+"""Name of the statistics of the whole cloud."""
 COLOR_STOPS = np.array(
     [[33, 60, 160], [80, 170, 230], [225, 235, 225], [245, 170, 60], [180, 30, 30]], dtype=np.float64
 )
-"""From − to + limit."""
+"""RGB colours from −limit to +limit."""
 _FIELDS = ("x", "y", "z", "distance_mm", "red", "green", "blue")
 _VERTEX = np.dtype([(name, "<f4" if index < 4 else "u1") for index, name in enumerate(_FIELDS)])
 _PROPERTIES = [f"property {'float' if index < 4 else 'uchar'} {name}" for index, name in enumerate(_FIELDS)]
@@ -32,7 +34,15 @@ _PROPERTIES = [f"property {'float' if index < 4 else 'uchar'} {name}" for index,
 
 @dataclass(frozen=True)
 class DistanceMap:
-    """Points (N,3) within reach of the CAD, their signed distances (N,) mm, outside positive, and components (N,)."""
+    """Points within reach of the CAD and their distances.
+
+    Attributes:
+        points_in_model: (N,3) mm.
+        distances: (N,) signed, positive outside, mm.
+        components: (N,) index of the nearest component, -1 if unknown.
+        reach_mm: points farther away were left out.
+        statistics: of the whole cloud, then of each component.
+    """
 
     points_in_model: Array
     distances: Array
@@ -44,11 +54,11 @@ class DistanceMap:
 def distance_map(
     cloud: DenseCloud, model: Model, places: Mapping[str, Array] | None = None, reach_mm: float = 3.0
 ) -> DistanceMap:
-    """Signed distances of a cloud (frame of the CAD, mm) to the model's surface.
+    """Signed distances of a cloud in mm, in the frame of the CAD, to the model's surface.
 
     Args:
         cloud: of the part.
-        model: nominal.
+        model: the nominal CAD.
         places: (4,4) ``measured_from_nominal`` by component, to see form errors without displacements; default none.
         reach_mm: points farther from every surface are left out.
 
@@ -74,7 +84,11 @@ def distance_map(
 
 
 def write_distance_ply(distances: DistanceMap, path: Path, limit_mm: float = 1.0) -> None:
-    """Binary PLY: x y z red green blue distance_mm; colours from −limit (blue) to +limit (red). Raises OutputError."""
+    """Write binary PLY with x y z distance_mm red green blue; colours run from −limit (blue) to +limit (red).
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     rows = np.zeros(len(distances.points_in_model), dtype=_VERTEX)
     values = [*distances.points_in_model.T, distances.distances, *_colors(distances.distances, limit_mm).T]
     for name, value in zip(_FIELDS, values, strict=True):
@@ -88,10 +102,10 @@ def write_distance_ply(distances: DistanceMap, path: Path, limit_mm: float = 1.0
 
 
 def read_distance_ply(path: Path, reach_mm: float, statistics: tuple[DistanceStatistics, ...]) -> DistanceMap:
-    """A map that ``write_distance_ply`` wrote; which component a point belongs to is not in the file (-1).
+    """Read a map that `write_distance_ply` wrote; the file does not hold the components, which are -1.
 
     Raises:
-        InputError: the file cannot be read, is cut short or holds other properties.
+        InputError: the file cannot be read, is truncated or has other properties.
     """
     try:
         data = path.read_bytes()
@@ -100,17 +114,17 @@ def read_distance_ply(path: Path, reach_mm: float, statistics: tuple[DistanceSta
     header, found, body = data.partition(b"end_header\n")
     lines = header.decode("ascii", "replace").split("\n")
     if not found or lines[0] != "ply" or [line for line in lines if line.startswith("property ")] != _PROPERTIES:
-        raise InputError(f"{path}: is not a distance map that arview wrote")
+        raise InputError(f"{path}: is not a distance map written by arview")
     count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex ")), -1)
     if len(body) != count * _VERTEX.itemsize:
-        raise InputError(f"{path}: is cut short; measure again")
+        raise InputError(f"{path}: is truncated; measure again")
     rows = np.frombuffer(body, dtype=_VERTEX)
     points = np.stack([rows[name] for name in "xyz"], axis=-1).astype(np.float64)
     return DistanceMap(points, rows["distance_mm"].astype(np.float64), np.full(count, -1), reach_mm, statistics)
 
 
 def histogram_picture(distances: DistanceMap, model: Model, component: str | None = None) -> Picture:
-    """Histogram of the distances of a component, or of all, with its numbers, (H,W,3) uint8 RGB."""
+    """Histogram of the distances of a component, or of all, with its statistics, as (H,W,3) uint8 RGB."""
     name = component or _WHOLE
     row = next((item for item in distances.statistics if item.name == name), None)
     if row is None:
@@ -131,7 +145,7 @@ def map_picture(
     distances: DistanceMap, direction: tuple[float, float, float] = (0.6, -0.8, 1.0), limit_mm: float = 1.0,
     width: int = 1200, height: int = 900,
 ) -> Picture:  # fmt: skip
-    """The points in their colours, seen from a direction in parallel projection, with a scale, (H,W,3) uint8 RGB."""
+    """The points in their colours in parallel projection from a direction, with a scale, as (H,W,3) uint8 RGB."""
     points = distances.points_in_model
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     eye = middle + np.array(direction) / np.linalg.norm(direction) * 1000.0
@@ -140,7 +154,7 @@ def map_picture(
     scale = 0.94 * float(min((width - 110) / (high[0] - low[0] + 1e-9), height / (high[1] - low[1] + 1e-9)))
     place = (seen[:, :2] - 0.5 * (low + high)) * scale + [0.5 * (width - 110), 0.5 * height]
     image = np.full((height, width, 3), 255, dtype=np.uint8)
-    order = np.argsort(-seen[:, 2])  # far ones first, so that near ones are drawn over them
+    order = np.argsort(-seen[:, 2])  # far points first, so that near ones are drawn over them
     u, v = np.floor(place[order]).astype(int).T
     colors = _colors(distances.distances, limit_mm)[order]
     size = 2 if len(points) > 200_000 else 3
@@ -159,6 +173,7 @@ def map_picture(
 
 
 def _statistics(name: str, distances: Array, reach_mm: float) -> DistanceStatistics:
+    """Statistics of some distances."""
     return DistanceStatistics(
         name, len(distances), float(distances.mean()), float(distances.std()), float(np.median(distances)),
         full_width_at_half_maximum(distances, reach_mm),
@@ -166,12 +181,12 @@ def _statistics(name: str, distances: Array, reach_mm: float) -> DistanceStatist
 
 
 def full_width_at_half_maximum(values: Array, reach: float) -> float:
-    """Width between the points left and right of the peak of a smoothed histogram where it is half as high."""
+    """Width of the peak of a smoothed histogram of values (N,) at half its height."""
     spread = 1.4826 * float(np.median(np.abs(values - np.median(values))))
     span = min(reach, max(6.0 * spread, 1e-4))
     edges = np.linspace(np.median(values) - span, np.median(values) + span, _BINS + 1)
     count, _ = np.histogram(values, edges)
-    # Silverman's width for the core; the smoothing widens a Gaussian, which is taken off again.
+    # Silverman's bandwidth for the core; the widening of a Gaussian by the smoothing is subtracted at the end.
     width = 0.9 * spread * len(values) ** -0.2 / (edges[1] - edges[0])
     reach_bins = int(np.ceil(4.0 * width)) + 1
     kernel = np.exp(-0.5 * (np.arange(-reach_bins, reach_bins + 1) / max(width, 0.3)) ** 2)
@@ -191,6 +206,7 @@ def full_width_at_half_maximum(values: Array, reach: float) -> float:
 
 
 def _colors(distances: Array, limit_mm: float) -> NDArray[np.uint8]:
+    """(N,3) uint8 RGB of distances."""
     share = np.clip(0.5 + 0.5 * distances / limit_mm, 0.0, 1.0)
     places = np.linspace(0.0, 1.0, len(COLOR_STOPS))
     return np.stack([np.interp(share, places, COLOR_STOPS[:, k]) for k in range(3)], axis=-1).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Foreign objects: surfaces in the cloud that belong to nothing in the CAD."""
+"""Foreign objects: surfaces in the cloud that belong to no component of the CAD."""
 
 from __future__ import annotations
 
@@ -19,21 +19,28 @@ class ForeignOptions:
     """Options of the search.
 
     Attributes:
-        far_mm: points nearer to the CAD (measured components at their places) belong to it, or are weld.
-        cell_mm: points in touching cells of this size are one object.
-        least_area_mm2: smaller ones are spatter or wrong points.
+        far_mm: points nearer to the CAD, with components at their measured places, belong to it or to a weld.
+        cell_mm: points in touching cells of this size form one object.
+        min_area_mm2: smaller objects are spatter or wrong points.
         grid_mm: of the averaging, see `CloudDeviationOptions`.
     """
 
     far_mm: float = 4.0
     cell_mm: float = 2.0
-    least_area_mm2: float = 40.0
+    min_area_mm2: float = 40.0
     grid_mm: float = 0.5
 
 
 @dataclass(frozen=True)
 class ForeignObject:
-    """A surface that is in no CAD: middle (3,) and extent (3,) of its box in the model frame, mm, and its area."""
+    """A surface that is not in the CAD.
+
+    Attributes:
+        center_in_model, size_mm: (3,) centre and extent of its bounding box in the model frame, mm.
+        area_mm2: approximate area.
+        nearest_component: name of the component nearest to its farthest point.
+        distance_mm: of its farthest point from the CAD.
+    """
 
     center_in_model: Array
     size_mm: Array
@@ -55,22 +62,22 @@ def find_foreign(
     cloud: DenseCloud, model: Model, places: Mapping[str, Array] | None = None, unknown: Sequence[str] = (),
     options: ForeignOptions | None = None,
 ) -> list[ForeignObject]:  # fmt: skip
-    """Objects inside the model's box that are far from all of its surfaces, the largest first.
+    """Find objects inside the model's bounding box that are far from all of its surfaces, largest first.
 
     Args:
-        cloud: in the frame of the CAD, mm.
-        model: nominal.
-        places: (4,4) ``measured_from_nominal`` by component, so that displaced ones are no foreign objects.
-        unknown: components that are there but could not be measured; around them nothing is said.
-        options: see ForeignOptions.
+        cloud: in mm, in the frame of the CAD.
+        model: the nominal CAD.
+        places: (4,4) ``measured_from_nominal`` by component, so that displaced components are not foreign objects.
+        unknown: components that are present but could not be measured; their surroundings are ignored.
+        options: see `ForeignOptions`.
 
     Raises:
-        InputError: the cloud has no points there.
+        InputError: the cloud has no points in the box.
     """
     from scipy.ndimage import label
 
     o = options or ForeignOptions()
-    # What lies below the part and around it shows at the rim of its box.
+    # The borders of the box are left out: what lies below and around the part appears there.
     points = prepare_cloud(cloud, model.bounds_in_model + np.array([[o.far_mm], [-o.far_mm]]), o.grid_mm, 1).points
     places = places or {}
     _, faces, groups = model.mesh
@@ -93,7 +100,7 @@ def find_foreign(
     for index in range(1, count + 1):
         mine = far[owner == index]
         area = len(mine) * o.grid_mm**2
-        if area < o.least_area_mm2:
+        if area < o.min_area_mm2:
             continue
         closest = surface.closest(mine)
         farthest = int(np.argmax(np.abs(closest.distances)))

@@ -1,9 +1,10 @@
-"""Where the CAD is in a cloud of which nothing is known: its frame, and its scale if that is unknown too.
+"""Global registration: the CAD in a cloud of unknown frame and, if need be, unknown scale.
 
-Rotations are tried that turn a main direction of the cloud's normals onto one of the CAD's, all around it; for each
-the shift follows from a correlation of both as voxels (by FFT, as in Padfield, CVPR 2010). The best are refined on
-the exact surface, and how well all of the part then fits decides: symmetric wrong answers fit the base, but not the
-components.
+Rotations that turn a principal direction of the cloud's normals onto one of the CAD's are tried all around it; for each
+the translation follows from a correlation of both as voxels (by FFT, as in Padfield, CVPR 2010). The best poses are
+refined on the exact surface, and the fit of the whole part decides: wrong poses of symmetric parts fit the base, but
+not
+the components.
 """
 
 from __future__ import annotations
@@ -27,30 +28,33 @@ from arview.reconstruction.types import DenseCloud
 class GlobalRegistrationOptions:
     """Options of the search. ``diameter`` is the model's."""
 
-    points: int = 4000  # of cloud and CAD each; a few to each voxel
+    points: int = 4000  # of cloud and CAD each; a few for each voxel
     voxels: int = 40  # across the diameter: components are some voxels wide
-    step_deg: float = 6.0  # of the turns about a main direction; refining takes half of it
+    step_deg: float = 6.0  # between rotations about a principal direction; refinement converges from half of it
     kept: int = 12  # poses that are refined and compared
-    scale_step: float = 1.08  # between scales that are tried when it is unknown
-    scale_range: tuple[float, float] = (0.7, 2.5)  # the part's size over the cloud's; more than 1: part of it is seen
-    limit_share: float = 0.015  # distances count up to this share of the diameter: displaced, or not the part
-    min_lead: float = 1.08  # cost of the next best place over the best one's, or it is ambiguous
+    scale_step: float = 1.08  # ratio of scales that are tried when the scale is unknown
+    scale_range: tuple[float, float] = (
+        0.7,
+        2.5,
+    )  # part's size over the cloud's; above 1, part of it is seen
+    limit_share: float = 0.015  # distances are limited to this share of the diameter
+    min_lead: float = 1.08  # cost of the next best pose over the best one's, below which it is ambiguous
     seed: int = 0
 
 
 def find_model_in_cloud(
     cloud: DenseCloud, model: Model, scale: float | None = 1.0, options: GlobalRegistrationOptions | None = None
 ) -> Similarity:
-    """The scale and rigid place ``model_from_scan`` of a cloud anywhere.
+    """Scale and rigid pose ``model_from_scan`` of the model in a cloud.
 
     Args:
         cloud: of the part and little else.
-        model: nominal.
-        scale: mm per unit of the cloud, None when it is unknown.
-        options: see GlobalRegistrationOptions.
+        model: the nominal CAD.
+        scale: mm per unit of the cloud, None when unknown.
+        options: see `GlobalRegistrationOptions`.
 
     Raises:
-        InputError: too few points; two places that are no symmetry of the part fit alike; none fits.
+        InputError: there are too few points, none fits, or two poses fit alike that are not related by a symmetry.
     """
     o = options or GlobalRegistrationOptions()
     points, normals, is_oriented = _some_points(cloud, o)
@@ -67,7 +71,7 @@ def find_model_in_cloud(
     ]
     places.sort(key=lambda place: -place[0])
     limit_mm = o.limit_share * model.diameter_mm
-    # A thin plate fits with its top at its bottom too: starts to both sides.
+    # A thin plate also fits with its top on its bottom, so there are starts displaced to both sides.
     step = 0.8 * model.diameter_mm / o.voxels * _main_axes(surface.face_normals[of_face], 1)[0]
     tried = [(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _distinct(places, o) for k in (-1.0, 0.0, 1.0)]
     sides = normals if is_oriented else None
@@ -77,7 +81,7 @@ def find_model_in_cloud(
     around = _around(apply(pose, points * found_scale), samples, limit_mm)
     cost -= around * limit_mm
     if around > 0.7 or cost > 0.6 * limit_mm * (1.0 - around):
-        raise InputError("cloud: the part is not found in it: another part, or too little of it")
+        raise InputError("cloud: the part was not found in it: another part, or too little of it")
     for rival_cost, _, rival in fits[1:]:
         if rival_cost - around * limit_mm > o.min_lead * cost + 1e-3 * limit_mm:
             break
@@ -85,14 +89,16 @@ def find_model_in_cloud(
         other_mm = np.abs(surface.closest(moved).distances)
         if np.mean(np.linalg.norm(moved - samples, axis=1)) > limit_mm and np.mean(other_mm) > 0.1 * limit_mm:
             raise InputError(
-                "cloud: the part fits in two ways alike, and in none well: it is mirrored, another part, or shows too "
-                "little of what tells its sides apart"
+                "cloud: the part fits in two ways equally, and in neither of them well: the cloud is mirrored, of "
+                "another part, or shows too little of what distinguishes its sides"
             )
     return Similarity(found_scale, pose)
 
 
 def _some_points(cloud: DenseCloud, o: GlobalRegistrationOptions) -> tuple[Array, Array, bool]:
-    """Points (N,3) spread evenly over a cloud, normals, and whether their side is known: else they are estimated."""
+    """Points (N,3) spread evenly over a cloud, their normals, and whether the sign of these is known; otherwise
+    estimated.
+    """
     points, own = np.asarray(cloud.points, dtype=np.float64), np.asarray(cloud.normals, dtype=np.float64)
     sound = np.isfinite(points).all(axis=1)
     points, own = points[sound], np.nan_to_num(own[sound])
@@ -105,7 +111,7 @@ def _some_points(cloud: DenseCloud, o: GlobalRegistrationOptions) -> tuple[Array
     low, high = np.quantile(points, [0.002, 0.998], axis=0)
     core = np.all((points >= low - 0.05 * (high - low)) & (points <= high + 0.05 * (high - low)), axis=1)
     points, own = points[core], own[core]
-    # As many cells as are wanted points: halve the cell until there are.
+    # Shrink the cells until there are as many as points are wanted.
     cell = float(np.linalg.norm(high - low)) / 20.0
     for _ in range(12):
         _, first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)
@@ -122,14 +128,15 @@ def _some_points(cloud: DenseCloud, o: GlobalRegistrationOptions) -> tuple[Array
 
 
 def _ladder(middle: float, o: GlobalRegistrationOptions) -> Array:
+    """Scales to try around a middle one, in geometric steps."""
     low, high = o.scale_range
     return np.asarray(middle * np.geomspace(low, high, int(np.log(high / low) / np.log(o.scale_step)) + 2))
 
 
-def _main_axes(normals: Array, most: int) -> list[Array]:
-    """Directions that most normals (N,3) have, with the sign that most of them have."""
+def _main_axes(normals: Array, max_count: int) -> list[Array]:
+    """Principal directions of normals (N,3), at most ``max_count``, with the sign that most normals have."""
     left, found = normals[np.linalg.norm(normals, axis=1) > 0.5], []
-    for _ in range(most):
+    for _ in range(max_count):
         if len(left) < 0.03 * len(normals):
             break
         tried = left[:: max(1, len(left) // 400)]
@@ -144,7 +151,7 @@ def _main_axes(normals: Array, most: int) -> list[Array]:
 
 
 def _turns(of_cloud: Array, of_model: Array, o: GlobalRegistrationOptions) -> list[Array]:
-    """Rotations (3,3) that turn the cloud's main direction onto one of the model's, either side, all around it."""
+    """Rotations (3,3) that turn the cloud's main direction onto one of the model's, either side up, all around it."""
     turns = []
     angles = np.arange(0.0, 360.0, o.step_deg)
     for target in _main_axes(of_model, 2):
@@ -155,7 +162,7 @@ def _turns(of_cloud: Array, of_model: Array, o: GlobalRegistrationOptions) -> li
 
 
 def _between(a: Array, b: Array) -> Array:
-    """(3,3) the smallest rotation of one unit vector onto another."""
+    """(3,3) smallest rotation of one unit vector onto another."""
     axis, cosine = np.cross(a, b), float(a @ b)
     if np.linalg.norm(axis) < 1e-9:
         across = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
@@ -166,7 +173,7 @@ def _between(a: Array, b: Array) -> Array:
 def _shifted(
     points: Array, samples: Array, turn: Array, model: Model, scale: float, o: GlobalRegistrationOptions
 ) -> tuple[float, float, Array]:
-    """How well turned points fit at their best shift: score, scale, pose (4,4) of the scaled points."""
+    """Best translation of rotated points: normalised score, scale, and pose (4,4) of the scaled points."""
     from scipy import fft
 
     turned = points @ turn.T
@@ -184,7 +191,7 @@ def _shifted(
 
 
 def _voxels(points: Array, cell: float) -> tuple[Array, Array]:
-    """Occupied cells, blurred by one, and the corner of the first."""
+    """Occupied cells, blurred, and the corner of the first cell."""
     from scipy.ndimage import gaussian_filter
 
     low = points.min(axis=0) - 2.0 * cell
@@ -197,7 +204,7 @@ def _voxels(points: Array, cell: float) -> tuple[Array, Array]:
 def _distinct(
     places: list[tuple[float, float, Array]], o: GlobalRegistrationOptions
 ) -> list[tuple[float, float, Array]]:
-    """The best places that are not nearly one that is better."""
+    """The best poses, without those close to a better one."""
     kept: list[tuple[float, float, Array]] = []
     for score, scale, pose in places:
         turns = [np.trace(other[:3, :3].T @ pose[:3, :3]) for _, s, other in kept if abs(s / scale - 1.0) < 0.04]
@@ -212,7 +219,7 @@ def _refined(
     points: Array, normals: Array | None, surface: MeshSurface, samples: Array, start: tuple[float, Array],
     with_scale: bool, limit_mm: float,
 ) -> tuple[float, float, Array]:  # fmt: skip
-    """Cost, scale and pose (4,4) on the exact surface: Gauss–Newton on seven numbers with Tukey's weights."""
+    """Cost, scale and pose (4,4) on the exact surface: Gauss–Newton on up to seven parameters with Tukey's weights."""
     scale, pose = start
     width, size = 4.0 * limit_mm, 0.25 * float(np.linalg.norm(np.ptp(samples, axis=0)))
     for _ in range(40):
@@ -239,19 +246,19 @@ def _refined(
         if np.abs(step).max() < 1e-4 * size and width <= 0.05 * limit_mm:
             break
         width = max(0.6 * width, 0.05 * limit_mm)
-    # Both ways: points that have no surface, and surface that has no points. What lies around the part costs the same
-    # wherever it is.
+    # Distances both ways: from points to the surface and from the surface to points. What lies around the part costs
+    # the same for every pose.
     moved = apply(pose, points * scale)
     closest = surface.closest(moved)
     of_points = np.minimum(np.abs(closest.distances), limit_mm)
     if normals is not None:
         of_points[np.sum(closest.normals * (normals @ pose[:3, :3].T), axis=1) < 0.0] = limit_mm
     apart = cKDTree(moved).query(samples)[0]
-    to_points = np.clip(apart - 2.0 * np.median(apart), 0.0, limit_mm)  # less what lies between the points
+    to_points = np.clip(apart - 2.0 * np.median(apart), 0.0, limit_mm)  # less the spacing of the points
     return float(of_points.mean() + 0.3 * to_points.mean()), scale, pose
 
 
 def _around(points: Array, samples: Array, limit_mm: float) -> float:
-    """Share of points (N,3) outside the model's box: no part of it."""
+    """Share of points (N,3) outside the model's bounding box, which are not part of it."""
     low, high = samples.min(axis=0) - limit_mm, samples.max(axis=0) + limit_mm
     return 1.0 - float(np.mean(np.all((points > low) & (points < high), axis=1)))

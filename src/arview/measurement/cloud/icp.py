@@ -1,7 +1,7 @@
-"""Registration of points to points (ICP): for references that are scans, and for the studies.
+"""Registration of points to points (ICP), for references that are scans and for the studies.
 
-Point to point (Besl & McKay 1992), point to plane (Chen & Medioni 1992) and generalized ICP, plane to plane
-(Segal, Haehnel & Thrun 2009). Registration to a CAD uses its exact surface instead: `measurement.cloud.registration`.
+Point to point (Besl & McKay 1992), point to plane (Chen & Medioni 1992) and generalized ICP, plane to plane (Segal,
+Haehnel & Thrun 2009). Registration to a CAD uses its exact surface instead: `measurement.cloud.registration`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from arview.geometry import Array, apply, rigid
 from arview.measurement.cloud.registration import move_about
 
 Method = Literal["point", "plane", "generalized"]
+"""Distance that is minimised."""
 
 
 @dataclass(frozen=True)
@@ -23,14 +24,14 @@ class IcpOptions:
     """Options of ICP between clouds.
 
     Attributes:
-        method: distance that is minimised: to the point, to the plane at the point, or between planes at both.
-        threshold_mm, threshold_deg: converged when the centre moves and the points turn less in a step: the
-            dissertation's values.
+        method: distance that is minimised: to the point, to the plane at the point, or between planes at both points.
+        threshold_mm, threshold_deg: converged when a step moves the centre and rotates the points by less than this.
         max_iterations: point to point needs tens where surfaces slide.
-        first_distance_mm, last_distance_mm: pairs farther apart do not count; the limit halves every iteration.
-        trim: share of the pairs, the farthest, that is left out.
-        neighbours: points that a normal is estimated from.
-        flatness: of generalized ICP: variance along the normal in units of that across it (Segal's epsilon).
+        first_distance_mm: largest distance of a pair in the first iteration; it halves in every iteration.
+        last_distance_mm: lower bound of that distance.
+        trim: share of the pairs, those farthest apart, that is left out.
+        neighbours: points from which a normal is estimated.
+        flatness: for generalized ICP, variance along the normal divided by that across it (Segal's epsilon).
     """
 
     method: Method = "plane"
@@ -46,7 +47,14 @@ class IcpOptions:
 
 @dataclass(frozen=True)
 class IcpResult:
-    """``target_from_source`` (4,4), root mean square distance of the pairs, their share, and how it ended."""
+    """Result of ICP.
+
+    Attributes:
+        target_from_source: (4,4) mm.
+        rms_mm: root mean square distance of the pairs.
+        overlap: share of the source points that have a partner.
+        iterations, converged: of the iteration.
+    """
 
     target_from_source: Array
     rms_mm: float
@@ -56,20 +64,29 @@ class IcpResult:
 
 
 class IcpTarget:
-    """A cloud (N,3) that others are registered to, its search tree and normals (N,3) (estimated when not given)."""
+    """A cloud to which others are registered, with its search tree and normals.
+
+    Args:
+        points: (N,3) mm.
+        normals: (N,3) unit; estimated when not given.
+        neighbours: points from which a normal is estimated.
+
+    Raises:
+        InputError: there are too few points, or one is not finite.
+    """
 
     def __init__(self, points: Array, normals: Array | None = None, neighbours: int = 12) -> None:
         from scipy.spatial import cKDTree
 
         self.points = np.ascontiguousarray(points, dtype=np.float64)
         if len(self.points) < neighbours or not np.isfinite(self.points).all():
-            raise InputError(f"reference cloud: needs at least {neighbours} points, none NaN")
+            raise InputError(f"reference cloud: expected at least {neighbours} points, all finite")
         self.tree = cKDTree(self.points)
         self.normals = estimate_normals(self.points, self.tree, neighbours) if normals is None else normals
 
 
 def estimate_normals(points: Array, tree: Any = None, neighbours: int = 12) -> Array:
-    """(N,3) unit normals of planes through the nearest points of each; their side is arbitrary."""
+    """(N,3) unit normals of planes through the nearest points of each; their sign is arbitrary."""
     from scipy.spatial import cKDTree
 
     search = cKDTree(points) if tree is None else tree
@@ -82,10 +99,10 @@ def estimate_normals(points: Array, tree: Any = None, neighbours: int = 12) -> A
 def register_clouds(
     source: Array, target: IcpTarget, start: Array | None = None, options: IcpOptions | None = None
 ) -> IcpResult:
-    """Move points (N,3) onto a cloud.
+    """Register points (N,3) to a cloud.
 
     Raises:
-        InputError: fewer than 6 pairs within the distance.
+        InputError: there are fewer than 6 pairs within the distance.
     """
     o = options or IcpOptions()
     source = np.asarray(source, dtype=np.float64)
@@ -123,7 +140,7 @@ def register_clouds(
 
 
 def _best_rigid(x: Array, y: Array) -> Array:
-    """(4,4) that moves points x nearest to their partners y (Arun, Huang & Blostein 1987)."""
+    """(4,4) least-squares rigid motion of points x to their partners y (Arun, Huang & Blostein 1987)."""
     middle_x, middle_y = x.mean(axis=0), y.mean(axis=0)
     u, _, vt = np.linalg.svd((x - middle_x).T @ (y - middle_y))
     rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
@@ -131,7 +148,7 @@ def _best_rigid(x: Array, y: Array) -> Array:
 
 
 def _step(hessian: Array, gradient: Array, center: Array) -> Array:
-    """Gauss–Newton step about a centre; directions without information stay."""
+    """Gauss–Newton step about a centre; directions without information are left at zero."""
     scales = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
     values, vectors = np.linalg.eigh(hessian * np.outer(scales, scales))
     kept = values > 1e-6
@@ -140,8 +157,8 @@ def _step(hessian: Array, gradient: Array, center: Array) -> Array:
 
 
 def _plane_to_plane(x: Array, y: Array, n: Array, m: Array, center: Array, flatness: float) -> Array:
-    """A step of generalized ICP: pairs weighed by the planes at both points, normals n at y and m at x."""
-    # Covariance I − (1 − ε) n nᵀ at each point; the sum over both is inverted.
+    """A step of generalized ICP: pairs weighted by the planes at both points, with normals n at y and m at x."""
+    # Each point has covariance I − (1 − ε) n nᵀ; a pair is weighted by the inverse of their sum.
     loss = 1.0 - flatness
     covariance = 2.0 * np.eye(3) - loss * (n[:, :, None] * n[:, None] + m[:, :, None] * m[:, None])
     weight = np.linalg.inv(covariance)

@@ -1,8 +1,8 @@
-"""Closest points on a triangle mesh, exact, for many points: what clouds are registered to and judged by.
+"""Exact closest points on a triangle mesh, for registering and comparing clouds.
 
 A tree of boxes is searched from near to far; the closest point of a triangle follows from the regions of its plane
-(Ericson, Real-Time Collision Detection, 2005, 5.1.5), and the side of the surface from angle-weighted normals of
-edges and corners (Bærentzen & Aanæs, TVCG 2005).
+(Ericson, Real-Time Collision Detection, 2005, 5.1.5), and the side of the surface from angle-weighted normals of edges
+and corners (Bærentzen & Aanæs, TVCG 2005).
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from arview.geometry import Array
 _LEAF = 4
 """Triangles in a leaf of the tree."""
 _CHUNK = 4096
-"""Points a thread takes at a time."""
+"""Points that a thread takes at a time."""
 _WELD_MM = 1e-5
-"""Vertices nearer than this are one: files give each face its own."""
+"""Vertices nearer than this are merged, because files may repeat them for each face."""
 _SHARP_DEG = 30.0
-"""Faces that meet at a larger angle make an edge; at a smaller one they are a curved surface's."""
+"""Faces that meet at a larger angle form an edge; at a smaller angle they belong to a curved surface."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,13 @@ class ClosestPoints:
 
     Attributes:
         points: (N,3) on the surface.
-        faces: (N,) int64 index of the triangle, -1 where none is within reach (the rest is NaN there).
+        faces: (N,) int64 index of the triangle, -1 where none is within reach (other values are NaN there).
         distances: (N,) mm, positive outside.
-        normals: (N,3) unit: inside smooth areas that of the curved surface that the triangles stand for, on edges the
-            direction in which ``distances`` grows.
-        is_edge: (N,) True where the closest point lies on an edge or corner of the shape, or on the rim of an open
-            surface: such a point says nothing about how far the surface is along its normal.
+        normals: (N,3) unit: on smooth areas the interpolated normal of the curved surface, on edges the direction in
+            which
+            ``distances`` increases.
+        is_edge: (N,) whether the closest point lies on an edge or corner of the shape, or on the border of an open
+            surface; such a point does not constrain the surface along its normal.
     """
 
     points: Array
@@ -51,15 +52,15 @@ class ClosestPoints:
 
 
 class MeshSurface:
-    """A triangle mesh that closest points are looked up on.
+    """A triangle mesh for closest-point queries.
 
     Args:
         vertices: (V,3), mm.
         faces: (F,3), counter-clockwise seen from outside. Faces without area are never returned.
-        groups: (F,) component of each face; only faces of one component are smooth with each other. Default: one.
+        groups: (F,) component of each face; normals are smoothed only within a component. Default: one component.
 
     Raises:
-        InputError: no face with an area, or a vertex that is not finite.
+        InputError: no face has an area, or a vertex is not finite.
     """
 
     def __init__(self, vertices: Array, faces: NDArray[np.integer], groups: NDArray[np.integer] | None = None) -> None:
@@ -86,9 +87,9 @@ class MeshSurface:
         self._place[self._order] = np.arange(len(self._order))
 
     def closest(self, points: Array, reach: float = np.inf, hint: NDArray[np.int64] | None = None) -> ClosestPoints:
-        """Closest points of the surface to ``points`` (N,3), no farther than ``reach`` mm.
+        """Closest points of the surface to points (N,3), within ``reach`` mm.
 
-        ``hint`` (N,) are faces that are likely near, as those of the last time; they only save time.
+        ``hint`` (N,) are faces that are likely to be near, such as those of the previous query; they only save time.
         """
         points = np.ascontiguousarray(points, dtype=np.float64)
         count = len(points)
@@ -118,11 +119,11 @@ class MeshSurface:
         return out
 
     def sample(self, spacing_mm: float, seed: int = 0) -> tuple[Array, NDArray[np.int64]]:
-        """Points (N,3) spread evenly by area, one per ``spacing_mm``² or at least one, and the face (N,) of each."""
+        """Points (N,3) spread evenly by area, one per ``spacing_mm``² but at least one, and the face (N,) of each."""
         return self.spread(max(1, round(self.areas.sum() / spacing_mm**2)), seed)
 
     def spread(self, count: int, seed: int = 0) -> tuple[Array, NDArray[np.int64]]:
-        """``count`` points (N,3) at random, evenly by area, and the face (N,) of each."""
+        """``count`` random points (N,3), evenly by area, and the face (N,) of each."""
         rng = np.random.default_rng(seed)
         share = np.cumsum(self.areas) / self.areas.sum()
         faces = np.searchsorted(share, (np.arange(count) + rng.random(count)) / count, side="right")
@@ -132,13 +133,14 @@ class MeshSurface:
         return np.einsum("nc,ncx->nx", weights, self.triangles[faces]), faces
 
     def _neighbourhood(self, used: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_], Array]:
-        """What the faces around a face say of it.
+        """Normals at the sides and corners of each face.
 
         Returns:
-            the normals (F,7,3) of a face, its sides 01 12 20 and its corners, which tell the side of the surface;
-            (F,7) which of them are sharp; the normals (F,3,3) at its corners of the smooth surface it belongs to.
+            (F,7,3) normals of the face, its sides 01 12 20 and its corners, which determine the side of the surface;
+            (F,7)
+            which of these are sharp; (F,3,3) normals at the corners of the smooth surface to which the face belongs.
         """
-        # Vertices of files are often given once per face; those of two components at one place stay two.
+        # Files often repeat vertices for each face; coinciding vertices of two components stay separate.
         _, same = np.unique(np.round(self.vertices / _WELD_MM).astype(np.int64), axis=0, return_inverse=True)
         _, corner = np.unique(same.ravel()[self.faces] * (self.groups.max() + 1) + self.groups[:, None],
                               return_inverse=True)  # fmt: skip
@@ -155,7 +157,7 @@ class MeshSurface:
         of_face = np.tile(used, 3)
         _, side = np.unique(sides.min(axis=1) * len(sums) + sides.max(axis=1), return_inverse=True)
         side_sums = np.stack([np.bincount(side, normals[of_face, axis]) for axis in range(3)], axis=1)
-        # Two faces at an angle have a sum of length 2 cos(angle / 2); a rim has 1, a crowd of faces is no surface.
+        # The sum of two unit normals has length 2 cos(angle / 2). A border has one face; more than two are no surface.
         on_side = np.bincount(side)
         is_sharp = (np.linalg.norm(side_sums, axis=1) < 2.0 * np.cos(np.deg2rad(0.5 * _SHARP_DEG))) | (on_side != 2)
         is_sharp_corner = np.zeros(len(sums), dtype=bool)
@@ -174,13 +176,13 @@ class MeshSurface:
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
-    """Threads of the look-ups alone, so that whoever waits for a look-up may itself be a job of other threads."""
+    """Threads for queries only, so that a thread of another pool can wait for a query without a deadlock."""
     return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)), thread_name_prefix="closest")
 
 
 @kernel
 def _smooth(corner, normals, angles, faces_around, ends, min_cosine):  # type: ignore[no-untyped-def]
-    """(F,3,3) normals at the corners of faces, of the faces around that meet them at a small angle."""
+    """(F,3,3) normals at the corners of faces, averaged over adjacent faces that meet the face at a small angle."""
     out = np.zeros((len(corner), 3, 3))
     for face in range(len(corner)):
         for k in range(3):
@@ -198,7 +200,7 @@ def _smooth(corner, normals, angles, faces_around, ends, min_cosine):  # type: i
 
 @kernel
 def _build(middles, lows, highs, order, low, high, right, start, count):  # type: ignore[no-untyped-def]
-    """Boxes of a tree in depth-first order (left child follows its parent); returns their number."""
+    """Boxes of a tree in depth-first order, the left child right after its parent; returns their number."""
     stack = np.empty((128, 3), dtype=np.int64)
     stack[0] = 0, len(order), -1
     top, nodes = 1, 0
@@ -232,7 +234,7 @@ def _build(middles, lows, highs, order, low, high, right, start, count):  # type
             order[first:last] = part[np.argsort(middles[part, axis])]
             split = (first + last) // 2
         count[node] = 0
-        # The left part is taken next, so that it follows its parent; the right one is told to the parent later.
+        # The left part is next, so that it follows its parent; the right one sets its parent's index later.
         stack[top] = split, last, node
         stack[top + 1] = first, split, -1
         top += 2
@@ -240,7 +242,12 @@ def _build(middles, lows, highs, order, low, high, right, start, count):  # type
 
 
 def _tree(triangles: Array, used: NDArray[np.int64]) -> tuple[NDArray, ...]:  # type: ignore[type-arg]
-    """Order of the used triangles, and per node: lowest and highest corner, right child, first triangle, number."""
+    """Tree over the triangles in use.
+
+    Returns:
+        order of the triangles, and for each node its lowest and highest corner, right child, first triangle and number
+        of triangles.
+    """
     lows, highs = triangles.min(axis=1), triangles.max(axis=1)
     order, size = used.copy(), 2 * len(used)
     low, high = np.empty((size, 3)), np.empty((size, 3))
@@ -260,7 +267,7 @@ def _to_box(x, y, z, low, high):  # type: ignore[no-untyped-def]
 
 @kernel(numpy_errors=True)
 def _on_triangle(px, py, pz, t):  # type: ignore[no-untyped-def]
-    """Weights of corners 1 and 2 at the closest point of a triangle, and where: 0 inside, 1–3 side, 4–6 corner."""
+    """Weights of corners 1 and 2 at the closest point of a triangle, and its region: 0 inside, 1–3 side, 4–6 corner."""
     abx, aby, abz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     acx, acy, acz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
     apx, apy, apz = px - t[0, 0], py - t[0, 1], pz - t[0, 2]
@@ -297,6 +304,7 @@ def _query(  # type: ignore[no-untyped-def]
     points, hints, reach2, triangles, sides, edges, corner_normals, low, high, right, start, count, order,
     out_points, out_faces, out_distances, out_normals, out_edges,
 ):  # fmt: skip
+    """Closest points of a chunk of points, written into the arrays ``out_…``; see `ClosestPoints`."""
     stack, near = np.empty(128, dtype=np.int64), np.empty(128)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]

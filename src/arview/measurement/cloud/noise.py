@@ -1,10 +1,10 @@
-"""How the residuals of a registration err together, and what that does to a result made of them.
+"""Correlated noise of the residuals of a registration, and its effect on results computed from them.
 
-The surface of a reconstruction is off by a smooth field of errors besides the noise of each point. It is taken for a
-vector field e(x) with covariance s² exp(−|x − x'| / ℓ) I, of which a residual sees the part along its normal, so that
-Cov(rᵢ, rⱼ) = s² exp(−hᵢⱼ/ℓ) nᵢ·nⱼ + noise² δᵢⱼ. The three numbers are estimated by restricted maximum likelihood
-(Patterson & Thompson, Biometrika 1971): the moves that were fitted are projected out of the residuals first, or a
-long-ranged error would hide in them.
+Besides the noise of each point, the surface of a reconstruction has a smooth field of errors. It is modelled as a
+vector field e(x) with covariance s² exp(−|x − x'| / ℓ) I, whose component along the normal enters a residual, so that
+Cov(rᵢ, rⱼ) = s² exp(−hᵢⱼ/ℓ) nᵢ·nⱼ + noise² δᵢⱼ. The three parameters are estimated by restricted maximum likelihood
+(Patterson & Thompson, Biometrika 1971): the fitted motions are projected out of the residuals first, because a
+long-ranged error would otherwise be absorbed by them.
 """
 
 from __future__ import annotations
@@ -17,23 +17,27 @@ from numpy.typing import NDArray
 from arview.geometry import Array
 
 _SHARES = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 0.95])
+"""Candidates for the shared part of the variance."""
 _LENGTHS = 6
+"""Number of correlation lengths tried."""
 _DOUBT = 2.0
-"""What the log-likelihood must gain by the two numbers of the shared part (Akaike 1974)."""
+"""Gain in log-likelihood that the two parameters of the shared part must bring (Akaike 1974)."""
 _NEIGHBOURS = 4
-"""Points of the sample come in groups of this size, near each other, so that short ranges are seen too."""
+"""The sample consists of groups of this many neighbouring points, so that short correlation lengths are visible."""
 _SUM_POINTS = 1000
+"""Points whose pairs represent all in the covariance of a sum."""
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Of the residuals of a fit.
+    """Noise of the residuals of a fit.
 
     Attributes:
         sigma_mm: standard deviation of a residual.
-        shared: 0–1, part of its variance that it shares with its neighbours.
-        length_mm: distance at which the shared part has dropped to 1/e.
-        effective_points: number of independent points that would average as well; all when ``shared`` is 0.
+        shared: 0–1, part of its variance that is correlated with its neighbours.
+        length_mm: distance at which the correlation has dropped to 1/e.
+        effective_points: number of independent points with the same variance of the mean; all points if ``shared`` is
+            0.
     """
 
     sigma_mm: float
@@ -43,9 +47,15 @@ class NoiseModel:
 
 
 def estimate_noise(points: Array, normals: Array, residuals: Array, rows: Array, count: int, seed: int) -> NoiseModel:
-    """Noise of residuals (N,) at points (N,3) with surface normals (N,3), after a fit with Jacobian rows (N,K).
+    """Estimate the noise of residuals after a fit.
 
-    ``count`` points are looked at; 0 takes the residuals to be independent.
+    Args:
+        points: (N,3) where the residuals are.
+        normals: (N,3) surface normals there.
+        residuals: (N,) mm.
+        rows: (N,K) Jacobian of the fit.
+        count: number of points used; 0 assumes independent residuals.
+        seed: of the choice of points.
     """
     total = float(np.sqrt(np.mean(residuals**2)))
     if count == 0 or len(points) < 60 or total < 1e-7:
@@ -74,9 +84,9 @@ def estimate_noise(points: Array, normals: Array, residuals: Array, rows: Array,
 
 
 def spread_of_sum(points: Array, normals: Array, pull: Array, noise: NoiseModel, seed: int) -> Array:
-    """(K,K) covariance of Σ pull[:, i] rᵢ over residuals r with this noise; ``pull`` is (K,N).
+    """(K,K) covariance of Σ pull[:, i] rᵢ for residuals r with this noise; ``pull`` is (K,N).
 
-    The shared part is summed over pairs of some points that stand for all.
+    The shared part is summed over pairs of a subset of the points, which represents all.
     """
     own = (1.0 - noise.shared) * pull @ pull.T
     if noise.shared == 0.0:
@@ -96,13 +106,13 @@ def spread_of_sum(points: Array, normals: Array, pull: Array, noise: NoiseModel,
 
 
 def _apart(a: Array, b: Array) -> Array:
-    """(N,M) distances between points."""
+    """(N,M) distances between two sets of points."""
     squared = np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1) - 2.0 * a @ b.T
     return np.sqrt(np.maximum(squared, 0.0))
 
 
 def _sample(points: Array, count: int, seed: int) -> NDArray[np.int64]:
-    """Indices of at most ``count`` points: some at random, each with some of its neighbours."""
+    """Indices of at most ``count`` points: random ones, most of them with some of their neighbours."""
     from scipy.spatial import cKDTree
 
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""A cloud made ready for measuring: what is broken left out, averaged on a grid."""
+"""Preparation of a cloud for measuring: invalid points are removed, the others averaged on a grid."""
 
 from __future__ import annotations
 
@@ -12,12 +12,18 @@ from arview.geometry import Array
 from arview.reconstruction.types import DenseCloud
 
 _CHUNK = 4_000_000
-"""Points averaged at a time, so that a cloud of any size needs little memory."""
+"""Points averaged at a time, so that memory does not grow with the cloud."""
 
 
 @dataclass(frozen=True)
 class CloudPoints:
-    """Points (N,3) mm, unit normals (N,3) (zero where unknown), standard deviations (N,) mm; all finite."""
+    """Points of a cloud; all values are finite.
+
+    Attributes:
+        points: (N,3) mm.
+        normals: (N,3) unit, zero where unknown.
+        sigma: (N,) standard deviations along the normals, mm.
+    """
 
     points: Array
     normals: Array
@@ -32,10 +38,10 @@ class CloudPoints:
 
 
 def prepare_cloud(cloud: DenseCloud, box: Array, grid_mm: float, min_points: int) -> CloudPoints:
-    """Points of a cloud inside a box (2,3), averaged on a grid; NaN, infinite ones and repeats do no harm.
+    """Points of a cloud inside a box (2,3), averaged on a grid; non-finite and repeated points are tolerated.
 
     Raises:
-        InputError: so few points are left that nothing can be measured.
+        InputError: fewer than ``min_points`` are left.
     """
     if len(cloud.points) == 0:
         raise InputError("cloud: is empty; reconstruct again with more photos or more texture around the part")
@@ -72,9 +78,9 @@ def join(parts: list[CloudPoints]) -> CloudPoints:
 
 
 def grid_average(cloud: CloudPoints, grid_mm: float) -> CloudPoints:
-    """One point per cell of a grid and main direction of the normal, so that the sides of a thin wall stay two.
+    """One point for each cell of a grid and main direction of the normal, so that both sides of a thin wall are kept.
 
-    Points are weighed by 1/σ². Because neighbours err together, a cell's σ is that of a typical point of it.
+    Points are weighted by 1/σ². Since errors of neighbours are correlated, σ of the average is that of a typical point.
     """
     if grid_mm <= 0 or len(cloud) == 0:
         return cloud

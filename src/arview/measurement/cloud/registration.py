@@ -1,9 +1,9 @@
-"""Registration of points to the exact surface of a mesh: one solver, any set of free degrees of freedom.
+"""Registration of points to the exact surface of a mesh, for any set of free degrees of freedom.
 
 Gauss–Newton on the signed distances of the points to the surface, reweighted for robustness (Holland & Welsch 1977;
-Huber 1981). What moves are free is a subspace of the six; those that the points do not determine are found in the
-information matrix and left alone. The covariance of the result takes into account that neighbouring points err
-together (`arview.measurement.cloud.noise`).
+Huber 1981). The free motions are a subspace of the six; those that the points do not determine are found in the
+information matrix and excluded. The covariance of the result includes the correlation of neighbouring errors
+(`measurement.cloud.noise`).
 """
 
 from __future__ import annotations
@@ -21,35 +21,36 @@ from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.noise import NoiseModel, estimate_noise, spread_of_sum
 
 NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
+"""Degrees of freedom, in the order of a twist."""
 TUKEY_SIGMAS, HUBER_SIGMAS = 4.685, 1.345
-"""Where the kernels begin to doubt a residual: 95 % efficiency on Gaussian noise."""
+"""Tuning constants of the robust kernels: 95 % efficiency for normal errors."""
 
 
 @dataclass(frozen=True)
 class RegistrationOptions:
-    """Options of the solver.
+    """Options of the registration.
 
     Attributes:
-        kernel: how residuals are weighed: ``tukey`` ignores outliers, ``huber`` only limits them, ``none`` is least
-            squares. Its width starts at the first distance and shrinks to the noise, or a face that is off by more
-            than the noise of the others would be taken for an outlier at once.
-        trim: share of the points, those with the largest residuals, that is left out in every iteration.
-        first_distance_mm: points farther from the surface than this are left out at first …
-        last_distance_mm: … and farther than this at last, unless the noise is larger.
-        distance_sigmas: the limit in widths of the kernel.
-        shrink: of that width from one iteration to the next, until it is that of the noise.
-        threshold_mm, threshold_deg: converged when the centre moves and the points turn less than this in a step.
-        max_iterations: the solver needs 4 to 15.
-        skips_edges: leaves out points whose closest point lies on an edge: with noise they pull to its outside.
-        min_normal_cosine: points with a normal that leans more against the surface's belong to another face.
-        min_information: moves with less information per point, in the unit of the best one's possible, are not
-            determined; turns are weighed with the size of the points' cloud.
-        min_points: fewer cannot tell a place from noise.
-        min_width_mm: of the kernel: a surface that is off by less is never left out as an outlier, however well the
-            rest fits.
-        noise_points: points that the noise is estimated from; 0 takes the points to err independently, which makes
-            the covariance far too small on real clouds.
-        seed: of the choice of those.
+        kernel: weighting of residuals: ``tukey`` ignores outliers, ``huber`` limits them, ``none`` is least squares.
+            Its
+            width starts at the first distance and shrinks to the noise; with a narrow kernel from the start, a face
+            displaced by more than the noise would be taken for an outlier.
+        trim: share of the points, those with the largest residuals, that each iteration leaves out.
+        first_distance_mm: maximum distance of points from the surface in the first iteration.
+        last_distance_mm: maximum distance in the last iteration, unless the noise is larger.
+        distance_sigmas: maximum distance in widths of the kernel.
+        shrink: factor by which the width decreases in each iteration, until it reaches the noise.
+        threshold_mm, threshold_deg: converged when a step moves the centre and rotates the points by less than this.
+        max_iterations: of the solver, which needs 4 to 15.
+        skips_edges: leave out points whose closest point lies on an edge: with noise they pull to its outside.
+        min_normal_cosine: points whose normal makes a larger angle with the surface's belong to another face.
+        min_information: motions with less information per point, as a share of the largest possible, are undetermined;
+            rotations are converted by the size of the cloud.
+        min_points: fewer points cannot be registered.
+        min_width_mm: lower bound of the kernel's width: surfaces displaced by less are never treated as outliers.
+        noise_points: points from which the noise is estimated; 0 assumes independent errors, which makes the covariance
+            far too small for real clouds.
+        seed: of the choice of these points.
     """
 
     kernel: Literal["tukey", "huber", "none"] = "tukey"
@@ -83,27 +84,27 @@ class RegistrationOptions:
 
 @dataclass(frozen=True)
 class Registration:
-    """Where points lie relative to a surface.
+    """Position of points relative to a surface.
 
     Attributes:
         surface_from_points: (4,4), mm.
-        twist: (6,) the same as rotation vector (rad) and shift (mm) of the centre: x → R (x − c) + c + t.
-        center: (3,) mm, c.
-        radius_mm: length that rotations are weighed with where directions of moves are compared.
+        twist: (6,) the same as rotation vector (rad) and translation (mm) of the centre: x → R (x − c) + c + t.
+        center: (3,) c, mm.
+        radius_mm: length that converts rotations to mm.
         free: (K,6) orthonormal directions, rotations scaled by ``radius_mm``, that were solved for.
-        undetermined: (M,6) the same, of those free ones that the points do not determine: nothing moved along them.
-        information: (6,6) of ``twist``: JᵀWJ in points per rad² and mm²; divided by ``sigma_mm``² it is the inverse
-            of the naive covariance.
-        covariance: (6,6) of ``twist`` with the correlation of the noise; zero along what was not solved.
+        undetermined: (M,6) those of the free directions that the points do not determine; nothing moved along them.
+        information: (6,6) of ``twist``: JᵀWJ in points per rad² and mm². Divided by ``sigma_mm``² it is the inverse of
+            the covariance for independent errors.
+        covariance: (6,6) of ``twist`` with correlated errors; zero along directions that were not solved for.
         noise: of the residuals.
-        residuals: (N,) mm, signed; NaN for points without a surface in reach.
-        weights: (N,) 0–1 of the last iteration.
+        residuals: (N,) signed, mm; NaN for points without a surface in reach.
+        weights: (N,) 0–1, of the last iteration.
         rms_mm: weighted root mean square of the residuals.
-        sigma_mm: robust standard deviation of those within reach.
+        sigma_mm: robust standard deviation of the residuals within reach.
         overlap: share of the points with a weight above one half.
         iterations, converged: of the solver.
-        runner_up: next best minimum that was found from other starts, or None.
-        runner_up_cost: its cost in units of the best one's: near 1 makes the result ambiguous.
+        runner_up: (4,4) next best minimum found from other starts, or None.
+        runner_up_cost: its cost divided by the best one's; a value near 1 makes the result ambiguous.
     """
 
     surface_from_points: Array
@@ -127,16 +128,16 @@ class Registration:
 
     @property
     def naive_covariance(self) -> Array:
-        """(6,6) as if all points erred independently: far too small on real clouds; for comparison."""
-        basis = _determined(self.free, self.undetermined) * _scales(self.radius_mm)
+        """(6,6) covariance for independent errors, for comparison; far too small for real clouds."""
+        basis = _observable_directions(self.free, self.undetermined) * _scales(self.radius_mm)
         return basis.T @ np.linalg.inv(basis @ self.information @ basis.T) @ basis * self.sigma_mm**2
 
 
 def degrees_of_freedom(names: str, axes: Array | None = None) -> Array:
-    """(K,6) directions of moves for names like ``"rz tx ty"``, about and along ``axes`` (3,3), rows; default XYZ.
+    """Directions (K,6) of names like ``"rz tx ty"``, about and along ``axes`` (3,3) given as rows; default XYZ.
 
     Raises:
-        InputError: an unknown name, or none.
+        InputError: a name is unknown, or there is none.
     """
     axes = np.eye(3) if axes is None else axes
     rows = []
@@ -147,18 +148,18 @@ def degrees_of_freedom(names: str, axes: Array | None = None) -> Array:
         row[NAMES.index(name) // 3] = axes[NAMES.index(name) % 3]
         rows.append(row.ravel())
     if not rows:
-        raise InputError("degrees of freedom: none is free; there is nothing to register")
+        raise InputError("degrees of freedom: none is free, so there is nothing to register")
     return np.array(rows)
 
 
 def move_about(center: Array, twist: Array) -> Array:
-    """(4,4) of a twist (rotation vector in rad, shift in mm) about a centre: x → R (x − c) + c + t."""
+    """(4,4) matrix of a twist (rotation vector in rad, translation in mm) about a centre: x → R (x − c) + c + t."""
     rotation = exp_so3(twist[:3])
     return rigid(rotation, center - rotation @ center + twist[3:])
 
 
 def twist_about(center: Array, b_from_a: Array) -> Array:
-    """(6,) inverse of `move_about`."""
+    """(6,) twist about a centre of a rigid motion (4,4); the inverse of `move_about`."""
     return np.concatenate([log_so3(b_from_a[:3, :3]), apply(b_from_a, center) - center])
 
 
@@ -174,31 +175,31 @@ def register_to_surface(
     usable_faces: NDArray[np.bool_] | None = None,
     options: RegistrationOptions | None = None,
 ) -> Registration:
-    """Move points onto a surface.
+    """Register points to a surface.
 
     Args:
         points: (N,3), mm.
         surface: the reference.
-        start: (4,4) first guess of ``surface_from_points``; default: none.
-        center: (3,) in the frame of the surface, about which the free moves turn; default: middle of the points.
-        free: (K,6) moves (rotation vector, shift) that are allowed, see `degrees_of_freedom`; default: all.
-            Finite turns about two axes leave their subspace in second order.
-        radius_mm: that rotations are weighed with; default: root mean square distance of the points to the centre.
-        point_weights: (N,) inverse variances; only their ratios count. Residuals are judged in units of these.
-        normals: (N,3) of the points, to keep them to faces that look the same way; zeros where unknown.
-        usable_faces: (F,) False for faces that cannot have been seen: points nearest to those do not count.
-        options: see RegistrationOptions.
+        start: (4,4) initial ``surface_from_points``; default: identity.
+        center: (3,) in the frame of the surface, about which the free motions rotate; default: mean of the points.
+        free: (K,6) allowed motions (rotation vector, translation), see `degrees_of_freedom`; default: all. Finite
+            rotations about two axes leave their subspace in second order.
+        radius_mm: length that converts rotations to mm; default: rms distance of the points from the centre.
+        point_weights: (N,) inverse variances, of which only the ratios count. Residuals are compared in these units.
+        normals: (N,3) of the points, to match faces with the same orientation; zero where unknown.
+        usable_faces: (F,) False for faces that cannot have been seen; points nearest to these are ignored.
+        options: see `RegistrationOptions`.
 
     Raises:
-        InputError: too few points, a NaN, or no point within reach of the surface.
+        InputError: there are too few points, a coordinate is not finite, or no point is within reach of the surface.
     """
     o = options or RegistrationOptions()
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < o.min_points:
-        raise InputError(f"registration: {len(points)} points are too few to place a surface; {o.min_points} needed")
+        raise InputError(f"registration: {len(points)} points are too few; at least {o.min_points} are needed")
     if not np.isfinite(points).all():
         bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
-        raise InputError(f"registration: {bad} of {len(points)} points are NaN or infinite; leave them out first")
+        raise InputError(f"registration: {bad} of {len(points)} points are NaN or infinite; remove them first")
     pose = np.eye(4) if start is None else np.asarray(start, dtype=np.float64)
     base = (
         np.ones(len(points)) if point_weights is None else np.clip(point_weights / np.median(point_weights), 0.04, 25.0)
@@ -237,16 +238,20 @@ def register_from_starts(
     options: RegistrationOptions | None = None,
     **given: object,
 ) -> Registration:
-    """The best of the minima found from several starts, with the next best one as ``runner_up``.
+    """Best of the minima found from several starts, with the next best one as ``runner_up``.
 
-    All starts are tried on few points, the best minimum is refined on all. The cost of a minimum is the mean of its
+    All starts are tried on few points; the best minimum is refined on all points. The cost of a minimum is the mean of
+    its
     squared residuals, each limited to three times the best minimum's noise.
 
     Args:
         points, surface, normals, point_weights, options, given: see `register_to_surface`.
         starts: (4,4) each.
-        coarse_points: number of points that starts are tried on.
-        apart_mm: minima whose points differ less on average are one.
+        coarse_points: number of points on which starts are tried.
+        apart_mm: minima whose points differ by less on average count as one.
+
+    Raises:
+        InputError: no start leads to a registration.
     """
     o = options or RegistrationOptions()
     few = slice(None, None, -(-len(points) // coarse_points))
@@ -283,7 +288,7 @@ def register_from_starts(
 
 @dataclass(frozen=True)
 class _LinearSystem:
-    """The linear system of one iteration; ``values`` and ``vectors`` are of the determined part of ``basis``."""
+    """The linear system of one iteration; ``values`` and ``vectors`` belong to the determined part of ``basis``."""
 
     residuals: Array
     weights: Array
@@ -303,7 +308,7 @@ def _measure(
     usable_faces: NDArray[np.bool_] | None, pose: Array, center: Array, radius: float, basis: Array, width: float,
     hint: NDArray[np.int64] | None, o: RegistrationOptions,
 ) -> _LinearSystem:  # fmt: skip
-    """Residuals, weights and normal equations at a pose; turns are scaled to mm at ``radius``."""
+    """Residuals, weights and normal equations at a pose; rotations are in mm at ``radius``."""
     moved = apply(pose, points)
     reach = min(max(o.distance_sigmas * width, o.last_distance_mm), o.first_distance_mm)
     closest = surface.closest(moved, reach, hint)
@@ -339,7 +344,7 @@ def _measure(
 
 
 def _kernel(size: Array, kernel: str) -> Array:
-    """Weights 0–1 of residuals in standard deviations."""
+    """Weights 0–1 for residuals in standard deviations."""
     if kernel == "none":
         return np.ones_like(size)
     if kernel == "huber":
@@ -351,11 +356,12 @@ def _result(
     system: _LinearSystem, pose: Array, center: Array, radius: float, basis: Array, base: Array, iterations: int,
     converged: bool, o: RegistrationOptions,
 ) -> Registration:  # fmt: skip
+    """The registration with its covariance."""
     determined = system.vectors.T @ basis
     scales = _scales(radius)
     used = np.flatnonzero(system.weights > 0.1 * base)
     residuals, weights = system.residuals[used], system.weights[used]
-    own = np.sqrt(base[used])  # residuals × own all have one variance
+    own = np.sqrt(base[used])  # residuals × own have equal variance
     noise = estimate_noise(
         system.moved[used],
         system.normals[used],
@@ -364,10 +370,10 @@ def _result(
         o.noise_points,
         o.seed,
     )
-    # Each residual moves the result by H⁻¹ Jᵀ w: what such a sum of correlated errors scatters by.
+    # A residual moves the result by H⁻¹ Jᵀ w; the covariance is that of the sum of correlated residuals.
     pull = (determined.T / system.values) @ (determined @ (system.rows[used] * (weights / own)[:, None]).T)
     scatter = spread_of_sum(system.moved[used], system.normals[used], pull, noise, o.seed)
-    undetermined = _complement(basis, determined)
+    undetermined = _orthogonal_complement(basis, determined)
     return Registration(
         surface_from_points=pose,
         twist=twist_about(center, pose),
@@ -389,26 +395,28 @@ def _result(
 
 
 def _cost(found: Registration, limit: float) -> float:
+    """Mean squared residual, each limited to ``limit`` mm; points without a surface in reach count as the limit."""
     size = np.abs(np.nan_to_num(found.residuals, nan=np.inf))
     return float(np.mean(np.minimum(size, limit) ** 2))
 
 
 def _scales(radius: float) -> Array:
-    """(6,) factors from scaled moves, mm at the radius, to rad and mm."""
+    """(6,) factors that convert scaled twists, mm at the radius, to rad and mm."""
     return np.array([1.0 / radius] * 3 + [1.0] * 3)
 
 
 def _orthonormal(rows: Array) -> Array:
-    """(K,6) orthonormal basis of the space that rows span."""
+    """(K,6) orthonormal basis of the row space."""
     _, values, vectors = np.linalg.svd(np.atleast_2d(rows), full_matrices=False)
     return vectors[values > 1e-9 * max(values[0], 1e-300)]
 
 
-def _complement(basis: Array, part: Array) -> Array:
+def _orthogonal_complement(basis: Array, part: Array) -> Array:
     """(M,6) what of the space of ``basis`` is not in the space of ``part``; both orthonormal."""
     values, vectors = np.linalg.eigh(basis @ (np.eye(6) - part.T @ part) @ basis.T)
     return vectors[:, values > 0.5].T @ basis
 
 
-def _determined(free: Array, undetermined: Array) -> Array:
-    return _complement(free, undetermined) if len(undetermined) else free
+def _observable_directions(free: Array, undetermined: Array) -> Array:
+    """(K-M,6) orthonormal basis of the free directions (K,6) without the undetermined ones (M,6)."""
+    return _orthogonal_complement(free, undetermined) if len(undetermined) else free

@@ -1,4 +1,4 @@
-"""Least-squares planes, cylinders and circles through points: the cross-check that feature-based metrology makes.
+"""Least-squares planes, cylinders and circles through points, as feature-based metrology fits them; for comparison.
 
 Gauss–Newton on orthogonal distances (Forbes, NPL DITC 140/89), with Tukey's weights against outliers.
 """
@@ -19,7 +19,14 @@ _ITERATIONS = 60
 
 @dataclass(frozen=True)
 class Plane:
-    """Point (3,) on it nearest to the points' middle, unit normal (3,), RMS of the residuals of the points used."""
+    """A plane.
+
+    Attributes:
+        point: (3,) on it, nearest to the mean of the points, mm.
+        normal: (3,) unit.
+        rms_mm: rms residual of the points used.
+        used: number of points used.
+    """
 
     point: Array
     normal: Array
@@ -29,7 +36,15 @@ class Plane:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """Point (3,) of the axis nearest to the points' middle, unit direction (3,), radius; RMS of the residuals."""
+    """A cylinder.
+
+    Attributes:
+        point: (3,) on the axis, nearest to the mean of the points, mm.
+        direction: (3,) unit, of the axis.
+        radius_mm: its radius.
+        rms_mm: rms residual of the points used.
+        used: number of points used.
+    """
 
     point: Array
     direction: Array
@@ -38,7 +53,7 @@ class Cylinder:
     used: int
 
     def axis_at(self, plane_point: Array, plane_normal: Array) -> Array:
-        """(3,) where the axis meets a plane."""
+        """(3,) intersection of the axis with a plane."""
         return self.point + self.direction * (
             float((plane_point - self.point) @ plane_normal) / float(self.direction @ plane_normal)
         )
@@ -46,7 +61,15 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Circle:
-    """Centre (3,), unit normal (3,) of its plane, radius; RMS of the residuals."""
+    """A circle in space.
+
+    Attributes:
+        center: (3,) mm.
+        normal: (3,) unit normal of its plane.
+        radius_mm: its radius.
+        rms_mm: rms residual of the points used.
+        used: number of points used.
+    """
 
     center: Array
     normal: Array
@@ -56,7 +79,7 @@ class Circle:
 
 
 def fit_plane(points: Array, is_robust: bool = True) -> Plane:
-    """Plane through points (N,3), mm. Raises InputError for fewer than 3 or a NaN."""
+    """Plane through points (N,3) in mm. Raises InputError for fewer than 3 points or one that is not finite."""
     points = _checked(points, 3, "plane")
     weights = np.ones(len(points))
     for _ in range(_ITERATIONS if is_robust else 1):
@@ -73,16 +96,16 @@ def fit_plane(points: Array, is_robust: bool = True) -> Plane:
 def fit_cylinder(
     points: Array, direction: Array | None = None, radius_mm: float | None = None, is_robust: bool = True
 ) -> Cylinder:
-    """Cylinder through points (N,3), mm.
+    """Cylinder through points (N,3) in mm.
 
     Args:
         points: on its wall.
-        direction: (3,) of the axis, roughly; None tries the three main directions of the points.
+        direction: (3,) approximate axis; None tries the three principal directions of the points.
         radius_mm: known radius; None fits it.
         is_robust: False is plain least squares.
 
     Raises:
-        InputError: fewer than 5 points, a NaN, or no cylinder there.
+        InputError: fewer than 5 points, one that is not finite, or the points do not lie on a cylinder.
     """
     points = _checked(points, 5, "cylinder")
     if direction is None:
@@ -94,14 +117,14 @@ def fit_cylinder(
             except InputError:
                 continue
         if not fits:
-            raise InputError("cylinder: the points lie on none")
+            raise InputError("cylinder: the points do not lie on one")
         return min(fits, key=lambda fit: fit.rms_mm / fit.used)
     middle = points.mean(axis=0)
     frame = _frame(np.asarray(direction, dtype=np.float64))
     local = (points - middle) @ frame.T
 
     def residuals(x: Array) -> tuple[Array, Array]:
-        """Distances to the wall, and their derivatives by centre (2), slopes of the axis (2) and radius."""
+        """Distances to the wall, and their derivatives by the centre (2), the slopes of the axis (2) and the radius."""
         axis = np.array([x[2], x[3], 1.0])
         scale = np.linalg.norm(axis)
         axis = axis / scale
@@ -124,10 +147,10 @@ def fit_cylinder(
 
 
 def fit_circle(points: Array, normal: Array | None = None, is_robust: bool = True) -> Circle:
-    """Circle through points (N,3), mm, in the plane through their middle with ``normal`` (None: their own plane).
+    """Circle through points (N,3) in mm, in the plane through their mean with ``normal``; None fits the plane.
 
     Raises:
-        InputError: fewer than 3 points or a NaN.
+        InputError: fewer than 3 points, or one that is not finite.
     """
     points = _checked(points, 3, "circle")
     plane = fit_plane(points, is_robust) if normal is None else Plane(points.mean(axis=0), normal, 0.0, 0)
@@ -147,7 +170,7 @@ def fit_circle(points: Array, normal: Array | None = None, is_robust: bool = Tru
 def _solve(
     residuals: Callable[[Array], tuple[Array, Array]], x: Array, free: int, is_robust: bool
 ) -> tuple[Array, Array, Array]:
-    """Gauss–Newton with weights over the first ``free`` unknowns; the unknowns, weights and residuals."""
+    """Reweighted Gauss–Newton over the first ``free`` unknowns; returns unknowns, weights and residuals."""
     for _ in range(_ITERATIONS):
         rest, rows = residuals(x)
         weights = _weights(rest) if is_robust else np.ones(len(rest))
@@ -158,16 +181,18 @@ def _solve(
             break
     rest, _ = residuals(x)
     if not np.isfinite(x).all():
-        raise InputError("cylinder: the points lie on none")
+        raise InputError("cylinder: the points do not lie on one")
     return x, weights, rest
 
 
 def _weights(residuals: Array) -> Array:
+    """Tukey's weights for the scale of the median residual."""
     limit = TUKEY_SIGMAS * max(1.4826 * float(np.median(np.abs(residuals))), 1e-9)
     return np.where(np.abs(residuals) < limit, (1.0 - np.minimum(np.abs(residuals) / limit, 1.0) ** 2) ** 2, 0.0)
 
 
 def _quality(residuals: Array, weights: Array) -> tuple[float, int]:
+    """Rms residual and number of the points with a weight above 0.1."""
     used = weights > 0.1
     return float(np.sqrt(np.mean(residuals[used] ** 2))), int(np.count_nonzero(used))
 
@@ -180,15 +205,16 @@ def _circle_start(local: Array) -> tuple[Array, float]:
 
 
 def _frame(direction: Array) -> Array:
-    """(3,3) rows: two directions across, and the direction itself."""
+    """(3,3) rows: two unit vectors orthogonal to the direction, and the direction."""
     z = direction / np.linalg.norm(direction)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])
 
 
-def _checked(points: Array, least: int, name: str) -> Array:
+def _checked(points: Array, minimum: int, name: str) -> Array:
+    """The points as float64. Raises InputError when there are too few, or one is not finite."""
     points = np.asarray(points, dtype=np.float64)
-    if len(points) < least or not np.isfinite(points).all():
-        raise InputError(f"{name}: needs at least {least} points, none NaN; got {len(points)}")
+    if len(points) < minimum or not np.isfinite(points).all():
+        raise InputError(f"{name}: expected at least {minimum} points, all finite; got {len(points)}")
     return points

@@ -1,4 +1,4 @@
-"""Which points of the CAD the photos can see."""
+"""Visibility of CAD surface points in the photos."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from arview.reconstruction.types import PosedPhoto
 from arview.rendering.rasterizer import rasterise
 
 _SIDE_PX = 800
-"""Longer side of the depth pictures: a pixel is under a millimetre where a photo resolves a tenth of one."""
+"""Longer side of the depth pictures: a pixel is below a millimetre where a photo resolves a tenth of one."""
 _MIN_COSINE = 0.15
-"""Surfaces that lean away more are seen too flat to be reconstructed."""
+"""Surfaces at a larger angle to the view are seen too obliquely to be reconstructed."""
 
 
 class SurfaceVisibility:
-    """What photos see of a model at nominal, by z-buffers that are drawn once.
+    """Visibility in photos of points of a model at nominal, from depth pictures that are rendered once.
 
-    ``cam_from_scan`` of the photos is taken for ``cam_from_model``.
+    ``cam_from_scan`` of the photos is used as ``cam_from_model``.
     """
 
     def __init__(self, model: Model, photos: Sequence[PosedPhoto]) -> None:
@@ -39,11 +39,11 @@ class SurfaceVisibility:
                 apply(photo.cam_from_scan, vertices), faces, camera.fx, camera.fy, camera.cx, camera.cy,
                 camera.width, camera.height,
             )  # fmt: skip
-            # Within a pixel the surface may be as much farther as it leans: the farthest of 3 × 3 pixels counts.
+            # The depth of an inclined surface varies within a pixel: the farthest of 3 × 3 pixels is used.
             self._drawn.append((camera, cv2.erode(np.where(inverse_depth > 0, inverse_depth, np.inf), np.ones((3, 3)))))
 
     def count(self, points: Array, normals: Array, slack_mm: float = 0.5) -> NDArray[np.int64]:
-        """(N,) number of photos that see points (N,3) of the model with their normals (N,3)."""
+        """(N,) number of photos that show points (N,3) of the model with normals (N,3)."""
         seen = np.zeros(len(points), dtype=np.int64)
         for photo, (camera, nearness) in zip(self._photos, self._drawn, strict=True):
             in_cam = apply(photo.cam_from_scan, points)

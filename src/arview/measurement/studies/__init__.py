@@ -1,4 +1,4 @@
-"""Studies of the registration on simulated posts: each reproduces a result of the dissertation, as CSV and picture."""
+"""Studies of the registration with simulated posts; each writes its results as CSV and a picture."""
 
 from arview.measurement.studies.common import Study, write_study
 from arview.measurement.studies.density import density_study

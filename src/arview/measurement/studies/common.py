@@ -1,4 +1,4 @@
-"""What the studies share: simulated posts, runs over all cores, files."""
+"""Simulated posts, parallel runs and output files that the studies share."""
 
 from __future__ import annotations
 
@@ -23,17 +23,25 @@ from arview.measurement.plot import Picture, save_picture
 T = TypeVar("T")
 R = TypeVar("R")
 POST_MM = (16.0, 40.0)
-"""Diameter and height of the dissertation's post."""
+"""Diameter and height of the first post."""
 SECOND_POST_MM = (20.0, 25.0)
+"""Diameter and height of the second post."""
 SECTIONS = 96
-"""Sides of the prism that stands for a post; points are taken from the prism itself, so it is no error."""
+"""Sides of the prism that represents a post. Points are sampled from the prism itself, so this is not an error."""
 EXACT = RegistrationOptions(noise_points=0)
-"""Only the place is wanted, not its covariance."""
+"""Options without a noise estimate: only the position is needed, not its covariance."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """Result of a study: tables (columns and rows) by file name, a picture, and what it says in a few lines."""
+    """Result of a study.
+
+    Attributes:
+        name: of the study and its picture.
+        tables: columns and rows by file name.
+        picture: (H,W,3) uint8 RGB.
+        summary: its findings in a few lines.
+    """
 
     name: str
     tables: dict[str, tuple[tuple[str, ...], list[tuple[object, ...]]]]
@@ -42,7 +50,7 @@ class Study:
 
 
 def post(size_mm: tuple[float, float] = POST_MM) -> tuple[MeshSurface, Array]:
-    """An upright closed post on z = 0, and the (3,) middle of it."""
+    """An upright closed post on z = 0, and its centre (3,)."""
     radius, height = 0.5 * size_mm[0], size_mm[1]
     angles = np.arange(SECTIONS) * 2.0 * np.pi / SECTIONS
     ring = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.zeros(SECTIONS)], axis=1)
@@ -57,18 +65,18 @@ def post(size_mm: tuple[float, float] = POST_MM) -> tuple[MeshSurface, Array]:
 
 
 def sideways(angle_rad: float, length_mm: float) -> Array:
-    """(3,) shift in the plane of the plate."""
+    """(3,) translation in the plane of the plate."""
     return length_mm * np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
 
 
 def over_cores(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
-    """Results of a function for each item, on all cores."""
+    """Results of a function for each item, computed on all cores."""
     with ThreadPoolExecutor(max(1, os.cpu_count() or 1)) as threads:
         return list(threads.map(work, items))
 
 
 def write_study(study: Study, folder: Path) -> list[Path]:
-    """Write the tables as CSV and the picture as PNG; the paths. Raises OutputError."""
+    """Write the tables as CSV and the picture as PNG; return their paths. Raises OutputError."""
     paths = []
     try:
         folder.mkdir(parents=True, exist_ok=True)

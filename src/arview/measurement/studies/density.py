@@ -1,4 +1,4 @@
-"""Densities of reference and measured points: bias and cost of a registration, without noise."""
+"""Density of reference and measured points: bias and cost of a registration without noise."""
 
 from __future__ import annotations
 
@@ -26,23 +26,25 @@ ROWS = (
 """Name, points of the reference, measured points."""
 TRUE_MM = 1.0
 _TIMED = 5
-"""Runs whose CPU time is taken."""
+"""Runs whose CPU time is measured."""
 
 
 def density_study(
     is_quick: bool = False, seed: int = 0, runs: int | None = None, cloud_runs: int | None = None, rows: str = "abcd"
 ) -> Study:
-    """A post moved by 1 mm: the exact surface, and point-to-plane and point-to-point ICP on sampled references.
+    """Register a post displaced by 1 mm to its exact surface, and by ICP to sampled references.
 
-    The exact surface needs no reference points: its rows differ in the measured ones only. Every run samples both
-    clouds anew. CPU seconds are the mean of the first runs, tree and normals of the reference
-    included, sampling left out.
+    The exact surface needs no reference points: its rows differ in the measured points only. Every run samples both
+    clouds
+    anew. CPU seconds are the mean of the first runs, including search tree and normals of the reference, but not
+    sampling.
 
     Args:
-        is_quick: few runs, a tenth of the points.
+        is_quick: few runs, with a tenth of the points.
         seed: of the samples.
-        runs: of the exact surface, default 500; cloud_runs: of the others, default 500.
-        rows: which.
+        runs: with the exact surface, default 500.
+        cloud_runs: with sampled references, default 500.
+        rows: which rows.
     """
     runs, cloud_runs = (2, 2) if is_quick else (runs or 500, cloud_runs or 500)
     surface, center = post()
@@ -76,7 +78,7 @@ def density_study(
                 spent = time.process_time() - start
                 return turn @ (center - apply(pose, center + shift)), spent
 
-            # The first runs alone: process time of runs side by side would count twice.
+            # The first runs are made alone, because process time includes runs in other threads.
             alone = [one(job) for job in jobs[:_TIMED]]
             done = alone + over_cores(one, jobs[_TIMED:])
             errors = 1e3 * np.array([error for error, _ in done])

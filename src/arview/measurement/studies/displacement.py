@@ -1,4 +1,4 @@
-"""Displaced posts: true against estimated displacement, and the cost around the minimum."""
+"""Displaced posts: estimated against true displacement, and the cost around the minimum."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from arview.measurement.plot import Chart, stack
 from arview.measurement.studies.common import EXACT, POST_MM, SECOND_POST_MM, Study, over_cores, post, sideways
 
 SIGMA_MM = 0.1
-"""Noise of a point along each axis: that of a usual reconstruction."""
+"""Noise of a point along each axis, as in a typical reconstruction."""
 
 
 def displacement_study(is_quick: bool = False, seed: int = 0) -> Study:
-    """Two posts moved by 1–9 mm sideways in random directions, 24,099 noisy points, registered without a start."""
+    """Register two posts displaced by 1–9 mm in random directions, with 24,099 noisy points, without a start."""
     runs, count = (3, 3000) if is_quick else (25, 24_099)
     rows: list[tuple[object, ...]] = []
     truth = Chart("Estimated against true displacement", "true / mm", "estimated / mm")
@@ -46,7 +46,7 @@ def displacement_study(is_quick: bool = False, seed: int = 0) -> Study:
 
 
 def cost_curve(count: int, seed: int) -> tuple[Array, Array]:
-    """Shifts (M,) mm of a noisy post along x and the root mean square distance (M,) to the surface at each."""
+    """Displacements (M,) in mm of a noisy post along x, and the rms distance (M,) to the surface at each."""
     surface, _ = post()
     rng = np.random.default_rng(seed)
     points, _ = surface.spread(count, seed)

@@ -1,4 +1,4 @@
-"""Noise of the points: bias and spread of the exact-surface registration beside a cylinder fit."""
+"""Noise of the points: bias and spread of the registration to the exact surface compared with a cylinder fit."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ METHODS = ("registration", "cylinder fit")
 
 
 def noise_study(is_quick: bool = False, seed: int = 0) -> Study:
-    """A post moved by 1 mm, 10,000 points of its wall and top, Gaussian noise along each axis.
+    """Register a post displaced by 1 mm, with 10,000 points of its wall and top and Gaussian noise along each axis.
 
-    The bias is that of the displacement's length in the plane; the cylinder is fitted to the points of the wall.
+    The bias is that of the length of the displacement in the plane; the cylinder is fitted to the points of the wall.
     """
     runs, count = (6, 2000) if is_quick else (100, COUNT)
     surface, center = post()
     up = np.array([0.0, 0.0, 1.0])
 
     def run(job: tuple[float, int]) -> Array:
-        """(2,3) displacement by both methods; the cylinder has no height."""
+        """(2,3) displacement by both methods; the cylinder does not determine the height."""
         sigma, k = job
         rng = np.random.default_rng([seed, k, round(sigma * 1000)])
         points, faces = surface.spread(round(count / 0.9167), int(rng.integers(1 << 31)))

@@ -1,4 +1,4 @@
-"""The length of a noisy displacement: what Rice's density says of it, against simulated ones."""
+"""Length of a noisy displacement: Rice's density compared with simulated lengths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BIN_MM = 0.05
 
 
 def rice_study(is_quick: bool = False, seed: int = 0) -> Study:
-    """10,000 displacements in a plane, of 0 and 1 mm, with 0.3 mm of noise along each axis: lengths and their mean."""
+    """Lengths of 10,000 displacements in a plane, of 0 and 1 mm, with 0.3 mm of noise along each axis."""
     count = 2000 if is_quick else 10_000
     rng = np.random.default_rng(seed)
     rows: list[tuple[object, ...]] = []

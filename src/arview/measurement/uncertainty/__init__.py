@@ -1,1 +1,1 @@
-"""Uncertainty: methods combined, budgets, Monte Carlo, and the decision rule."""
+"""Uncertainty of displacements: combination of methods, budget, Monte Carlo, and the decision rule."""

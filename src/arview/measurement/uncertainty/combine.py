@@ -1,4 +1,4 @@
-"""One move of the sweep's and the edges', weighed by their covariances, and whether the methods agree."""
+"""Combination of a component's moves by several methods, weighted by covariance, and agreement of the methods."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _PARTS = (slice(0, 3), slice(3, 6))
 
 @dataclass(frozen=True)
 class Agreement:
-    """How two methods compare.
+    """Comparison of two methods.
 
     Attributes:
         first, second: the methods.
-        difference_mm: length of the difference of their displacements, along what both determine.
-        joint_mm: 95 % of such differences are shorter if both covariances hold.
+        difference_mm: length of the difference of their displacements, along directions that both determine.
+        joint_mm: length that 95 % of such differences do not exceed if both covariances are right.
     """
 
     first: Method
@@ -38,14 +38,14 @@ class Agreement:
 
 @dataclass(frozen=True)
 class CombinedMove:
-    """The move that methods give together.
+    """Weighted mean of the moves of several methods.
 
     Attributes:
-        twist: (6,), see ``Move``; zero along ``undetermined``.
-        covariances: by method, (6,6) share of its noise in the twist.
-        disagreement: (6,6) share of what the methods contradict each other by, beyond their covariances.
+        twist: (6,), see `Move`; zero along ``undetermined``.
+        covariances: (6,6) contribution of each method's noise.
+        disagreement: (6,6) contribution of differences that the methods' covariances do not explain.
         undetermined: (K,6) orthonormal, scaled directions that no method determines.
-        radius_mm: rotations are scaled with it.
+        radius_mm: length that converts rotations to mm.
         center_in_model: (3,) mm.
     """
 
@@ -60,17 +60,19 @@ class CombinedMove:
 def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove:
     """Weighted mean of moves of one component by independent methods.
 
-    Methods that differ by more than their covariances allow have an error that neither knows. Rotations and shifts for
-    themselves, the covariance is then inflated until the difference is explained (Birge 1932), and the scatter of the
-    methods about the mean is added along the difference: who claims little gets a small weight, and still a say.
-    What only one determines is its alone.
+    Methods that differ by more than their covariances allow have an error that neither of them knows. For rotations and
+    translations separately, the covariance is then inflated until it explains the difference (Birge 1932), and the
+    scatter
+    of the methods about the mean is added along the difference. A direction that only one method determines is taken
+    from
+    that method.
 
     Args:
-        moves: at least one, about the same centre.
-        undetermined_mm: a direction that stays more uncertain than this, rotations scaled by the radius, is free.
+        moves: at least one, all about the same centre.
+        undetermined_mm: a direction with a larger standard deviation, rotations scaled by the radius, is undetermined.
 
     Raises:
-        InputError: no moves, or of different components.
+        InputError: there are no moves, or they are of different components.
     """
     if not moves or any(move.component != moves[0].component for move in moves):
         raise InputError("combine: expected at least one move, and all of one component")
@@ -78,7 +80,7 @@ def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove
     unit = np.array([radius] * 3 + [1.0] * 3)
     scaled = np.outer(unit, unit)
     twists = [move.twist * unit for move in moves]
-    bases = [_determined(move.undetermined) for move in moves]
+    bases = [_orthogonal_complement(move.undetermined) for move in moves]
     noise = [move.covariance * scaled for move in moves]
     weights = []
     for covariance, basis in zip(noise, bases, strict=True):
@@ -92,7 +94,7 @@ def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove
     disagreement = np.zeros((6, 6))
     for i, j in combinations(range(len(moves)), 2):
         for part in _PARTS:
-            axes = _common(_common(bases[i], bases[j]), np.eye(6)[:, part])
+            axes = _intersection(_intersection(bases[i], bases[j]), np.eye(6)[:, part])
             disagreement += _beyond_chance(
                 twists[i] - twists[j], noise[i] + noise[j], gains[i], gains[j], inverse, axes
             )
@@ -106,7 +108,7 @@ def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove
 def _beyond_chance(
     difference: Array, joint: Array, gain: Array, other_gain: Array, combined: Array, axes: Array
 ) -> Array:
-    """(6,6) variance to add along axes (6,K) for a difference that its covariance does not explain."""
+    """(6,6) covariance to add along axes (6,K) for a difference that the joint covariance does not explain."""
     if axes.shape[1] == 0:
         return np.zeros((6, 6))
     seen = axes.T @ difference
@@ -116,17 +118,17 @@ def _beyond_chance(
     along = axes @ seen
     unit = along / np.linalg.norm(along)
     shares = np.clip([unit @ gain @ unit, unit @ other_gain @ unit], 0.0, 1.0)
-    # Axis by axis: that two methods differ along an oblique direction ties no axes to each other.
+    # Axis by axis: a difference along an oblique direction does not imply that the axes are correlated.
     scatter = float(shares.prod()) * (1.0 - 1.0 / squares) * np.diag(along**2)
     project = axes @ axes.T
     return np.asarray(scatter + (squares - 1.0) * project @ combined @ project)
 
 
 def agreements(moves: Sequence[Move]) -> tuple[Agreement, ...]:
-    """Each pair of methods compared where both determine the displacement."""
+    """Compare each pair of methods where both determine the displacement."""
     found = []
     for a, b in combinations(moves, 2):
-        basis = _common(_determined(a.undetermined), _determined(b.undetermined))
+        basis = _intersection(_orthogonal_complement(a.undetermined), _orthogonal_complement(b.undetermined))
         project = basis @ basis.T
         difference = (project @ (a.twist - b.twist))[3:]
         joint = (project @ (a.covariance + b.covariance) @ project)[3:, 3:]
@@ -137,7 +139,7 @@ def agreements(moves: Sequence[Move]) -> tuple[Agreement, ...]:
 
 
 def quantile_of_length(covariance: Array, probability: float = 0.95) -> float:
-    """Length that a normal vector of zero mean stays below; its square is taken as scaled χ² (Satterthwaite 1946)."""
+    """Quantile of the length of a normal vector of zero mean, whose square is a scaled χ² (Satterthwaite 1946)."""
     from scipy.special import gammaincinv
 
     trace, square = float(np.trace(covariance)), float(np.sum(covariance * covariance.T))
@@ -146,15 +148,15 @@ def quantile_of_length(covariance: Array, probability: float = 0.95) -> float:
     return float(np.sqrt(2.0 * square / trace * gammaincinv(0.5 * trace**2 / square, probability)))
 
 
-def _determined(undetermined: Array) -> Array:
-    """(6,6-K) orthonormal columns across (K,6) rows."""
+def _orthogonal_complement(undetermined: Array) -> Array:
+    """(6,6-K) orthonormal columns orthogonal to the rows (K,6)."""
     if len(undetermined) == 0:
         return np.eye(6)
     return np.linalg.svd(undetermined)[2][len(undetermined) :].T
 
 
-def _common(a: Array, b: Array) -> Array:
-    """Orthonormal basis of what two subspaces (6,K), (6,L) share, to 3°."""
+def _intersection(a: Array, b: Array) -> Array:
+    """Orthonormal basis of the intersection of two subspaces (6,K), (6,L), to within 3°."""
     if a.shape[1] == 0 or b.shape[1] == 0:
         return np.zeros((6, 0))
     left, values, _ = np.linalg.svd(a.T @ b, full_matrices=False)

@@ -11,7 +11,7 @@ from arview.inspection import Verdict
 
 @dataclass(frozen=True)
 class DecisionOptions:
-    """The rule's guard band."""
+    """Options of the decision rule."""
 
     guard: float = 1.0  # share of U kept from the limit on both sides; 1 is ISO 14253-1's default, 0 simple acceptance
 
@@ -21,10 +21,11 @@ class DecisionOptions:
 
 
 def decide(value: float | None, uncertainty: float | None, tolerance: float | None, guard: float = 1.0) -> Verdict:
-    """Verdict on a value with its expanded uncertainty U, in the unit of the tolerance.
+    """Verdict on a value with its expanded uncertainty U, all in the unit of the tolerance.
 
-    It passes when even ``value + guard · U`` is allowed, fails when ``value − guard · U`` is not, and is undecided
-    between, or without a tolerance; without a value it is not measured.
+    It passes if ``value + guard · U`` is within the tolerance, fails if ``value − guard · U`` is not, and is undecided
+    in
+    between or without a tolerance. Without a value it is not measured.
     """
     if value is None or uncertainty is None:
         return Verdict.NOT_MEASURED
@@ -36,7 +37,9 @@ def decide(value: float | None, uncertainty: float | None, tolerance: float | No
 
 
 def worst(verdicts: Iterable[Verdict]) -> Verdict:
-    """The verdict on several characteristics of a component: one that fails fails it, one undecided leaves it so."""
+    """Verdict on several characteristics of a component: one that fails fails it, else one undecided leaves it
+    undecided.
+    """
     order = (Verdict.PASS, Verdict.NOT_MEASURED, Verdict.UNDECIDED, Verdict.FAIL)
     return max(verdicts, key=order.index, default=Verdict.NOT_MEASURED)
 

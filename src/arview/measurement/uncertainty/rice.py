@@ -1,10 +1,10 @@
-"""The length of a measured displacement is too large: its density, mean and most likely true length.
+"""Bias of the length of a noisy displacement: density and mean of the measured length, and the most likely true length.
 
-Noise of standard deviation σ on each of n axes makes of a true length A measured lengths r of the density
+With noise of standard deviation σ on each of n axes, a true length A gives measured lengths r with the density
 
     p(r) = r/σ² · (r/A)^(n/2 − 1) · exp(−(r² + A²) / 2σ²) · I_{n/2 − 1}(r A/σ²),
 
-for two axes Rice's (S. O. Rice 1945), Rayleigh's at A = 0, Maxwell's at A = 0 for three.
+which is Rice's for two axes (S. O. Rice 1945); at A = 0 it is Rayleigh's for two and Maxwell's for three axes.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from arview.geometry import Array
 
 
 def rice_density(lengths: ArrayLike, true_length: float, sigma: float, axes: int = 2) -> Array:
-    """Density of measured lengths (...,) where the true length and the noise of each axis are known.
+    """Density of measured lengths (...,) for a true length and the noise of each axis.
 
-    Raises InputError for sigma ≤ 0, a negative true length, or axes other than 1, 2, 3.
+    Raises:
+        InputError: sigma ≤ 0, a negative true length, or ``axes`` other than 1, 2, 3.
     """
     from scipy.special import gamma, ive
 
@@ -37,22 +38,26 @@ def rice_density(lengths: ArrayLike, true_length: float, sigma: float, axes: int
 
 
 def rice_mean(true_length: float, sigma: float, axes: int = 2) -> float:
-    """Mean of the measured lengths; larger than the true one."""
+    """Mean of the measured lengths, which exceeds the true length."""
     from scipy.special import gamma, hyp1f1
 
     _check(true_length, sigma, axes)
     x = -0.5 * (true_length / sigma) ** 2
-    if x < -500.0:  # far from zero: the series in σ/A
+    if x < -500.0:  # far from zero, use the series in σ/A
         return true_length + 0.5 * (axes - 1) * sigma**2 / true_length
     factor = np.sqrt(2.0) * gamma(0.5 * (axes + 1)) / gamma(0.5 * axes)
     return float(sigma * factor * hyp1f1(-0.5, 0.5 * axes, x))
 
 
 def rice_estimate(lengths: ArrayLike, sigma: float, axes: int = 2) -> float:
-    """Most likely true length of measured ones (N,), or of a single one; 0 when noise alone explains them.
+    """Most likely true length for measured lengths (N,), or a single one; 0 where noise alone explains them.
 
-    At the maximum of the likelihood A = mean of r · I_{n/2}(rA/σ²) / I_{n/2 − 1}(rA/σ²); it is 0 where the mean square
-    is at most n σ².
+    The maximum of the likelihood satisfies A = mean of r · I_{n/2}(rA/σ²) / I_{n/2 − 1}(rA/σ²); it is at 0 where the
+    mean
+    square is at most n σ².
+
+    Raises:
+        InputError: no lengths, or one that is not finite; see also `rice_density`.
     """
     from scipy.optimize import brentq
     from scipy.special import ive
@@ -60,7 +65,7 @@ def rice_estimate(lengths: ArrayLike, sigma: float, axes: int = 2) -> float:
     _check(0.0, sigma, axes)
     r = np.atleast_1d(np.asarray(lengths, dtype=np.float64)) / sigma
     if len(r) == 0 or not np.isfinite(r).all():
-        raise InputError("rice: no lengths, or one that is not a number")
+        raise InputError("rice: no lengths, or one that is not finite")
     if float(np.mean(r**2)) <= axes * (1.0 + 1e-9):
         return 0.0
 
