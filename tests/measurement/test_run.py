@@ -222,7 +222,7 @@ def test_folders_that_hold_no_measurement(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="arbitrary unit"):
         read_folder(tmp_path)
     (tmp_path / "scale.json").write_text(json.dumps(replace(scale, scale=2.0).provenance()), encoding="utf-8")
-    with pytest.raises(InputError, match="the part was not found in the photos, there is no CAD frame: not found"):
+    with pytest.raises(InputError, match="no CAD frame, because the part was not found in the photos: not found"):
         read_folder(tmp_path)
     known = replace(scale, scale=2.0, scale_std=1e-4, model_from_scan=np.eye(4))
     (tmp_path / "scale.json").write_text(json.dumps(known.provenance()), encoding="utf-8")

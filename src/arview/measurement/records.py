@@ -194,7 +194,7 @@ def datum_doubts(alignment: Alignment) -> list[str]:
         excess = np.sqrt(max(0.0, result.rest_mm**2 - result.residual_mm**2))
         if result.feature != "fit" and excess > max(0.1, result.residual_mm):
             doubts.append(
-                f"datum {result.label}: {excess:.2f} mm rms off the earlier datums; is the feature placed as in the CAD?"
+                f"datum {result.label}: {excess:.2f} mm rms off the earlier datums; is the feature where the CAD says?"
             )
     return doubts
 

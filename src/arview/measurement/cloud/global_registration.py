@@ -33,10 +33,7 @@ class GlobalRegistrationOptions:
     step_deg: float = 6.0  # between rotations about a principal direction; refinement converges from half of it
     kept: int = 12  # poses that are refined and compared
     scale_step: float = 1.08  # ratio of scales that are tried when the scale is unknown
-    scale_range: tuple[float, float] = (
-        0.7,
-        2.5,
-    )  # part's size over the cloud's; above 1, part of it is seen
+    scale_range: tuple[float, float] = (0.7, 2.5)  # size of the part over the cloud's; above 1, part of it is unseen
     limit_share: float = 0.015  # distances are limited to this share of the diameter
     min_lead: float = 1.08  # cost of the next best pose over the best one's, below which it is ambiguous
     seed: int = 0
