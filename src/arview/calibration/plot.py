@@ -20,7 +20,7 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
     """Corners with their residuals, and U of a ray's place, as a picture of a kind of FORMATS. Raises InputError."""
     if kind not in FORMATS:
         raise InputError(f"plot: {kind!r}: expected one of {', '.join(FORMATS)}")
-    solution, judged = calibration.solution, calibration.verdict
+    solution, verdict = calibration.solution, calibration.verdict
     camera = solution.camera
     pixels = np.concatenate([view.pixels for view in solution.views])
     residuals = np.concatenate(solution.residuals)
@@ -32,7 +32,7 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
         arrows = left.quiver(*pixels.T, *(residuals * scale).T, length, angles="xy", scale_units="xy", scale=1,
                              cmap="viridis", width=0.0022, clim=(0, most))  # fmt: skip
         made.colorbar(arrows, ax=left, orientation="horizontal", aspect=40, label="residual, px")
-        covered = f"{len(pixels)} corners, {len(solution.views)} views, {100 * judged.coverage:.0f} % of the picture"
+        covered = f"{len(pixels)} corners, {len(solution.views)} views, {100 * verdict.coverage:.0f} % of the picture"
         left.set_title(f"{covered}; residuals {solution.rms_px:.2f} px", loc="left", fontsize=9.5, color=INK)
         columns, rows = 33, 25
         grid = picture_grid(camera.width, camera.height, columns, rows)
@@ -43,7 +43,7 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
             levels = np.linspace(0.0, top, 9)
             filled = right.contourf(u, v, uncertainty, levels=levels, cmap="magma_r", extend="max")
             made.colorbar(filled, ax=right, orientation="horizontal", aspect=40, label="U (k = 2), px", format="%.2f")
-        median, worst = judged.pixel_u_px
+        median, worst = verdict.pixel_u_px
         title = f"U of a ray's place: median {median:.2f}, worst {worst:.2f} px"
         right.set_title(title, loc="left", fontsize=9.5, color=INK)
         for axes in (left, right):
@@ -52,8 +52,8 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
             axes.set_aspect("equal")
             axes.set_xlabel("u, px")
         left.set_ylabel("v, px")
-        focal = f"focal length {camera.fx:.1f} px ± {100 * judged.focal_u:.2f} %"
-        made.suptitle(f"{calibration.sightings.label}: {judged.grade.value}, {focal}", x=0.01, ha="left", fontsize=11)
+        focal = f"focal length {camera.fx:.1f} px ± {100 * verdict.focal_u:.2f} %"
+        made.suptitle(f"{calibration.sightings.label}: {verdict.grade.value}, {focal}", x=0.01, ha="left", fontsize=11)
         out = io.BytesIO()
         metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
         made.savefig(out, format=kind, dpi=110, metadata=metadata)

@@ -83,7 +83,7 @@ def calibrate(
 
 def record_of(calibration: Calibration) -> dict[str, Any]:
     """What goes into the camera file beside the numbers: ``calibration`` and ``lens``. Infinite values are null."""
-    solution, judged, seen = calibration.solution, calibration.verdict, calibration.sightings
+    solution, verdict, seen = calibration.solution, calibration.verdict, calibration.sightings
 
     def plain(value: float) -> float | None:
         return float(value) if np.isfinite(value) else None
@@ -94,9 +94,9 @@ def record_of(calibration: Calibration) -> dict[str, Any]:
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "board": spec_of(calibration.board),
             "source": seen.label,
-            "verdict": judged.grade.value,
-            "reasons": list(judged.reasons),
-            "advice": list(judged.advice),
+            "verdict": verdict.grade.value,
+            "reasons": list(verdict.reasons),
+            "advice": list(verdict.advice),
             "pictures": seen.looked_at,
             "views_found": len(seen.views),
             "views_used": len(solution.views),
@@ -106,11 +106,11 @@ def record_of(calibration: Calibration) -> dict[str, Any]:
             "uncertainty_k": K,
             "uncertainty": {name: plain(K * std) for name, std in zip(PARAMETERS, solution.std, strict=True)},
             "covariance": [[plain(value) for value in row] for row in solution.covariance],
-            "focal_uncertainty": plain(judged.focal_u),
-            "pixel_uncertainty_px": {"median": plain(judged.pixel_u_px[0]), "worst": plain(judged.pixel_u_px[1])},
-            "coverage": judged.coverage,
-            "tilts_deg": dict(zip(("least", "median", "most"), judged.tilts_deg, strict=True)),
-            "distance_ratio": judged.distance_ratio,
+            "focal_uncertainty": plain(verdict.focal_u),
+            "pixel_uncertainty_px": {"median": plain(verdict.pixel_u_px[0]), "worst": plain(verdict.pixel_u_px[1])},
+            "coverage": verdict.coverage,
+            "tilts_deg": dict(zip(("least", "median", "most"), verdict.tilts_deg, strict=True)),
+            "distance_ratio": verdict.distance_ratio,
             "quarter_turns_clockwise": seen.quarter_turns_clockwise,
             "rejected": calibration.rejected,
         },

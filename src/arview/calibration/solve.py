@@ -87,10 +87,10 @@ def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOpt
         solution = _adjust(kept, width, height, None if solution is None else solution.camera)
         trimmed = [_without_outliers(view, r, options) for view, r in zip(kept, solution.residuals, strict=True)]
         # A wrong corner spoils its view's pose: whether the view fits is seen when it is gone.
-        settled = {view.name for view, less in zip(kept, trimmed, strict=True) if len(view.ids) == len(less.ids)}
-        bad = _bad_views(solution, settled, options)
+        unchanged = {view.name for view, less in zip(kept, trimmed, strict=True) if len(view.ids) == len(less.ids)}
+        bad = _bad_views(solution, unchanged, options)
         rejected |= bad
-        if not bad and len(settled) == len(kept):
+        if not bad and len(unchanged) == len(kept):
             break
         kept = [view for view in trimmed if view.name not in bad and len(view.ids) >= MIN_CORNERS]
     if solution is None:
@@ -210,14 +210,14 @@ def _project(points: Array, camera: Camera, cam_from_points: Array) -> tuple[Arr
     return pixels.reshape(-1, 2), np.asarray(jacobian[:, 6:15]), np.asarray(jacobian[:, :6])
 
 
-def _bad_views(solution: Solution, settled: set[str], options: SolveOptions) -> dict[str, str]:
+def _bad_views(solution: Solution, unchanged: set[str], options: SolveOptions) -> dict[str, str]:
     """Views that fit much worse than the others, at most a third of them at once, the worst first."""
     rms = np.array([np.sqrt(np.mean(residual**2)) for residual in solution.residuals])
     # Of each view the robust size: a single wrong corner is left out by itself.
     size = np.array([np.median(np.abs(residual)) / 0.6745 for residual in solution.residuals])
     usual = float(np.median(size))
     limit = max(options.view_outlier * usual, options.view_floor_px)
-    bad = [int(i) for i in np.argsort(-size) if size[i] > limit and solution.views[i].name in settled]
+    bad = [int(i) for i in np.argsort(-size) if size[i] > limit and solution.views[i].name in unchanged]
     bad = bad[: max(1, len(rms) // 3)]
     return {
         solution.views[i].name: f"does not fit the others ({rms[i]:.2f} px, the others {usual:.2f} px)" for i in bad

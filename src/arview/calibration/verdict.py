@@ -37,7 +37,7 @@ class VerdictOptions:
 
 @dataclass(frozen=True)
 class CalibrationVerdict:
-    """A calibration judged.
+    """A calibration verdict.
 
     Attributes:
         grade: the whole.

@@ -212,7 +212,7 @@ def _parse_squares(text: str | None) -> tuple[int | None, int | None]:
 
 def _print(result: Calibration) -> None:
     """Print what was seen, the camera with U, the verdict and advice; warnings go to stderr."""
-    seen, solution, judged = result.sightings, result.solution, result.verdict
+    seen, solution, verdict = result.sightings, result.solution, result.verdict
     for warning in seen.warnings:
         say(f"warning: {warning}")
     reasons: dict[str, list[str]] = {}
@@ -230,27 +230,27 @@ def _print(result: Calibration) -> None:
     )
     for line in _camera_lines(result):
         click.echo(line)
-    least, _, most = judged.tilts_deg
+    least, _, most = verdict.tilts_deg
     click.echo(
-        f"coverage: {100 * judged.coverage:.0f} % of the picture, tilts {least:.0f}° to {most:.0f}°, farthest view"
-        f" {judged.distance_ratio:.1f} × the nearest"
+        f"coverage: {100 * verdict.coverage:.0f} % of the picture, tilts {least:.0f}° to {most:.0f}°, farthest view"
+        f" {verdict.distance_ratio:.1f} × the nearest"
     )
-    click.echo(f"verdict: {judged.grade.value}" + (f": {'; '.join(judged.reasons)}" if judged.reasons else ""))
-    for advice in judged.advice:
+    click.echo(f"verdict: {verdict.grade.value}" + (f": {'; '.join(verdict.reasons)}" if verdict.reasons else ""))
+    for advice in verdict.advice:
         click.echo(f"advice: {advice}")
 
 
 def _camera_lines(result: Calibration) -> list[str]:
-    camera, judged = result.camera, result.verdict
+    camera, verdict = result.camera, result.verdict
     values: Any = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist]
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     cells = [
         f"{name} {value:{form}} ± {2 * std:{form}}"
         for name, value, std, form in zip(names, values, result.solution.std, [".2f"] * 4 + [".5f"] * 5, strict=True)
     ]
-    worst = f"{judged.pixel_u_px[0]:.2f} px in the median, {judged.pixel_u_px[1]:.2f} px at worst"
+    worst = f"{verdict.pixel_u_px[0]:.2f} px in the median, {verdict.pixel_u_px[1]:.2f} px at worst"
     return [
         f"camera: {', '.join(cells[:4])} px",
         f"lens: {', '.join(cells[4:])}",
-        f"uncertainty (k = 2): focal length {100 * judged.focal_u:.2f} %, where a ray is seen {worst}",
+        f"uncertainty (k = 2): focal length {100 * verdict.focal_u:.2f} %, where a ray is seen {worst}",
     ]

@@ -57,15 +57,11 @@ def measure(
         InputError: the reconstruction contradicts the CAD, a datum is not covered, or there is nothing to inspect.
         OutputError: the distance map cannot be written.
     """
-<<<<<<< HEAD
     check_type(reconstruction, (MetricReconstruction, *PATH), "measure: reconstruction")
     check_type(part, Part, "measure: part")
     if isinstance(reconstruction, str | Path):
         reconstruction = read_folder(reconstruction)
-    # The threads are ours: those of BLAS, on matrices of some hundred rows, would only wait for each other.
-=======
     # One thread for BLAS: work is parallel over components, and the matrices have only some hundred rows.
->>>>>>> 6b92833 (Measurement: docstrings and messages in plain English)
     with threadpool_limits(1, "blas"):
         return _measure(reconstruction, part, options or MeasureOptions(), progress or (lambda what, done, total: None))
 

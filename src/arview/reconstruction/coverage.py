@@ -93,7 +93,7 @@ def coverage(
             ComponentCoverage(
                 component.name,
                 tuple(int(photo) for photo in photos),
-                _distinct(directions, options.direction_deg),
+                _count_separated(directions, options.direction_deg),
                 _spread_deg(directions),
                 _gap(directions, axis)[0],
             )
@@ -208,7 +208,7 @@ def _orbit_axis(directions: Array) -> Array:
     return np.asarray(axis if axis @ mean >= 0 else -axis)
 
 
-def _distinct(directions: Array, apart_deg: float) -> int:
+def _count_separated(directions: Array, apart_deg: float) -> int:
     """How many directions (N,3) remain when those closer than an angle to one already kept are left out."""
     kept: list[Array] = []
     for direction in directions:

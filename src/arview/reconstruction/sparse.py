@@ -99,7 +99,7 @@ def _match_by_appearance(
     found: dict[Pair, Matches] = {}
     # Products of descriptors run one a thread: threads of the BLAS library below them would only wait for each other.
     with ThreadPoolExecutor(threads) as pool, threadpool_limits(1, "blas"):
-        chosen = _pairs_worth_matching(features, options, pool)
+        chosen = _promising_pairs(features, options, pool)
         for done, (pair, matches) in enumerate(zip(chosen, pool.map(match, chosen), strict=True)):
             if len(matches) >= options.min_matches:
                 found[pair] = matches
@@ -107,7 +107,7 @@ def _match_by_appearance(
     return found
 
 
-def _pairs_worth_matching(features: Sequence[Features], options: SparseOptions, pool: ThreadPoolExecutor) -> list[Pair]:
+def _promising_pairs(features: Sequence[Features], options: SparseOptions, pool: ThreadPoolExecutor) -> list[Pair]:
     """Pairs of photos whose largest features match often enough (preemptive matching, Wu 2013)."""
     pairs = list(itertools.combinations(range(len(features)), 2))
     if len(features) <= options.all_pairs_up_to:
@@ -117,12 +117,12 @@ def _pairs_worth_matching(features: Sequence[Features], options: SparseOptions, 
         for one in features
     ]
 
-    def is_worth(pair: Pair) -> bool:
+    def is_promising(pair: Pair) -> bool:
         if pair[1] - pair[0] <= options.neighbours:
             return True
         return len(match_descriptors(largest[pair[0]], largest[pair[1]])) >= options.preview_matches
 
-    return [pair for pair, worth in zip(pairs, pool.map(is_worth, pairs), strict=True) if worth]
+    return [pair for pair, is_chosen in zip(pairs, pool.map(is_promising, pairs), strict=True) if is_chosen]
 
 
 def _write_database(

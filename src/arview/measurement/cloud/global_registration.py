@@ -70,7 +70,7 @@ def find_model_in_cloud(
     limit_mm = o.limit_share * model.diameter_mm
     # A thin plate also fits with its top on its bottom, so there are starts displaced to both sides.
     step = 0.8 * model.diameter_mm / o.voxels * _main_axes(surface.face_normals[of_face], 1)[0]
-    tried = [(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _distinct(places, o) for k in (-1.0, 0.0, 1.0)]
+    tried = [(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _separated(places, o) for k in (-1.0, 0.0, 1.0)]
     sides = normals if is_oriented else None
     fits = list(pool().map(lambda job: _refined(points, sides, surface, samples, job, scale is None, limit_mm), tried))
     fits.sort(key=lambda fit: fit[0])
@@ -198,7 +198,7 @@ def _voxels(points: Array, cell: float) -> tuple[Array, Array]:
     return gaussian_filter(grid, 0.8), low
 
 
-def _distinct(
+def _separated(
     places: list[tuple[float, float, Array]], o: GlobalRegistrationOptions
 ) -> list[tuple[float, float, Array]]:
     """The best poses, without those close to a better one."""

@@ -20,15 +20,15 @@ def base_plane(component: Component, toward: Array) -> Datum | None:
     areas = np.linalg.norm(doubled, axis=1)
     normals = doubled / np.maximum(areas, 1e-12)[:, None]
     heights = np.einsum("nx,nx->n", normals, corners.mean(axis=1))
-    ahead = normals @ (toward / np.linalg.norm(toward)) > 0.5
-    if not ahead.any():
+    is_facing = normals @ (toward / np.linalg.norm(toward)) > 0.5
+    if not is_facing.any():
         return None
-    keys = np.round(np.concatenate([normals * 500.0, heights[:, None] * 20.0], axis=1)[ahead])
+    keys = np.round(np.concatenate([normals * 500.0, heights[:, None] * 20.0], axis=1)[is_facing])
     groups, owner = np.unique(keys, axis=0, return_inverse=True)
-    of_group = np.bincount(owner.ravel(), weights=areas[ahead], minlength=len(groups))
+    of_group = np.bincount(owner.ravel(), weights=areas[is_facing], minlength=len(groups))
     if of_group.max() < 0.2 * areas.sum():
         return None
-    face = np.flatnonzero(ahead)[np.flatnonzero(owner.ravel() == np.argmax(of_group))[0]]
+    face = np.flatnonzero(is_facing)[np.flatnonzero(owner.ravel() == np.argmax(of_group))[0]]
     point, normal = corners[face].mean(axis=0), normals[face]
     x, y, z = point.tolist()
     a, b, c = normal.tolist()

@@ -94,10 +94,10 @@ def fit_rigid(
     covariance = basis @ inverse @ middle @ inverse @ basis.T
     shares, modes = _support(scaled, weights, scaled if searched_rows is None else searched_rows * scale, basis)
     # Where only few of many measurements agree, some of these may be wrong too: their scatter understates the error.
-    growth = np.maximum(2.0 * min_support / np.maximum(shares, 1e-9), 1.0)
+    inflation = np.maximum(2.0 * min_support / np.maximum(shares, 1e-9), 1.0)
     own = np.linalg.pinv(modes)
     inner = own @ covariance @ own.T
-    covariance = covariance + modes @ np.diag(np.diag(inner) * (growth**2 - 1.0)) @ modes.T
+    covariance = covariance + modes @ np.diag(np.diag(inner) * (inflation**2 - 1.0)) @ modes.T
     # Directions whose covariance is too large, or whose support is too small, are undetermined as well.
     values, vectors = np.linalg.eigh(basis.T @ covariance @ basis)
     is_open = np.concatenate([(basis @ vectors[:, values > undetermined_mm**2]).T, modes[:, shares < min_support].T])

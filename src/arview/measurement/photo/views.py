@@ -91,10 +91,10 @@ class PhotoViews:
             InputError: the point is behind every camera.
         """
         depths = apply_all(self.cam_from_model, point)[:, 2]
-        ahead = depths > 0
-        if not ahead.any():
+        in_front = depths > 0
+        if not in_front.any():
             raise InputError("photos: the part is behind every camera; the poses are not in the frame of the CAD")
-        return float(np.median(depths[ahead] / np.array([camera.fx for camera in self.cameras])[ahead]))
+        return float(np.median(depths[in_front] / np.array([camera.fx for camera in self.cameras])[in_front]))
 
     def window(
         self, view: int, component: int | None, place: Array, around: Array, margin_px: int = 12
@@ -120,10 +120,10 @@ class PhotoViews:
         pixels = camera.without_distortion().project(apply(pose, around))
         if not np.isfinite(pixels).all():
             return RenderedWindow((1.0, 1.0, 0.0, 0.0), (0, 0), np.zeros((1, 1)), np.full((1, 1), -1, dtype=np.int32))
-        spare = 0.15 * max(camera.width, camera.height)  # a distorted picture may show more than the ideal one
-        largest = np.array([camera.width, camera.height]) + spare
-        low = np.floor(np.clip(pixels.min(axis=0) - margin_px, -spare, largest)).astype(int)
-        high = np.ceil(np.clip(pixels.max(axis=0) + margin_px, -spare, largest)).astype(int)
+        border = 0.15 * max(camera.width, camera.height)  # a distorted picture may show more than the ideal one
+        largest = np.array([camera.width, camera.height]) + border
+        low = np.floor(np.clip(pixels.min(axis=0) - margin_px, -border, largest)).astype(int)
+        high = np.ceil(np.clip(pixels.max(axis=0) + margin_px, -border, largest)).astype(int)
         width, height = (int(v) for v in np.maximum(high - low, 1))
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
         origin = (int(low[0]), int(low[1]))

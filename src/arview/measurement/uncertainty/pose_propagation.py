@@ -53,7 +53,7 @@ def shifts_from_poses(points: Array, photos: Sequence[PosedPhoto], sees: NDArray
 def visibility(points: Array, normals: Array, sparse: SparseModel, model: Model) -> NDArray[np.bool_]:
     """(N,M) which photos, posed in the model's frame, show surface points (N,3) with normals (N,3)."""
 
-    def look(photo: PosedPhoto) -> NDArray[np.bool_]:
+    def seen_in(photo: PosedPhoto) -> NDArray[np.bool_]:
         shrink = min(1.0, DRAWN_PX / max(photo.camera.width, photo.camera.height))
         size = (round(photo.camera.width * shrink), round(photo.camera.height * shrink))
         camera = photo.camera.without_distortion().scaled(*size)
@@ -66,7 +66,7 @@ def visibility(points: Array, normals: Array, sparse: SparseModel, model: Model)
         near = np.abs(depth[v, u] - in_cam[:, 2]) < 4.0 * in_cam[:, 2] / camera.fx
         return np.asarray(inside & facing & near)
 
-    return np.stack(list(pool().map(look, sparse.photos)), axis=1)
+    return np.stack(list(pool().map(seen_in, sparse.photos)), axis=1)
 
 
 def surface_points(component: Component, count: int, seed: int = 0) -> tuple[Array, Array]:

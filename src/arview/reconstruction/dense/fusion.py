@@ -302,9 +302,9 @@ def _points(m: DepthMap, image: Image, stack: _Stack, merged: NDArray[np.float32
     (leaning,) = np.nonzero(is_leaning)
     for quarter in np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]):
         aside = m.camera.unproject(pixels[leaning] + quarter)
-        ahead = np.sum(element[leaning] * aside, axis=1) / facing[leaning]
-        is_near = ahead > 0.5  # the pixel may reach past the horizon of its plane
-        places.append(aside[is_near] * (depth[leaning] / ahead)[is_near, None])
+        ratio = np.sum(element[leaning] * aside, axis=1) / facing[leaning]
+        is_near = ratio > 0.5  # the pixel may reach past the horizon of its plane
+        places.append(aside[is_near] * (depth[leaning] / ratio)[is_near, None])
         of.append(leaning[is_near])
     which = np.concatenate(of)
     points = np.concatenate(places) @ scan_from_cam[:3, :3].T + scan_from_cam[:3, 3]

@@ -36,7 +36,7 @@ from arview.reconstruction.dense.kernels import (
 _ZERO, _ONE = float32(0.0), float32(1.0)
 _SEES = float32(0.5)
 """Correlation from which a source is taken to see the element."""
-_SETTLED = 0.1
+_MAX_LAST_STEP = 0.1
 """Last step in px that an element may still make: what has not settled shows where it started, not what is there."""
 _SLOPE_PRIOR = 0.05
 """Weight of the slopes' start, as a share of the evidence for w: keeps them where texture is poor."""
@@ -183,6 +183,6 @@ def polish(p, s, index, planes, scores, sigmas, step_px, iterations, unit_w):  #
                     break
                 if abs(step) < 0.03 * unit_w:
                     break
-            if lasting and abs(step) < _SETTLED * unit_w:
+            if lasting and abs(step) < _MAX_LAST_STEP * unit_w:
                 planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, du * float32(step_px), dv * float32(step_px)
                 scores[y, x], sigmas[y, x] = float32(system[11] / system[10]), float32(sigma)

@@ -86,9 +86,9 @@ def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int
             a, b = shared - centres[i], shared - centres[j]
             cosine = np.sum(a * b, axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
             angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
-            worth = np.clip(angle / low, 0.0, 1.0) ** 2
-            worth *= np.clip((options.max_angle_deg - angle) / (options.max_angle_deg - high), 0.0, 1.0)
-            score[i, j] = score[j, i] = worth.sum()
+            weights = np.clip(angle / low, 0.0, 1.0) ** 2
+            weights *= np.clip((options.max_angle_deg - angle) / (options.max_angle_deg - high), 0.0, 1.0)
+            score[i, j] = score[j, i] = weights.sum()
             apart[i, j] = apart[j, i] = np.median(angle)
     chosen: list[tuple[int, ...]] = []
     for i in range(count):

@@ -100,9 +100,9 @@ def base_names(part: Part) -> tuple[str, ...]:
 def spread_order(photos: Sequence[PosedPhoto]) -> list[int]:
     """Indices of the photos such that those at the front look from as different places as possible."""
     centres = np.array([photo.centre_in_scan for photo in photos])
-    ahead = np.array([photo.cam_from_scan[2, :3] for photo in photos])
+    axes = np.array([photo.cam_from_scan[2, :3] for photo in photos])
     size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean() or 1.0
-    places = np.concatenate([centres / size, ahead], axis=1)
+    places = np.concatenate([centres / size, axes], axis=1)
     order = [int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
     distance = np.full(len(places), np.inf)
     while len(order) < len(places):
@@ -246,22 +246,22 @@ def _refined(
         if progress:
             progress("reading photos", len(views), len(chosen))
     base, model = base_names(part), part.model
-    judge = JointRefiner(model, base, views[: options.rival_views], options.refine)
+    scorer = JointRefiner(model, base, views[: options.rival_views], options.refine)
     starts = [v.similarity for v in votes[:3] if v.score >= 0.4 * votes[0].score]
     starts += [_turned(votes[0].similarity, turn, model) for turn in turns]
-    judged = []
+    scored = []
     for start in starts:
-        rough, borne_out = judge.rough(start)
-        judged.append((borne_out.score, rough))
-    judged.sort(key=lambda pair: -pair[0])
+        rough, support = scorer.rough(start)
+        scored.append((support.score, rough))
+    scored.sort(key=lambda pair: -pair[0])
     warnings = []
-    rivals = [score for score, other in judged[1:] if _is_other(judged[0][1], other)]
-    if rivals and judged[0][0] - max(rivals) < options.clear_lead:
+    rivals = [score for score, other in scored[1:] if _is_other(scored[0][1], other)]
+    if rivals and scored[0][0] - max(rivals) < options.clear_lead:
         warnings.append("the part looks much the same after a turn: the frame may be that of its twin")
     if progress:
         progress("fitting the CAD", 0, 1)
     refiner = JointRefiner(model, base, views, options.refine)
-    fit = refiner.refine(judged[0][1])
+    fit = refiner.refine(scored[0][1])
     support = refiner.support(fit.similarity, fit.samples)
     if max(support.score, support.base_score) < options.min_support:
         reason = (

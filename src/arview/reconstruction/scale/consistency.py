@@ -42,10 +42,10 @@ def check_consistency(sparse: SparseModel, model: Model, found: CadFind, similar
     usual = float(np.nanmedian(support.by_view))
     is_misfit = support.by_view < MIN_OF_OTHERS * usual
     misfits = tuple(v.name for v, bad in zip(found.refiner.views, is_misfit, strict=True) if bad)
-    ahead = points_before_surface(sparse, model, similarity)
+    offsets = points_before_surface(sparse, model, similarity)
     tolerance_mm = NEAR_SHARE * model.diameter_mm
-    near = float(np.mean(np.abs(ahead) < tolerance_mm)) if len(ahead) >= MIN_POINTS else None
-    behind = float(np.mean(ahead < -tolerance_mm)) if len(ahead) >= MIN_POINTS else None
+    near = float(np.mean(np.abs(offsets) < tolerance_mm)) if len(offsets) >= MIN_POINTS else None
+    behind = float(np.mean(offsets < -tolerance_mm)) if len(offsets) >= MIN_POINTS else None
     against = []
     if usual < MIN_EDGES:
         against.append(
@@ -79,7 +79,7 @@ def points_before_surface(sparse: SparseModel, model: Model, similarity: Similar
     """
     points = similarity.points_in_model(sparse.points_in_scan)
 
-    def look(index: int) -> tuple[Array, Array]:
+    def offsets_in(index: int) -> tuple[Array, Array]:
         photo = sparse.photos[index]
         shrink = min(1.0, DRAWN_PX / max(photo.camera.width, photo.camera.height))
         camera = photo.camera.without_distortion().scaled(
@@ -102,7 +102,7 @@ def points_before_surface(sparse: SparseModel, model: Model, similarity: Similar
         before[ok] = np.where(lowest > 0, gap, np.nan)
         return which, before
 
-    seen = list(pool().map(look, range(len(sparse.photos))))
+    seen = list(pool().map(offsets_in, range(len(sparse.photos))))
     if not seen:
         return np.zeros(0)
     which, before = np.concatenate([s[0] for s in seen]), np.concatenate([s[1] for s in seen])

@@ -108,13 +108,13 @@ def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:
     names both. What scatters more than it should has a standard deviation as much larger.
     """
     ordered = sorted(evidence, key=lambda e: TRUST.index(e.kind))
-    judged: list[ScaleEvidence] = []
+    checked: list[ScaleEvidence] = []
     warnings = []
     for e in ordered:
-        trusted = [other for other in judged if other.is_used]
+        trusted = [other for other in checked if other.is_used]
         apart = [abs(np.log(e.mm_per_unit / t.mm_per_unit)) / np.hypot(e.std, t.std) for t in trusted]
         is_used = not apart or bool(max(apart) <= DISAGREE)
-        judged.append(replace(e, is_used=is_used))
+        checked.append(replace(e, is_used=is_used))
         if not is_used:
             rival = trusted[int(np.argmax(apart))]
             percent = 100.0 * (e.mm_per_unit / rival.mm_per_unit - 1.0)
@@ -122,7 +122,7 @@ def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:
                 f"the scale of [{e.detail}] differs by {percent:+.3f} % ({max(apart):.0f} σ) from that of "
                 f"[{rival.detail}], which is trusted more and was used"
             )
-    used = [e for e in judged if e.is_used]
+    used = [e for e in checked if e.is_used]
     if not used:
         return None
     weights = np.array([1.0 / e.std**2 for e in used])
@@ -130,7 +130,7 @@ def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:
     mean = float(weights @ logs / weights.sum())
     excess = float(weights @ (logs - mean) ** 2) / max(1, len(used) - 1)
     std = float(np.sqrt(max(1.0, excess) / weights.sum()))
-    return CombinedScale(float(np.exp(mean)), std, tuple(judged), tuple(warnings))
+    return CombinedScale(float(np.exp(mean)), std, tuple(checked), tuple(warnings))
 
 
 def _positive(covariance: Array) -> Array:

@@ -314,9 +314,9 @@ class JointRefiner:
     @staticmethod
     def _normals(camera: Camera, cam_from_model: Array, points: Array, tangents: Array) -> Array:
         """(N,2) unit normals of the edges in the picture."""
-        ahead = apply(cam_from_model, points)
-        along = camera.project(ahead + 1e-4 * ahead[:, 2:] * (tangents @ cam_from_model[:3, :3].T))
-        along -= camera.project(ahead)
+        in_cam = apply(cam_from_model, points)
+        along = camera.project(in_cam + 1e-4 * in_cam[:, 2:] * (tangents @ cam_from_model[:3, :3].T))
+        along -= camera.project(in_cam)
         with np.errstate(invalid="ignore"):
             along /= np.linalg.norm(along, axis=1, keepdims=True)
         return np.asarray(np.stack([-along[:, 1], along[:, 0]], axis=1))

@@ -17,7 +17,7 @@ from arview.geometry import Array, apply, invert, orthonormalise, rigid, rotatio
 from arview.reconstruction.scale.similarity import Similarity
 
 AGREE_RAD = np.deg2rad(2.5)
-ACROSS, AHEAD = 0.02, 0.06
+ACROSS, ALONG = 0.02, 0.06
 """Detections agree when they place the middle this near across the view and along it, in diameters of the part."""
 SAME_RAD, SAME_PLACE, SAME_SCALE = np.deg2rad(8.0), 0.1, 0.06
 
@@ -109,9 +109,9 @@ def _agrees(similarity: Similarity, sighting: Sighting, center_in_model: Array, 
         return False
     middle = apply(sighting.cam_from_model, center_in_model)
     away = apply(expected, center_in_model) - middle
-    ahead = away @ middle / np.linalg.norm(middle)
-    across = float(np.sqrt(max(0.0, away @ away - ahead**2)))
-    return bool(across < ACROSS * diameter_mm and abs(ahead) < AHEAD * diameter_mm)
+    along = away @ middle / np.linalg.norm(middle)
+    across = float(np.sqrt(max(0.0, away @ away - along**2)))
+    return bool(across < ACROSS * diameter_mm and abs(along) < ALONG * diameter_mm)
 
 
 def _same(a: Similarity, b: Similarity, center_in_model: Array, diameter_mm: float) -> bool:
