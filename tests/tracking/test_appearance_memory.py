@@ -152,13 +152,13 @@ def test_nothing_is_believed_where_there_is_no_part_or_another_side_of_it() -> N
     options = SessionOptions(eager_frames=0, search_every=1000)
     session = TrackingSession(assembly_views(), CAMERA, assembly(), options)
     session.appearance_memory = six_sides()
-    session.state = TrackingState.LOST
+    session._state.state = TrackingState.LOST
     for k in range(12):
-        session._last_seen = pose_from(*SIDES[k % 6], 520)
+        session._state.last_sure_pose = pose_from(*SIDES[k % 6], 520)
         assert session.process(picture(None, seed=k, scene=10 + k), k, 0.0).cam_from_model is None
     # The bracket is another part, in the same place.
     for k in range(6):
-        session._last_seen = pose_from(*SIDES[k], 520)
+        session._state.last_sure_pose = pose_from(*SIDES[k], 520)
         image = picture(pose_from(*SIDES[k], 400, bracket()), bracket(), seed=k, scene=k)
         assert session.process(image, k, 0.0).cam_from_model is None
 

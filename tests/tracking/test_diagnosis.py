@@ -15,11 +15,11 @@ from arview.refinement.evidence import PoseEvidence
 from arview.tracking import Estimate, TrackingSession
 from arview.tracking.diagnosis import (
     BLURRED,
-    NOTHING,
+    NOTHING_IN_VIEW,
     diagnose_loss,
+    diagnose_picture,
     diagnose_search,
     edge_widths_px,
-    poor_picture,
 )
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, background, picture, pose_from
 
@@ -51,8 +51,8 @@ def on_plain(image: NDArray[np.uint8], level: float = 150.0) -> NDArray[np.uint8
 
 @pytest.mark.parametrize("scene", range(6))
 def test_an_ordinary_picture_has_nothing_wrong(scene: int) -> None:
-    assert poor_picture(picture(TRUTH, scene=scene, noise=4.0)) == ""
-    assert poor_picture(picture(None, scene=scene, noise=4.0)) == ""
+    assert diagnose_picture(picture(TRUTH, scene=scene, noise=4.0)) == ""
+    assert diagnose_picture(picture(None, scene=scene, noise=4.0)) == ""
 
 
 def test_light() -> None:
@@ -60,27 +60,29 @@ def test_light() -> None:
         assert why(picture(TRUTH, gain=gain)) == "too dark"
     assert why(picture(TRUTH, gain=7.0)) == "overexposed"
     for gain in (0.35, 1.5):
-        assert why(picture(TRUTH, gain=gain)).startswith(NOTHING)
+        assert why(picture(TRUTH, gain=gain)).startswith(NOTHING_IN_VIEW)
     # A white wall behind a well lit part is neither.
-    assert poor_picture(on_plain(picture(TRUTH, scene=1, noise=0.0), 200.0)) == ""
+    assert diagnose_picture(on_plain(picture(TRUTH, scene=1, noise=0.0), 200.0)) == ""
 
 
 @pytest.mark.parametrize("sigma_px", [4.0, 6.0, 9.0])
 def test_a_picture_out_of_focus_is_blurred(sigma_px: float) -> None:
     for image in (picture(TRUTH, scene=2, noise=0.0), on_plain(picture(TRUTH, scene=1, noise=0.0))):
-        assert poor_picture(cv2.GaussianBlur(image, (0, 0), sigma_px)) == BLURRED
+        assert diagnose_picture(cv2.GaussianBlur(image, (0, 0), sigma_px)) == BLURRED
 
 
 @pytest.mark.parametrize("size", [(20, 1), (1, 20), (32, 1), (1, 32)])
 def test_motion_blurs_the_edges_across_it(size: tuple[int, int]) -> None:
     for scene in (1, 3):
-        assert poor_picture(cv2.blur(picture(TRUTH, scene=scene, noise=0.0), size)) == BLURRED
+        assert diagnose_picture(cv2.blur(picture(TRUTH, scene=scene, noise=0.0), size)) == BLURRED
 
 
 def test_a_plain_background_is_not_taken_for_blur() -> None:
-    assert poor_picture(on_plain(picture(TRUTH, scene=1, noise=0.0))) == ""
+    assert diagnose_picture(on_plain(picture(TRUTH, scene=1, noise=0.0))) == ""
     noise = np.random.default_rng(0).normal(0, 2, (480, 640, 3))
-    assert poor_picture(np.clip(150 + noise, 0, 255).astype(np.uint8)) == "low contrast: hardly an edge in the picture"
+    assert (
+        diagnose_picture(np.clip(150 + noise, 0, 255).astype(np.uint8)) == "low contrast: hardly an edge in the picture"
+    )
 
 
 @pytest.mark.parametrize("sigma_px", [1.5, 2.0, 3.0, 4.0])
@@ -99,18 +101,18 @@ def test_the_width_of_edges_is_that_of_the_blur(sigma_px: float) -> None:
 def test_large_pictures_are_judged_like_small_ones() -> None:
     small = cv2.GaussianBlur(picture(TRUTH, scene=2, noise=0.0), (0, 0), 5.0)
     large = cv2.resize(small, (1920, 1440), interpolation=cv2.INTER_LINEAR)
-    assert poor_picture(np.asarray(large)) == BLURRED
+    assert diagnose_picture(np.asarray(large)) == BLURRED
     sharp = cv2.resize(picture(TRUTH, scene=2, noise=0.0), (1920, 1440), interpolation=cv2.INTER_LINEAR)
-    assert poor_picture(np.asarray(sharp)) == ""
+    assert diagnose_picture(np.asarray(sharp)) == ""
 
 
 # --- The best hypothesis --------------------------------------------------------------------------------
 
 
 def test_nothing_like_the_part() -> None:
-    assert why(background(3)) == f"{NOTHING}, 420 to 640 mm away"
+    assert why(background(3)) == f"{NOTHING_IN_VIEW}, 420 to 640 mm away"
     # Hypotheses as good as this are found in any clutter.
-    assert why(background(3), TRUTH, quality=0.03) == f"{NOTHING}, 420 to 640 mm away"
+    assert why(background(3), TRUTH, quality=0.03) == f"{NOTHING_IN_VIEW}, 420 to 640 mm away"
 
 
 def test_a_part_of_the_outline() -> None:

@@ -2,35 +2,62 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from arview.geometry import Array
 
-DECIDED = 0.25
-"""The same for the sum of the differences over frames."""
+
+@dataclass(frozen=True)
+class DisambiguationOptions:
+    """Options of the disambiguation.
+
+    Attributes:
+        decision_margin: sum over the frames of the differences in score that decides between two poses.
+    """
+
+    decision_margin: float = 0.25
 
 
 class HypothesisSet:
-    """Twins of a tracked pose, told from it by what the frames bear out.
+    """Near-symmetric alternatives of a tracked pose, compared with it frame by frame.
 
     Args:
-        model_from_twins: (4,4) transforms on the model's side that lead from the tracked pose to each twin.
+        model_from_other: (4,4) transforms on the model's side that lead from the tracked pose to each alternative.
+        options: see `DisambiguationOptions`.
     """
 
-    def __init__(self, model_from_twins: list[Array]) -> None:
-        self.model_from_twins = model_from_twins
-        self._leads = [0.0] * len(model_from_twins)
+    def __init__(self, model_from_other: list[Array], options: DisambiguationOptions | None = None) -> None:
+        self.options = options or DisambiguationOptions()
+        self.model_from_other = model_from_other
+        self._margins = [0.0] * len(model_from_other)
 
-    def __bool__(self) -> bool:
-        return bool(self.model_from_twins)
+    def __len__(self) -> int:
+        return len(self.model_from_other)
 
-    def update(self, worth: float, twin_worths: list[float]) -> Array | None:
-        """Count a frame: twins that are clearly worse are dropped; the transform to one that is clearly better."""
-        self._leads = [lead + worth - other for lead, other in zip(self._leads, twin_worths, strict=True)]
-        worst = int(np.argmin(self._leads))
-        if self._leads[worst] <= -DECIDED:
-            return self.model_from_twins[worst]
-        kept = [k for k, lead in enumerate(self._leads) if lead < DECIDED]
-        self.model_from_twins = [self.model_from_twins[k] for k in kept]
-        self._leads = [self._leads[k] for k in kept]
+    def poses(self, cam_from_model: Array) -> list[Array]:
+        """The alternatives (4,4) of a tracked pose."""
+        return [cam_from_model @ turn for turn in self.model_from_other]
+
+    def update(self, score: float, other_scores: list[float]) -> Array | None:
+        """Count a frame.
+
+        Alternatives whose scores sum up to clearly less than those of the tracked pose are dropped.
+
+        Args:
+            score: score of the tracked pose in this frame.
+            other_scores: scores of the alternatives.
+
+        Returns:
+            Transform (4,4) to the alternative that is clearly better than the tracked pose; None if there is none.
+        """
+        pairs = zip(self._margins, other_scores, strict=True)
+        self._margins = [margin + score - other for margin, other in pairs]
+        worst = int(np.argmin(self._margins))
+        if self._margins[worst] <= -self.options.decision_margin:
+            return self.model_from_other[worst]
+        kept = [k for k, margin in enumerate(self._margins) if margin < self.options.decision_margin]
+        self.model_from_other = [self.model_from_other[k] for k in kept]
+        self._margins = [self._margins[k] for k in kept]
         return None

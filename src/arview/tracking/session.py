@@ -1,7 +1,9 @@
-"""TrackingSession: one part in one stream of frames, as a machine of states with hysteresis.
+"""TrackingSession: detects one part and tracks it through a stream of frames.
 
-``searching`` until the part is first found, ``tracked`` while the picture bears the pose out, ``critical`` while it
-hardly does, ``lost`` when it no longer does; from ``searching`` and ``lost`` the detector looks for the part.
+The part is ``searching`` until first found, ``tracked`` while the picture supports its pose, ``critical`` while the
+support is weak, and ``lost`` when there is none. Every frame follows the last pose or searches for the part; a pose is
+then disambiguated, its components are checked, and the part's appearance is remembered. The transitions between the
+states are a table, see `session_state`.
 """
 
 from __future__ import annotations
@@ -16,27 +18,22 @@ from arview.assembly.monitor import AssemblyMonitor
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.core.checks import check_type
-from arview.detection.detector import (
-    Detection,
-    Detector,
-    DetectorOptions,
-    RejectedHypothesis,
-    local_search_for,
-)
+from arview.detection.detector import Detection, Detector, DetectorOptions, RejectedHypothesis, local_search_for
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, check_rigid, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
-from arview.tracking.appearance_memory import AppearanceMemory, Proposal
-from arview.tracking.diagnosis import NOTHING, diagnose_loss, diagnose_search, poor_picture
+from arview.tracking.appearance_memory import AppearanceMemory
+from arview.tracking.diagnosis import NOTHING_IN_VIEW, diagnose_loss, diagnose_picture, diagnose_search
 from arview.tracking.disambiguation import HypothesisSet
 from arview.tracking.estimate import Estimate
 from arview.tracking.guided_init import GuidedInit
 from arview.tracking.pose_recheck import LocalSearchRecheck
+from arview.tracking.session_state import Event, SessionState
 from arview.tracking.tracker import Tracker, TrackerOptions
 
 ALIGN = "align the part with the outline"
-"""The reason while the session waits for the part at its guide pose."""
+"""Reason given while the session waits for the part at its guide pose."""
 
 
 @dataclass(frozen=True)
@@ -44,20 +41,26 @@ class SessionOptions:
     """Options of a session.
 
     Attributes:
-        use_region, use_edge, use_texture: modalities of the tracker.
-        use_recheck: ask the detector's local search where a tracked pose surprises, see `LocalSearchRecheck`.
-        use_appearance_memory: remember how the part looks while it is tracked well, and look for that after a loss.
-        lock_quality: a detection must be this good to be believed at once; a weaker one must hold a second frame.
-        tracked_quality: at least this to be or become ``tracked``.
-        critical_quality: a tracked pose turns ``critical`` only below this (hysteresis).
-        lost_quality: below this the pose is dropped after ``lost_frames`` frames.
-        lost_frames: frames in a row.
-        critical_frames: so many critical frames in a row end in ``lost`` too.
-        eager_frames, search_every: a lost part is looked for in so many frames at once, then in every n-th.
-        likely_look: between these searches only what looks so much (correlation) as it did is looked at closer.
-        align_again_frames: a part that is not found again in so many frames may be aligned with the guide again.
-        min_in_picture: less of the outline inside the picture cannot hold a pose.
-        detector: None chooses by the declared range.
+        use_region: let the tracker use colours along the outline.
+        use_edge: let the tracker use grey-level edges.
+        use_texture: let the tracker use the part's own texture.
+        use_recheck: run the detector's local search where a tracked pose is far from the predicted one.
+        use_appearance_memory: remember how the part looks while it is tracked, and look for that after a loss.
+        lock_quality: a detection of this quality is accepted at once; a weaker one must be confirmed by a second frame.
+        tracked_quality: quality needed to become ``tracked``.
+        critical_quality: a tracked pose becomes ``critical`` only below this quality (hysteresis).
+        lost_quality: a pose below this quality for ``lost_frames`` frames is given up.
+        lost_frames: frames in a row below ``lost_quality`` after which the part is lost.
+        critical_frames: critical frames in a row after which the part is lost.
+        eager_frames: frames after a loss in each of which the part is searched for.
+        search_every: later only every n-th frame is searched.
+        min_resting_score: correlation with the remembered appearance from which a place is examined in frames between
+            these searches.
+        align_again_frames: frames after a loss from which the part may be aligned with the guide view again.
+        align_advice_every: frames between two checks of the picture while the session waits for the alignment.
+        min_in_picture: share of the outline inside the picture below which no pose is kept.
+        distance_margin: factor by which a pose may be nearer or farther than the declared range.
+        detector: options of the detector; None chooses them by the declared range.
     """
 
     use_region: bool = True
@@ -73,9 +76,11 @@ class SessionOptions:
     critical_frames: int = 45
     eager_frames: int = 2
     search_every: int = 3
-    likely_look: float = 0.7
+    min_resting_score: float = 0.7
     align_again_frames: int = 60
+    align_advice_every: int = 10
     min_in_picture: float = 0.25
+    distance_margin: float = 2.0
     detector: DetectorOptions | None = None
 
     def __post_init__(self) -> None:
@@ -90,15 +95,13 @@ class TrackingSession:
         views: guide views of the model.
         camera: intrinsics of the frames.
         model: the CAD model of the guide views; the texture modality needs its surface.
-        options: see SessionOptions.
-        initial_cam_from_model: (4,4) mm; the first frame snaps to it and does not search.
-        guide_cam_from_model: (4,4) mm; the part is first found by bringing it near this pose, not by a search,
-            and by both when it has been lost for a while.
-
-    ``learned`` holds how the part looked while it was tracked well: a lost part is looked for there first.
+        options: see `SessionOptions`.
+        initial_cam_from_model: (4,4) mm, rough pose in the first frame, which is refined instead of a search.
+        guide_cam_from_model: (4,4) mm, guide pose. The part is first found when it is brought near this pose, not by
+            a search, and by both after it has been lost for a while.
 
     Raises:
-        MismatchError: guide views of another model.
+        MismatchError: the guide views belong to another model.
         InputError: an initial or guide pose that is not a rigid transform.
     """
 
@@ -115,7 +118,7 @@ class TrackingSession:
         check_type(views, GuideViewSet, "TrackingSession: views")
         check_type(camera, Camera, "TrackingSession: camera")
         check_type(model, Model, "TrackingSession: model")
-        self.options = options or SessionOptions()
+        self.options = o = options or SessionOptions()
         if views.model_hash != model.source_hash:
             raise MismatchError(
                 f"guide views of model {views.model_name!r} ({views.model_hash[:12]}) do not belong to "
@@ -123,17 +126,13 @@ class TrackingSession:
             )
         self.camera = camera
         self._views = views
-        self._local = local_search_for(views, camera, self.options.detector)
+        self._local = local_search_for(views, camera, o.detector)
         self.tracker = Tracker(
             views,
             camera,
             model,
-            TrackerOptions(
-                use_region=self.options.use_region,
-                use_edge=self.options.use_edge,
-                use_texture=self.options.use_texture,
-            ),
-            recheck=LocalSearchRecheck(self._local) if self.options.use_recheck else None,
+            TrackerOptions(use_region=o.use_region, use_edge=o.use_edge, use_texture=o.use_texture),
+            recheck=LocalSearchRecheck(self._local) if o.use_recheck else None,
             part=self._local.refiner.part,
         )
         self._detector: Detector | None = None
@@ -142,21 +141,26 @@ class TrackingSession:
         self._guided_init: GuidedInit | None = None
         self.components = AssemblyMonitor(views, camera, model)
         self.appearance_memory = AppearanceMemory(views, camera)
-        self.reset()
+        self._state = SessionState()
 
     def __repr__(self) -> str:
         return f"<TrackingSession {self._views.model_name}: {self.state}, {len(self._views)} views, {self.camera!r}>"
 
     @property
+    def state(self) -> TrackingState:
+        """State after the last frame."""
+        return self._state.state
+
+    @property
     def detector(self) -> Detector:
-        """The detector, made when first needed."""
+        """The detector, created when first needed."""
         if self._detector is None:
             self._detector = Detector(self._views, self.camera, self.options.detector, local=self._local)
         return self._detector
 
     @property
     def guided_init(self) -> GuidedInit:
-        """The search around a given pose, made when first needed."""
+        """The search around a given pose, created when first needed."""
         if self._guided_init is None:
             self._guided_init = GuidedInit(self._views, self.camera)
         return self._guided_init
@@ -164,51 +168,32 @@ class TrackingSession:
     @property
     def is_aligning(self) -> bool:
         """Whether the part can be found by bringing it near the guide pose."""
-        has_waited = self.state == TrackingState.LOST and self._lost_frames > self.options.align_again_frames
-        return self._guide is not None and (self.state == TrackingState.SEARCHING or has_waited)
+        s = self._state
+        has_waited = s.state == TrackingState.LOST and s.frames_without_pose > self.options.align_again_frames
+        return self._guide is not None and (s.state == TrackingState.SEARCHING or has_waited)
 
     def reset(self) -> None:
-        """Forget the part's place: search again. What was learned of its look is kept."""
-        self.state = TrackingState.SEARCHING
-        self._poor = 0
-        self._critical = 0
-        self._lost_frames = 0
-        self._confirmed = False
-        self._borne_out = False
-        self._was_found = False
-        self._recent: list[Array] = []
-        self._last_seen: Array | None = None
-        self._hypotheses = HypothesisSet([])
-        self._why = self._why_lost = ""
+        """Forget the part's pose and search again. The remembered appearance is kept."""
+        self._state = SessionState()
 
     def process(self, image: NDArray[np.uint8], index: int, time_s: float) -> Pose:
         """Pose and state of the next frame.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
-            index, time_s: of the frame, copied into the pose.
+            index: index of the frame, copied into the pose.
+            time_s: time stamp of the frame, copied into the pose.
 
         Raises:
             InputError: an image of another size or type.
         """
-        if image.shape != (self.camera.height, self.camera.width, 3) or image.dtype != np.uint8:
-            raise InputError(
-                f"frame {index}: {image.shape} {image.dtype}, expected "
-                f"({self.camera.height}, {self.camera.width}, 3) uint8 as the camera says"
-            )
+        self._check_image(image, index)
         started = time.perf_counter()
-        if self.state in (TrackingState.TRACKED, TrackingState.CRITICAL):
-            estimate, reason = self._follow(image)
-        else:
-            estimate, reason = self._search(image)
+        estimate, reason = self._follow(image) if self._state.has_pose else self._search(image)
         if estimate is not None:
-            estimate, reason = self._tell_apart(image, estimate, reason)
-            reason = self._compare(image, estimate, reason)
-            is_sure = self.state == TrackingState.TRACKED and self._confirmed
-            if self.options.use_appearance_memory:
-                self.appearance_memory.learn(image, estimate, is_sure)
-            if is_sure:
-                self._last_seen = estimate.cam_from_model
+            estimate, reason = self._disambiguate(image, estimate, reason)
+            reason = self._check_components(image, estimate, reason)
+            self._remember(image, estimate)
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
             guide = self._guide if self.is_aligning else None
@@ -224,161 +209,191 @@ class TrackingSession:
             reason=reason,
             mismatches=self.components.mismatches,
             unverified=self.components.unverified,
-            alternatives=tuple(estimate.cam_from_model @ turn for turn in self._hypotheses.model_from_twins),
+            alternatives=tuple(self._state.hypotheses.poses(estimate.cam_from_model)),
         )
 
-    def _tell_apart(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> tuple[Estimate, str]:
-        """Watch the twins of an ambiguous pose until the frames say which is right."""
-        if not self._hypotheses:
+    def _check_image(self, image: NDArray[np.uint8], index: int) -> None:
+        if image.shape != (self.camera.height, self.camera.width, 3) or image.dtype != np.uint8:
+            raise InputError(
+                f"frame {index}: {image.shape} {image.dtype}, expected "
+                f"({self.camera.height}, {self.camera.width}, 3) uint8 as the camera says"
+            )
+
+    # --- Follow a pose ------------------------------------------------------------------------------------
+
+    def _follow(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
+        """Track the part into this frame; the reason says why the pose is weak or was given up."""
+        o, s = self.options, self._state
+        estimate = self.tracker.track(image)
+        is_possible = self._is_possible(estimate)
+        is_outside = estimate.evidence.points_in_picture < o.min_in_picture or not is_possible
+        is_poor = is_outside or estimate.quality < o.lost_quality
+        s.poor_frames = s.poor_frames + 1 if is_poor else 0
+        if s.poor_frames >= o.lost_frames or (is_poor and not s.is_confirmed):
+            recent = (s.recent_poses[0], s.recent_poses[1]) if len(s.recent_poses) == 2 else None
+            return self._give_up(diagnose_loss(image, estimate, recent, self.camera, self._views, is_possible))
+        if not is_poor:
+            s.recent_poses = (*s.recent_poses[-1:], estimate.cam_from_model)
+            if estimate.quality >= (o.critical_quality if s.is_supported else o.tracked_quality):
+                s.confirm()
+                return estimate, ""
+        s.apply(Event.WEAK)
+        s.critical_frames += 1
+        if s.critical_frames > o.critical_frames or not s.is_confirmed:
+            return self._give_up("the outline is not seen where it should be")
+        return estimate, "the outline is hardly seen"
+
+    def _give_up(self, reason: str) -> tuple[None, str]:
+        """Give the pose up; one from the guide view that was never confirmed leaves the session waiting as before."""
+        if self._guide is not None and not self._state.is_confirmed:
+            self._state.retract()
+        else:
+            self._state.lose(reason)
+        return None, self._state.reason
+
+    def _is_possible(self, estimate: Estimate) -> bool:
+        """Whether the part is in front of the camera and not much nearer or farther than declared."""
+        center = apply(estimate.cam_from_model, self._views.center_in_model)
+        low, high = self._views.view_range.distance_mm
+        margin = self.options.distance_margin
+        return bool(center[2] > 0 and low / margin < np.linalg.norm(center) < margin * high)
+
+    # --- Search -------------------------------------------------------------------------------------------
+
+    def _search(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
+        """Find the part: at the initial pose, at the guide pose, or by detection; the reason says why not."""
+        o, s = self.options, self._state
+        s.frames_without_pose += 1
+        if self._initial is not None:
+            return self._initialize(image, self._initial)
+        if s.state == TrackingState.SEARCHING and self._guide is not None:
+            return self._align(image, self._guide)
+        is_resting = s.frames_without_pose > o.eager_frames and s.frames_without_pose % o.search_every != 0
+        is_resting = is_resting and s.state == TrackingState.LOST
+        detections = self._detect_remembered(image) if is_resting else self._detect(image)
+        if detections:
+            start = detections[0].cam_from_model
+            s.hypotheses = HypothesisSet([invert(start) @ other for other in detections[0].alternatives])
+            return self._begin(image, start)
+        if not is_resting:
+            return None, self._diagnose(image, self.detector.best_rejected)
+        if self._guide is not None and self.is_aligning:
+            return self._align(image, self._guide)
+        return None, s.reason
+
+    def _initialize(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[Estimate | None, str]:
+        """Find the part near the initial pose, which is used only once."""
+        found = self.guided_init.find(image, cam_from_model)
+        self._initial = None
+        if found is None:
+            return None, "the part is outside the picture at the initial pose"
+        return self._begin(image, found.cam_from_model)
+
+    def _begin(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[Estimate | None, str]:
+        """Accept a found pose if it is good enough; one that is not certain must be confirmed by the next frame."""
+        o = self.options
+        estimate = self._restart(image, cam_from_model)
+        if estimate.quality < o.tracked_quality or not self._is_possible(estimate):
+            rejected = RejectedHypothesis(estimate.cam_from_model, estimate.evidence, estimate.quality)
+            return None, self._diagnose(image, rejected)
+        is_confirmed = estimate.quality >= o.lock_quality
+        self._state.begin(is_confirmed)
+        return estimate, "" if is_confirmed else "found, to be confirmed"
+
+    def _restart(self, image: NDArray[np.uint8], cam_from_model: Array) -> Estimate:
+        """Track from a pose on; nothing is known of the components yet."""
+        self.tracker.start(image, cam_from_model)
+        self.components.reset()
+        return self.tracker.track(image)
+
+    def _detect(self, image: NDArray[np.uint8]) -> list[Detection]:
+        """Detect the part in the whole picture, with the remembered appearance as a hint."""
+        o, s = self.options, self._state
+        guesses: list[Array] = []
+        if o.use_appearance_memory:
+            if s.last_sure_pose is not None and s.frames_without_pose <= o.eager_frames:
+                guesses = self._remembered(image, s.last_sure_pose)
+            guesses = guesses or self._remembered(image)
+        # The thorough search takes long, so it is not run in every frame.
+        turn = s.frames_without_pose % (2 * o.search_every)
+        is_thorough = turn == 1 if s.state == TrackingState.SEARCHING else turn == 0
+        return self.detector.detect(image, max_results=1, is_thorough=is_thorough, guesses=guesses)
+
+    def _detect_remembered(self, image: NDArray[np.uint8]) -> list[Detection]:
+        """Detect the part only where the picture looks like the last sure view of it."""
+        near = self._state.last_sure_pose
+        if not self.options.use_appearance_memory or near is None:
+            return []
+        guesses = self._remembered(image, near, self.options.min_resting_score)
+        return self.detector.detect_near(image, guesses) if guesses else []
+
+    def _remembered(self, image: NDArray[np.uint8], near: Array | None = None, min_score: float = 0.0) -> list[Array]:
+        """Rough poses (4,4) where the picture looks like a remembered view, best first."""
+        matches = self.appearance_memory.propose(image, near)
+        return [match.cam_from_model for match in matches if match.score >= min_score]
+
+    def _align(self, image: NDArray[np.uint8], guide_cam_from_model: Array) -> tuple[Estimate | None, str]:
+        """Find the part near the guide pose; what is found must be confirmed by the next frame."""
+        o, s = self.options, self._state
+        found = self.guided_init.lock(image, guide_cam_from_model, o.lock_quality)
+        if found is not None:
+            estimate = self._restart(image, found.cam_from_model)
+            is_good = estimate.quality >= o.lock_quality and self._is_possible(estimate)
+            if is_good and self.guided_init.is_near(estimate.cam_from_model, guide_cam_from_model):
+                s.reason = ALIGN
+                s.begin(is_confirmed=False)
+                return estimate, "found, to be confirmed"
+        if s.state == TrackingState.SEARCHING and s.frames_without_pose % o.align_advice_every == 1:
+            s.reason = diagnose_picture(image) or ALIGN
+        return None, s.reason
+
+    def _diagnose(self, image: NDArray[np.uint8], rejected: RejectedHypothesis | None) -> str:
+        """Why a search found nothing; of a lost part the loss says more than that nothing is in view."""
+        s = self._state
+        reason = diagnose_search(image, self.camera, self._views, rejected)
+        is_lost = s.state == TrackingState.LOST
+        s.reason = s.loss_reason if is_lost and reason.startswith(NOTHING_IN_VIEW) else reason
+        if is_lost and self.is_aligning:
+            s.reason += f"; {ALIGN}"
+        return s.reason
+
+    # --- Examine a pose -----------------------------------------------------------------------------------
+
+    def _disambiguate(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> tuple[Estimate, str]:
+        """Compare an ambiguous pose with its alternatives until the frames decide between them."""
+        s = self._state
+        if not s.hypotheses:
             return estimate, reason
-        twins = [estimate.cam_from_model @ turn for turn in self._hypotheses.model_from_twins]
-        better = self._hypotheses.update(estimate.evidence.score, self.tracker.scores_near(image, twins))
+        others = s.hypotheses.poses(estimate.cam_from_model)
+        better = s.hypotheses.update(estimate.evidence.score, self.tracker.scores_near(image, others))
         if better is not None:
-            self._hypotheses = HypothesisSet([])
-            return self._begun(image, estimate.cam_from_model @ better), reason
-        count = len(self._hypotheses.model_from_twins)
+            s.hypotheses = HypothesisSet([])
+            return self._restart(image, estimate.cam_from_model @ better), reason
+        count = len(s.hypotheses)
         if count == 0 or reason:
             return estimate, reason
-        self.state = TrackingState.CRITICAL
+        s.apply(Event.CONTRADICTED)
         poses = "another pose fits" if count == 1 else f"{count} other poses fit"
         return estimate, f"ambiguous: {poses} as well; show another side"
 
-    def _compare(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:
-        """Look whether the components are where the CAD has them; a part with one wrong is never `tracked`."""
-        self._borne_out = self.state == TrackingState.TRACKED
-        if self._borne_out:
+    def _check_components(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:
+        """Check that the components are where the CAD has them; a part with a wrong one is never ``tracked``."""
+        s = self._state
+        s.is_supported = s.state == TrackingState.TRACKED
+        if s.is_supported:
             self.components.update(image, estimate.cam_from_model)
         reasons = [reason, *self.components.mismatches] if reason else [*self.components.mismatches]
         uncertain = self.components.uncertain
         if uncertain and not reasons:
             reasons = [f"in doubt: {', '.join(uncertain)}"]
         if reasons:
-            self.state = TrackingState.CRITICAL
+            s.apply(Event.CONTRADICTED)
         return "; ".join(reasons)
 
-    def _follow(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
-        o = self.options
-        estimate = self.tracker.track(image)
-        quality = estimate.quality
-        is_possible = self._is_possible(estimate)
-        outside = estimate.evidence.points_in_picture < o.min_in_picture or not is_possible
-        poor = outside or quality < o.lost_quality
-        self._poor = self._poor + 1 if poor else 0
-        if self._poor >= o.lost_frames or (poor and not self._confirmed):
-            recent = (self._recent[0], self._recent[1]) if len(self._recent) == 2 else None
-            return self._lose(diagnose_loss(image, estimate, recent, self.camera, self._views, is_possible))
-        if not poor:
-            self._recent = [*self._recent[-1:], estimate.cam_from_model]
-        if not poor and quality >= (o.critical_quality if self._borne_out else o.tracked_quality):
-            self.state = TrackingState.TRACKED
-            self._critical = 0
-            self._confirmed = self._was_found = True
-            return estimate, ""
-        self.state = TrackingState.CRITICAL
-        self._critical += 1
-        if self._critical > o.critical_frames or not self._confirmed:
-            return self._lose("the outline is not seen where it should be")
-        return estimate, "the outline is hardly seen"
-
-    def _lose(self, reason: str) -> tuple[None, str]:
-        self._hypotheses = HypothesisSet([])
-        self._poor = self._critical = 0
-        if self._guide is not None and not self._confirmed:
-            # It was aligned, but did not hold the second frame: go on as before.
-            self.state = TrackingState.LOST if self._was_found else TrackingState.SEARCHING
-            return None, self._why
-        self.state = TrackingState.LOST
-        self._lost_frames = 0
-        self._confirmed = False
-        self._why = self._why_lost = reason
-        return None, reason
-
-    def _is_possible(self, estimate: Estimate) -> bool:
-        """In front of the camera and not much nearer or farther than declared."""
-        center = apply(estimate.cam_from_model, self._views.center_in_model)
-        low, high = self._views.view_range.distance_mm
-        return bool(center[2] > 0 and 0.5 * low < np.linalg.norm(center) < 2.0 * high)
-
-    def _search(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
-        o = self.options
-        self._lost_frames += 1
-        if self._initial is not None:
-            found = self.guided_init.find(image, self._initial)
-            self._initial = None
-            if found is None:
-                return None, "the part is outside the picture at the initial pose"
-            start = found.cam_from_model
-        elif self.state == TrackingState.SEARCHING and self._guide is not None:
-            return self._align(image, self._guide)
-        else:
-            rests = self._lost_frames > o.eager_frames and self._lost_frames % o.search_every != 0
-            rests = rests and self.state == TrackingState.LOST
-            detections = self._detect(image, rests)
-            if not detections and rests:
-                if self._guide is not None and self.is_aligning:
-                    return self._align(image, self._guide)
-                return None, self._why
-            if not detections:
-                return None, self._why_not(image, self.detector.best_rejected)
-            start = detections[0].cam_from_model
-            self._hypotheses = HypothesisSet([invert(start) @ twin for twin in detections[0].alternatives])
-        estimate = self._begun(image, start)
-        if estimate.quality < o.tracked_quality or not self._is_possible(estimate):
-            return None, self._why_not(
-                image, RejectedHypothesis(estimate.cam_from_model, estimate.evidence, estimate.quality)
-            )
-        self._poor = self._critical = 0
-        self._confirmed = estimate.quality >= o.lock_quality
-        self._was_found |= self._confirmed
-        self._recent = []
-        self.state = TrackingState.TRACKED if self._confirmed else TrackingState.CRITICAL
-        return estimate, "" if self._confirmed else "found, to be confirmed"
-
-    def _begun(self, image: NDArray[np.uint8], cam_from_model: Array) -> Estimate:
-        """Track from a pose on; nothing is known of the components yet."""
-        self.tracker.start(image, cam_from_model)
-        self.components.reset()
-        return self.tracker.track(image)
-
-    def _detect(self, image: NDArray[np.uint8], rests: bool) -> list[Detection]:
-        """Look for the part, first where it looks as it did; nowhere else while the search rests."""
-        o = self.options
-        proposals: list[Proposal] = []
-        if o.use_appearance_memory and self._last_seen is not None and (rests or self._lost_frames <= o.eager_frames):
-            proposals = self.appearance_memory.propose(image, self._last_seen)
-        if o.use_appearance_memory and not proposals and not rests:
-            proposals = self.appearance_memory.propose(image)
-        least = o.likely_look if rests else 0.0
-        guesses = [proposal.cam_from_model for proposal in proposals if proposal.score >= least]
-        if rests:
-            return self.detector.detect_near(image, guesses) if guesses else []
-        # The wide search takes long: not in every frame.
-        turn = self._lost_frames % (2 * o.search_every)
-        is_thorough = turn == 1 if self.state == TrackingState.SEARCHING else turn == 0
-        return self.detector.detect(image, max_results=1, is_thorough=is_thorough, guesses=guesses)
-
-    def _align(self, image: NDArray[np.uint8], guide_cam_from_model: Array) -> tuple[Estimate | None, str]:
-        """Look whether the part has been brought near the guide pose; what is found must hold a second frame."""
-        found = self.guided_init.lock(image, guide_cam_from_model, self.options.lock_quality)
-        if found is not None:
-            estimate = self._begun(image, found.cam_from_model)
-            is_good = estimate.quality >= self.options.lock_quality and self._is_possible(estimate)
-            if is_good and self.guided_init.is_near(estimate.cam_from_model, guide_cam_from_model):
-                self._why = ALIGN
-                self._poor = self._critical = 0
-                self._confirmed = False
-                self._recent = []
-                self.state = TrackingState.CRITICAL
-                return estimate, "found, to be confirmed"
-        if self.state == TrackingState.SEARCHING and self._lost_frames % 10 == 1:
-            self._why = poor_picture(image) or ALIGN
-        return None, self._why
-
-    def _why_not(self, image: NDArray[np.uint8], rejected: RejectedHypothesis | None) -> str:
-        """Why a search found nothing; a lost part's loss says more than that nothing is in view."""
-        reason = diagnose_search(image, self.camera, self._views, rejected)
-        is_told = self.state == TrackingState.LOST and reason.startswith(NOTHING)
-        self._why = self._why_lost if is_told else reason
-        if self.is_aligning and self.state == TrackingState.LOST:
-            self._why += f"; {ALIGN}"
-        return self._why
+    def _remember(self, image: NDArray[np.uint8], estimate: Estimate) -> None:
+        """Remember pose and appearance of a part that is tracked without doubt."""
+        is_sure = self.state == TrackingState.TRACKED and self._state.is_confirmed
+        if self.options.use_appearance_memory:
+            self.appearance_memory.learn(image, estimate, is_sure)
+        if is_sure:
+            self._state.last_sure_pose = estimate.cam_from_model

@@ -1,0 +1,119 @@
+"""State of a tracking session: what it keeps between frames, and the table of its transitions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from arview.geometry import Array
+from arview.pose import TrackingState
+from arview.tracking.disambiguation import HypothesisSet
+
+
+class Event(StrEnum):
+    """What a frame says about the pose of the part."""
+
+    SUPPORTED = "supported"
+    """The picture supports the pose clearly."""
+    WEAK = "weak"
+    """The picture supports the pose weakly, or the pose was found in this frame and is still to be confirmed."""
+    CONTRADICTED = "contradicted"
+    """The pose fits, but another pose fits as well, or a component is not where the CAD has it."""
+    FAILED = "failed"
+    """There is no pose: none was found, or the last one is given up."""
+    RETRACTED = "retracted"
+    """A pose found at the guide view was not confirmed, and the part has not been tracked before."""
+
+
+TRANSITIONS: dict[tuple[TrackingState, Event], TrackingState] = {
+    (TrackingState.SEARCHING, Event.SUPPORTED): TrackingState.TRACKED,
+    (TrackingState.SEARCHING, Event.WEAK): TrackingState.CRITICAL,
+    (TrackingState.SEARCHING, Event.FAILED): TrackingState.SEARCHING,
+    (TrackingState.TRACKED, Event.SUPPORTED): TrackingState.TRACKED,
+    (TrackingState.TRACKED, Event.WEAK): TrackingState.CRITICAL,
+    (TrackingState.TRACKED, Event.CONTRADICTED): TrackingState.CRITICAL,
+    (TrackingState.TRACKED, Event.FAILED): TrackingState.LOST,
+    (TrackingState.CRITICAL, Event.SUPPORTED): TrackingState.TRACKED,
+    (TrackingState.CRITICAL, Event.WEAK): TrackingState.CRITICAL,
+    (TrackingState.CRITICAL, Event.CONTRADICTED): TrackingState.CRITICAL,
+    (TrackingState.CRITICAL, Event.FAILED): TrackingState.LOST,
+    (TrackingState.CRITICAL, Event.RETRACTED): TrackingState.SEARCHING,
+    (TrackingState.LOST, Event.SUPPORTED): TrackingState.TRACKED,
+    (TrackingState.LOST, Event.WEAK): TrackingState.CRITICAL,
+    (TrackingState.LOST, Event.FAILED): TrackingState.LOST,
+}
+"""The state after an event. Pairs that are not listed do not occur: only a pose can be contradicted or retracted."""
+
+
+@dataclass
+class SessionState:
+    """What a session keeps between frames.
+
+    Attributes:
+        state: see `TrackingState`.
+        poor_frames: frames in a row with hardly any support of the pose.
+        critical_frames: frames in a row with weak support of the pose.
+        frames_without_pose: frames since the last pose, or since the start.
+        is_confirmed: whether the present pose has been supported clearly in a frame since it was found.
+        is_supported: whether the last frame supported the pose clearly, whatever the components say.
+        was_tracked: whether the part has been tracked since the last reset.
+        recent_poses: the last poses (4,4) with support, at most two, oldest first.
+        last_sure_pose: (4,4) the last pose that was ``tracked``.
+        hypotheses: near-symmetric alternatives of the present pose.
+        reason: why the last search found nothing.
+        loss_reason: why the part was lost.
+    """
+
+    state: TrackingState = TrackingState.SEARCHING
+    poor_frames: int = 0
+    critical_frames: int = 0
+    frames_without_pose: int = 0
+    is_confirmed: bool = False
+    is_supported: bool = False
+    was_tracked: bool = False
+    recent_poses: tuple[Array, ...] = ()
+    last_sure_pose: Array | None = None
+    hypotheses: HypothesisSet = field(default_factory=lambda: HypothesisSet([]))
+    reason: str = ""
+    loss_reason: str = ""
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether there is a pose to follow."""
+        return self.state in (TrackingState.TRACKED, TrackingState.CRITICAL)
+
+    def apply(self, event: Event) -> None:
+        """Go on to the next state.
+
+        Raises:
+            KeyError: the event cannot occur in this state.
+        """
+        self.state = TRANSITIONS[self.state, event]
+
+    def begin(self, is_confirmed: bool) -> None:
+        """A pose was found; unless it is confirmed, the next frame must support it."""
+        self.poor_frames = self.critical_frames = 0
+        self.is_confirmed = is_confirmed
+        self.was_tracked |= is_confirmed
+        self.recent_poses = ()
+        self.apply(Event.SUPPORTED if is_confirmed else Event.WEAK)
+
+    def confirm(self) -> None:
+        """The picture supports the pose clearly."""
+        self.critical_frames = 0
+        self.is_confirmed = self.was_tracked = True
+        self.apply(Event.SUPPORTED)
+
+    def lose(self, reason: str) -> None:
+        """Give the pose up, for a reason in words."""
+        self.hypotheses = HypothesisSet([])
+        self.poor_frames = self.critical_frames = self.frames_without_pose = 0
+        self.is_confirmed = False
+        self.reason = self.loss_reason = reason
+        self.apply(Event.FAILED)
+
+    def retract(self) -> None:
+        """Give up a pose found at the guide view that the next frame did not confirm, and wait as before."""
+        self.hypotheses = HypothesisSet([])
+        self.poor_frames = self.critical_frames = 0
+        self.apply(Event.FAILED if self.was_tracked else Event.RETRACTED)
