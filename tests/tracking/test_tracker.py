@@ -217,10 +217,12 @@ def test_quality_parts_right_from_wrong_poses() -> None:
         for angle_deg, shift_mm in ((rng.uniform(15, 40), 0.0), (0.0, 0.3 * tracker.diameter_mm)):
             start = wrong(truth, rng, angle_deg, shift_mm)
             tracker.start(image, start)
-            pose, _ = tracker.refine(image, gray, start @ tracker.part.model_from_body, TRACK_STAGES)
-            mm, _, deg = error(pose @ tracker.part.body_from_model, truth)
+            refiner, appearance = tracker.refiner, tracker.state.appearance
+            start = start @ refiner.part.model_from_body
+            pose, _ = refiner.refine(image, gray, start, TRACK_STAGES, appearance)
+            mm, _, deg = error(pose @ refiner.part.body_from_model, truth)
             if mm > 10.0 or deg > 5.0:
-                mistaken.append(tracker.evidence(image, gray, pose).quality)
+                mistaken.append(refiner.evidence(image, gray, pose, appearance).quality)
                 mm, _, deg = error(tracker.track(image).cam_from_model, truth)
                 found += mm < 5.0 and deg < 1.0
     assert len(right) >= 38
