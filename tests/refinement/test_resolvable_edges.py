@@ -13,7 +13,7 @@ from arview.evaluation.semisynthetic.solids import Mesh, box, circle, prism, rec
 from arview.geometry import Array
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.refinement.view_model import APART, PartView, is_crowded
+from arview.refinement.view_model import MIN_SEPARATION, PartView, find_unresolvable
 
 SMALL, LARGE = ((-35.0, -15.0), (-35.0, 15.0), (-25.0, 0.0)), (20.0, 0.0)
 SMALL_MM, LARGE_MM = 1.5, 14.0
@@ -47,35 +47,35 @@ def design_points(views: GuideViewSet) -> tuple[Array, NDArray[np.bool_]]:
     of_view = np.repeat(np.arange(len(views.directions)), np.diff(raw["edge_start"]))
     is_design = ((kinds & EDGE_SHARP) > 0) & ((kinds & EDGE_CONTOUR) == 0)
     chosen = is_design & (views.directions[of_view, 2] > 0.95)
-    return np.asarray(raw["edge_points"], dtype=np.float64)[chosen], is_crowded(views)[chosen]
+    return np.asarray(raw["edge_points"], dtype=np.float64)[chosen], find_unresolvable(views)[chosen]
 
 
 def test_rims_of_small_holes_are_crowded_and_those_of_large_ones_are_not() -> None:
-    points, crowded = design_points(perforated())
+    points, unresolvable = design_points(perforated())
     on_small = np.any([np.linalg.norm(points[:, :2] - center, axis=1) < 1.2 * SMALL_MM for center in SMALL], axis=0)
     on_large = (np.linalg.norm(points[:, :2] - LARGE, axis=1) < 1.1 * LARGE_MM) & (points[:, 2] > 0.9)
     assert on_small.sum() > 40 and on_large.sum() > 40
-    assert crowded[on_small].mean() > 0.7  # few points are on each
-    assert crowded[on_large].mean() < 0.25
+    assert unresolvable[on_small].mean() > 0.7  # few points are on each
+    assert unresolvable[on_large].mean() < 0.25
 
 
-@pytest.mark.parametrize(("apart", "expected"), [(0.5 * APART, True), (3.0 * APART, False)])
+@pytest.mark.parametrize(("apart", "expected"), [(0.5 * MIN_SEPARATION, True), (3.0 * MIN_SEPARATION, False)])
 def test_edges_of_a_rib_are_crowded_where_it_is_thin(apart: float, expected: bool) -> None:
     half_mm = 0.5 * apart * 126.0
     # So low that its foot is not seen beside it.
     views = views_of(box((-55.0, -30.0, 0.0), (55.0, 30.0, 8.0)), box((-40.0, -half_mm, 8.0), (40.0, half_mm, 9.0)))
-    points, crowded = design_points(views)
+    points, unresolvable = design_points(views)
     along = (np.abs(points[:, 2] - 9.0) < 0.1) & (np.abs(points[:, 0]) < 38.0)
     assert along.sum() > 50
-    assert (crowded[along].mean() > 0.95) if expected else (crowded[along].mean() < 0.3)
+    assert (unresolvable[along].mean() > 0.95) if expected else (unresolvable[along].mean() < 0.3)
 
 
 def test_a_part_keeps_all_its_edges_beside_the_distinct_ones() -> None:
     views = perforated()
     part = PartView(views)
-    all_kinds, distinct_kinds, crowded = part.arrays[-1], part.distinct[-1], is_crowded(views)
+    all_kinds, resolvable_kinds, unresolvable = part.arrays[-1], part.resolvable[-1], find_unresolvable(views)
     assert np.array_equal(all_kinds, views.arrays["edge_kinds"])
-    assert crowded.any()
-    assert np.array_equal(all_kinds != distinct_kinds, crowded)
-    assert not np.any(distinct_kinds[crowded] & EDGE_SHARP)
-    assert np.array_equal(all_kinds & EDGE_CONTOUR, distinct_kinds & EDGE_CONTOUR)
+    assert unresolvable.any()
+    assert np.array_equal(all_kinds != resolvable_kinds, unresolvable)
+    assert not np.any(resolvable_kinds[unresolvable] & EDGE_SHARP)
+    assert np.array_equal(all_kinds & EDGE_CONTOUR, resolvable_kinds & EDGE_CONTOUR)

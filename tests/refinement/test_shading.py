@@ -16,16 +16,15 @@ from arview.guideviews.surface import Surface, draw_surface, reduced_surface, su
 from arview.refinement.gauss_newton import apply_twist
 from arview.refinement.modalities.shading import (
     COEFFICIENTS,
-    GAIN,
-    LEAST_CURVED,
-    _functions,
-    _inner_places,
-    _motion,
-    _smooth,
+    ShadingOptions,
+    _harmonics,
+    _inner_pixels,
+    _jacobian,
+    _smooth_normals,
     corner_normals,
+    crop_for_shading,
     curved_share,
-    look_at,
-    shade,
+    refine_by_shading,
 )
 from arview.rendering.rasterizer import rasterise
 from helpers.synthetic import CAMERA, assembly
@@ -33,6 +32,7 @@ from helpers.synthetic import CAMERA, assembly
 TRUTH = rigid(Rotation.from_euler("xyz", (20, -35, 50), degrees=True).as_matrix(), np.array([15.0, -10.0, 420.0]))
 WEAK = np.diag(np.r_[np.full(3, 3000.0), np.full(3, 100.0)])
 """As outlines of smooth parts have it that hardly turn with the part: 1° and 0.1 mm, they say."""
+OPTIONS = ShadingOptions()
 LIGHT, SHINE = np.array([0.4, -0.6, -0.7]), 25.0
 
 
@@ -94,10 +94,10 @@ def _normals_at(pixels: NDArray[np.int64], faces: NDArray[np.int32], seen: Array
 def shaded(
     model: Model, image: NDArray[np.uint8], pose: Array, information: Array = WEAK
 ) -> tuple[Array, Array, float]:
-    look = look_at(image, CAMERA, model.diameter_mm, pose)
+    look = crop_for_shading(image, CAMERA, model.diameter_mm, pose, OPTIONS)
     assert look is not None
-    found, more, explained = shade(
-        *look, surface_of(model), corners_of(model), model.diameter_mm, pose, information, GAIN
+    found, more, explained = refine_by_shading(
+        look, surface_of(model), corners_of(model), model.diameter_mm, pose, information, OPTIONS.gain
     )
     return found, more, float(explained)
 
@@ -149,15 +149,15 @@ def test_the_change_of_brightness_with_the_pose_is_that_of_drawn_pictures() -> N
         drawn, face_ids = np.empty((4, size, size), np.float32), np.empty((size, size), np.int32)
         center_px = middle_px + focal_px * pose[:2, 3] / pose[2, 3]
         draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids)
-        _smooth(drawn, face_ids, surface, corners_of(blob()), pose, focal_px, middle_px, diameter_mm)
+        _smooth_normals(drawn, face_ids, surface, corners_of(blob()), pose, focal_px, middle_px, diameter_mm)
         functions = np.zeros((size, size, COEFFICIENTS))
         for v, u in zip(*np.nonzero(face_ids >= 0), strict=True):
-            _functions(*drawn[:3, v, u], functions[v, u])
+            _harmonics(*drawn[:3, v, u], functions[v, u])
         return functions @ light, drawn, face_ids
 
     _, drawn, face_ids = brightness(TRUTH)
-    places = _inner_places(drawn, face_ids)
-    motion = _motion(places, light, drawn, face_ids, TRUTH, focal_px, middle_px, diameter_mm)
+    places = _inner_pixels(drawn, face_ids)
+    motion = _jacobian(places, light, drawn, face_ids, TRUTH, focal_px, middle_px, diameter_mm)
     assert len(places) > 800
     for k in range(6):
         step = np.zeros(6)
@@ -173,7 +173,7 @@ def test_only_parts_with_curved_surfaces_are_looked_at() -> None:
     assert curved_share(surface_of(_of(trimesh.creation.box((40.0, 30.0, 20.0))))) == 0.0
     assert curved_share(surface_of(blob())) > 0.95
     assert curved_share(surface_of(_of(trimesh.creation.cylinder(20.0, 80.0, sections=64)))) > 0.5
-    assert curved_share(surface_of(assembly())) < LEAST_CURVED
+    assert curved_share(surface_of(assembly())) < OPTIONS.min_curved_share
 
 
 def test_flat_faces_move_no_pose() -> None:
@@ -188,7 +188,7 @@ def test_outside_the_picture_nothing_is_looked_at() -> None:
     for way in ((900.0, 0.0, 0.0), (0.0, 0.0, -800.0), (np.nan, 0.0, 0.0)):
         pose = TRUTH.copy()
         pose[:3, 3] += way
-        assert look_at(image, CAMERA, blob().diameter_mm, pose) is None
+        assert crop_for_shading(image, CAMERA, blob().diameter_mm, pose, OPTIONS) is None
 
 
 def test_a_picture_without_the_part_moves_a_pose_little() -> None:
@@ -201,8 +201,10 @@ def test_a_picture_without_the_part_moves_a_pose_little() -> None:
 def test_a_pose_that_nothing_determines_stays_as_it_is() -> None:
     surface, corners = surface_of(blob()), corners_of(blob())
     flat = np.full((CAMERA.height, CAMERA.width), 90, dtype=np.uint8)
-    look = look_at(flat, CAMERA, blob().diameter_mm, TRUTH)
+    look = crop_for_shading(flat, CAMERA, blob().diameter_mm, TRUTH, OPTIONS)
     assert look is not None
-    pose, information, explained = shade(*look, surface, corners, blob().diameter_mm, TRUTH, np.zeros((6, 6)), GAIN)
+    pose, information, explained = refine_by_shading(
+        look, surface, corners, blob().diameter_mm, TRUTH, np.zeros((6, 6)), OPTIONS.gain
+    )
     np.testing.assert_array_equal(pose, TRUTH)
     assert not information.any() and explained == -1.0

@@ -9,7 +9,7 @@ from arview.errors import InputError
 from arview.geometry import apply, exp_se3, invert, look_at, rotation_angle_rad
 from arview.refinement.gauss_newton import apply_twist, solve_step
 from arview.refinement.modalities.keyframes import TextureOptions
-from arview.refinement.modalities.texture import TextureModality, add_features
+from arview.refinement.modalities.texture import TextureModality, add_matches
 from arview.rendering.raycast import RayCaster
 
 HALF = np.array([60.0, 40.0, 25.0])
@@ -233,7 +233,7 @@ def test_features_that_disagree_lose_trust(first):
     before = features.measure(pyramid, START)
     for _ in range(30):
         features.measure(pyramid, START)
-        features.settle(moved)
+        features.update_trust(moved)
     after = features.measure(pyramid, START)
     wrong = errors_px(CAMERA, moved, before) > 2
     assert np.count_nonzero(wrong) >= 3
@@ -241,7 +241,7 @@ def test_features_that_disagree_lose_trust(first):
     assert len(after.pixels) >= 0.8 * np.count_nonzero(~wrong)
 
 
-def test_add_features_solves_the_pose_despite_outliers():
+def test_add_matches_solves_the_pose_despite_outliers():
     rng = np.random.default_rng(11)
     points = rng.uniform(-1, 1, (60, 3)) * HALF
     truth = START @ exp_se3([0.02, -0.03, 0.01, 1.0, -2.0, 3.0])
@@ -251,7 +251,7 @@ def test_add_features_solves_the_pose_despite_outliers():
     pose = START
     for robust_px in (40.0, 20.0, 10.0, 5.0, 5.0, 5.0):
         hessian, gradient = np.zeros((6, 6)), np.zeros(6)
-        cost, weight, inliers = add_features(
+        cost, weight, inliers = add_matches(
             hessian, gradient, points, pose, intrinsics, pixels, np.ones(60), 0.5, robust_px
         )
         pose = apply_twist(pose, solve_step(hessian, gradient, np.full(6, 1e-9)))

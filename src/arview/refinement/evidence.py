@@ -1,12 +1,14 @@
-"""How well a pose is borne out by the picture: the evidence that separates right poses from wrong ones.
+"""Evidence of the picture for a pose: how well edges and colours support it.
 
-Every CAD edge point is asked whether a step lies where the edge should be, against how often a step would lie there
-by chance (the density of steps along the same profile); every contour line whether the colours change there.
+For every edge point of the CAD a step of the grey level is expected where the edge should be. The share of points with
+such a step is compared with the share expected by chance, from the density of steps along the same profiles. For every
+line across the outline the colours are expected to change at the outline.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,20 +16,30 @@ from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 
+DECISION_SCORE = 0.58
+"""Score that separates right from wrong poses best on the recorded sequences; their quality is 0.5 there."""
+SCORE_SLOPE = 16.0
+"""Slope of the logistic function from score to quality."""
+MIN_IN_PICTURE = 0.05
+"""Share of the outline inside the picture below which the quality is 0."""
+MIN_REGION_LINES = 8
+"""Lines across the outline needed for an evidence of colours."""
+
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """Evidence for a pose.
+    """Evidence of the picture for a pose.
 
     Attributes:
-        contour_support: 0–1, outline points borne out beyond chance.
-        inner_support: the same for the design edges inside the outline.
-        inner_share: share of the design edges among the points looked at, 0 for organic shapes.
-        sharpness: 0–1, how much stronger the steps are on the outline than beside it.
-        region_support: 0–1, contour lines whose colours change at the contour, by information; -1 if none says.
-        region_information: mean information of a line, 1/px².
-        points_in_picture: share of the outline inside the picture.
-        scatter_px: mean distance of the steps that bear the outline out from it; chance puts them anywhere.
+        contour_support: 0–1, share of outline points with a step at the outline, beyond chance.
+        inner_support: 0–1, the same for the design edges inside the outline.
+        inner_share: 0–1, share of the design edges among the points measured; 0 for a part without any.
+        sharpness: 0–1, mean strength of the step on the outline over the strongest step nearby.
+        region_support: 0–1, how closely the colours change at the outline, weighted by information; -1 if no line
+            across the outline was measured.
+        region_information: mean information of a line across the outline, 1/px².
+        points_in_picture: 0–1, share of the outline inside the picture.
+        scatter_px: mean distance between the outline and the steps that support it; steps that fit by chance scatter.
     """
 
     contour_support: float
@@ -41,11 +53,10 @@ class PoseEvidence:
 
     @property
     def score(self) -> float:
-        """Sum of what speaks for the pose, 0 to about 1.5; right and wrong poses part at about DECISION_SCORE.
+        """Weighted sum of the support, 0 to about 1.5; right poses mostly exceed `DECISION_SCORE`.
 
-        Outline and, as far as the part has them, design edges count; colours that change along the outline add
-        to it, by how sure they are, where design edges are few: on soft or blurred
-        outlines they are the better witness.
+        Outline and design edges are weighted by the share of design edges, at most half. Colours add to it by their
+        information, the more the fewer design edges there are, because they are reliable on soft or blurred outlines.
         """
         outline = 0.6 * self.contour_support + 0.4 * self.sharpness
         share = min(0.5, self.inner_share)
@@ -54,22 +65,42 @@ class PoseEvidence:
 
     @property
     def quality(self) -> float:
-        """0–1, 0.5 where right and wrong poses part on the recorded sequences."""
-        return quality_of(self.score) if self.points_in_picture > 0.05 else 0.0
-
-
-DECISION_SCORE = 0.58
-"""Between the scores of right and wrong poses on the recorded sequences."""
+        """0–1, 0.5 at `DECISION_SCORE`; 0 for a part outside the picture."""
+        return quality_of(self.score) if self.points_in_picture > MIN_IN_PICTURE else 0.0
 
 
 def quality_of(score: float) -> float:
-    """Logistic of a score, 0–1."""
-    return float(1.0 / (1.0 + np.exp(-(score - DECISION_SCORE) * 16.0)))
+    """Logistic function of a score, 0–1."""
+    return float(1.0 / (1.0 + np.exp(-(score - DECISION_SCORE) * SCORE_SLOPE)))
+
+
+class EdgeTerms(NamedTuple):
+    """The part of a `PoseEvidence` that comes from edges."""
+
+    contour_support: float
+    inner_support: float
+    inner_share: float
+    sharpness: float
+    points_in_picture: float
+    scatter_px: float
+
+
+class RegionTerms(NamedTuple):
+    """The part of a `PoseEvidence` that comes from colours."""
+
+    region_support: float
+    region_information: float
 
 
 @dataclass(frozen=True)
 class EdgeSteps:
-    """Edges of the part at a pose: ``pixels`` (N,2), ``normals`` (N,2), and their ``support`` (N,) beyond chance."""
+    """Edge points of the part at a pose.
+
+    Attributes:
+        pixels: (N,2) projections of the points.
+        normals: (N,2) unit normals of the edges in the picture.
+        support: (N,) support of each point by the picture beyond chance, -1 to 1.
+    """
 
     pixels: Array
     normals: Array
@@ -77,8 +108,16 @@ class EdgeSteps:
 
 
 @kernel
-def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  # type: ignore[no-untyped-def]
-    """contour_support, inner_support, inner_share, sharpness, points_in_picture and scatter_px, see PoseEvidence."""
+def edge_evidence(profiles, kinds, reach_px, tolerance_px):  # type: ignore[no-untyped-def]
+    """Evidence of edges, `EdgeTerms`.
+
+    Args:
+        profiles: `EdgeProfiles` of the points.
+        kinds: (N,) EDGE_* bits of the points.
+        reach_px: steps farther from the edge do not count.
+        tolerance_px: steps at most this far from the edge support it.
+    """
+    positions, strengths = profiles.positions, profiles.strengths
     hits = np.zeros(2)
     chances = np.zeros(2)
     counts = np.zeros(2)
@@ -91,7 +130,7 @@ def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  #
             outline += 1.0
         elif (kinds[i] & EDGE_SHARP) == 0:
             continue
-        if not seen[i]:
+        if not profiles.visible[i]:
             continue
         steps = 0
         best_near = 0.0
@@ -125,21 +164,22 @@ def edge_evidence(positions, strengths, seen, kinds, reach_px, tolerance_px):  #
     inside = counts[0] / outline if outline > 0 else 0.0
     share = counts[1] / max(counts[0] + counts[1], 1.0)
     scatter = scatter / hits[0] if hits[0] > 0 else tolerance_px
-    return support[0], support[1], share, sharp / max(counts[0], 1.0), inside, scatter
+    return EdgeTerms(support[0], support[1], share, sharp / max(counts[0], 1.0), inside, scatter)
 
 
 @kernel
-def region_evidence(mean, information, agreement, tolerance_px):  # type: ignore[no-untyped-def]
-    """Support by information and mean information of the lines looked at; support -1 when there are none."""
+def region_evidence(lines, tolerance_px):  # type: ignore[no-untyped-def]
+    """Evidence of colours, `RegionTerms`, of the lines across the outline, a `RegionLines`."""
+    information = lines.information
     total = 0.0
     near = 0.0
-    lines = 0
-    for i in range(mean.shape[0]):
-        if agreement[i] < 0.0:
+    count = 0
+    for i in range(information.shape[0]):
+        if lines.agreement[i] < 0.0:
             continue
-        lines += 1
+        count += 1
         total += information[i]
-        near += information[i] * np.exp(-0.5 * (mean[i] / tolerance_px) ** 2)
-    if lines < 8:
-        return -1.0, 0.0
-    return (near / total if total > 0 else 0.0), total / lines
+        near += information[i] * np.exp(-0.5 * (lines.mean[i] / tolerance_px) ** 2)
+    if count < MIN_REGION_LINES:
+        return RegionTerms(-1.0, 0.0)
+    return RegionTerms(near / total if total > 0 else 0.0, total / count)

@@ -1,7 +1,7 @@
-"""Gauss-Newton kernels that all modalities share: the point-to-line Jacobian, the 6×6 solve, the update of a pose.
+"""Gauss-Newton kernels shared by all modalities: point-to-line Jacobian, 6×6 solver and pose update.
 
-The pose is perturbed on the right about the model's centre: ``cam_from_body @ exp_se3(twist)`` with the body frame
-at the centre. For a residual along a unit image direction n, J = [p × a, a] with a = Rᵀ (∂π/∂X)ᵀ n.
+The pose is perturbed on the right: ``cam_from_body @ exp_se3(twist)``, with the origin of the body frame at the model's
+centre. For a residual along a unit image direction n, J = [p × a, a] with a = Rᵀ (∂π/∂X)ᵀ n.
 """
 
 from __future__ import annotations
@@ -13,7 +13,13 @@ from arview.core.kernel import kernel
 
 @kernel(inline=True)
 def add_line(hessian, gradient, point, cam_from_body, x, y, z, nu, nv, intrinsics, residual, weight):  # type: ignore[no-untyped-def]
-    """Add weight · (Jᵀ J, Jᵀ r) of one residual along (nu, nv) to the system; lower triangle only."""
+    """Add weight · (Jᵀ J, Jᵀ r) of one residual along (nu, nv) to the system; only the lower triangle is filled.
+
+    Args:
+        hessian, gradient: (6,6) and (6,) of the system.
+        point: (3,) in the body frame; x, y, z is the same point in the camera's frame.
+        residual: px.
+    """
     ax = nu * intrinsics[0] / z
     ay = nv * intrinsics[1] / z
     az = -(ax * x + ay * y) / z
@@ -34,7 +40,10 @@ def add_line(hessian, gradient, point, cam_from_body, x, y, z, nu, nv, intrinsic
 
 @kernel
 def solve_step(hessian, gradient, damping):  # type: ignore[no-untyped-def]
-    """Twist (6,) that solves (H + diag(damping)) x = -g, H given by its lower triangle; zeros when singular."""
+    """Twist (6,) that solves (H + diag(damping)) x = -g by Cholesky decomposition; zeros for a singular system.
+
+    ``hessian`` is given by its lower triangle.
+    """
     lower = np.zeros((6, 6))
     twist = np.zeros(6)
     for i in range(6):
@@ -65,7 +74,10 @@ def solve_step(hessian, gradient, damping):  # type: ignore[no-untyped-def]
 
 @kernel
 def apply_twist(cam_from_body, twist):  # type: ignore[no-untyped-def]
-    """``cam_from_body`` after a small twist on the right: rotation by Rodrigues, then translation in the body."""
+    """``cam_from_body`` (4,4) after a twist (rotation rad, translation mm) on the right.
+
+    The rotation follows Rodrigues' formula; the translation is applied along the axes of the body before the rotation.
+    """
     wx, wy, wz = twist[0], twist[1], twist[2]
     theta = np.sqrt(wx * wx + wy * wy + wz * wz)
     if theta < 1e-9:
@@ -101,7 +113,7 @@ def apply_twist(cam_from_body, twist):  # type: ignore[no-untyped-def]
 
 @kernel
 def relative_twist(cam_from_before, cam_from_after):  # type: ignore[no-untyped-def]
-    """Twist (6,) with ``apply_twist(cam_from_before, twist) = cam_from_after``, for turns below 180°."""
+    """Twist (6,) with ``apply_twist(cam_from_before, twist) = cam_from_after``, for rotations below 180°."""
     a, b = cam_from_before, cam_from_after
     turn = np.zeros((3, 3))
     twist = np.zeros(6)

@@ -1,26 +1,77 @@
-"""The inner loop of the tracker as one compiled call: project, measure, solve, stage after stage."""
+"""Kernels of the refinement: the stages of a pose, its evidence, and its colours, each as one compiled call."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from arview.core.kernel import kernel
+from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.evidence import edge_evidence, region_evidence
 from arview.refinement.gauss_newton import apply_twist, solve_step
-from arview.refinement.modalities.edge import add_edges, measure_edges
-from arview.refinement.modalities.region import (
-    add_histograms,
-    add_region,
-    measure_region,
-)
-from arview.refinement.modalities.texture import add_features
+from arview.refinement.modalities.edge import HYPOTHESES, EdgeProfiles, add_edges, measure_edges
+from arview.refinement.modalities.region import RegionLines, add_histograms, add_region, measure_region
+from arview.refinement.modalities.texture import add_matches
 from arview.refinement.projection import project_lines
+
+STRENGTH_HALF = 15.0
+"""Strength of an edge step, in grey levels over two pixels, that has half the weight of a very strong one."""
+EVIDENCE_REACH, EVIDENCE_STEP_PX = 10, 1.0
+"""Samples to either side of an edge, and their distance, in the profiles of the evidence."""
+EVIDENCE_SCALE, EVIDENCE_REGION_PX = 2, 2.0
+"""Pixels per segment, and tolerated displacement, of the lines across the outline in the evidence."""
+HISTOGRAM_REACH_PX, HISTOGRAM_GAP_PX = 20.0, 1.5
+"""Pixels counted to either side of the outline, and left out beside it, in the colour histograms."""
+
+
+class ModalityWeights(NamedTuple):
+    """Weights of the modalities; a weight of 0 leaves a modality out. See `RefinerOptions`."""
+
+    region: float
+    edge: float
+    edge_sigma_px: float
+    edge_threshold: float
+    texture_sigma_px: float
+
+
+class EvidenceTerms(NamedTuple):
+    """The attributes of `PoseEvidence`, in the form of a kernel's result."""
+
+    contour_support: float
+    inner_support: float
+    inner_share: float
+    sharpness: float
+    region_support: float
+    region_information: float
+    points_in_picture: float
+    scatter_px: float
+
+
+class ViewLines(NamedTuple):
+    """Points of the nearest guide view, and their projections.
+
+    Attributes:
+        contour: (C,3) contour points in the body frame.
+        contour_runs_mm: (C,2) see `ViewArrays`.
+        contour_lines: `ProjectedLines` of the contour points and their normals.
+        edges: (E,3) edge points in the body frame.
+        edge_kinds: (E,) EDGE_* bits.
+        edge_lines: `ProjectedLines` of the edge points and the normals of their edges.
+    """
+
+    contour: Array
+    contour_runs_mm: Array
+    contour_lines: NamedTuple
+    edges: Array
+    edge_kinds: Array
+    edge_lines: NamedTuple
 
 
 @kernel
 def nearest_view(directions, cam_from_body):  # type: ignore[no-untyped-def]
-    """Index of the direction (N,3) nearest to that of the camera."""
+    """Index of the view whose direction (N,3) is nearest to that of the camera."""
     r = cam_from_body
     x = -(r[0, 0] * r[0, 3] + r[1, 0] * r[1, 3] + r[2, 0] * r[2, 3])
     y = -(r[0, 1] * r[0, 3] + r[1, 1] * r[1, 3] + r[2, 1] * r[2, 3])
@@ -37,86 +88,107 @@ def nearest_view(directions, cam_from_body):  # type: ignore[no-untyped-def]
 
 @kernel
 def run_stages(  # type: ignore[no-untyped-def]
-    image, gray, bin_of, odds, edge_function, part, cam_from_body, intrinsics, step_mm, stages, damping,
-    region_weight, edge_weight, edge_sigma_px, edge_threshold, match_points, match_pixels, match_weights,
-    feature_sigma_px
-):  # fmt: skip
-    """Pose and information after all stages.
+    image, gray, colors, part, cam_from_body, intrinsics, step_mm, stages, damping, weights, matches
+):
+    """Refine a pose through some stages.
 
     Args:
-        part: arrays of all guide views, see `PartView.arrays`.
-        stages: (S,7) region scale, edge reach, edge step px, edge spread px, updates, region gain, stride of points.
-        region_weight, edge_weight: 0 leaves the modality out; match_points (0,3) leaves features out.
+        image: (H,W,3) uint8 RGB.
+        gray: (H,W) uint8, smoothed.
+        colors: `ColorModel`.
+        part: `ViewArrays`.
+        cam_from_body: (4,4) start.
+        intrinsics: as of `intrinsics_of`.
+        step_mm: length along a normal or tangent by which its projection is measured.
+        stages: `StageTable`.
+        damping: (6,) diagonal that holds every update towards no change, as in `solve_step`.
+        weights: `ModalityWeights`.
+        matches: `TextureMatches`; without any match texture is left out.
 
     Returns:
-        cam_from_body (4,4), information (6,6).
+        cam_from_body (4,4) and information (6,6) of the twist on its right.
     """
-    directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
     pose = cam_from_body.copy()
     hessian = np.zeros((6, 6))
     gradient = np.zeros(6)
-    focal = intrinsics[0]
-    for s in range(stages.shape[0]):
-        scale = int(stages[s, 0])
-        spread = stages[s, 3]
-        stride = int(stages[s, 6])
-        view = nearest_view(directions, pose)
-        contour = c_points[c_start[view] : c_start[view + 1] : stride]
-        edges = e_points[e_start[view] : e_start[view + 1] : stride]
-        region_gain = region_weight * stages[s, 5] * stride
-        edge_gain = edge_weight * stride
-        kinds = e_kinds[e_start[view] : e_start[view + 1] : stride]
-        c_px, c_n, c_z = project_lines(
-            contour, c_normals[c_start[view] : c_start[view + 1] : stride], False, pose, intrinsics, step_mm
+    for s in range(stages.stride.shape[0]):
+        stride = stages.stride[s]
+        region_weight = weights.region * stages.region_gain[s] * stride
+        edge_weight = weights.edge * stride
+        spread_px = stages.edge_spread_px[s]
+        view = _project_view(part, pose, intrinsics, step_mm, stride)
+        region = _measure_contour(image, colors, view, intrinsics[0], stages.region_scale[s], region_weight > 0)
+        profiles = _measure_profiles(
+            gray, view, stages.edge_reach[s], stages.edge_step_px[s], weights.edge_threshold, edge_weight > 0
         )
-        e_px, e_n, e_z = project_lines(
-            edges, e_tangents[e_start[view] : e_start[view + 1] : stride], True, pose, intrinsics, step_mm
-        )
-        if region_gain > 0:
-            runs = c_runs[c_start[view] : c_start[view + 1] : stride]
-            mean, information, _ = measure_region(
-                image, bin_of, c_px, c_n, c_z, runs, focal, odds, edge_function, scale
-            )
-        else:
-            mean, information = np.zeros(0), np.zeros(0)
-        if edge_gain > 0:
-            positions, strengths, _ = measure_edges(
-                gray, e_px, e_n, e_z, int(stages[s, 1]), stages[s, 2], edge_threshold
-            )
-        else:
-            positions, strengths = np.zeros((0, 5)), np.zeros((0, 5))
-        for _ in range(int(stages[s, 4])):
+        for _ in range(stages.updates[s]):
             hessian[:] = 0.0
             gradient[:] = 0.0
-            if region_gain > 0:
+            if region_weight > 0:
                 add_region(
-                    hessian,
-                    gradient,
-                    contour,
-                    pose,
-                    intrinsics,
-                    c_px,
-                    c_n,
-                    mean,
-                    information,
-                    region_gain,
-                    3.0 * scale,
-                )
-            if edge_gain > 0:
-                add_edges(
-                    hessian, gradient, edges, kinds, pose, intrinsics, e_px, e_n, positions, strengths,
-                    15.0, edge_sigma_px * max(1.0, 0.5 * spread), spread, edge_gain,
+                    hessian, gradient, view.contour, pose, intrinsics, view.contour_lines, region, region_weight,
+                    3.0 * stages.region_scale[s],
                 )  # fmt: skip
-            if match_points.shape[0] > 0:
-                add_features(
-                    hessian, gradient, match_points, pose, intrinsics, match_pixels, match_weights,
-                    feature_sigma_px, max(4.0, 2.0 * spread),
+            if edge_weight > 0:
+                add_edges(
+                    hessian, gradient, view.edges, view.edge_kinds, pose, intrinsics, view.edge_lines, profiles,
+                    STRENGTH_HALF, weights.edge_sigma_px * max(1.0, 0.5 * spread_px), spread_px, edge_weight,
+                )  # fmt: skip
+            if matches.weights.shape[0] > 0:
+                add_matches(
+                    hessian, gradient, matches.points_in_body, pose, intrinsics, matches.pixels, matches.weights,
+                    weights.texture_sigma_px, max(4.0, 2.0 * spread_px),
                 )  # fmt: skip
             pose = apply_twist(pose, solve_step(hessian, gradient, damping))
+    _fill_upper(hessian)
+    _orthonormalize(pose)
+    return pose, hessian
+
+
+@kernel
+def _project_view(part, pose, intrinsics, step_mm, stride):  # type: ignore[no-untyped-def]
+    """`ViewLines` of every ``stride``-th point of the nearest view at a pose."""
+    view = nearest_view(part.directions, pose)
+    first, last = part.contour_starts[view], part.contour_starts[view + 1]
+    contour = part.contour_points[first:last:stride]
+    normals = part.contour_normals[first:last:stride]
+    runs_mm = part.contour_runs_mm[first:last:stride]
+    contour_lines = project_lines(contour, normals, False, pose, intrinsics, step_mm)
+    first, last = part.edge_starts[view], part.edge_starts[view + 1]
+    edges = part.edge_points[first:last:stride]
+    tangents = part.edge_tangents[first:last:stride]
+    kinds = part.edge_kinds[first:last:stride]
+    edge_lines = project_lines(edges, tangents, True, pose, intrinsics, step_mm)
+    return ViewLines(contour, runs_mm, contour_lines, edges, kinds, edge_lines)
+
+
+@kernel
+def _measure_contour(image, colors, view, focal, scale, is_used):  # type: ignore[no-untyped-def]
+    """`RegionLines` of the contour; empty without the region modality."""
+    if is_used:
+        return measure_region(image, colors, view.contour_lines, view.contour_runs_mm, focal, scale)
+    return RegionLines(np.zeros(0), np.zeros(0), np.zeros(0))
+
+
+@kernel
+def _measure_profiles(gray, view, reach, step_px, threshold, is_used):  # type: ignore[no-untyped-def]
+    """`EdgeProfiles` of the edges; empty without the edge modality."""
+    if is_used:
+        return measure_edges(gray, view.edge_lines, reach, step_px, threshold)
+    return EdgeProfiles(np.zeros((0, HYPOTHESES)), np.zeros((0, HYPOTHESES)), np.zeros(0, dtype=np.bool_))
+
+
+@kernel
+def _fill_upper(matrix):  # type: ignore[no-untyped-def]
+    """Mirror the lower triangle of a matrix (6,6)."""
     for i in range(6):
         for j in range(i):
-            hessian[j, i] = hessian[i, j]
-    # Keep the rotation a rotation: Gram-Schmidt over its rows.
+            matrix[j, i] = matrix[i, j]
+
+
+@kernel
+def _orthonormalize(pose):  # type: ignore[no-untyped-def]
+    """Make the rotation of a pose (4,4) orthonormal again: Gram-Schmidt over its rows."""
     for i in range(3):
         for j in range(i):
             dot = pose[i, 0] * pose[j, 0] + pose[i, 1] * pose[j, 1] + pose[i, 2] * pose[j, 2]
@@ -125,79 +197,89 @@ def run_stages(  # type: ignore[no-untyped-def]
         norm = np.sqrt(pose[i, 0] ** 2 + pose[i, 1] ** 2 + pose[i, 2] ** 2)
         for k in range(3):
             pose[i, k] /= norm
-    return pose, hessian
 
 
 @kernel
 def run_evidence(  # type: ignore[no-untyped-def]
-    image, gray, bin_of, odds, has_colours, edge_function, part, cam_from_body, intrinsics, step_mm,
-    edge_threshold, tolerance_px
-):  # fmt: skip
-    """The numbers of `PoseEvidence` at a pose."""
-    directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
-    view = nearest_view(directions, cam_from_body)
-    first, last = e_start[view], e_start[view + 1]
-    pixels, normals, depths = project_lines(
-        e_points[first:last], e_tangents[first:last], True, cam_from_body, intrinsics, step_mm
+    image, gray, colors, has_colors, part, cam_from_body, intrinsics, step_mm, edge_threshold, tolerance_px
+):
+    """`EvidenceTerms` of the picture for a pose; arguments as of `run_stages`.
+
+    Args:
+        has_colors: whether ``colors`` have been learned.
+        tolerance_px: steps at most this far from an edge support it.
+    """
+    view = nearest_view(part.directions, cam_from_body)
+    first, last = part.edge_starts[view], part.edge_starts[view + 1]
+    lines = project_lines(
+        part.edge_points[first:last], part.edge_tangents[first:last], True, cam_from_body, intrinsics, step_mm
     )
-    positions, strengths, seen = measure_edges(gray, pixels, normals, depths, 10, 1.0, edge_threshold)
-    contour, inner, share, sharpness, inside, scatter = edge_evidence(
-        positions, strengths, seen, e_kinds[first:last], 10.0, tolerance_px
-    )
-    region, region_information = -1.0, 0.0
-    if has_colours:
-        first, last = c_start[view], c_start[view + 1]
-        pixels, normals, depths = project_lines(
-            c_points[first:last], c_normals[first:last], False, cam_from_body, intrinsics, step_mm
+    profiles = measure_edges(gray, lines, EVIDENCE_REACH, EVIDENCE_STEP_PX, edge_threshold)
+    edges = edge_evidence(profiles, part.edge_kinds[first:last], EVIDENCE_REACH * EVIDENCE_STEP_PX, tolerance_px)
+    region_support, region_information = -1.0, 0.0
+    if has_colors:
+        first, last = part.contour_starts[view], part.contour_starts[view + 1]
+        lines = project_lines(
+            part.contour_points[first:last], part.contour_normals[first:last], False, cam_from_body, intrinsics, step_mm
         )
-        mean, information, agreement = measure_region(
-            image, bin_of, pixels, normals, depths, c_runs[first:last], intrinsics[0], odds, edge_function, 2
-        )
-        region, region_information = region_evidence(mean, information, agreement, 2.0)
-    return contour, inner, share, sharpness, region, region_information, inside, scatter
+        runs_mm = part.contour_runs_mm[first:last]
+        region = measure_region(image, colors, lines, runs_mm, intrinsics[0], EVIDENCE_SCALE)
+        terms = region_evidence(region, EVIDENCE_REGION_PX)
+        region_support, region_information = terms.region_support, terms.region_information
+    return EvidenceTerms(
+        edges.contour_support, edges.inner_support, edges.inner_share, edges.sharpness, region_support,
+        region_information, edges.points_in_picture, edges.scatter_px,
+    )  # fmt: skip
 
 
 @kernel
 def run_edge_steps(gray, part, cam_from_body, intrinsics, step_mm, edge_threshold, tolerance_px):  # type: ignore[no-untyped-def]
-    """Outline and design edges at a pose: pixels (N,2), normals (N,2), and support (N,) beyond chance, -1 to 1."""
-    directions, _, _, _, _, e_start, e_points, e_tangents, e_kinds = part
-    view = nearest_view(directions, cam_from_body)
-    first, last = e_start[view], e_start[view + 1]
-    pixels, normals, depths = project_lines(
-        e_points[first:last], e_tangents[first:last], True, cam_from_body, intrinsics, step_mm
+    """Outline and design edges at a pose, see `EdgeSteps`; arguments as of `run_evidence`."""
+    view = nearest_view(part.directions, cam_from_body)
+    first, last = part.edge_starts[view], part.edge_starts[view + 1]
+    lines = project_lines(
+        part.edge_points[first:last], part.edge_tangents[first:last], True, cam_from_body, intrinsics, step_mm
     )
-    positions, strengths, seen = measure_edges(gray, pixels, normals, depths, 10, 1.0, edge_threshold)
-    chosen = seen & ((e_kinds[first:last] & (EDGE_CONTOUR | EDGE_SHARP)) > 0)
+    profiles = measure_edges(gray, lines, EVIDENCE_REACH, EVIDENCE_STEP_PX, edge_threshold)
+    positions, strengths = profiles.positions, profiles.strengths
+    reach_px = EVIDENCE_REACH * EVIDENCE_STEP_PX
+    chosen = profiles.visible & ((part.edge_kinds[first:last] & (EDGE_CONTOUR | EDGE_SHARP)) > 0)
     support = np.zeros(last - first)
     for i in range(last - first):
         steps = 0
         for j in range(positions.shape[1]):
-            if strengths[i, j] != 0.0 and abs(positions[i, j]) <= 10.0:
+            if strengths[i, j] != 0.0 and abs(positions[i, j]) <= reach_px:
                 steps += 1
                 if abs(positions[i, j]) <= tolerance_px:
                     support[i] = 1.0
-        support[i] -= 1.0 - (1.0 - tolerance_px / 10.0) ** steps
-    return pixels[chosen], normals[chosen], support[chosen]
+        support[i] -= 1.0 - (1.0 - tolerance_px / reach_px) ** steps
+    return lines.pixels[chosen], lines.normals[chosen], support[chosen]
 
 
 @kernel
-def count_colours(image, bin_of, part, cam_from_body, intrinsics, step_mm, fore, back):  # type: ignore[no-untyped-def]
-    """Add the colours inside and outside of the contour at a pose to the histograms."""
-    directions, c_start, c_points, c_normals, c_runs, _, _, _, _ = part
-    view = nearest_view(directions, cam_from_body)
-    first, last = c_start[view], c_start[view + 1]
-    pixels, normals, depths = project_lines(
-        c_points[first:last], c_normals[first:last], False, cam_from_body, intrinsics, step_mm
+def count_colors(image, bin_of, part, cam_from_body, intrinsics, step_mm, fore, back):  # type: ignore[no-untyped-def]
+    """Add the colours inside and outside the contour at a pose to histograms of part and background (BINS³,)."""
+    view = nearest_view(part.directions, cam_from_body)
+    first, last = part.contour_starts[view], part.contour_starts[view + 1]
+    lines = project_lines(
+        part.contour_points[first:last], part.contour_normals[first:last], False, cam_from_body, intrinsics, step_mm
     )
-    add_histograms(image, bin_of, pixels, normals, depths, c_runs[first:last], intrinsics[0], fore, back, 20.0, 1.5)
+    runs_mm = part.contour_runs_mm[first:last]
+    add_histograms(
+        image, bin_of, lines, runs_mm, intrinsics[0], fore, back, HISTOGRAM_REACH_PX, HISTOGRAM_GAP_PX
+    )  # fmt: skip
 
 
 @kernel
 def median_brightness_ratio(gray, before, step):  # type: ignore[no-untyped-def]
-    """Median ratio of the brightness to that of the last frame on a grid, by a histogram of logarithms.
+    """Median ratio of the brightness to that of the last frame on a grid; 1 where too few pixels are usable.
 
-    ``before`` (rows, columns) holds the last frame's grid and is overwritten. Saturated and black pixels do not
-    count; 1 when too few are left.
+    The median is that of a histogram of logarithms. Saturated and black pixels do not count.
+
+    Args:
+        gray: (H,W) uint8.
+        before: (rows,columns) the last frame on the grid; overwritten with this frame.
+        step: distance of the grid's points, px.
     """
     histogram = np.zeros(401, dtype=np.int64)
     count = 0

@@ -1,6 +1,8 @@
-"""Projection of a part's points and lines into the picture, as all kernels of refinement and search use it."""
+"""Projection of points and lines of the part into the picture, used by all kernels of refinement and search."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,14 +11,29 @@ from arview.core.kernel import kernel
 from arview.geometry import Array
 
 
+class ProjectedLines(NamedTuple):
+    """Points of the part with a direction each, in the picture.
+
+    Attributes:
+        pixels: (N,2) distorted px.
+        normals: (N,2) unit directions in the picture.
+        depths: (N,) mm along the optical axis; -1 for points that are not in front of the camera or whose direction
+            vanishes in the picture. Pixels and normals of such points are undefined.
+    """
+
+    pixels: Array
+    normals: Array
+    depths: Array
+
+
 def intrinsics_of(camera: Camera) -> Array:
-    """Intrinsics as the kernels take them: (10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted."""
+    """Intrinsics in the form of the kernels: (10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0])
 
 
 @kernel(inline=True)
 def project(x, y, z, intrinsics):  # type: ignore[no-untyped-def]
-    """Pixel of a camera-frame point; ``intrinsics`` is (10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted."""
+    """Pixel (u, v) of a point in the camera's frame; ``intrinsics`` as of `intrinsics_of`."""
     xn = x / z
     yn = y / z
     if intrinsics[9] != 0.0:
@@ -30,10 +47,15 @@ def project(x, y, z, intrinsics):  # type: ignore[no-untyped-def]
 
 @kernel
 def project_lines(points, directions, across, cam_from_body, intrinsics, step_mm):  # type: ignore[no-untyped-def]
-    """Pixels (N,2) of body points and unit image directions (N,2) of 3D directions at them, and depths (N,).
+    """Project points with directions, see `ProjectedLines`.
 
-    With ``across`` the direction is turned a quarter: the image normal of a tangent. Depth is -1 for points that are
-    not in front of the camera or whose direction vanishes in the picture.
+    Args:
+        points: (N,3) mm in the body frame.
+        directions: (N,3) unit directions at the points.
+        across: turn the projected directions by 90°, which makes the image normals of tangents.
+        cam_from_body: (4,4).
+        intrinsics: as of `intrinsics_of`.
+        step_mm: length along a direction by which its projection is measured.
     """
     count = points.shape[0]
     pixels = np.empty((count, 2))
@@ -73,4 +95,4 @@ def project_lines(points, directions, across, cam_from_body, intrinsics, step_mm
             normals[i, 0] = du / norm
             normals[i, 1] = dv / norm
         depths[i] = z
-    return pixels, normals, depths
+    return ProjectedLines(pixels, normals, depths)

@@ -1,7 +1,7 @@
-"""PoseRefiner: from a rough pose of the part to the pose, in one picture.
+"""PoseRefiner: refines a rough pose of the part in one picture.
 
-Every iteration projects the points of the nearest guide view, measures with each modality, adds all measurements to
-one 6×6 system that is damped towards the start, and updates the pose (Gauss-Newton). Scales and reach shrink from
+Every stage projects the points of the nearest guide view and measures with each modality. Every update adds all
+measurements to one damped 6×6 system and solves it for a step of the pose (Gauss-Newton). Scales and reach shrink from
 stage to stage. Nothing is kept between calls, so threads may share a refiner.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +17,12 @@ from arview.camera import Camera
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.evidence import EdgeSteps, PoseEvidence
-from arview.refinement.kernels import count_colours, run_edge_steps, run_evidence, run_stages
-from arview.refinement.modalities.region import BINS, EDGE_FUNCTION, log_odds, value_bins
-from arview.refinement.modalities.shading import GAIN, look_at, shade
+from arview.refinement.kernels import ModalityWeights, count_colors, run_edge_steps, run_evidence, run_stages
+from arview.refinement.modalities.region import BINS, EDGE_FUNCTION, ColorModel, log_odds, value_bins
+from arview.refinement.modalities.shading import ShadingOptions, crop_for_shading, refine_by_shading
 from arview.refinement.modalities.texture import TextureMatches
 from arview.refinement.projection import intrinsics_of
-from arview.refinement.schedules import Stage
+from arview.refinement.schedules import Stage, stage_table
 from arview.refinement.view_model import PartView
 
 NO_MATCHES = TextureMatches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
@@ -35,19 +34,21 @@ class RefinerOptions:
     """Options of the refinement.
 
     Attributes:
-        use_region: measure the colours along the outline.
-        use_edge: measure grey-level steps at outline and design edges.
-        region_weight: trust in colours against edges; neighbours along an outline are not independent.
-        edge_weight: trust in edges.
-        edge_sigma_px: standard deviation of a correct step from the CAD's edge.
+        use_region: use the colours along the outline.
+        use_edge: use grey-level steps at outline and design edges.
+        region_weight: weight of colours; below 1, because neighbouring lines across the outline are correlated.
+        edge_weight: weight of edges.
+        edge_sigma_px: standard deviation of a correct step from the edge of the CAD.
         edge_threshold: weakest step used, in grey levels over two pixels.
-        feature_sigma_px: standard deviation of a matched texture patch from its place.
-        rotation_sigma_rad: expected rotation error of a start.
-        translation_sigma: expected translation error of a start, in diameters.
+        texture_sigma_px: standard deviation of a matched texture patch from its true position.
+        rotation_sigma_rad: expected rotation error of a start, which sets the damping.
+        translation_sigma: expected translation error of a start, in diameters, which sets the damping.
         min_inner_share: share of design edges inside the outline below which colours get more weight.
-        plain_region_gain: extra weight of colours, relative to `region_weight`, for a part without any inner edge.
-        min_histogram_count: pixels on either side of the outline from which colours are learned.
-        size_unit_px: half diameter in the picture for which the stages are made; larger ones widen them.
+        plain_region_gain: extra weight of colours, as a multiple of ``region_weight``, for a part without inner edges.
+        min_histogram_count: pixels needed on either side of the outline to learn colours.
+        size_unit_px: half diameter in the picture for which the stages are made; a larger part widens them.
+        step_share: length, in diameters, by which the projections of normals and tangents are measured.
+        shading: options of the shading modality.
     """
 
     use_region: bool = True
@@ -56,18 +57,20 @@ class RefinerOptions:
     edge_weight: float = 1.0
     edge_sigma_px: float = 0.7
     edge_threshold: float = 3.0
-    feature_sigma_px: float = 0.5
+    texture_sigma_px: float = 0.5
     rotation_sigma_rad: float = 0.3
     translation_sigma: float = 0.3
     min_inner_share: float = 0.3
     plain_region_gain: float = 6.0
     min_histogram_count: int = 50
     size_unit_px: float = 80.0
+    step_share: float = 0.01
+    shading: ShadingOptions = field(default_factory=ShadingOptions)
 
 
 @dataclass
 class Appearance:
-    """Colour model of part and background: histograms along the outline and their log odds.
+    """Colours of part and background: histograms along the outline and their log odds.
 
     Attributes:
         fore, back: (BINS³,) normalised histograms of part and background.
@@ -82,25 +85,25 @@ class Appearance:
     bin_of: NDArray[np.int64] = field(default_factory=lambda: value_bins(1.0))
     is_known: bool = False
 
-    def blend(self, colours: tuple[Array, Array], rate: float) -> None:
-        """Move the histograms towards those of a frame by a share; the first ones are taken as they are."""
+    @property
+    def colors(self) -> ColorModel:
+        """The colours in the form of the kernels."""
+        return ColorModel(self.bin_of, self.odds, EDGE_FUNCTION)
+
+    def blend(self, colors: tuple[Array, Array], rate: float) -> None:
+        """Move the histograms towards those of a frame (part, background) by a share; the first are copied."""
         share = rate if self.is_known else 1.0
-        self.fore += share * (colours[0] - self.fore)
-        self.back += share * (colours[1] - self.back)
+        self.fore += share * (colors[0] - self.fore)
+        self.back += share * (colors[1] - self.back)
         self.is_known = True
         log_odds(self.fore, self.back, self.odds)
 
 
-@lru_cache(maxsize=64)
-def _stage_table(stages: tuple[Stage, ...]) -> Array:
-    return np.array([stage.row() for stage in stages], dtype=np.float64)
-
-
 class PoseRefiner:
-    """Refinement of rough poses of one part with one camera.
+    """Refinement of rough poses of one part for one camera.
 
     Args:
-        part: of the guide views.
+        part: the part in the form of the kernels.
         camera: intrinsics of the pictures.
         options: see `RefinerOptions`.
     """
@@ -111,13 +114,13 @@ class PoseRefiner:
         self.options = options or RefinerOptions()
         self.diameter_mm = part.views.diameter_mm
         self.intrinsics = intrinsics_of(camera)
-        self._step_mm = 0.01 * self.diameter_mm
+        self._step_mm = self.options.step_share * self.diameter_mm
         o = self.options
         kinds = np.asarray(part.views.arrays["edge_kinds"])
         outline = int(np.count_nonzero(kinds & EDGE_CONTOUR))
         inner = int(np.count_nonzero(((kinds & EDGE_CONTOUR) == 0) & ((kinds & EDGE_SHARP) > 0)))
         inner_share = inner / max(outline + inner, 1)
-        # Parts without design edges inside their outline depend more on colours.
+        # Colours count more for a part with few design edges inside its outline.
         plainness = max(0.0, 1.0 - inner_share / o.min_inner_share)
         self._region_weight = o.region_weight * (1.0 + o.plain_region_gain * plainness)
         self._damping = np.concatenate(
@@ -128,32 +131,32 @@ class PoseRefiner:
         )
 
     def with_camera(self, camera: Camera) -> PoseRefiner:
-        """The same refiner for pictures of another camera, such as the one of a window."""
+        """The same refiner for pictures of another camera, such as crops."""
         other = copy.copy(self)
         other.camera, other.intrinsics = camera, intrinsics_of(camera)
         return other
 
     def radius_px(self, cam_from_body: Array) -> float:
-        """Half the part's diameter in the picture, at a pose (4,4)."""
+        """Half the part's diameter in the picture at a pose (4,4), px."""
         return 0.5 * self.diameter_mm * self.camera.fx / max(float(cam_from_body[2, 3]), 1.0)
 
     def color_histograms(
         self, image: NDArray[np.uint8], cam_from_body: Array, bin_of: NDArray[np.int64]
     ) -> tuple[Array, Array] | None:
-        """Normalised histograms (part, background) along the outline at a pose; None where the outline is too short."""
+        """Normalised histograms (part, background) along the outline at a pose; None for too few pixels."""
         fore, back = np.zeros(BINS**3), np.zeros(BINS**3)
-        count_colours(image, bin_of, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm, fore, back)
+        count_colors(image, bin_of, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm, fore, back)
         fore_count, back_count = fore.sum(), back.sum()
         if min(fore_count, back_count) < self.options.min_histogram_count:
             return None
         return fore / fore_count, back / back_count
 
     def appearance_at(self, image: NDArray[np.uint8], cam_from_body: Array) -> Appearance:
-        """The colours along the outline at a pose, learned from this picture alone."""
+        """Colours along the outline at a pose (4,4), learned from this picture only."""
         appearance = Appearance()
-        colours = self.color_histograms(image, cam_from_body, appearance.bin_of)
-        if colours is not None:
-            appearance.blend(colours, 1.0)
+        colors = self.color_histograms(image, cam_from_body, appearance.bin_of)
+        if colors is not None:
+            appearance.blend(colors, 1.0)
         return appearance
 
     def refine(
@@ -165,33 +168,37 @@ class PoseRefiner:
         appearance: Appearance,
         matches: TextureMatches = NO_MATCHES,
     ) -> tuple[Array, Array]:
-        """Pose and information after the given stages.
+        """Refine a pose through some stages.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
-            gray: (H,W) smoothed, see `smoothed`.
+            gray: (H,W) uint8, smoothed by `smoothed`.
             cam_from_body: (4,4) start, about the part's centre.
             stages: see `schedules`.
-            appearance: colours that tell the part from its background.
-            matches: texture of the part found in this frame, measured once for all stages.
+            appearance: colours of part and background.
+            matches: texture of the part found in this frame, the same for all stages.
 
         Returns:
             ``cam_from_body`` (4,4) and information (6,6) of the twist (rad, mm) on its right.
         """
         o = self.options
+        weights = ModalityWeights(
+            region=self._region_weight if o.use_region and appearance.is_known else 0.0,
+            edge=o.edge_weight if o.use_edge else 0.0,
+            edge_sigma_px=o.edge_sigma_px,
+            edge_threshold=o.edge_threshold,
+            texture_sigma_px=o.texture_sigma_px,
+        )
         pose, information = run_stages(
-            image, gray, appearance.bin_of, appearance.odds, EDGE_FUNCTION, self.part.arrays, cam_from_body,
-            self.intrinsics, self._step_mm, _stage_table(stages), self._damping,
-            self._region_weight if o.use_region and appearance.is_known else 0.0,
-            o.edge_weight if o.use_edge else 0.0, o.edge_sigma_px, o.edge_threshold,
-            matches.points_in_body, matches.pixels, matches.weights, o.feature_sigma_px,
+            image, gray, appearance.colors, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm,
+            stage_table(stages), self._damping, weights, matches,
         )  # fmt: skip
         return pose, information
 
     def refine_fresh(
         self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...]
     ) -> Array:
-        """Refine a pose of unknown quality (4,4): colours are learned anew before every stage."""
+        """Refine a pose (4,4) of unknown quality: colours are learned anew before every stage, without any memory."""
         unit = max(1.0, self.radius_px(cam_from_body) / self.options.size_unit_px)
         for stage in stages:
             appearance = self.appearance_at(image, cam_from_body)
@@ -199,20 +206,25 @@ class PoseRefiner:
         return cam_from_body
 
     def refine_shading(self, gray: NDArray[np.uint8], cam_from_body: Array, information: Array) -> tuple[Array, Array]:
-        """Pose and information after the surface's shading under an unknown light is used too, see `shading`.
+        """Refine a pose by the shading of the surface under an unknown light, see `shading`.
 
         Args:
-            gray: (H,W), not smoothed.
-            cam_from_body: (4,4), the best by outline and edges.
-            information: (6,6) of outline and edges.
+            gray: (H,W) uint8, not smoothed.
+            cam_from_body: (4,4) the best pose by outline and edges.
+            information: (6,6) of that pose.
+
+        Returns:
+            ``cam_from_body`` (4,4) and information (6,6), unchanged where the part is not in the picture.
         """
-        look = look_at(gray, self.camera, self.diameter_mm, cam_from_body)
-        if look is None:
+        o = self.options.shading
+        crop = crop_for_shading(gray, self.camera, self.diameter_mm, cam_from_body, o)
+        if crop is None:
             return cam_from_body, information
-        pose, more, _ = shade(
-            *look, self.part.surface, self.part.corner_normals, self.diameter_mm, cam_from_body, information, GAIN
+        part = self.part
+        refined = refine_by_shading(
+            crop, part.surface, part.corner_normals, self.diameter_mm, cam_from_body, information, o.gain
         )
-        return pose, more
+        return refined.cam_from_body, refined.information
 
     def evidence(
         self,
@@ -222,17 +234,15 @@ class PoseRefiner:
         appearance: Appearance,
         tolerance_px: float = 1.5,
     ) -> PoseEvidence:
-        """How well the picture supports a pose (4,4); steps count within a tolerance."""
-        return PoseEvidence(
-            *run_evidence(
-                image, gray, appearance.bin_of, appearance.odds, appearance.is_known, EDGE_FUNCTION,
-                self.part.arrays, cam_from_body, self.intrinsics, self._step_mm, self.options.edge_threshold,
-                tolerance_px,
-            )
+        """Evidence of the picture for a pose (4,4); steps farther from an edge than the tolerance do not support it."""
+        terms = run_evidence(
+            image, gray, appearance.colors, appearance.is_known, self.part.arrays, cam_from_body, self.intrinsics,
+            self._step_mm, self.options.edge_threshold, tolerance_px,
         )  # fmt: skip
+        return PoseEvidence(**terms._asdict())
 
     def edge_steps(self, gray: NDArray[np.uint8], cam_from_body: Array, tolerance_px: float = 1.5) -> EdgeSteps:
-        """The part's edges at a pose (4,4), and how far the picture supports each."""
+        """Outline and design edges at a pose (4,4), and the support of the picture for each of their points."""
         return EdgeSteps(
             *run_edge_steps(
                 gray, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm, self.options.edge_threshold,

@@ -3,11 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.geometry import Array
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One iteration of the solver: scales and reach of the modalities."""
+    """One stage of the refinement: measurements at one scale and the pose updates made with them.
+
+    Attributes:
+        region_scale: pixels per segment of the lines across the outline (SRT3D).
+        edge_reach: samples to either side of an edge within which steps are found.
+        edge_step_px: distance between these samples.
+        edge_spread_px: expected distance of the pose from the edges; steps farther away count less.
+        updates: updates of the pose with the same measurements.
+        region_gain: weight of colours, as a factor of the refiner's.
+        stride: every n-th point is measured, with n times the weight.
+    """
 
     region_scale: int
     edge_reach: int
@@ -17,20 +34,8 @@ class Stage:
     region_gain: float = 1.0
     stride: int = 1
 
-    def row(self) -> tuple[float, ...]:
-        """As `run_stages` takes it."""
-        return (
-            self.region_scale,
-            self.edge_reach,
-            self.edge_step_px,
-            self.edge_spread_px,
-            self.updates,
-            self.region_gain,
-            self.stride,
-        )
-
     def widened(self, factor: float) -> Stage:
-        """The same stage for a part that is larger in the picture; fine stages stay fine."""
+        """The same stage for a part that is larger in the picture by a factor; the finest stages do not change."""
         if self.region_scale <= 1 or factor == 1.0:
             return self
         return replace(
@@ -41,54 +46,78 @@ class Stage:
         )
 
 
+class StageTable(NamedTuple):
+    """Stages in the form of the kernels: a column (S,) for each attribute of `Stage`."""
+
+    region_scale: NDArray[np.int64]
+    edge_reach: NDArray[np.int64]
+    edge_step_px: Array
+    edge_spread_px: Array
+    updates: NDArray[np.int64]
+    region_gain: Array
+    stride: NDArray[np.int64]
+
+
+@lru_cache(maxsize=64)
+def stage_table(stages: tuple[Stage, ...]) -> StageTable:
+    """The columns of some stages."""
+    return StageTable(
+        region_scale=np.array([stage.region_scale for stage in stages], dtype=np.int64),
+        edge_reach=np.array([stage.edge_reach for stage in stages], dtype=np.int64),
+        edge_step_px=np.array([stage.edge_step_px for stage in stages], dtype=np.float64),
+        edge_spread_px=np.array([stage.edge_spread_px for stage in stages], dtype=np.float64),
+        updates=np.array([stage.updates for stage in stages], dtype=np.int64),
+        region_gain=np.array([stage.region_gain for stage in stages], dtype=np.float64),
+        stride=np.array([stage.stride for stage in stages], dtype=np.int64),
+    )
+
+
 TRACK_STAGES = (
-    Stage(4, 12, 1.0, 5.0, 2, 0.5, 2),
-    Stage(2, 8, 1.0, 3.0, 2, 0.2, 2),
-    Stage(1, 6, 1.0, 1.5, 2, 0.1),
-    Stage(1, 5, 1.0, 1.0, 2, 0.1),
+    Stage(region_scale=4, edge_reach=12, edge_step_px=1.0, edge_spread_px=5.0, region_gain=0.5, stride=2),
+    Stage(region_scale=2, edge_reach=8, edge_step_px=1.0, edge_spread_px=3.0, region_gain=0.2, stride=2),
+    Stage(region_scale=1, edge_reach=6, edge_step_px=1.0, edge_spread_px=1.5, region_gain=0.1),
+    Stage(region_scale=1, edge_reach=5, edge_step_px=1.0, edge_spread_px=1.0, region_gain=0.1),
 )
-"""Coarse to fine for the usual frame. Colours help to find the outline, the edges say where it is."""
+"""Coarse to fine, for a usual frame. Colours help to find the outline; edges then locate it precisely."""
 NEAR_STAGES = (
-    Stage(2, 12, 1.5, 3.0, 2, 0.0),
-    Stage(2, 10, 1.0, 2.5, 2, 0.0),
-    Stage(1, 8, 1.0, 2.0, 2, 0.0),
-    Stage(1, 6, 1.0, 1.5, 2, 0.0),
-    Stage(1, 5, 1.0, 1.0, 2, 0.0),
+    Stage(region_scale=2, edge_reach=12, edge_step_px=1.5, edge_spread_px=3.0, region_gain=0.0),
+    Stage(region_scale=2, edge_reach=10, edge_step_px=1.0, edge_spread_px=2.5, region_gain=0.0),
+    Stage(region_scale=1, edge_reach=8, edge_step_px=1.0, edge_spread_px=2.0, region_gain=0.0),
+    Stage(region_scale=1, edge_reach=6, edge_step_px=1.0, edge_spread_px=1.5, region_gain=0.0),
+    Stage(region_scale=1, edge_reach=5, edge_step_px=1.0, edge_spread_px=1.0, region_gain=0.0),
 )
-"""Edges nearby alone: colours mislead where something hides a part of the outline, or looks like the part."""
-SETTLING_STAGES = (
-    Stage(2, 12, 1.5, 5.0, 2),
-    Stage(2, 10, 1.0, 4.0, 2),
-    Stage(1, 8, 1.0, 2.5, 2),
-    Stage(1, 6, 1.0, 1.5, 2),
-    Stage(1, 5, 1.0, 1.0, 2),
+"""Near edges without colours, which mislead where something hides a part of the outline or looks like the part."""
+SEARCH_STAGES = (
+    Stage(region_scale=2, edge_reach=12, edge_step_px=1.5, edge_spread_px=5.0),
+    Stage(region_scale=2, edge_reach=10, edge_step_px=1.0, edge_spread_px=4.0),
+    Stage(region_scale=1, edge_reach=8, edge_step_px=1.0, edge_spread_px=2.5),
+    Stage(region_scale=1, edge_reach=6, edge_step_px=1.0, edge_spread_px=1.5),
+    Stage(region_scale=1, edge_reach=5, edge_step_px=1.0, edge_spread_px=1.0),
 )
-"""Edges and colours, for a pose that a search found, some pixels off."""
-PLAIN_SHARE = 0.05
-"""With fewer design edges than this the outline alone turns with the light: colours are needed."""
+"""Edges and colours, for a pose found by a search, which is off by some pixels."""
 LAST_STAGES = 2 * TRACK_STAGES[2:]
-"""For a pose that is nearly right: coarse stages can lead away from it, into an edge beside the outline."""
+"""For a pose that is nearly right: coarse stages could lead it away, to an edge beside the outline."""
 
 
-def _colour_led(gain: float) -> tuple[Stage, ...]:
+def _color_led(gain: float) -> tuple[Stage, ...]:
+    """Coarse stages in which colours outweigh edges."""
     return (
-        Stage(6, 12, 2.0, 8.0, 2, gain, 2),
-        Stage(4, 12, 1.0, 5.0, 2, gain, 2),
-        Stage(2, 8, 1.0, 3.0, 2, gain, 2),
+        Stage(region_scale=6, edge_reach=12, edge_step_px=2.0, edge_spread_px=8.0, region_gain=gain, stride=2),
+        Stage(region_scale=4, edge_reach=12, edge_step_px=1.0, edge_spread_px=5.0, region_gain=gain, stride=2),
+        Stage(region_scale=2, edge_reach=8, edge_step_px=1.0, edge_spread_px=3.0, region_gain=gain, stride=2),
     )
 
 
 FAR_STAGES = (
-    _colour_led(5.0) + TRACK_STAGES,
+    _color_led(5.0) + TRACK_STAGES,
     (
-        Stage(6, 12, 2.0, 10.0, 2, 1.0, 2),
-        Stage(4, 12, 2.0, 7.0, 2, 1.0, 2),
-        Stage(4, 12, 1.5, 5.0, 2, 1.0, 2),
-        Stage(3, 10, 1.0, 3.5, 2, 1.0, 2),
+        Stage(region_scale=6, edge_reach=12, edge_step_px=2.0, edge_spread_px=10.0, stride=2),
+        Stage(region_scale=4, edge_reach=12, edge_step_px=2.0, edge_spread_px=7.0, stride=2),
+        Stage(region_scale=4, edge_reach=12, edge_step_px=1.5, edge_spread_px=5.0, stride=2),
+        Stage(region_scale=3, edge_reach=10, edge_step_px=1.0, edge_spread_px=3.5, stride=2),
         *TRACK_STAGES,
     ),
-    _colour_led(20.0) + NEAR_STAGES,
+    _color_led(20.0) + NEAR_STAGES,
 )
-"""For a part that moved far: the usual stages take the next of many parallel edges for the right one, the outline as
-colours show it leads past them. Of 720 pairs of semi-synthetic frames one or two steps apart, without a prediction,
-the usual ones and those nearby bring 362 within 5 cm and 5°, with these 591."""
+"""For a part that moved far. The usual stages lock on to the next of many parallel edges; the outline as the colours
+show it leads past these edges."""

@@ -1,14 +1,14 @@
-"""The part as the kernels of refinement and detection see it: its guide views as flat arrays about its centre.
+"""PartView: the guide views of a part as flat arrays about its centre, for the kernels of refinement and detection.
 
-Design edges that lie so close together that a picture does not resolve them are marked as unresolvable here. The rims
-of small holes, thin ribs, pins and knurls are many lines in the CAD and one grey patch in a picture of the whole part:
-looked for one by one, they are missed or taken for each other, and a test that expects them rejects right poses.
+Design edges too close together to be resolved in a picture are marked here. The rims of small holes, thin ribs, pins
+and knurls are many lines in the CAD but one grey patch in a picture of the whole part. Expected one by one they are
+missed or confused with each other, and a test that expects them rejects right poses.
 """
 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,26 +17,61 @@ from arview.core.kernel import kernel
 from arview.geometry import invert, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.refinement.modalities.shading import LEAST_CURVED, corner_normals, curved_share
+from arview.refinement.modalities.shading import ShadingOptions, corner_normals, curved_share
 
-APART = 0.035
-"""In diameters: edges nearer to each other are crowded. Profiles across lines reach 6 px to both sides in pictures in
-which the diameter is 96 px, those of the verifier show it at 70 px: it is 3.4 and 2.5 px there."""
+MIN_SEPARATION = 0.035
+"""Edges closer to each other than this, in diameters of the part, are unresolvable: 3.4 px where the diameter is 96 px,
+as in the profiles of the ranker, and 2.5 px where it is 70 px, as in the crops of the verifier."""
 SAME_LINE = 0.004
-"""Nearer than this are points of one and the same line."""
-ALONG = 0.015
-"""And what lies further along the edge is not beside it."""
+"""Points closer than this across an edge, in diameters, lie on the same line."""
+MAX_ALONG = 0.015
+"""Points farther away than this along an edge, in diameters, are not beside it."""
 PARALLEL_COS = 0.7
-"""Edges that cross are no neighbours."""
+"""Edges whose directions have a smaller cosine cross and are no neighbours."""
 END_ON = 0.02
-"""Of edges seen so nearly end-on nothing is said."""
+"""Edges whose projected tangent is shorter than this are seen end-on and left out."""
+UNIT_16 = np.float32(1.0 / 32767.0)
+"""Scale of the unit vectors that guide views store as 16-bit integers."""
+
+
+class ViewArrays(NamedTuple):
+    """All guide views of a part as flat arrays. Points are in the body frame, whose origin is the part's centre.
+
+    Attributes:
+        directions: (N,3) unit directions from the part's centre to the camera of each view.
+        contour_starts: (N+1,) first contour point of each view.
+        contour_points: (C,3) float32 mm.
+        contour_normals: (C,3) float32, outward unit normals of the contour.
+        contour_runs_mm: (C,2) how far the picture stays part inwards and background outwards of the contour.
+        edge_starts: (N+1,) first edge point of each view.
+        edge_points: (E,3) float32 mm.
+        edge_tangents: (E,3) float32, unit tangents of the edges.
+        edge_kinds: (E,) EDGE_* bits.
+    """
+
+    directions: NDArray[Any]
+    contour_starts: NDArray[Any]
+    contour_points: NDArray[Any]
+    contour_normals: NDArray[Any]
+    contour_runs_mm: NDArray[Any]
+    edge_starts: NDArray[Any]
+    edge_points: NDArray[Any]
+    edge_tangents: NDArray[Any]
+    edge_kinds: NDArray[Any]
 
 
 class PartView:
-    """A guide-view set as the kernels need it: flat float32 arrays about the model's centre.
+    """A part in the form of the kernels.
 
-    ``arrays`` holds directions (N,3), contour starts (N+1), points, normals, runs, edge starts (N+1), points,
-    tangents, kinds; ``surface`` is its mesh, of which enough may be curved for `shading`.
+    Args:
+        views: guide views of the part.
+
+    Attributes:
+        arrays: the guide views, see `ViewArrays`.
+        model_from_body, body_from_model: (4,4) translations between the frames of model and body.
+        surface: reduced mesh of the part.
+        is_curved: whether enough of the surface is curved for the shading modality.
+        corner_normals: (F,3,3) smooth normals of the surface.
     """
 
     def __init__(self, views: GuideViewSet) -> None:
@@ -44,49 +79,51 @@ class PartView:
         self.model_from_body = rigid(np.eye(3), views.center_in_model)
         self.body_from_model = invert(self.model_from_body)
         raw = views.arrays
-        unit16 = np.float32(1.0 / 32767.0)
         center = views.center_in_model
-        self.arrays = (
-            np.ascontiguousarray(views.directions),
-            np.array(raw["contour_start"]),
-            (raw["contour_points"] - center).astype(np.float32),
-            raw["contour_normals"] * unit16,
-            np.array(raw["contour_runs_mm"]),
-            np.array(raw["edge_start"]),
-            (raw["edge_points"] - center).astype(np.float32),
-            raw["edge_tangents"] * unit16,
-            np.array(raw["edge_kinds"]),
+        self.arrays = ViewArrays(
+            directions=np.ascontiguousarray(views.directions),
+            contour_starts=np.array(raw["contour_start"]),
+            contour_points=(raw["contour_points"] - center).astype(np.float32),
+            contour_normals=raw["contour_normals"] * UNIT_16,
+            contour_runs_mm=np.array(raw["contour_runs_mm"]),
+            edge_starts=np.array(raw["edge_start"]),
+            edge_points=(raw["edge_points"] - center).astype(np.float32),
+            edge_tangents=raw["edge_tangents"] * UNIT_16,
+            edge_kinds=np.array(raw["edge_kinds"]),
         )
         self.surface = views.surface
-        self.is_curved = curved_share(self.surface) >= LEAST_CURVED
+        self.is_curved = curved_share(self.surface) >= ShadingOptions.min_curved_share
         self.corner_normals = corner_normals(self.surface)
 
     @cached_property
-    def distinct(self) -> tuple[NDArray[Any], ...]:
-        """``arrays`` without the design edges that are crowded, see `is_crowded`; worked out when first asked for."""
-        kinds = self.arrays[-1].copy()
-        kinds[is_crowded(self.views)] &= np.uint8(255 - EDGE_SHARP)
-        return (*self.arrays[:-1], kinds)
+    def resolvable(self) -> ViewArrays:
+        """``arrays`` in which unresolvable design edges are not marked as design edges."""
+        kinds = self.arrays.edge_kinds.copy()
+        kinds[find_unresolvable(self.views)] &= np.uint8(255 - EDGE_SHARP)
+        return self.arrays._replace(edge_kinds=kinds)
 
 
-def is_crowded(views: GuideViewSet) -> NDArray[np.bool_]:
-    """Which of the edge points (E,) of guide views are design edges with another close beside them in the view."""
+def find_unresolvable(views: GuideViewSet) -> NDArray[np.bool_]:
+    """Which of the edge points (E,) of guide views lie on a design edge with another one close beside it in the view.
+
+    Outline edges are never among them.
+    """
     raw = views.arrays
     kinds = np.asarray(raw["edge_kinds"])
     is_design = ((kinds & EDGE_SHARP) > 0) & ((kinds & EDGE_CONTOUR) == 0)
-    crowded = np.zeros(len(kinds), dtype=np.bool_)
-    _mark_crowded(
-        views.directions, raw["edge_start"], raw["edge_points"], raw["edge_tangents"] * np.float32(1.0 / 32767.0),
-        is_design, np.float32(views.diameter_mm), crowded,
+    unresolvable = np.zeros(len(kinds), dtype=np.bool_)
+    _mark_unresolvable(
+        views.directions, raw["edge_start"], raw["edge_points"], raw["edge_tangents"] * UNIT_16, is_design,
+        np.float32(views.diameter_mm), unresolvable,
     )  # fmt: skip
-    return crowded
+    return unresolvable
 
 
 @kernel(fastmath=True)
-def _mark_crowded(directions, starts, points, tangents, is_design, diameter_mm, crowded):  # type: ignore[no-untyped-def]
-    """Mark edge points, see `is_crowded`; what is in line with the view's direction is left as it is."""
-    nearest, furthest = np.float32(SAME_LINE) * diameter_mm, np.float32(APART) * diameter_mm
-    along = np.float32(ALONG) * diameter_mm
+def _mark_unresolvable(directions, starts, points, tangents, is_design, diameter_mm, unresolvable):  # type: ignore[no-untyped-def]
+    """Mark edge points, see `find_unresolvable`. Edges are compared in the image plane of each view."""
+    nearest, furthest = np.float32(SAME_LINE) * diameter_mm, np.float32(MIN_SEPARATION) * diameter_mm
+    along = np.float32(MAX_ALONG) * diameter_mm
     for view in range(starts.shape[0] - 1):
         first, last = starts[view], starts[view + 1]
         way = directions[view]
@@ -123,5 +160,5 @@ def _mark_crowded(directions, starts, points, tangents, is_design, diameter_mm, 
                 if abs(x * flat[i, 2] + y * flat[i, 3]) > along:
                     continue
                 if abs(flat[i, 2] * flat[j, 2] + flat[i, 3] * flat[j, 3]) > np.float32(PARALLEL_COS):
-                    crowded[index[i]] = True
+                    unresolvable[index[i]] = True
                     break

@@ -23,7 +23,7 @@ from arview.refinement.evidence import PoseEvidence
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.projection import intrinsics_of
 from arview.refinement.refiner import PoseRefiner
-from arview.refinement.schedules import SETTLING_STAGES
+from arview.refinement.schedules import SEARCH_STAGES
 from arview.refinement.view_model import PartView
 
 
@@ -242,7 +242,7 @@ class GuidedInit:
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
         def refine(start: Array) -> GuidedPose:
-            pose = self._refiner.refine_fresh(image, gray, start, SETTLING_STAGES)
+            pose = self._refiner.refine_fresh(image, gray, start, SEARCH_STAGES)
             look = self._refiner.appearance_at(image, pose)
             evidence = self._refiner.evidence(image, gray, pose, look)
             is_inside = evidence.points_in_picture >= self.options.min_in_picture

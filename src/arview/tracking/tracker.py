@@ -1,8 +1,8 @@
 """Tracker: follows the pose of a part from frame to frame on its guide views, without rendering.
 
-Each frame goes through one loop: poses are proposed (the prediction, other schedules, a wide search, a recheck by the
-detector's local search, shading), refined, scored by the evidence in the picture, and the best is selected. What is
-kept between frames is in `TrackerState`; refinement itself is done by the stateless `PoseRefiner`.
+Every frame runs one loop: poses are proposed (the predicted pose, other schedules, a wide search, a recheck by the
+detector's local search, shading), refined, scored by the evidence of the picture, and the best is selected. The state
+kept between frames is a `TrackerState`; the refinement is done by the stateless `PoseRefiner`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from arview.core.checks import check_type
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
-from arview.refinement.evidence import PoseEvidence, quality_of
+from arview.refinement.evidence import MIN_IN_PICTURE, PoseEvidence, quality_of
 from arview.refinement.gauss_newton import apply_twist, relative_twist
 from arview.refinement.kernels import median_brightness_ratio
 from arview.refinement.modalities.edge import smoothed
@@ -31,7 +31,7 @@ from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.modalities.region import value_bins
 from arview.refinement.modalities.texture import TextureMatches, TextureModality
 from arview.refinement.refiner import NO_MATCHES, Appearance, PoseRefiner, RefinerOptions
-from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES, PLAIN_SHARE, TRACK_STAGES, Stage
+from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES, TRACK_STAGES, Stage
 from arview.refinement.view_model import PartView
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import squared_motion_distance
@@ -40,39 +40,58 @@ from arview.tracking.wide_search import WideSearch
 
 @dataclass(frozen=True)
 class TrackerOptions(RefinerOptions):
-    """Options of the tracker, beside those of the refinement.
+    """Options of the tracker, in addition to those of the refinement.
 
     Attributes:
         use_texture: match the part's own texture; needs the model's surface.
         use_shading: use the brightness of curved surfaces.
         stages: schedule of a usual frame.
-        feature_min_count: fewer texture matches are not used.
-        feature_min_share: a smaller share of the texture looked for is not used.
+        min_matches: texture matches needed to use texture.
+        min_match_share: share of the expected texture that must be found to use texture.
+        texture_score: score that texture adds to the quality when all of it is found, because it supports the pose
+            where a hand hides the outline.
         learning_rate: share by which the colour histograms follow each frame.
-        min_learning_quality: below it colours are not learned, and the part is searched for around the prediction.
-        other_schedules_share: other schedules are tried below this share of the usual score.
-        far_schedules_share: so are those for a part that moved far, below this share.
-        wide_search_share: the part is searched for around the prediction below this share of the usual score.
-        surprise_share: so it is below this share for a pose off the prediction by more than `surprise`.
-        surprise: squared motion distance of a pose off the prediction (0.02: about 6°).
-        recheck_distance: squared motion distance from which on the recheck is made (0.005: about 3°).
-        motion_penalty: score that a squared motion distance of 1 costs; turned parts often look alike.
-        min_gain: score by which a pose found far from the usual one must be better, and that shading may cost.
-        min_keyframe_in_picture: share of the outline in the picture needed to remember texture; what enters the
-            picture is placed badly at first, and so would be all that is measured against it.
-        min_keyframe_quality: quality needed to remember texture.
-        correlated_points: how many neighbouring edge points share one error.
+        min_learning_quality: quality below which colours are not learned, and the part is searched for around the
+            predicted pose.
+        score_rate: share by which the usual score follows each frame.
+        other_schedules_share: share of the usual score below which other schedules are tried.
+        near_schedules_min_inner_share: share of design edges needed for schedules without colours, because the apparent
+            outline of a rounded part moves with the light.
+        far_schedules_share: share of the usual score below which schedules for a part that moved far are tried.
+        wide_search_share: share of the usual score below which the part is searched for around the predicted pose.
+        surprise_share: the same for a pose whose squared motion distance exceeds ``surprise``.
+        surprise: squared motion distance of a surprising pose; 0.02 is about 6°.
+        recheck_distance: squared motion distance from which a pose is rechecked; 0.005 is about 3°.
+        motion_penalty: score that a squared motion distance of 1 costs, because turned parts often look alike.
+        min_gain: score by which a pose found far from the predicted one must be better, and largest loss of score
+            accepted from the shading refinement.
+        min_keyframe_in_picture: share of the outline in the picture needed for a keyframe. A part that enters the
+            picture is located badly at first, and so would be all that is later matched with the keyframe.
+        min_keyframe_quality: quality needed for a keyframe.
+        min_keyframe_support: share of the best recent support of the outline needed for a keyframe; with less,
+            something is in front of the part.
+        support_decay: factor by which the best recent support of the outline decreases in each frame.
+        exposure_grid_px: distance of the pixels from which a change of exposure is measured.
+        exposure_decay: exponent by which the estimated exposure fades, because the histograms follow slow changes.
+        exposure_limits: smallest and largest exposure relative to the first frame.
+        window_margin_px: pixels around the part, in addition to ``window_reach`` half diameters, in which the grey
+            picture is computed.
+        window_reach: see ``window_margin_px``.
+        correlated_points: neighbouring edge points that share one error.
         velocity_decay: share of the last frame's motion that is expected in the next frame.
     """
 
     use_texture: bool = True
     use_shading: bool = True
     stages: tuple[Stage, ...] = TRACK_STAGES
-    feature_min_count: int = 12
-    feature_min_share: float = 0.4
+    min_matches: int = 12
+    min_match_share: float = 0.4
+    texture_score: float = 0.5
     learning_rate: float = 0.2
     min_learning_quality: float = 0.4
+    score_rate: float = 0.1
     other_schedules_share: float = 0.97
+    near_schedules_min_inner_share: float = 0.05
     far_schedules_share: float = 0.9
     wide_search_share: float = 0.8
     surprise_share: float = 0.95
@@ -82,6 +101,13 @@ class TrackerOptions(RefinerOptions):
     min_gain: float = 0.02
     min_keyframe_in_picture: float = 0.9
     min_keyframe_quality: float = 0.6
+    min_keyframe_support: float = 0.85
+    support_decay: float = 0.99
+    exposure_grid_px: int = 16
+    exposure_decay: float = 0.9
+    exposure_limits: tuple[float, float] = (0.2, 5.0)
+    window_margin_px: float = 50.0
+    window_reach: float = 1.15
     correlated_points: float = 8.0
     velocity_decay: float = 0.9
 
@@ -91,10 +117,13 @@ class TrackerOptions(RefinerOptions):
 
 
 class PoseRecheck(Protocol):
-    """A second opinion on a tracked pose, see `arview.tracking.pose_recheck`."""
+    """Independent search that confirms or replaces a tracked pose, see `arview.tracking.pose_recheck`."""
 
     def better(self, image: NDArray[np.uint8], cam_from_body: Array, predicted: list[Array]) -> Array | None:
-        """A pose (4,4) that is likelier than the tracked one; None where there is none."""
+        """A pose (4,4) that is likelier than the tracked one, in a frame (H,W,3) uint8 RGB; None if there is none.
+
+        The search starts at the tracked pose and at predicted ones, all (4,4).
+        """
         ...
 
 
@@ -104,12 +133,12 @@ class TrackerState:
 
     Attributes:
         cam_from_body: (4,4) pose in the last frame.
-        velocity: (6,) twist expected until the next frame.
-        usual_score: running mean of the evidence's score.
+        velocity: (6,) twist (rad, mm) expected until the next frame.
+        usual_score: running mean of the score.
         appearance: colours of part and background.
-        exposure: brightness of the frames against the one in which colours were first learned.
+        exposure: brightness relative to the frame in which colours were first learned.
         sparse_gray: (rows,columns) brightness of the last frame on a coarse grid.
-        best_contour_support: recent best support of the outline: with much less, something is in front of the part.
+        best_contour_support: best recent support of the outline.
     """
 
     cam_from_body: Array
@@ -121,8 +150,15 @@ class TrackerState:
     best_contour_support: float = 0.0
 
 
-class Candidate(NamedTuple):
-    """A refined pose of one frame: ``cam_from_body`` (4,4), information (6,6), evidence, and the matches used."""
+class RefinedPose(NamedTuple):
+    """A pose of one frame after refinement.
+
+    Attributes:
+        cam_from_body: (4,4) pose.
+        information: (6,6) of the twist on its right.
+        evidence: evidence of the picture for it.
+        matches: texture used; None without.
+    """
 
     cam_from_body: Array
     information: Array
@@ -131,15 +167,15 @@ class Candidate(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """A pose to try, and what it must gain to be selected.
+    """A pose to be refined, and what it must gain to be selected.
 
     Attributes:
         cam_from_body: (4,4) start.
         stages: schedule of its refinement; empty: the start is refined by shading.
-        matches: texture used beside colours and edges.
+        matches: texture used in addition to colours and edges.
         min_gain: by how much its score must exceed that of the best pose so far.
         motion_penalty: score that a squared motion distance of 1 costs.
-        is_final: the start itself is the pose; the stages only give its information.
+        is_final: keep the start as the pose and use the stages only for its information.
     """
 
     cam_from_body: Array
@@ -156,12 +192,12 @@ class TrackedFrame:
 
     Attributes:
         image: (H,W,3) uint8 RGB.
-        gray, smooth: (H,W) grey levels and their smoothed copy, filled where the part may be.
-        predicted: (4,4) pose by the motion so far.
-        start: (4,4) the prediction, moved to where the part's texture was found.
-        pyramid: of the grey picture; None without texture.
+        gray, smooth: (H,W) grey levels and their smoothed copy, computed where the part may be.
+        predicted: (4,4) pose predicted from the motion so far.
+        start: (4,4) the predicted pose, aligned with the texture found.
+        pyramid: image pyramid of the grey picture; None without texture.
         matches: texture found; None where it is too little.
-        found_share: share of the texture looked for that was found.
+        found_share: share of the expected texture that was found.
         best: the best pose so far; None before the first one.
     """
 
@@ -173,11 +209,11 @@ class TrackedFrame:
     pyramid: Pyramid | None = None
     matches: TextureMatches | None = None
     found_share: float = 0.0
-    best: Candidate | None = None
+    best: RefinedPose | None = None
 
     @property
-    def found(self) -> Candidate:
-        """The best pose so far; there is one after the first proposal."""
+    def found(self) -> RefinedPose:
+        """The best pose so far, which exists after the first proposal."""
         assert self.best is not None
         return self.best
 
@@ -190,8 +226,8 @@ class Tracker:
         camera: intrinsics of the frames.
         model: the part's CAD model; without it the texture modality is left out.
         options: see `TrackerOptions`.
-        recheck: asked where a pose is far from the prediction; None leaves it out.
-        part: the views as the kernels need them; made when None.
+        recheck: recheck of poses far from the predicted one; None leaves it out.
+        part: the guide views in the form of the kernels; created when None.
     """
 
     def __init__(
@@ -215,10 +251,10 @@ class Tracker:
         self._state: TrackerState | None = None
         self._gray = np.zeros((0, 0), dtype=np.uint8)
         self._smooth = np.zeros((0, 0), dtype=np.uint8)
-        self._features: TextureModality | None = None
+        self._texture: TextureModality | None = None
         if self.options.use_texture and model is not None:
             vertices, faces, _ = model.mesh
-            self._features = TextureModality(vertices - views.center_in_model, faces, camera)
+            self._texture = TextureModality(vertices - views.center_in_model, faces, camera)
 
     @property
     def diameter_mm(self) -> float:
@@ -227,7 +263,7 @@ class Tracker:
 
     @property
     def state(self) -> TrackerState:
-        """What is known from earlier frames.
+        """What the tracker knows from earlier frames.
 
         Raises:
             RuntimeError: before `start`.
@@ -237,20 +273,20 @@ class Tracker:
         return self._state
 
     def start(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
-        """Begin at a pose (4,4): colours are learned from this frame, and no motion is expected."""
+        """Start at a pose (4,4): colours are learned from this frame (H,W,3) uint8 RGB, and no motion is expected."""
         state = self._state = TrackerState(cam_from_model @ self.refiner.part.model_from_body)
-        if self._features is not None:
-            self._features.clear()
+        if self._texture is not None:
+            self._texture.clear()
         self._learn_colors(image, state.cam_from_body, 1.0)
-        if self._features is not None and not (self.options.use_region or self.options.use_edge):
-            # Nothing else can support the pose before texture is remembered.
+        if self._texture is not None and not (self.options.use_region or self.options.use_edge):
+            # Nothing else can support the pose before there is a keyframe.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-            self._features.add_keyframe(self._features.pyramid(gray), state.cam_from_body)
+            self._texture.add_keyframe(self._texture.pyramid(gray), state.cam_from_body)
         _, smooth = self._gray_around(image, state.cam_from_body)
         state.usual_score = self.refiner.evidence(image, smooth, state.cam_from_body, state.appearance).score
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
-        """Pose in the next frame (H,W,3) uint8 RGB, with its evidence.
+        """Track the part into the next frame (H,W,3) uint8 RGB.
 
         Raises:
             RuntimeError: before `start`.
@@ -270,17 +306,17 @@ class Tracker:
     # --- Propose ------------------------------------------------------------------------------------------
 
     def _predicted(self, frame: TrackedFrame) -> Iterator[Proposal]:
-        """The pose by the motion so far and by the texture found."""
+        """The pose predicted from the motion so far and aligned with the texture found."""
         yield Proposal(frame.start, self.options.stages, frame.matches)
 
     def _other_schedules(self, frame: TrackedFrame) -> Iterator[Proposal]:
-        """Other schedules where the score is less than usual."""
+        """Other schedules, where the score is lower than usual."""
         o, usual = self.options, self.state.usual_score
         first = frame.found
         if first.evidence.score >= o.other_schedules_share * usual:
             return
         yield Proposal(frame.start, LAST_STAGES, frame.matches)
-        if o.use_edge and first.evidence.inner_share > PLAIN_SHARE:
+        if o.use_edge and first.evidence.inner_share > o.near_schedules_min_inner_share:
             yield Proposal(frame.start, NEAR_STAGES, frame.matches)
             yield Proposal(first.cam_from_body, NEAR_STAGES, frame.matches)
         for stages in FAR_STAGES:
@@ -289,36 +325,36 @@ class Tracker:
             yield Proposal(frame.start, stages, frame.matches, o.min_gain)
 
     def _searched(self, frame: TrackedFrame) -> Iterator[Proposal]:
-        """Poses of a search around the prediction where the part may be elsewhere."""
+        """Poses of a wide search around the predicted one, where the best pose so far is suspicious."""
         if not self._is_suspicious(frame):
             return
         o, state = self.options, self.state
         frame.gray, frame.smooth = self._gray_around(frame.image)
-        colours = state.appearance.bin_of, state.appearance.odds
-        for start in self._search.find(frame.image, colours, frame.predicted):
+        for start in self._search.find(frame.image, state.appearance.colors, frame.predicted):
             yield Proposal(start, o.stages, None, o.min_gain, o.motion_penalty)
-        # When a search of the whole neighbourhood finds nothing better, this score is usual from now on.
+        # This score is usual from now on, because a search of the whole neighbourhood found nothing better.
         state.usual_score = frame.found.evidence.score
 
     def _rechecked(self, frame: TrackedFrame) -> Iterator[Proposal]:
-        """The pose of the recheck where the best one is far from the prediction."""
+        """The pose of the recheck, where the best pose so far is far from the predicted one."""
         if self._recheck is None or self._motion(frame, frame.found) <= self.options.recheck_distance:
             return
         pose = self._recheck.better(frame.image, frame.found.cam_from_body, [frame.predicted, self.state.cam_from_body])
         if pose is not None:
             frame.gray, frame.smooth = self._gray_around(frame.image, pose)
-            # Refining it with the remembered colours would lead it back to where these were wrong.
+            # Refinement with the learned colours would lead it back, because they misled the best pose.
             yield Proposal(pose, LAST_STAGES[-1:], None, -math.inf, is_final=True)
 
     def _shaded(self, frame: TrackedFrame) -> Iterator[Proposal]:
-        """The best pose, refined by the shading of a curved surface."""
+        """The best pose so far, refined by the shading of a curved surface."""
         if self.options.use_shading and self.refiner.part.is_curved:
             best = frame.found
             yield Proposal(best.cam_from_body, (), best.matches, -self.options.min_gain)
 
     # --- Refine, score, select ----------------------------------------------------------------------------
 
-    def _refine(self, frame: TrackedFrame, proposal: Proposal) -> Candidate:
+    def _refine(self, frame: TrackedFrame, proposal: Proposal) -> RefinedPose:
+        """Refine a proposal and collect its evidence."""
         refiner, appearance = self.refiner, self.state.appearance
         if proposal.stages:
             pose, information = refiner.refine(
@@ -330,9 +366,10 @@ class Tracker:
         else:
             pose, information = refiner.refine_shading(frame.gray, proposal.cam_from_body, frame.found.information)
         evidence = refiner.evidence(frame.image, frame.smooth, pose, appearance)
-        return Candidate(pose, information, evidence, proposal.matches)
+        return RefinedPose(pose, information, evidence, proposal.matches)
 
-    def _is_better(self, frame: TrackedFrame, candidate: Candidate, proposal: Proposal) -> bool:
+    def _is_better(self, frame: TrackedFrame, candidate: RefinedPose, proposal: Proposal) -> bool:
+        """Whether a refined proposal gains enough over the best pose so far."""
         if frame.best is None:
             return True
         penalty = proposal.motion_penalty
@@ -342,11 +379,12 @@ class Tracker:
             best -= penalty * self._motion(frame, frame.best)
         return score > best + proposal.min_gain
 
-    def _motion(self, frame: TrackedFrame, candidate: Candidate) -> float:
+    def _motion(self, frame: TrackedFrame, candidate: RefinedPose) -> float:
+        """Squared motion distance of a pose from the predicted one."""
         return squared_motion_distance(candidate.cam_from_body, frame.predicted, self.diameter_mm)
 
     def _is_suspicious(self, frame: TrackedFrame) -> bool:
-        """Whether the part may be elsewhere: the score is low, lower than usual, or the pose off the prediction."""
+        """Whether the best pose may be wrong: its score is low, or lower than usual, or it is off the prediction."""
         o, evidence = self.options, frame.found.evidence
         share = evidence.score / max(self.state.usual_score, 1e-6)
         is_less = share < o.wide_search_share or (
@@ -355,74 +393,76 @@ class Tracker:
         return is_less or evidence.quality < o.min_learning_quality
 
     def _quality(self, frame: TrackedFrame) -> float:
-        """Quality of the selected pose; the part's own texture supports it where a hand hides the outline."""
+        """Quality of the selected pose by edges, colours and texture."""
         evidence = frame.found.evidence
-        if frame.found.matches is not None and evidence.points_in_picture > 0.05:
-            return quality_of(evidence.score + 0.5 * frame.found_share)
+        if frame.found.matches is not None and evidence.points_in_picture > MIN_IN_PICTURE:
+            return quality_of(evidence.score + self.options.texture_score * frame.found_share)
         return evidence.quality
 
     # --- State --------------------------------------------------------------------------------------------
 
     def _prepare(self, image: NDArray[np.uint8]) -> TrackedFrame:
-        """The frame with its prediction and the texture found in it."""
+        """A frame with its predicted pose and the texture found in it."""
         state, o = self.state, self.options
         self._follow_exposure(image[..., 1])
         predicted = apply_twist(state.cam_from_body, state.velocity)
         gray, smooth = self._gray_around(image, state.cam_from_body, predicted)
         frame = TrackedFrame(image, gray, smooth, predicted, predicted)
-        if self._features is not None:
-            frame.pyramid = self._features.pyramid(gray)
-            matches = self._features.measure(frame.pyramid, predicted)
+        if self._texture is not None:
+            frame.pyramid = self._texture.pyramid(gray)
+            matches = self._texture.measure(frame.pyramid, predicted)
             frame.found_share = len(matches.weights) / max(matches.tried, 1)
-            if len(matches.weights) >= o.feature_min_count and frame.found_share >= o.feature_min_share:
-                frame.matches, frame.start = matches, self._features.align(matches, predicted)
+            if len(matches.weights) >= o.min_matches and frame.found_share >= o.min_match_share:
+                frame.matches, frame.start = matches, self._texture.align(matches, predicted)
         return frame
 
     def _update(self, frame: TrackedFrame, quality: float) -> None:
-        """Carry pose, motion, usual score, colours and texture over to the next frame."""
+        """Update pose, velocity, usual score, colours and texture for the next frame."""
         state, o = self.state, self.options
         pose, evidence = frame.found.cam_from_body, frame.found.evidence
-        state.usual_score += 0.1 * (evidence.score - state.usual_score)
+        state.usual_score += o.score_rate * (evidence.score - state.usual_score)
         state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
         state.cam_from_body = pose
         if quality > o.min_learning_quality:
             if o.use_region:
                 self._learn_colors(frame.image, pose, o.learning_rate)
-            if self._features is not None:
+            if self._texture is not None:
                 self._remember_texture(frame)
 
     def _learn_colors(self, image: NDArray[np.uint8], cam_from_body: Array, rate: float) -> None:
         """Blend the colours along the outline at a pose into the histograms."""
         appearance = self.state.appearance
-        colours = self.refiner.color_histograms(image, cam_from_body, appearance.bin_of)
-        if colours is not None:
-            appearance.blend(colours, rate)
+        colors = self.refiner.color_histograms(image, cam_from_body, appearance.bin_of)
+        if colors is not None:
+            appearance.blend(colors, rate)
 
     def _follow_exposure(self, channel: NDArray[np.uint8]) -> None:
-        """Take a change of exposure since the last frame out of the colours.
+        """Compensate the colours for a change of exposure since the last frame.
 
-        The factor is the median ratio of the brightness on a coarse grid; saturated and black pixels do not count.
+        The change is the median ratio of the brightness of a colour channel (H,W) on a coarse grid.
         """
-        state = self.state
+        o, state = self.options, self.state
+        step = o.exposure_grid_px
         if state.sparse_gray is None:
-            state.sparse_gray = np.zeros((channel.shape[0] // 16, channel.shape[1] // 16))
-        ratio = median_brightness_ratio(channel, state.sparse_gray, 16)
+            state.sparse_gray = np.zeros((channel.shape[0] // step, channel.shape[1] // step))
+        ratio = median_brightness_ratio(channel, state.sparse_gray, step)
         if ratio != 1.0 or state.exposure != 1.0:
-            # The histograms follow slow changes by themselves: the factor fades.
-            state.exposure = min(max(state.exposure**0.9 * ratio, 0.2), 5.0)
+            low, high = o.exposure_limits
+            state.exposure = min(max(state.exposure**o.exposure_decay * ratio, low), high)
             state.appearance.bin_of = value_bins(state.exposure)
 
     def _gray_around(self, image: NDArray[np.uint8], *poses: Array) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Grey picture (H,W) and its smoothed copy, filled only around where the part may be.
+        """Grey picture (H,W) and its smoothed copy, computed only around the part at some poses (4,4).
 
-        Without poses, and for texture, the whole picture is filled.
+        Without poses, and for texture, the whole picture is computed.
         """
         height, width = image.shape[:2]
         first, last = np.array([0, 0]), np.array([width, height])
-        if self._features is None and poses:
+        if self._texture is None and poses:
             centers = np.array([self.camera.project(pose[:3, 3]) for pose in poses])
             if np.all(np.isfinite(centers)):
-                reach = 1.15 * max(self.refiner.radius_px(pose) for pose in poses) + 50.0
+                o = self.options
+                reach = o.window_reach * max(self.refiner.radius_px(pose) for pose in poses) + o.window_margin_px
                 first = np.clip(centers.min(axis=0) - reach, 0, last).astype(int)
                 last = np.clip(centers.max(axis=0) + reach, 0, last).astype(int)
         if np.any(last - first < 16):
@@ -436,26 +476,26 @@ class Tracker:
         return self._gray, self._smooth
 
     def _remember_texture(self, frame: TrackedFrame) -> None:
-        """Refine the remembered texture, and take a new keyframe where one is missing and nothing hides the outline."""
-        assert self._features is not None and frame.pyramid is not None
+        """Update the trust in the keyframes, and add one where it is missing and nothing hides the outline."""
+        assert self._texture is not None and frame.pyramid is not None
         o, state, (pose, _, evidence, matches) = self.options, self.state, frame.found
         if matches is not None:
-            self._features.settle(pose)
-        state.best_contour_support = max(0.99 * state.best_contour_support, evidence.contour_support)
-        unhidden = evidence.contour_support > 0.85 * state.best_contour_support
-        unhidden &= evidence.points_in_picture > o.min_keyframe_in_picture
+            self._texture.update_trust(pose)
+        state.best_contour_support = max(o.support_decay * state.best_contour_support, evidence.contour_support)
+        is_unhidden = evidence.contour_support > o.min_keyframe_support * state.best_contour_support
+        is_unhidden &= evidence.points_in_picture > o.min_keyframe_in_picture
         tracked_count = 0 if matches is None else len(matches.weights)
         if (
-            unhidden
+            is_unhidden
             and evidence.quality > o.min_keyframe_quality
-            and self._features.wants_keyframe(pose, tracked_count)
+            and self._texture.wants_keyframe(pose, tracked_count)
         ):
-            self._features.add_keyframe(frame.pyramid, pose)
+            self._texture.add_keyframe(frame.pyramid, pose)
 
     # --- Other poses of the last frame, and covariance ----------------------------------------------------
 
     def scores_near(self, image: NDArray[np.uint8], cams_from_model: list[Array]) -> list[float]:
-        """Scores (see `PoseEvidence.score`) of other poses (4,4) in this frame, each after a fine refinement."""
+        """Scores, see `PoseEvidence.score`, of other poses (4,4) in this frame, each after a fine refinement."""
         appearance, fine = self.state.appearance, self.options.stages[-2:]
         smooth = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
@@ -463,12 +503,12 @@ class Tracker:
         return [self.refiner.evidence(image, smooth, pose, appearance).score for pose in poses]
 
     def covariance(self, estimate: Estimate) -> Array:
-        """(6,6) covariance of the twist (rad, mm) about the model's centre.
+        """Covariance (6,6) of the twist (rad, mm) about the model's centre.
 
-        The inverse information, widened by the number of neighbours that share an error: edge points every few pixels
-        along one line share the line's error.
+        It is the inverse of the information, enlarged by the number of edge points that share an error, because the
+        points along one edge are measured every few pixels, and limited by half a radian and half a diameter.
         """
         scale = self.options.correlated_points / max(estimate.quality, 0.05)
-        widest = np.array([0.5] * 3 + [0.5 * self.diameter_mm] * 3)
-        covariance = np.linalg.inv(estimate.information / scale + np.diag(1.0 / widest**2))
+        max_sigma = np.array([0.5] * 3 + [0.5 * self.diameter_mm] * 3)
+        covariance = np.linalg.inv(estimate.information / scale + np.diag(1.0 / max_sigma**2))
         return np.asarray(covariance, dtype=np.float64)

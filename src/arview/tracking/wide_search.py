@@ -21,7 +21,7 @@ from arview.detection.features.response_maps import response_maps, score_around
 from arview.detection.search.pattern_search import search_poses
 from arview.detection.search.template_bank import select_distinct
 from arview.geometry import Array, turn_ball
-from arview.refinement.modalities.region import BINS
+from arview.refinement.modalities.region import BINS, ColorModel
 
 
 @dataclass(frozen=True)
@@ -73,12 +73,12 @@ class WideSearch:
         self._turns = turn_ball(self.options.turn_reach_deg, self.options.turn_step_deg)
         self._stretches = np.array(self.options.stretches)
 
-    def find(self, image: NDArray[np.uint8], colours: tuple[NDArray[np.int64], Array], start: Array) -> list[Array]:
+    def find(self, image: NDArray[np.uint8], colors: ColorModel, start: Array) -> list[Array]:
         """The likeliest poses (``cam_from_body``) around a start, best first; none outside the picture.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
-            colours: bins of the channel values, and the log-odds (4096,) of the part against the background.
+            colors: colours of part and background.
             start: (4,4) ``cam_from_body``.
         """
         o = self.options
@@ -86,7 +86,7 @@ class WideSearch:
         if start[2, 3] <= 0 or not np.all(np.isfinite(center)):
             return []
         radius_px = 0.5 * self._diameter_mm * self._camera.fx / start[2, 3]
-        made = self._maps(image, colours, center, (1.1 + o.shift) * radius_px, o.radii_px[0] / radius_px)
+        made = self._maps(image, colors, center, (1.1 + o.shift) * radius_px, o.radii_px[0] / radius_px)
         if made is None:
             return []
         maps, intrinsics = made
@@ -107,7 +107,7 @@ class WideSearch:
         best = poses[0]
         radius_px = 0.5 * self._diameter_mm * self._camera.fx / best[2, 3]
         center = self._camera.project(best[:3, 3])
-        made = self._maps(image, colours, center, 1.25 * radius_px, o.radii_px[1] / radius_px)
+        made = self._maps(image, colors, center, 1.25 * radius_px, o.radii_px[1] / radius_px)
         if made is None:
             return []
         maps, intrinsics = made
@@ -147,7 +147,7 @@ class WideSearch:
     def _maps(
         self,
         image: NDArray[np.uint8],
-        colours: tuple[NDArray[np.int64], Array],
+        colors: ColorModel,
         center: Array,
         reach_px: float,
         scale: float,
@@ -161,7 +161,7 @@ class WideSearch:
         small = np.round((last - first) * scale).astype(int)
         if small.min() < 16:
             return None
-        crop = _with_odds(image[first[1] : last[1], first[0] : last[0]], *colours)
+        crop = _with_odds(image[first[1] : last[1], first[0] : last[0]], colors.bin_of, colors.odds)
         way = cv2.INTER_AREA if scale * pool < 0.6 else cv2.INTER_LINEAR
         crop = np.asarray(cv2.resize(crop, (pool * int(small[0]), pool * int(small[1])), interpolation=way))
         stretch = small / (last - first)

@@ -139,7 +139,7 @@ class ProfileRanker:
             name, step, some = batch
             return np.asarray(
                 score_profiles(
-                    pyramid.level(step), part.distinct, poses[some], np.log(view_lines[some]), part.views.diameter_mm,
+                    pyramid.level(step), part.resolvable, poses[some], np.log(view_lines[some]), part.views.diameter_mm,
                     ranker_layers(name),
                 )
             )  # fmt: skip
@@ -159,7 +159,7 @@ def describe_poses(
     for step, some in _batches(pyramid, part, poses, radius_px):
         for k in some:
             describe_profiles(
-                pyramid.level(step), part.distinct, poses[k], np.log(view_lines[k]), part.views.diameter_mm,
+                pyramid.level(step), part.resolvable, poses[k], np.log(view_lines[k]), part.views.diameter_mm,
                 profiles[k], scalars[k],
             )  # fmt: skip
     return profiles, scalars

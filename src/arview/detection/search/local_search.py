@@ -31,7 +31,7 @@ from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.refinement.evidence import DECISION_SCORE, PoseEvidence
 from arview.refinement.refiner import PoseRefiner
-from arview.refinement.schedules import NEAR_STAGES, SETTLING_STAGES, Stage
+from arview.refinement.schedules import NEAR_STAGES, SEARCH_STAGES, Stage
 from arview.refinement.view_model import PartView
 
 
@@ -58,9 +58,9 @@ BEFORE_WORTH = 0.5
 something in the way the right pose is among the first forty of a level in 52 with it, in 48 without."""
 COARSE_TOLERANCE_PX, FINE_TOLERANCE_PX = 3.5, 1.5
 """After the coarse and the fine stages edges are looked for this near."""
-FINE_STAGES = (SETTLING_STAGES, NEAR_STAGES)
+FINE_STAGES = (SEARCH_STAGES, NEAR_STAGES)
 """Both ways are gone: edges and colours; near edges alone, for what hides a part of the outline pulls the colours."""
-LAST_STAGE = SETTLING_STAGES[-1:]
+LAST_STAGE = SEARCH_STAGES[-1:]
 LARGEST_LOSS = 3.0
 """Shading may cost so much of what outline and edges say of a pose."""
 
@@ -239,7 +239,7 @@ class LocalSearch:
         def search(job: tuple[int, Array]) -> tuple[Array, Array]:
             maps, intrinsics = picture.maps(job[0])
             found: tuple[Array, Array] = search_poses(
-                maps, self.refiner.part.distinct, job[1], intrinsics, 0.01 * self.views.diameter_mm,
+                maps, self.refiner.part.resolvable, job[1], intrinsics, 0.01 * self.views.diameter_mm,
                 np.deg2rad(level.turn_step_deg), level.stretch_step, level.rounds, level.halvings, 2, 2,
                 level.points, level.points,
             )  # fmt: skip
@@ -293,7 +293,7 @@ class LocalSearch:
         poses = np.stack([h.cam_from_body for h in found])
         scores = self._verifier.scores(picture, poses, known).tolist()
         strips = self._strips.scores(picture, poses).tolist()
-        seen, part, step_mm = picture.edge_responses(), self.refiner.part.distinct, 0.01 * self.views.diameter_mm
+        seen, part, step_mm = picture.edge_responses(), self.refiner.part.resolvable, 0.01 * self.views.diameter_mm
         supports = [mean_edge_response(seen.maps, part, pose, seen.intrinsics, step_mm) for pose in poses]
         return [
             replace(h, verifier_score=score, edge_response=float(support), contour_score=across)

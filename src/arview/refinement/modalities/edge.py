@@ -1,52 +1,69 @@
-"""Edge modality: intensity steps across the projected CAD edges, several hypotheses a point, robust.
+"""Edge modality: grey-level steps across the projected edges of the CAD, with several hypotheses per point.
 
 RAPID (Harris 1990) and its successors with multiple hypotheses (Vacchetti, Lepetit & Fua, ISMAR 2004) and
 M-estimators (Drummond & Cipolla 2002; Comport et al. 2006). The local extrema of the slope across an edge are the
-hypotheses; at every solver step a point takes the one that best joins nearness and strength.
+hypotheses. At every update of the pose each point uses the hypothesis with the best product of strength and nearness.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
+from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.gauss_newton import add_line
 from arview.refinement.projection import project
 
-SOFT_EDGE_TRUST = 0.2
-"""Weight of folds of a curved surface against outline and design edges: they need not show, and texture is near."""
+SOFT_EDGE_WEIGHT = 0.2
+"""Weight of folds of a curved surface relative to outline and design edges. They may be invisible, and texture is often
+near them."""
 HYPOTHESES = 5
-"""Steps kept per point, the strongest."""
+"""Steps kept per point, the strongest ones."""
+CUT_OFF = 2.5
+"""Residuals from this multiple of the expected spread on do not count (Tukey's estimator)."""
+
+
+class EdgeProfiles(NamedTuple):
+    """Grey-level steps along the normals of N points.
+
+    Attributes:
+        positions: (N,K) px along the normal, relative to the point.
+        strengths: (N,K) slope in grey levels over two samples, with the sign of the step; 0 = no step.
+        visible: (N,) whether the profile is inside the picture.
+    """
+
+    positions: Array
+    strengths: Array
+    visible: NDArray[np.bool_]
 
 
 def smoothed(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A grey picture (H,W) as the edge modality takes it: averaged over 3×3."""
+    """Grey picture (H,W) averaged over 3×3 pixels, the input of the edge modality."""
     return np.asarray(cv2.blur(gray, (3, 3)))
 
 
 @kernel
-def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # type: ignore[no-untyped-def]
-    """Intensity steps along the normal of each point.
+def measure_edges(gray, lines, reach, step_px, threshold):  # type: ignore[no-untyped-def]
+    """Grey-level steps along the normal of each point, see `EdgeProfiles`.
 
     Args:
-        gray: (H,W) uint8, smoothed by 3×3: it stands for averaging over neighbouring lines.
-        pixels, normals, depths: of the projected points, see `project_lines`.
+        gray: (H,W) uint8, smoothed over 3×3, which replaces averaging over neighbouring profiles.
+        lines: `ProjectedLines` of the points.
         reach: samples to either side.
         step_px: distance between samples.
         threshold: weakest step, grey levels over two samples.
-
-    Returns:
-        positions (N,K) px along the normal, strengths (N,K) grey levels with the sign of the step, 0 = none;
-        seen (N,) whether the profile was inside the picture.
     """
+    pixels, normals, depths = lines.pixels, lines.normals, lines.depths
     height, width = gray.shape
     count = pixels.shape[0]
-    positions = np.zeros((count, 5))
-    strengths = np.zeros((count, 5))
-    seen = np.zeros(count, dtype=np.bool_)
+    positions = np.zeros((count, HYPOTHESES))
+    strengths = np.zeros((count, HYPOTHESES))
+    visible = np.zeros(count, dtype=np.bool_)
     size = 2 * reach + 3
     profile = np.empty(size)
     slope = np.zeros(size)
@@ -75,7 +92,7 @@ def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # 
                 last = min(last, k - 1)
         if last - first < 4:
             continue
-        seen[i] = True
+        visible[i] = True
         for k in range(first + 1, last):
             slope[k] = 0.5 * (profile[k + 1] - profile[k - 1])
         kept = 0
@@ -90,9 +107,9 @@ def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # 
             offset = 0.5 * (a - b) / bend if bend < -1e-9 else 0.0
             position = (k - half + min(max(offset, -0.5), 0.5)) * step_px
             slot = kept
-            if kept == 5:
+            if kept == HYPOTHESES:
                 slot = 0
-                for j in range(1, 5):
+                for j in range(1, HYPOTHESES):
                     if abs(strengths[i, j]) < abs(strengths[i, slot]):
                         slot = j
                 if abs(strengths[i, slot]) >= s:
@@ -101,24 +118,32 @@ def measure_edges(gray, pixels, normals, depths, reach, step_px, threshold):  # 
                 kept += 1
             positions[i, slot] = position
             strengths[i, slot] = slope[k]
-    return positions, strengths, seen
+    return EdgeProfiles(positions, strengths, visible)
 
 
 @kernel
 def add_edges(  # type: ignore[no-untyped-def]
-    hessian, gradient, points, kinds, cam_from_body, intrinsics, pixels, normals, positions, strengths,
-    strength_half, sigma_px, spread_px, weight
+    hessian, gradient, points, kinds, cam_from_body, intrinsics, lines, profiles, strength_half, sigma_px, spread_px,
+    weight
 ):  # fmt: skip
-    """Add the chosen hypothesis of each point to the 6×6 system.
+    """Add the best hypothesis of each point to the 6×6 system.
 
-    ``kinds`` are EDGE_* bits. ``spread_px`` is how far the pose may still be off: hypotheses are judged by
-    strength × Gaussian of that width,
-    and residuals beyond about twice it fade out (Tukey). Returns the summed weighted squared residual and weight.
+    Args:
+        hessian, gradient: (6,6) and (6,) of the system.
+        points, kinds: (N,3) in the body frame, and their EDGE_* bits.
+        cam_from_body, intrinsics: current pose (4,4) and camera.
+        lines: `ProjectedLines` of the points at the pose of the measurement.
+        profiles: `EdgeProfiles` measured there.
+        strength_half: strength in grey levels that has half the weight of a very strong step.
+        sigma_px: standard deviation of a correct step.
+        spread_px: expected distance of the pose from the edges: the best hypothesis maximises strength × Gaussian of
+            this width.
+        weight: of the modality.
     """
     r = cam_from_body
-    cut = 2.5 * spread_px
-    sum_weight = 0.0
-    sum_square = 0.0
+    pixels, normals = lines.pixels, lines.normals
+    positions, strengths = profiles.positions, profiles.strengths
+    cut = CUT_OFF * spread_px
     for i in range(points.shape[0]):
         best = 0.0
         residual = 0.0
@@ -133,7 +158,7 @@ def add_edges(  # type: ignore[no-untyped-def]
             continue
         u, v = project(x, y, z, intrinsics)
         here = (u - pixels[i, 0]) * normals[i, 0] + (v - pixels[i, 1]) * normals[i, 1]
-        for j in range(5):
+        for j in range(HYPOTHESES):
             s = abs(strengths[i, j])
             if s == 0.0:
                 break
@@ -148,8 +173,5 @@ def add_edges(  # type: ignore[no-untyped-def]
         fade = 1.0 - (residual / cut) ** 2
         w = weight * fade * fade * strength / (strength + strength_half) / (sigma_px * sigma_px)
         if (kinds[i] & (EDGE_CONTOUR | EDGE_SHARP)) == 0:
-            w *= SOFT_EDGE_TRUST
+            w *= SOFT_EDGE_WEIGHT
         add_line(hessian, gradient, p, r, x, y, z, normals[i, 0], normals[i, 1], intrinsics, residual, w)
-        sum_weight += w
-        sum_square += w * residual * residual
-    return sum_square, sum_weight

@@ -1,7 +1,7 @@
-"""Keyframes of the feature modality: pictures of known pose with corners on the part and their surface in 3D.
+"""Keyframes of the texture modality: pictures of known pose with corners on the part's surface.
 
-Corners by the minimum eigenvalue of the gradient's covariance (Shi & Tomasi, CVPR 1994); their 3D points and
-normals come from rays cast onto the CAD, so a keyframe needs one picture only.
+Corners are found by the minimum eigenvalue of the gradient's covariance (Shi & Tomasi, CVPR 1994). Their 3D points and
+normals come from rays cast at the CAD, so that a keyframe needs a single picture.
 """
 
 from __future__ import annotations
@@ -20,28 +20,36 @@ from arview.refinement.projection import project
 from arview.rendering.raycast import RayCaster, cast_ray
 
 _RESPONSE = (8.0 / (4 * 255)) ** 2
-"""What cornerMinEigenVal (3×3 Sobel, uint8) gives for a mean squared gradient of one (grey level/px)²."""
+"""Response of cornerMinEigenVal (3×3 Sobel, uint8) to a mean squared gradient of one (grey level/px)²."""
 
 
 @dataclass(frozen=True)
 class TextureOptions:
-    """Options of the feature modality.
+    """Options of the texture modality.
 
     Attributes:
-        levels: of the pyramid; the common shift is searched at the last: 4 px there are 32 px in the picture.
-        search_px: reach of the common shift at the last level, px of that level; 0 leaves the search out.
-        max_corners, min_corners: per keyframe; with fewer than the least, no keyframe is made.
-        corner_distance_px: least distance of two corners.
-        corner_contrast: weakest corner, rms gradient along the weaker direction, grey levels per px
-            of the half-size picture.
-        margin_px: the surface must go on for so far around a corner, or the patch would hold background.
-        flatness_px: largest height of that surroundings over the tangent plane, px of the keyframe.
-        min_facing: least cosine between surface normal and line of sight; foreshortened patches match badly.
-        check_occlusion: cast a shadow ray from each point to the camera.
-        min_ncc: least normalised correlation of an aligned patch with its keyframe.
+        levels: levels of the image pyramid. The common shift is searched for at the coarsest, where 4 px are 32 px of
+            the picture.
+        search_px: largest common shift, px of the coarsest level; 0 leaves this search out.
+        max_corners: corners kept in a keyframe.
+        min_corners: corners needed for a keyframe.
+        corner_distance_px: smallest distance between two corners.
+        corner_contrast: weakest corner: rms gradient along the weaker direction, grey levels per px of the half-size
+            picture.
+        margin_px: the surface must continue this far around a corner, so that patches hold no background.
+        flatness_px: largest height of these surroundings over the tangent plane, px of the keyframe.
+        min_facing: smallest cosine between surface normal and line of sight; foreshortened patches match badly.
+        check_occlusion: test by a ray from each point to the camera whether the part hides it.
+        min_ncc: smallest normalised correlation of an aligned patch with its keyframe.
         neighbour_px: largest deviation from the median displacement of the nearest neighbours.
-        view_step_rad, roll_step_rad, scale_step: a view differing by more asks for a new keyframe.
-        max_keyframes: the least recently used is dropped beyond.
+        view_step_rad: difference in direction of view that asks for a new keyframe.
+        roll_step_rad: difference in roll that asks for a new keyframe.
+        scale_step: relative difference in distance that asks for a new keyframe.
+        max_keyframes: keyframes kept; the least recently used is dropped beyond.
+        replace_distance: a keyframe nearer than this to a new one, in the steps above, is replaced by it.
+        min_trust: trust below which a corner is no longer used.
+        trust_rate: share by which a corner's trust follows each frame.
+        trusted_px: distance from where the pose places it within which a found corner gains trust.
     """
 
     levels: int = 4
@@ -60,27 +68,31 @@ class TextureOptions:
     roll_step_rad: float = 0.26
     scale_step: float = 0.15
     max_keyframes: int = 12
+    replace_distance: float = 0.3
+    min_trust: float = 0.2
+    trust_rate: float = 0.1
+    trusted_px: float = 2.0
 
     def __post_init__(self) -> None:
         if not 2 <= self.levels <= 6:
-            raise InputError(f"feature options: levels is {self.levels}, expected 2 to 6")
+            raise InputError(f"texture options: levels is {self.levels}, expected 2 to 6")
         if not 0 < self.min_corners <= self.max_corners:
             raise InputError(
-                f"feature options: min_corners {self.min_corners} is not in 1..max_corners {self.max_corners}"
+                f"texture options: min_corners {self.min_corners} is not in 1..max_corners {self.max_corners}"
             )
         if not 0.0 < self.min_ncc < 1.0:
-            raise InputError(f"feature options: min_ncc is {self.min_ncc}, expected within 0 to 1")
+            raise InputError(f"texture options: min_ncc is {self.min_ncc}, expected within 0 to 1")
 
 
 class Anchors(NamedTuple):
-    """The features of a keyframe, as the kernels take them.
+    """Corners of a keyframe in the form of the kernels.
 
     Attributes:
         pixels: (N,2) corners, px from the first pixel of the keyframe's cropped pyramid.
-        points: (N,3) in the body, mm.
-        tangents: (N,2,3) unit vectors spanning the surface; their cross product looks away from the camera.
+        points: (N,3) mm in the body frame.
+        tangents: (N,2,3) unit vectors that span the surface; their cross product points away from the camera.
         jacobians: (N,2,2) px per mm along the tangents.
-        trust: (N,) 0–1, falls when a feature is found elsewhere than the pose says.
+        trust: (N,) 0–1; falls when a corner is found away from where the pose places it.
     """
 
     pixels: Array
@@ -92,7 +104,14 @@ class Anchors(NamedTuple):
 
 @dataclass(eq=False)
 class Keyframe:
-    """A view of the part with a known pose; ``pyramid`` is the part's rectangle of each level."""
+    """A picture of the part with a known pose.
+
+    Attributes:
+        cam_from_body: (4,4) pose.
+        pyramid: crop around the part of each level of the image pyramid.
+        anchors: corners on the part.
+        last_used: counter value of the last use.
+    """
 
     cam_from_body: Array
     pyramid: Pyramid
@@ -102,7 +121,7 @@ class Keyframe:
 
 @kernel(inline=True)
 def to_camera(m, x, y, z):  # type: ignore[no-untyped-def]
-    """A point mapped by a (4,4) rigid transform."""
+    """Point (x, y, z) transformed by a rigid transform (4,4)."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
         m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
@@ -112,7 +131,10 @@ def to_camera(m, x, y, z):  # type: ignore[no-untyped-def]
 
 @kernel
 def tangent_jacobian(point, tangents, cam_from_body, intrinsics, out):  # type: ignore[no-untyped-def]
-    """Pixel, depth, and (2,2) px per mm along the two tangents (central differences over about 4 px)."""
+    """Pixel u, v and depth of a point; depth -1 behind the camera.
+
+    Fills ``out`` (2,2) with px per mm along the two tangents, by central differences over about 4 px.
+    """
     x, y, z = to_camera(cam_from_body, point[0], point[1], point[2])
     if z < 1.0:
         return 0.0, 0.0, -1.0
@@ -133,7 +155,7 @@ def tangent_jacobian(point, tangents, cam_from_body, intrinsics, out):  # type: 
 
 @kernel
 def _best_corners(response, threshold, cell):  # type: ignore[no-untyped-def]
-    """The strongest pixel of each ``cell`` × ``cell`` square if a local maximum: (N,3) u, v, response."""
+    """Strongest pixel of each square of ``cell`` × ``cell`` pixels that is a local maximum: (N,3) u, v, response."""
     height, width = response.shape
     rows, columns = (height + cell - 1) // cell, (width + cell - 1) // cell
     found = np.empty((rows * columns, 3))
@@ -157,7 +179,7 @@ def _best_corners(response, threshold, cell):  # type: ignore[no-untyped-def]
 
 @kernel
 def _unproject(u, v, intrinsics):  # type: ignore[no-untyped-def]
-    """Ideal x, y at z = 1 of a pixel; distortion is removed by iteration."""
+    """Undistorted x, y at z = 1 of a pixel, by fixed-point iteration."""
     x = xd = (u - intrinsics[2]) / intrinsics[0]
     y = yd = (v - intrinsics[3]) / intrinsics[1]
     if intrinsics[9] != 0.0:
@@ -170,32 +192,35 @@ def _unproject(u, v, intrinsics):  # type: ignore[no-untyped-def]
 
 @kernel
 def _place_corners(hierarchy, body_from_cam, corners, intrinsics, margin_px,  # type: ignore[no-untyped-def]
-                   distance_px, flatness_px, min_facing, most):  # fmt: skip
+                   distance_px, flatness_px, min_facing, max_count):  # fmt: skip
     """Corners that lie on a smooth piece of the part's surface, strongest first.
 
-    Rays go through the corner and ``margin_px`` left, right, above and below it. The surface normal is taken
-    across these four hits, which smooths the tessellation; steps and creases stand off that plane and are
-    refused. Returns the number kept, their indices (most,), points (most,3) and tangents (most,2,3) in the
-    body.
+    Rays are cast through the corner and ``margin_px`` left, right, above and below it. The surface normal is taken
+    across these four hits, which smooths the tessellation. Corners near steps and creases, which stand off that plane,
+    are refused.
+
+    Returns:
+        Number of corners kept, and their indices (max_count,), points (max_count,3) and tangents (max_count,2,3) in
+        the body frame.
     """
-    kept = np.empty(most, dtype=np.int64)
-    points = np.empty((most, 3))
-    tangents = np.empty((most, 2, 3))
+    kept = np.empty(max_count, dtype=np.int64)
+    points = np.empty((max_count, 3))
+    tangents = np.empty((max_count, 2, 3))
     around = np.empty((5, 3))
     n = np.empty(3)
     sight = np.empty(3)
     r = body_from_cam
     used = 0
     for i in range(corners.shape[0]):
-        if used == most:
+        if used == max_count:
             break
-        crowded = False
+        is_taken = False
         for k in range(used):
             du, dv = corners[i, 0] - corners[kept[k], 0], corners[i, 1] - corners[kept[k], 1]
             if du * du + dv * dv < distance_px * distance_px:
-                crowded = True
+                is_taken = True
                 break
-        if crowded:
+        if is_taken:
             continue
         whole = True
         middle = 0.0
@@ -233,7 +258,7 @@ def _place_corners(hierarchy, body_from_cam, corners, intrinsics, margin_px,  # 
         a /= np.sqrt(np.sum(a * a))
         kept[used] = i
         points[used] = around[0]
-        # The second tangent is n × t0, so that t0 × t1 = n, which looks away from the camera as a × b does.
+        # The second tangent is n × t0, so that t0 × t1 = n, which points away from the camera as a × b does.
         tangents[used, 0] = a
         tangents[used, 1, 0] = n[1] * a[2] - n[2] * a[1]
         tangents[used, 1, 1] = n[2] * a[0] - n[0] * a[2]
@@ -244,7 +269,7 @@ def _place_corners(hierarchy, body_from_cam, corners, intrinsics, margin_px,  # 
 
 @kernel
 def _all_jacobians(points, tangents, cam_from_body, intrinsics):  # type: ignore[no-untyped-def]
-    """(N,2,2) of `tangent_jacobian`."""
+    """Jacobians (N,2,2) of all points, see `tangent_jacobian`."""
     jacobians = np.empty((points.shape[0], 2, 2))
     for i in range(points.shape[0]):
         tangent_jacobian(points[i], tangents[i], cam_from_body, intrinsics, jacobians[i])
@@ -259,22 +284,22 @@ def make_keyframe(
     intrinsics: Array,
     options: TextureOptions,
 ) -> Keyframe | None:
-    """Keyframe of a picture, or None when too few corners lie on the part.
+    """Keyframe of a picture; None when too few corners lie on the part.
 
     Args:
-        pyramid: of the picture.
-        cam_from_body: (4,4) its pose.
+        pyramid: image pyramid of the picture.
+        cam_from_body: (4,4) pose of the part.
         outline: (K,2) convex polygon around the part, px.
-        caster: of the part in the body.
-        intrinsics: (10,) as in `solver.project`.
-        options: of the modality.
+        caster: ray caster of the part in the body frame.
+        intrinsics: (10,) as of `intrinsics_of`.
+        options: options of the modality.
     """
     o = options
     rectangle = _rectangle(outline, pyramid)
     if rectangle is None:
         return None
     left, top, right, bottom = rectangle
-    # Corners of the half-size picture: four times as quick, quieter, and as wide as the patches.
+    # The half-size picture has less noise, takes a quarter of the time, and its corners are as wide as the patches.
     half = pyramid[1][top >> 1 : bottom >> 1, left >> 1 : right >> 1]
     response = cv2.cornerMinEigenVal(half, 3, ksize=3)
     mask = np.zeros(response.shape, dtype=np.uint8)
@@ -308,10 +333,10 @@ def make_keyframe(
 
 
 def _rectangle(outline: Array, pyramid: Pyramid) -> tuple[int, int, int, int] | None:
-    """Left, top, right, bottom px around an outline (K,2) in the picture, on the coarsest level's grid."""
+    """Left, top, right and bottom px of a rectangle around an outline (K,2), on the grid of the coarsest level."""
     height, width = pyramid[0].shape
     grid = 1 << (len(pyramid) - 1)
-    # Room for the warped patches of the coarser levels.
+    # The margin leaves room for warped patches of the coarser levels.
     low = np.maximum(outline.min(axis=0) - 5 * grid, 0.0)
     high = np.minimum(outline.max(axis=0) + 5 * grid, (width, height))
     if np.any(high - low < 16):

@@ -1,8 +1,7 @@
-"""Patches of texture: pyramid, templates, and their alignment by inverse-compositional Lucas-Kanade.
+"""Alignment of texture patches: image pyramid, templates, and inverse-compositional Lucas-Kanade.
 
-Baker & Matthews, "Lucas-Kanade 20 years on" (IJCV 2004), for translation only; brightness gain and offset are
-projected out of the steepest-descent images (Hager & Belhumeur, PAMI 1998), so exposure may jump between
-frames.
+Baker & Matthews, "Lucas-Kanade 20 years on" (IJCV 2004), for translations only. Brightness gain and offset are
+projected out of the steepest-descent images (Hager & Belhumeur, PAMI 1998), so that exposure may change between frames.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ Pyramid = tuple[NDArray[np.uint8], ...]
 
 
 def build_pyramid(gray: NDArray[np.uint8], levels: int) -> Pyramid:
-    """``levels`` images (H,W) uint8, each half the last; (u, v) of level l is (u, v)·2^l of the first."""
+    """``levels`` images (H,W) uint8, each half the size of the last; (u, v) on level l is (u, v)·2^l on the first."""
     pyramid = [np.ascontiguousarray(gray)]
     for _ in range(levels - 1):
         pyramid.append(cv2.pyrDown(pyramid[-1]))
@@ -26,7 +25,7 @@ def build_pyramid(gray: NDArray[np.uint8], levels: int) -> Pyramid:
 
 @kernel(fastmath=True)
 def sample_patch(image, u, v, warp, half, out):  # type: ignore[no-untyped-def]
-    """Fill out (2·half+1)² with the image at (u, v) + warp · offset; False when it leaves the image."""
+    """Fill ``out`` (2·half+1)² with the image at (u, v) + warp · offset; False when the patch leaves the image."""
     height, width = image.shape
     reach_u = half * (abs(warp[0, 0]) + abs(warp[0, 1]))
     reach_v = half * (abs(warp[1, 0]) + abs(warp[1, 1]))
@@ -49,10 +48,16 @@ def sample_patch(image, u, v, warp, half, out):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath=True)
 def prepare_template(patch, side, template, across, down):  # type: ignore[no-untyped-def]
-    """Zero-mean template of unit norm and its gradients made orthogonal to it and to a constant.
+    """Fill ``template`` with zero mean and unit norm, and its gradients orthogonal to it and to a constant.
 
-    From a patch (side+2)² with a border. Returns the inverse of the (2,2) normal matrix as its (0,0), (0,1)
-    and (1,1) entries, and the norm of the template; a norm of 0 says that the patch has no usable texture.
+    Args:
+        patch: (side+2)² with a border of one pixel.
+        side: of the template, px.
+        template, across, down: (side²,) outputs.
+
+    Returns:
+        Entries (0,0), (0,1) and (1,1) of the inverse of the (2,2) normal matrix, and the norm of the template, which is
+        0 for a patch without usable texture.
     """
     count = side * side
     mean_t, mean_x, mean_y = np.float32(0.0), np.float32(0.0), np.float32(0.0)
@@ -99,10 +104,19 @@ def prepare_template(patch, side, template, across, down):  # type: ignore[no-un
 
 @kernel(fastmath=True)
 def align_template(image, u, v, side, template, across, down, normal, norm, steps, stop_px):  # type: ignore[no-untyped-def]
-    """Shift a prepared template onto the image from (u, v); returns u, v, correlation (-1 = failed).
+    """Align a prepared template with the image, starting at (u, v).
 
-    The gradients are orthogonal to template and constant, so gain and offset need no estimate in the
-    residual; the gain only scales the step.
+    The gradients are orthogonal to the template and to a constant, so that gain and offset do not enter the residual;
+    the gain only scales the step.
+
+    Args:
+        image: (H,W) uint8.
+        side, template, across, down, normal, norm: of the template, see `prepare_template`.
+        steps: largest number of updates.
+        stop_px: the alignment has converged when an update is shorter.
+
+    Returns:
+        u, v and the normalised correlation, -1 = failed.
     """
     height, width = image.shape
     half = side // 2
@@ -155,10 +169,10 @@ def align_template(image, u, v, side, template, across, down, normal, norm, step
 
 @kernel(fastmath=True)
 def common_shift(key_image, image, scale, key_pixels, pixels, warps, chosen, reach):  # type: ignore[no-untyped-def]
-    """One shift (du, dv) in px of the finest level that lays the chosen patches best onto a coarse image.
+    """Shift (du, dv), px of the finest level, that aligns the chosen patches best with a coarse image.
 
-    Exhaustive over ±reach px of the level, scored by the sum of squared positive correlations, so that
-    patches on something else count for little; refined by parabolas.
+    The search is exhaustive over ±``reach`` px of the coarse level and refined by parabolas. A shift is scored by the
+    sum of squared positive correlations, so that patches on another surface count little.
     """
     side, half = 7, 3
     span = 2 * reach + 1

@@ -1,13 +1,15 @@
-"""Region modality: where along its normal does each contour point part the part's colours from the background's?
+"""Region modality: displacement of the contour along its normals that best separates part and background by colour.
 
-Colour histograms of both sides give every pixel a probability; a line of pixels across the contour then gives a
-posterior over the contour's displacement, taken as a Gaussian: Stoiber et al., "SRT3D: A Sparse Region-Based 3D
-Object Tracking Approach for the Real World" (IJCV 2022), after Prisacariu & Reid, "PWP3D" (IJCV 2012).
-Own here: the information that a flat posterior seems to hold (the width of its support) is taken out again, so that
-lines that see nothing weigh nothing.
+Colour histograms of both sides give a probability for every pixel. A line of pixels across the contour then gives a
+posterior of the contour's displacement, approximated by a Gaussian: Stoiber et al., "SRT3D: A Sparse Region-Based 3D
+Object Tracking Approach for the Real World" (IJCV 2022), after Prisacariu & Reid, "PWP3D" (IJCV 2012). In addition to
+SRT3D, the information that a flat posterior seems to hold, because its support is bounded, is subtracted, so that lines
+without any contrast have no weight.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,29 +20,70 @@ from arview.refinement.gauss_newton import add_line
 from arview.refinement.projection import project
 
 BINS = 16
-"""Histogram bins per colour channel; 16³ log-odds stay in the first-level cache."""
+"""Histogram bins per colour channel: 16³ log odds fit into the first-level cache."""
 _DISPLACEMENTS = 12
 _SEGMENTS = 19
 
 
+class ColorModel(NamedTuple):
+    """Colours of part and background in the form of the kernels.
+
+    Attributes:
+        bin_of: (256,) histogram bin of a channel value, which takes a change of exposure out.
+        odds: (BINS³,) log odds of part against background.
+        edge_function: (19,12) see `EDGE_FUNCTION`.
+    """
+
+    bin_of: NDArray[np.int64]
+    odds: Array
+    edge_function: Array
+
+
+class RegionLines(NamedTuple):
+    """Displacement of the contour along N lines across it.
+
+    Attributes:
+        mean: (N,) px along the outward normal.
+        information: (N,) 1/px²; 0 for a line without contrast.
+        agreement: (N,) 0–1, how much better a contour explains the colours than none does; -1 for lines that were not
+            measured.
+    """
+
+    mean: Array
+    information: Array
+    agreement: Array
+
+
 def _edge_function() -> Array:
-    """(19, 12): 2 h - 1, h the probability of "part" of segment r under displacement d (SRT3D eq. 13)."""
+    """(19,12) 2 h - 1, with the probability h of "part" for segment r at displacement d (SRT3D eq. 13)."""
     r = np.arange(_SEGMENTS) - 0.5 * (_SEGMENTS - 1)
     d = np.arange(_DISPLACEMENTS) - 0.5 * (_DISPLACEMENTS - 1)
     return np.ascontiguousarray(-0.86 * np.tanh((r[:, None] - d[None, :]) / (2.0 * 0.5)))
 
 
 EDGE_FUNCTION = _edge_function()
+"""Smoothed step from part to background: rows are the segments of a line, columns the displacements of the contour."""
 
 
 def value_bins(gain: float) -> NDArray[np.int64]:
-    """(256,) histogram bin of a channel value in a picture ``gain`` times brighter than the colours learned."""
+    """(256,) histogram bin of a channel value in a picture ``gain`` times brighter than the learned colours."""
     return np.minimum(np.arange(256) / gain / (256 / BINS), BINS - 1).astype(np.int64)
 
 
 @kernel
-def add_histograms(image, bin_of, pixels, normals, depths, runs_mm, focal, fore, back, reach_px, gap_px):  # type: ignore[no-untyped-def]
-    """Count the colours within ``reach_px`` inside and outside of the contour into fore and back (4096,)."""
+def add_histograms(image, bin_of, lines, runs_mm, focal, fore, back, reach_px, gap_px):  # type: ignore[no-untyped-def]
+    """Count the colours inside and outside the contour into ``fore`` and ``back`` (BINS³,).
+
+    Args:
+        image: (H,W,3) uint8 RGB.
+        bin_of: (256,) histogram bin of a channel value.
+        lines: `ProjectedLines` of the contour.
+        runs_mm: (N,2) how far the picture stays part and background along each line.
+        focal: focal length, px.
+        reach_px: pixels counted to either side.
+        gap_px: pixels beside the contour that are left out.
+    """
+    pixels, normals, depths = lines.pixels, lines.normals, lines.depths
     height, width = image.shape[0], image.shape[1]
     for i in range(pixels.shape[0]):
         z = depths[i]
@@ -65,25 +108,30 @@ def add_histograms(image, bin_of, pixels, normals, depths, runs_mm, focal, fore,
 
 @kernel
 def log_odds(fore, back, out):  # type: ignore[no-untyped-def]
-    """Log-odds (4096,) of "part" against "background" per colour; unseen colours say nothing."""
+    """Fill ``out`` (BINS³,) with the log odds of part against background per colour; 0 for colours never observed."""
     total_fore = fore.sum() + 1e-9
     total_back = back.sum() + 1e-9
     for i in range(fore.shape[0]):
-        # A pseudo-count keeps rare colours from being believed.
+        # A pseudo-count limits the odds of rare colours.
         f = fore[i] / total_fore + 2e-4
         b = back[i] / total_back + 2e-4
         out[i] = np.log(f / b)
 
 
 @kernel(fastmath=True)
-def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds, edge_function, scale):  # type: ignore[no-untyped-def]
-    """Displacement of the contour along each line.
+def measure_region(image, colors, lines, runs_mm, focal, scale):  # type: ignore[no-untyped-def]
+    """Displacement of the contour along each line, see `RegionLines`.
 
-    ``bin_of`` (256,) gives the histogram bin of a channel's value, exposure taken out.
-
-    Returns mean (N,) px along the outward normal, information (N,) 1/px² (0 = the line says nothing), and agreement
-    (N,) 0–1: how much better the colours fit a contour than no contour, -1 for lines that were not looked at.
+    Args:
+        image: (H,W,3) uint8 RGB.
+        colors: `ColorModel`.
+        lines: `ProjectedLines` of the contour.
+        runs_mm: (N,2) how far the picture stays part and background along each line.
+        focal: focal length, px.
+        scale: pixels per segment.
     """
+    bin_of, odds, edge_function = colors.bin_of, colors.odds, colors.edge_function
+    pixels, normals, depths = lines.pixels, lines.normals, lines.depths
     height, width = image.shape[0], image.shape[1]
     count = pixels.shape[0]
     mean = np.zeros(count)
@@ -92,7 +140,7 @@ def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds,
     posterior = np.empty(12)
     flat = 1.0 / 12.0
     half = 0.5 * 19 * scale
-    # Long segments are sampled, not summed: neighbours say the same.
+    # Long segments are sampled, because neighbouring pixels are similar.
     hop = max(1, scale // 3)
     soften = 0.55 * np.sqrt(scale) / (1 + (scale - 1) // hop)
     for i in range(count):
@@ -101,7 +149,7 @@ def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds,
             continue
         run_in = runs_mm[i, 0] * focal / z
         run_out = runs_mm[i, 1] * focal / z
-        # The line must stay on one side each for as long as the edge function matters.
+        # The line must stay on either side as far as the edge function varies.
         if run_in < 2.5 * scale or run_out < 2.5 * scale:
             continue
         u, v = pixels[i, 0], pixels[i, 1]
@@ -118,13 +166,13 @@ def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds,
             total = 0.0
             for k in range(0, scale, hop):
                 t = (s - 9.5) * scale + k + 0.5
-                # Beyond the run the line is on something else again: it says nothing there.
+                # Beyond the run the line is on another surface.
                 if t < -run_in or t > run_out:
                     continue
                 x = int(u + t * nu + 0.5)
                 y = int(v + t * nv + 0.5)
                 total += odds[bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]]
-            # A soft sign in place of tanh: probability of "part" less that of "background".
+            # Probability of "part" minus that of "background", by a soft sign instead of tanh.
             total *= soften
             lean = total / np.sqrt(1.0 + total * total)
             for d in range(12):
@@ -149,26 +197,24 @@ def measure_region(image, bin_of, pixels, normals, depths, runs_mm, focal, odds,
         shrink = (1.0 / variance) / gain
         mean[i] = scale * min(max(m * shrink, -8.0), 8.0)
         information[i] = gain / (scale * scale)
-    return mean, information, agreement
+    return RegionLines(mean, information, agreement)
 
 
 @kernel
-def add_region(  # type: ignore[no-untyped-def]
-    hessian,
-    gradient,
-    points,
-    cam_from_body,
-    intrinsics,
-    pixels,
-    normals,
-    mean,
-    information,
-    weight,
-    robust_px,
-):
-    """Add the lines' Gaussians to the 6×6 system at the current pose; returns cost and number of lines."""
+def add_region(hessian, gradient, points, cam_from_body, intrinsics, lines, region, weight, robust_px):  # type: ignore[no-untyped-def]
+    """Add the Gaussians of the lines to the 6×6 system.
+
+    Args:
+        hessian, gradient: (6,6) and (6,) of the system.
+        points: (N,3) contour points in the body frame.
+        cam_from_body, intrinsics: current pose (4,4) and camera.
+        lines: `ProjectedLines` of the points at the pose of the measurement.
+        region: `RegionLines` measured there.
+        weight: of the modality.
+        robust_px: residual that halves the weight of a line.
+    """
     r = cam_from_body
-    used = 0
+    pixels, normals, mean, information = lines.pixels, lines.normals, region.mean, region.information
     for i in range(points.shape[0]):
         if information[i] <= 0.0:
             continue
@@ -182,5 +228,3 @@ def add_region(  # type: ignore[no-untyped-def]
         residual = (u - pixels[i, 0]) * normals[i, 0] + (v - pixels[i, 1]) * normals[i, 1] - mean[i]
         w = weight * information[i] / (1.0 + (residual / robust_px) ** 2)
         add_line(hessian, gradient, p, r, x, y, z, normals[i, 0], normals[i, 1], intrinsics, residual, w)
-        used += 1
-    return used

@@ -1,14 +1,16 @@
-"""Shading modality: the brightness of a part's surface says how it is turned where its outline hardly does.
+"""Shading modality: refines the pose of a curved part by the brightness of its surface.
 
-The outline of a smooth part turns little with the part; the bright and dark places of its surface do. Under far lights
-the brightness of a matt surface is a quadratic function of its normal (Basri and Jacobs, "Lambertian reflectance and
-linear subspaces", PAMI 2003). Its nine coefficients, the light, are unknown; they are found together with the pose, and
-only what no other light could explain as well moves the pose. Own here: the Gauss–Newton system of both, reduced to
-the pose and added to what edges and colours know of it; shine, print and what hides the part are outliers.
+The outline of a smooth part changes little when the part turns, but the brightness of its surface does. Under distant
+lights the brightness of a matt surface is a quadratic function of its normal (Basri & Jacobs, "Lambertian reflectance
+and linear subspaces", PAMI 2003). The nine coefficients of this function, the light, are unknown and are estimated
+together with the pose. The Gauss-Newton system of both is reduced to the pose by the Schur complement, so that only
+brightness that no other light explains moves the pose, and is added to the information of edges and colours.
+Highlights, print and occluders are outliers of a robust estimator.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -22,48 +24,58 @@ from arview.guideviews.surface import Surface, draw_surface
 from arview.refinement.gauss_newton import apply_twist, relative_twist
 
 COEFFICIENTS = 9
-"""Of a light: spherical harmonics up to the second order, in the camera's frame, y down and z towards the camera."""
-RADIUS_PX = 26.0
-"""Half the part's diameter in the picture that is looked at; nothing is enlarged."""
-REACH = 1.15
-"""It shows so much around the part, in half diameters."""
+"""Coefficients of a light: spherical harmonics up to the second order in a frame with x right, y down and z towards the
+camera."""
 RIM_PX = 2
-"""So near to the surface's end, or to a jump in depth, its pixels are not looked at."""
-JUMP = 0.12
-"""In half diameters per pixel."""
+"""Pixels closer than this to the border of the surface or to a jump in depth are not used."""
+MAX_DEPTH_STEP = 0.12
+"""Larger steps in depth between neighbouring pixels, in half diameters, are jumps."""
 SMOOTH_COS = 0.2
-"""Nor where the surface turns by more over that way: beside an edge brightness says less than the edge itself."""
-FEWEST_PIXELS = 60
-"""Of fewer nothing is told."""
-GAIN = 5.0
-"""Of the system beside those of edges and colours, by the variance of what is left of the brightness."""
-PRIOR = 1e-4
-"""Of every pixel so much speaks for no shading: few normals leave some of a light open."""
-OUTLYING = 2.0
-"""Median deviations at which a pixel counts a quarter."""
-ROUNDS, FITS = 4, 3
-"""Of the pose; of the light before each, with what it does not explain counting less and less."""
-LARGEST_TURN_RAD = 0.12
-"""Of one round."""
-LEAST_DEVIATION = 1.0
-"""Grey levels: nothing is explained better than this."""
-LEAST_DETERMINED = 1e-9
-"""Least information along any direction, against that along the others, with which a pose is moved."""
-
-
+"""Pixels are not used, either, where normals within ``RIM_PX`` have a smaller cosine: there the edge tells more."""
+MIN_PIXELS = 60
+"""Pixels of the surface needed."""
+LIGHT_PRIOR = 1e-4
+"""Regularisation of the light per pixel, towards no shading, because few normals determine a light only in part."""
+MEAN_PRIOR = 1e-9
+"""The same for the mean brightness, which is always determined."""
+OUTLIER_SCALE = 2.0
+"""Multiple of the median residual at which a pixel has a quarter of its weight."""
+POSE_ROUNDS, LIGHT_ROUNDS = 4, 3
+"""Updates of the pose, and of the light with robust weights before each."""
+MAX_TURN_RAD = 0.12
+"""Largest rotation in one update."""
+MIN_DEVIATION = 1.0
+"""Smallest standard deviation of the brightness that is assumed, grey levels."""
+MIN_RELATIVE_INFORMATION = 1e-9
+"""Smallest eigenvalue of the normalised information with which a pose is updated."""
 CREASE_DEG = 40.0
-"""Surfaces that meet at more than this have an edge between them."""
-LEAST_CURVED, FLAT_DEG = 0.2, 0.5
-"""With less of its surface curved, by more than that angle from face to face, a part's shading is not looked at: flat
-faces tell nothing that the light could not be the reason of."""
+"""Faces that meet at a larger angle have an edge between them."""
 
 
-class LookedAt(NamedTuple):
-    """The part of a picture that a pose shows the part in, made small.
+@dataclass(frozen=True)
+class ShadingOptions:
+    """Options of the shading modality.
+
+    Attributes:
+        gain: weight of the shading relative to edges and colours, by the residual variance of the brightness.
+        radius_px: half diameter of the part in the reduced picture; smaller parts are not enlarged.
+        reach: half size of the crop, in half diameters of the part.
+        min_curved_share: share of curved surface needed, because any light can explain the brightness of flat faces.
+    """
+
+    gain: float = 5.0
+    radius_px: float = 26.0
+    reach: float = 1.15
+    min_curved_share: float = 0.2
+
+
+class ShadingCrop(NamedTuple):
+    """Reduced picture around the part.
 
     Attributes:
         bright: (H,W) float32 grey levels.
-        focal_px: (2,) of it; center_px: (2,) the principal point.
+        focal_px: (2,) focal lengths of the crop.
+        center_px: (2,) principal point of the crop.
     """
 
     bright: NDArray[np.float32]
@@ -71,8 +83,22 @@ class LookedAt(NamedTuple):
     center_px: Array
 
 
-def curved_share(surface: Surface) -> float:
-    """Share of a surface's area in faces that another one joins at an angle that is neither flat nor an edge."""
+class ShadedPose(NamedTuple):
+    """Result of the refinement.
+
+    Attributes:
+        cam_from_body: (4,4) refined pose.
+        information: (6,6) of edges, colours and shading.
+        explained: share of the brightness' variance that the light explains; -1 where the pose was not refined.
+    """
+
+    cam_from_body: Array
+    information: Array
+    explained: float
+
+
+def curved_share(surface: Surface, flat_deg: float = 0.5) -> float:
+    """Share of a surface's area in faces that meet a neighbour at an angle that is neither flat nor an edge."""
     points, faces, normals = (np.asarray(part, dtype=np.float64) for part in surface[:3])
     corners = faces.astype(np.int64)
     edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
@@ -82,7 +108,7 @@ def curved_share(surface: Surface) -> float:
     joined = np.flatnonzero(np.all(edges[1:] == edges[:-1], axis=1))
     one, other = owners[joined], owners[joined + 1]
     cosine = np.abs(np.sum(normals[one] * normals[other], axis=1))
-    is_curved = (cosine < np.cos(np.deg2rad(FLAT_DEG))) & (cosine > np.cos(np.deg2rad(CREASE_DEG)))
+    is_curved = (cosine < np.cos(np.deg2rad(flat_deg))) & (cosine > np.cos(np.deg2rad(CREASE_DEG)))
     curved = np.unique(np.concatenate([one[is_curved], other[is_curved]]))
     a, b, c = points[corners].transpose(1, 0, 2)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -91,9 +117,10 @@ def curved_share(surface: Surface) -> float:
 
 @kernel
 def corner_normals(surface):  # type: ignore[no-untyped-def]
-    """Unit normals (F,3,3) float32 at the corners of a surface's faces: the mean of those around that go on smoothly.
+    """Unit normals (F,3,3) float32 at the corners of the faces of a `Surface`.
 
-    Weighted by area; faces that meet at more than CREASE_DEG do not count as one surface.
+    Each is the mean, weighted by area, of the normals of the faces around the corner that differ from the own one by
+    less than ``CREASE_DEG``.
     """
     points, faces, normals, _ = surface
     count = len(faces)
@@ -112,28 +139,31 @@ def corner_normals(surface):  # type: ignore[no-untyped-def]
         for k in range(3):
             around[filled[faces[i, k]]] = i
             filled[faces[i, k]] += 1
-    least = np.cos(np.deg2rad(CREASE_DEG))
+    min_cosine = np.cos(np.deg2rad(CREASE_DEG))
     smooth = np.empty((count, 3, 3), dtype=np.float32)
     for i in range(count):
         for k in range(3):
             x, y, z = 0.0, 0.0, 0.0
             for other in around[starts[faces[i, k]] : starts[faces[i, k] + 1]]:
                 a, b = normals[i], normals[other]
-                if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] > least:
+                if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] > min_cosine:
                     x, y, z = x + areas[other] * b[0], y + areas[other] * b[1], z + areas[other] * b[2]
             size = np.sqrt(x * x + y * y + z * z) + 1e-30
             smooth[i, k, 0], smooth[i, k, 1], smooth[i, k, 2] = x / size, y / size, z / size
     return smooth
 
 
-def look_at(gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_from_body: Array) -> LookedAt | None:
-    """What `shade` looks at; None where the part is not in the picture.
+def crop_for_shading(
+    gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_from_body: Array, options: ShadingOptions
+) -> ShadingCrop | None:
+    """Reduced picture around the part for `refine_by_shading`; None where the part is not in the picture.
 
     Args:
-        gray: (H,W) of the camera's size.
-        camera: of it; its distortion counts by the place of the part's centre, not within the part.
-        diameter_mm: of the part.
-        cam_from_body: (4,4), roughly.
+        gray: (H,W) uint8 of the camera's size.
+        camera: camera of the picture. Its distortion moves the part as a whole; within the part it is neglected.
+        diameter_mm: diameter of the part.
+        cam_from_body: (4,4) rough pose.
+        options: see `ShadingOptions`.
     """
     place = cam_from_body[:3, 3]
     center = camera.project(place)
@@ -141,9 +171,9 @@ def look_at(gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_fro
         return None
     radius_px = 0.5 * diameter_mm * camera.fx / float(np.linalg.norm(place))
     limits = np.array([camera.width, camera.height])
-    first = np.clip(np.floor(center - REACH * radius_px), 0, limits).astype(int)
-    last = np.clip(np.ceil(center + REACH * radius_px), 0, limits).astype(int)
-    scale = min(1.0, RADIUS_PX / radius_px)
+    first = np.clip(np.floor(center - options.reach * radius_px), 0, limits).astype(int)
+    last = np.clip(np.ceil(center + options.reach * radius_px), 0, limits).astype(int)
+    scale = min(1.0, options.radius_px / radius_px)
     size = np.round(scale * (last - first)).astype(int)
     if np.any(size < 2 * RIM_PX + 4):
         return None
@@ -151,27 +181,27 @@ def look_at(gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_fro
     crop = gray[first[1] : last[1], first[0] : last[0]]
     bright = cv2.resize(crop, tuple(size.tolist()), interpolation=cv2.INTER_AREA).astype(np.float32)
     focal_px = zoom * (camera.fx, camera.fy)
-    return LookedAt(bright, focal_px, (center - first + 0.5) * zoom - 0.5 - focal_px * place[:2] / place[2])
+    return ShadingCrop(bright, focal_px, (center - first + 0.5) * zoom - 0.5 - focal_px * place[:2] / place[2])
 
 
 @kernel
-def shade(  # type: ignore[no-untyped-def]
-    bright, focal_px, middle_px, surface, corners, diameter_mm, cam_from_body, information, gain
-):
-    """A pose refined by the shading of the part's surface, beside what else is known of it.
+def refine_by_shading(crop, surface, corners, diameter_mm, cam_from_body, information, gain):  # type: ignore[no-untyped-def]
+    """Refine a pose by the shading of the part's surface, see `ShadedPose`.
 
     Args:
-        bright, focal_px, middle_px: see `LookedAt`.
-        surface: of the part, a `Surface` about the origin of the body; corners: see `corner_normals`.
-        diameter_mm: of the part.
-        cam_from_body: (4,4); information: (6,6) of it, from edges and colours, that it is the best of.
-        gain: of the shading beside that.
+        crop: `ShadingCrop` of the picture.
+        surface: `Surface` of the part, in the body frame.
+        corners: (F,3,3) see `corner_normals`.
+        diameter_mm: diameter of the part.
+        cam_from_body: (4,4) the best pose by edges and colours.
+        information: (6,6) of that pose.
+        gain: weight of the shading relative to that information.
 
     Returns:
-        ``cam_from_body`` (4,4) and information (6,6) with the shading's, and the share of the brightness of the
-        surface that is explained; as before, and -1, where too little of the surface is seen, or nothing determines
-        the pose.
+        The pose and information as they were, with -1, where too little of the surface is visible or the pose is not
+        determined.
     """
+    bright, focal_px, middle_px = crop.bright, crop.focal_px, crop.center_px
     pose = cam_from_body.copy()
     best = information.copy()
     light = np.zeros(COEFFICIENTS)
@@ -179,49 +209,49 @@ def shade(  # type: ignore[no-untyped-def]
     drawn = np.empty((4, bright.shape[0], bright.shape[1]), dtype=np.float32)
     face_ids = np.empty(bright.shape, dtype=np.int32)
     center_px = np.empty(2)
-    for _ in range(ROUNDS):
+    for _ in range(POSE_ROUNDS):
         if pose[2, 3] <= 0.0:
-            return cam_from_body.copy(), information.copy(), -1.0
+            return ShadedPose(cam_from_body.copy(), information.copy(), -1.0)
         for k in range(2):
             center_px[k] = middle_px[k] + focal_px[k] * pose[k, 3] / pose[2, 3]
         draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids)
-        _smooth(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm)
-        places = _inner_places(drawn, face_ids)
-        if len(places) < FEWEST_PIXELS:
-            return cam_from_body.copy(), information.copy(), -1.0
+        _smooth_normals(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm)
+        places = _inner_pixels(drawn, face_ids)
+        if len(places) < MIN_PIXELS:
+            return ShadedPose(cam_from_body.copy(), information.copy(), -1.0)
         values = np.empty(len(places))
         functions = np.empty((len(places), COEFFICIENTS))
         for i in range(len(places)):
             v, u = places[i]
             values[i] = bright[v, u]
-            _functions(drawn[0, v, u], drawn[1, v, u], drawn[2, v, u], functions[i])
-        light, weights = _fitted_light(values, functions, light, explained >= 0.0)
-        motion = _motion(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_mm)
-        hessian, gradient, explained = _reduced(motion, functions, values, weights, light)
+            _harmonics(drawn[0, v, u], drawn[1, v, u], drawn[2, v, u], functions[i])
+        light, weights = _fit_light(values, functions, light, explained >= 0.0)
+        motion = _jacobian(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_mm)
+        hessian, gradient, explained = _reduce_system(motion, functions, values, weights, light)
         best = information + gain * hessian
-        if not _determines(best):
-            return cam_from_body.copy(), information.copy(), -1.0
+        if not _is_determined(best):
+            return ShadedPose(cam_from_body.copy(), information.copy(), -1.0)
         slope = np.dot(information, relative_twist(cam_from_body, pose)) + gain * gradient
         step = -np.linalg.solve(best, slope)
         turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-        if turn > LARGEST_TURN_RAD:
-            step *= LARGEST_TURN_RAD / turn
+        if turn > MAX_TURN_RAD:
+            step *= MAX_TURN_RAD / turn
         pose = apply_twist(pose, step)
-    return pose, best, explained
+    return ShadedPose(pose, best, explained)
 
 
 @kernel
-def _determines(information):  # type: ignore[no-untyped-def]
-    """Whether information (6,6) leaves no direction open, its units taken out of it."""
+def _is_determined(information):  # type: ignore[no-untyped-def]
+    """Whether information (6,6), normalised to a unit diagonal, determines all six directions."""
     sizes = np.sqrt(np.maximum(np.diag(information), 0.0))
     if not np.all(np.isfinite(information)) or sizes.min() == 0.0:
         return False
-    return np.linalg.eigvalsh(information / np.outer(sizes, sizes))[0] > LEAST_DETERMINED
+    return np.linalg.eigvalsh(information / np.outer(sizes, sizes))[0] > MIN_RELATIVE_INFORMATION
 
 
 @kernel
-def _smooth(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm):  # type: ignore[no-untyped-def]
-    """Replace the normals of faces by those between the normals of their corners (Phong, CACM 1975)."""
+def _smooth_normals(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm):  # type: ignore[no-untyped-def]
+    """Replace the normals of the faces by interpolated normals of their corners (Phong, CACM 1975), in place."""
     points, faces = surface[0], surface[1]
     place, normal = np.empty(3), np.empty(3)
     for v in range(face_ids.shape[0]):
@@ -255,15 +285,15 @@ def _smooth(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diamet
             size = np.sqrt(x * x + y * y + z * z)
             if size < 1e-6:
                 continue
-            # Faces are drawn as if their normals pointed to the camera.
+            # Faces are drawn with normals that point to the camera.
             if x * drawn[0, v, u] + y * drawn[1, v, u] + z * drawn[2, v, u] < 0.0:
                 size = -size
             drawn[0, v, u], drawn[1, v, u], drawn[2, v, u] = x / size, y / size, z / size
 
 
 @kernel
-def _inner_places(drawn, face_ids):  # type: ignore[no-untyped-def]
-    """Rows and columns (N,2) of the pixels looked at."""
+def _inner_pixels(drawn, face_ids):  # type: ignore[no-untyped-def]
+    """Rows and columns (N,2) of the pixels inside the surface, away from its border, jumps in depth and edges."""
     height, width = face_ids.shape
     places = np.empty((height * width, 2), dtype=np.int64)
     count = 0
@@ -278,7 +308,7 @@ def _inner_places(drawn, face_ids):  # type: ignore[no-untyped-def]
                     cosine = 0.0
                     for k in range(3):
                         cosine += drawn[k, y, x] * drawn[k, v, u]
-                    if face_ids[y, x] < 0 or jump > JUMP * (abs(y - v) + abs(x - u)) or cosine < SMOOTH_COS:
+                    if face_ids[y, x] < 0 or jump > MAX_DEPTH_STEP * (abs(y - v) + abs(x - u)) or cosine < SMOOTH_COS:
                         is_inner = False
             if is_inner:
                 places[count, 0], places[count, 1] = v, u
@@ -287,44 +317,48 @@ def _inner_places(drawn, face_ids):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _functions(x, y, z, out):  # type: ignore[no-untyped-def]
-    """Write what a light's coefficients belong to, at a normal: right, down, towards the camera."""
+def _harmonics(x, y, z, out):  # type: ignore[no-untyped-def]
+    """Write the spherical harmonics of a normal (x right, y down, z towards the camera) to ``out`` (9,)."""
     out[0], out[1], out[2], out[3] = 1.0, x, y, z
     out[4], out[5], out[6], out[7], out[8] = x * y, x * z, y * z, x * x - y * y, 3.0 * z * z - 1.0
 
 
 @kernel
-def _fitted_light(values, functions, light, is_known):  # type: ignore[no-untyped-def]
-    """The light (9,) that explains grey levels (N,) best, and what each of them counts (N,); see `PRIOR`.
+def _fit_light(values, functions, light, is_known):  # type: ignore[no-untyped-def]
+    """Light (9,) that explains grey levels (N,) best, and their robust weights (N,) (Geman & McClure).
 
-    Weights are Geman and McClure's, at twice the mean deviation.
+    Args:
+        values: (N,) grey levels.
+        functions: (N,9) harmonics of their normals.
+        light: (9,) last estimate, from which the first weights are computed if ``is_known``.
     """
     weights = np.ones(len(values))
     if is_known:
         _weigh(values - np.dot(functions, light), weights)
-    for _ in range(FITS):
+    for _ in range(LIGHT_ROUNDS):
         weighted = functions * weights.reshape(-1, 1)
         products, sums = np.dot(weighted.T, functions), np.dot(weighted.T, values)
         total = weights.sum()
         for k in range(COEFFICIENTS):
-            products[k, k] += (PRIOR if k > 0 else 1e-9) * total
+            products[k, k] += (LIGHT_PRIOR if k > 0 else MEAN_PRIOR) * total
         light = np.linalg.solve(products, sums)
         _weigh(values - np.dot(functions, light), weights)
     return light, weights
 
 
 @kernel
-def _weigh(left, weights):  # type: ignore[no-untyped-def]
-    scale = LEAST_DEVIATION + OUTLYING * np.median(np.abs(left))
-    for i in range(len(left)):
-        weights[i] = 1.0 / (1.0 + (left[i] / scale) ** 2) ** 2
+def _weigh(residuals, weights):  # type: ignore[no-untyped-def]
+    """Fill the robust weights (N,) of residuals (N,)."""
+    scale = MIN_DEVIATION + OUTLIER_SCALE * np.median(np.abs(residuals))
+    for i in range(len(residuals)):
+        weights[i] = 1.0 / (1.0 + (residuals[i] / scale) ** 2) ** 2
 
 
 @kernel
-def _motion(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_mm):  # type: ignore[no-untyped-def]
-    """By how much the brightness at each place changes with each part of a twist (N,6), see `solver`.
+def _jacobian(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_mm):  # type: ignore[no-untyped-def]
+    """Derivative (N,6) of the brightness at each pixel with respect to the twist, see `gauss_newton`.
 
-    A place shows another point of the surface then, and that point's normal is turned.
+    A moved surface shows another of its points at a pixel, and the normal of that point is turned.
     """
     height, width = face_ids.shape
     shading = np.zeros((height, width))
@@ -332,11 +366,11 @@ def _motion(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_
     for v in range(height):
         for u in range(width):
             if face_ids[v, u] >= 0:
-                _functions(drawn[0, v, u], drawn[1, v, u], drawn[2, v, u], functions)
+                _harmonics(drawn[0, v, u], drawn[1, v, u], drawn[2, v, u], functions)
                 for k in range(COEFFICIENTS):
                     shading[v, u] += light[k] * functions[k]
     jacobian = np.empty((len(places), 6))
-    seen = np.empty((3, 3))
+    in_camera = np.empty((3, 3))
     moved, point, slope, normal = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(len(places)):
         v, u = places[i]
@@ -345,18 +379,18 @@ def _motion(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_
         x, y, z = drawn[0, v, u], drawn[1, v, u], drawn[2, v, u]
         depth = pose[2, 3] + 0.5 * diameter_mm * drawn[3, v, u]
         along_x, along_y = (u - middle_px[0]) / focal_px[0], (v - middle_px[1]) / focal_px[1]
-        # In the camera's frame: what the point's motion changes, where it is, what the normal's turn changes, and it.
-        seen[0, 0], seen[1, 0] = -right / depth, -down / depth
-        seen[2, 0] = (right * along_x + down * along_y) / depth
-        seen[0, 1], seen[1, 1] = along_x * depth - pose[0, 3], along_y * depth - pose[1, 3]
-        seen[2, 1] = depth - pose[2, 3]
-        seen[0, 2] = light[1] + light[4] * y + light[5] * z + 2.0 * light[7] * x
-        seen[1, 2] = light[2] + light[4] * x + light[6] * z - 2.0 * light[7] * y
-        seen[2, 2] = -(light[3] + light[5] * x + light[6] * y + 6.0 * light[8] * z)
+        # Columns in the camera's frame: derivative by the point, the point itself, derivative by the normal.
+        in_camera[0, 0], in_camera[1, 0] = -right / depth, -down / depth
+        in_camera[2, 0] = (right * along_x + down * along_y) / depth
+        in_camera[0, 1], in_camera[1, 1] = along_x * depth - pose[0, 3], along_y * depth - pose[1, 3]
+        in_camera[2, 1] = depth - pose[2, 3]
+        in_camera[0, 2] = light[1] + light[4] * y + light[5] * z + 2.0 * light[7] * x
+        in_camera[1, 2] = light[2] + light[4] * x + light[6] * z - 2.0 * light[7] * y
+        in_camera[2, 2] = -(light[3] + light[5] * x + light[6] * y + 6.0 * light[8] * z)
         for a in range(3):
-            moved[a] = pose[0, a] * seen[0, 0] + pose[1, a] * seen[1, 0] + pose[2, a] * seen[2, 0]
-            point[a] = pose[0, a] * seen[0, 1] + pose[1, a] * seen[1, 1] + pose[2, a] * seen[2, 1]
-            slope[a] = pose[0, a] * seen[0, 2] + pose[1, a] * seen[1, 2] + pose[2, a] * seen[2, 2]
+            moved[a] = pose[0, a] * in_camera[0, 0] + pose[1, a] * in_camera[1, 0] + pose[2, a] * in_camera[2, 0]
+            point[a] = pose[0, a] * in_camera[0, 1] + pose[1, a] * in_camera[1, 1] + pose[2, a] * in_camera[2, 1]
+            slope[a] = pose[0, a] * in_camera[0, 2] + pose[1, a] * in_camera[1, 2] + pose[2, a] * in_camera[2, 2]
             normal[a] = pose[0, a] * x + pose[1, a] * y - pose[2, a] * z
         for a in range(3):
             b, c = (a + 1) % 3, (a + 2) % 3
@@ -366,10 +400,10 @@ def _motion(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_
 
 
 @kernel
-def _reduced(motion, functions, values, weights, light):  # type: ignore[no-untyped-def]
-    """The system (6,6), (6,) of the pose after the light was taken out of it, and the share that is explained.
+def _reduce_system(motion, functions, values, weights, light):  # type: ignore[no-untyped-def]
+    """System (6,6), (6,) of the pose with the light eliminated, and the share of the variance that is explained.
 
-    In units of the variance of what the light leaves.
+    The system is divided by the residual variance of the brightness.
     """
     left = values - np.dot(functions, light)
     total = weights.sum()
@@ -379,15 +413,15 @@ def _reduced(motion, functions, values, weights, light):  # type: ignore[no-unty
     weighted = functions * weights.reshape(-1, 1)
     products, sums = np.dot(weighted.T, functions), np.dot(weighted.T, left)
     for k in range(COEFFICIENTS):
-        prior = PRIOR * total if k > 0 else 1e-9 * total
+        prior = LIGHT_PRIOR * total if k > 0 else MEAN_PRIOR * total
         products[k, k] += prior
         sums[k] -= prior * light[k]
     solved = np.linalg.solve(products, np.ascontiguousarray(across.T))
     mean = (weights * values).sum() / total
-    variance = LEAST_DEVIATION**2 + (weights * left * left).sum() / total
-    spread = LEAST_DEVIATION**2 + (weights * (values - mean) ** 2).sum() / total
+    variance = MIN_DEVIATION**2 + (weights * left * left).sum() / total
+    spread = MIN_DEVIATION**2 + (weights * (values - mean) ** 2).sum() / total
     explained = 1.0 - variance / spread
-    # What is explained badly is hardly the part.
+    # A surface whose brightness is explained badly is hardly the part.
     share = max(explained, 0.0) ** 2 / variance
     hessian = share * (hessian - np.dot(across, solved))
     gradient = share * (gradient + np.dot(solved.T, sums))

@@ -1,11 +1,10 @@
-"""Feature modality: the part's own texture, tracked from keyframes of known pose so that it does not drift.
+"""Texture modality: the part's own texture, matched from keyframes of known pose, so that it does not drift.
 
-A keyframe holds corners (Shi & Tomasi, CVPR 1994) with their 3D points and surface normals from the CAD. In a
-new frame every patch is warped into the predicted view by its tangent plane (PTAM: Klein & Murray, ISMAR
-2007) and aligned coarse to fine by inverse-compositional Lucas-Kanade (Baker & Matthews, IJCV 2004).
-Brightness gain and offset are projected out of the steepest-descent images (Hager & Belhumeur, PAMI 1998), so
-exposure may jump. Before that, all patches together search one common shift at the coarsest level, as PTAM's
-small image does, for large motion.
+A keyframe holds corners (Shi & Tomasi, CVPR 1994) with 3D points and surface normals from the CAD. In a new frame every
+patch is warped into the predicted view by its tangent plane (PTAM: Klein & Murray, ISMAR 2007) and aligned coarse to
+fine by inverse-compositional Lucas-Kanade (Baker & Matthews, IJCV 2004). Brightness gain and offset are projected out
+of the steepest-descent images (Hager & Belhumeur, PAMI 1998), so that exposure may change abruptly. For large motion,
+a shift common to all patches is first searched for at the coarsest level, as with the small image of PTAM.
 """
 
 from __future__ import annotations
@@ -36,18 +35,18 @@ from arview.refinement.modalities.patch_alignment import (
     prepare_template,
     sample_patch,
 )
-from arview.refinement.projection import project
+from arview.refinement.projection import intrinsics_of, project
 from arview.rendering.raycast import RayCaster, cast_ray
 
 
 class TextureMatches(NamedTuple):
-    """Features found in one frame.
+    """Corners of a keyframe found in a frame.
 
     Attributes:
         points_in_body: (N,3) mm.
         pixels: (N,2) where each was found, distorted px.
-        weights: (N,) 0–1, by how well the patch fits; times 1/σ² in `add_features`.
-        tried: how many were expected in view, to judge the share found.
+        weights: (N,) 0–1, by the correlation of the patch; multiplied by 1/σ² in `add_matches`.
+        tried: number of corners expected in view.
     """
 
     points_in_body: Array
@@ -56,11 +55,35 @@ class TextureMatches(NamedTuple):
     tried: int
 
 
+class PatchMatches(NamedTuple):
+    """Result of `match_texture` for the N corners of a keyframe.
+
+    Attributes:
+        pixels: (N,2) where each corner was found or predicted, px.
+        weights: (N,) 0–1; 0 = not found.
+        expected: (N,) whether the corner should be in view.
+    """
+
+    pixels: Array
+    weights: Array
+    expected: NDArray[np.bool_]
+
+
+NEIGHBOURS = 7
+"""Nearest neighbours with which the displacement of a patch is compared."""
+PATCH_SIDE = 9
+"""Side of the patches, px."""
+MIN_TRUST = TextureOptions.min_trust
+"""Trust below which a corner is not searched for."""
+COARSE_NCC = 0.6
+"""Smallest correlation of a patch on the coarse level from which a pose is estimated."""
+
+
 @kernel
 def _agree_with_neighbours(predicted, pixels, weights, limit_px):  # type: ignore[no-untyped-def]
-    """Clear the weights of points displaced unlike the median of their seven nearest neighbours."""
+    """Clear the weights of points whose displacement differs from the median of their nearest neighbours."""
     count = predicted.shape[0]
-    near = 7
+    near = NEIGHBOURS
     index = np.empty(near, dtype=np.int64)
     distance = np.empty(near)
     du, dv = np.empty(near), np.empty(near)
@@ -98,11 +121,19 @@ def _agree_with_neighbours(predicted, pixels, weights, limit_px):  # type: ignor
 
 
 @kernel
-def add_features(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px):  # type: ignore[no-untyped-def]
+def add_matches(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px):  # type: ignore[no-untyped-def]
     """Add the reprojection residuals of matched points to the 6×6 system.
 
-    Residuals fade out towards ``robust_px`` (Tukey). Returns the summed weighted squared residual, the summed
-    weight, and the number of points within ``robust_px``.
+    Args:
+        hessian, gradient: (6,6) and (6,) of the system.
+        points: (N,3) in the body frame.
+        cam_from_body, intrinsics: current pose (4,4) and camera.
+        pixels, weights: (N,2) and (N,) of the matches.
+        sigma_px: standard deviation of a correct match.
+        robust_px: residual at which the weight has faded to 0 (Tukey).
+
+    Returns:
+        Sum of the weighted squared residuals, sum of the weights, and number of points within ``robust_px``.
     """
     r = cam_from_body
     sum_square = 0.0
@@ -131,14 +162,14 @@ def add_features(hessian, gradient, points, cam_from_body, intrinsics, pixels, w
 
 @kernel
 def _align_pose(points, cam_from_body, intrinsics, pixels, weights, damping, sigma_px):  # type: ignore[no-untyped-def]
-    """Pose that lays points on their pixels: Gauss-Newton, robust limit shrinking from 40 to 3 px."""
+    """Pose (4,4) that projects points on their pixels; the robust limit shrinks from 40 to 3 px."""
     hessian = np.zeros((6, 6))
     gradient = np.zeros(6)
     robust_px = 40.0
     for _ in range(8):
         hessian[:] = 0.0
         gradient[:] = 0.0
-        add_features(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px)
+        add_matches(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px)
         cam_from_body = apply_twist(cam_from_body, solve_step(hessian, gradient, damping))
         robust_px = max(3.0, 0.6 * robust_px)
     return cam_from_body
@@ -146,7 +177,7 @@ def _align_pose(points, cam_from_body, intrinsics, pixels, weights, damping, sig
 
 @kernel
 def _count_near(points, cam_from_body, intrinsics, pixels, weights, limit_px):  # type: ignore[no-untyped-def]
-    """How many points of positive weight project to within ``limit_px`` of their pixels."""
+    """Number of points of positive weight that project to within ``limit_px`` of their pixels."""
     count = 0
     for i in range(points.shape[0]):
         x, y, z = to_camera(cam_from_body, points[i, 0], points[i, 1], points[i, 2])
@@ -158,15 +189,15 @@ def _count_near(points, cam_from_body, intrinsics, pixels, weights, limit_px):  
 
 
 @kernel
-def _facing_camera(anchors, hierarchy, cam_from_body, min_facing, check_occlusion):  # type: ignore[no-untyped-def]
-    """(N,) whether each trusted anchor faces the camera and is not hidden behind the part itself."""
+def _find_visible(anchors, hierarchy, cam_from_body, min_facing, check_occlusion):  # type: ignore[no-untyped-def]
+    """Whether each trusted anchor (N,) faces the camera and is not hidden behind the part itself."""
     r = cam_from_body
     eye = np.empty(3)
     for a in range(3):
         eye[a] = -(r[0, a] * r[0, 3] + r[1, a] * r[1, 3] + r[2, a] * r[2, 3])
     wanted = np.zeros(anchors.points.shape[0], dtype=np.bool_)
     for i in range(wanted.shape[0]):
-        if anchors.trust[i] < 0.2:
+        if anchors.trust[i] < MIN_TRUST:
             continue
         p, t = anchors.points[i], anchors.tangents[i]
         dx, dy, dz = eye[0] - p[0], eye[1] - p[1], eye[2] - p[2]
@@ -179,7 +210,7 @@ def _facing_camera(anchors, hierarchy, cam_from_body, min_facing, check_occlusio
             continue
         face = -1
         if check_occlusion:
-            # From 1 % along the way on, so that the surface itself is not hit.
+            # The ray starts 1 % along its way, so that it does not hit the surface itself.
             x, y, z = p[0] + 0.01 * dx, p[1] + 0.01 * dy, p[2] + 0.01 * dz
             _, face = cast_ray(hierarchy, x, y, z, dx, dy, dz, 0.99, True)
         wanted[i] = face < 0
@@ -188,9 +219,9 @@ def _facing_camera(anchors, hierarchy, cam_from_body, min_facing, check_occlusio
 
 @kernel
 def _predict(anchors, cam_from_body, intrinsics, width, height, wanted, predicted, warps):  # type: ignore[no-untyped-def]
-    """Fill predicted pixels (N,2) and the warps (N,2,2) from frame to keyframe px of the tangent planes.
+    """Fill the predicted pixels (N,2) and the warps (N,2,2) of the tangent planes from frame to keyframe px.
 
-    Clears ``wanted`` where the patch is out of the picture or much larger or smaller than in the keyframe.
+    Clears ``wanted`` (N,) where the patch is outside the picture or much larger or smaller than in the keyframe.
     """
     jacobian = np.empty((2, 2))
     for i in range(wanted.shape[0]):
@@ -217,8 +248,8 @@ def _predict(anchors, cam_from_body, intrinsics, width, height, wanted, predicte
 
 @kernel
 def _align_level(level, key_pyramid, pyramid, key_pixels, warps, wanted, min_ncc, pixels, scores):  # type: ignore[no-untyped-def]
-    """Align wanted patches on one level from ``pixels`` on, in place; scores (N,) = correlation or 0."""
-    side = 9
+    """Align the wanted patches on one level, starting at ``pixels`` (N,2) in place; fills scores (N,), 0 = failed."""
+    side = PATCH_SIDE
     patch = np.empty((side + 2, side + 2), dtype=np.float32)
     template = np.empty(side * side, dtype=np.float32)
     across = np.empty(side * side, dtype=np.float32)
@@ -243,17 +274,21 @@ def _align_level(level, key_pyramid, pyramid, key_pixels, warps, wanted, min_ncc
 
 
 @kernel
-def match_features(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intrinsics,  # type: ignore[no-untyped-def]
+def match_texture(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intrinsics,  # type: ignore[no-untyped-def]
                    damping, search_px, check_occlusion, min_facing, min_ncc, neighbour_px):  # fmt: skip
-    """Find a keyframe's features in a new frame.
+    """Find the corners of a keyframe in a new frame, see `PatchMatches`.
 
-    Common shift on the coarsest level; patches alone on level 2; a pose from these, where they agree on one,
-    predicts anew; patches alone on levels 1 and 0. ``pyramid`` and ``key_pyramid`` are of frame and keyframe,
-    ``hierarchy`` of the part's triangles in the body, ``cam_from_body`` (4,4) the predicted pose, ``damping``
-    (6,) of the coarse pose as in `solve_step`; the rest as in `TextureOptions`.
+    All patches are first shifted together on the coarsest level, then aligned one by one on level 2. If these agree on
+    a pose, it replaces the prediction. Patches are then aligned on levels 1 and 0.
 
-    Returns:
-        pixels (N,2); weights (N,), 0 = not found; expected (N,) whether the feature should be in view.
+    Args:
+        key_pyramid, pyramid: image pyramids of keyframe and frame.
+        anchors: `Anchors` of the keyframe.
+        hierarchy: of the part's triangles in the body frame, see `RayCaster`.
+        cam_from_body: (4,4) predicted pose.
+        intrinsics: (10,) as of `intrinsics_of`.
+        damping: (6,) of the pose on level 2, as in `solve_step`.
+        search_px, check_occlusion, min_facing, min_ncc, neighbour_px: see `TextureOptions`.
     """
     points = anchors.points
     count = points.shape[0]
@@ -262,7 +297,7 @@ def match_features(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intr
     predicted = np.zeros((count, 2))
     warps = np.empty((count, 2, 2))
     scores = np.zeros(count)
-    expected = _facing_camera(anchors, hierarchy, cam_from_body, min_facing, check_occlusion)
+    expected = _find_visible(anchors, hierarchy, cam_from_body, min_facing, check_occlusion)
     _predict(anchors, cam_from_body, intrinsics, width, height, expected, predicted, warps)
     seen = np.flatnonzero(expected)
     pixels = predicted.copy()
@@ -274,7 +309,7 @@ def match_features(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intr
         for a in range(2):
             pixels[:, a] += shift[a]
     if top > 1:
-        _align_level(2, key_pyramid, pyramid, anchors.pixels, warps, expected, 0.6, pixels, scores)
+        _align_level(2, key_pyramid, pyramid, anchors.pixels, warps, expected, COARSE_NCC, pixels, scores)
         found = np.count_nonzero(scores)
         coarse = _align_pose(points, cam_from_body, intrinsics, pixels, scores, damping, 1.0)
         near = _count_near(points, coarse, intrinsics, pixels, scores, 5.0)
@@ -282,18 +317,25 @@ def match_features(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intr
             _predict(anchors, coarse, intrinsics, width, height, expected, predicted, warps)
             pixels[:] = predicted
     _align_level(1, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels, scores)
-    # A patch found at half resolution only (motion blur, noise) is worth half the accuracy.
+    # A patch found only at half resolution, because of blur or noise, is half as accurate.
     weights = np.maximum(scores - min_ncc, 0.0) / (4.0 * (1.0 - min_ncc))
     _align_level(0, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels, scores)
     for i in range(count):
         if scores[i] > 0.0:
             weights[i] = (scores[i] - min_ncc) / (1.0 - min_ncc)
     _agree_with_neighbours(predicted, pixels, weights, neighbour_px)
-    return pixels, weights, expected
+    return PatchMatches(pixels, weights, expected)
 
 
 class TextureModality:
-    """Texture of one part, matched from a bank of keyframes."""
+    """Texture of one part, matched from a bank of keyframes.
+
+    Args:
+        vertices_in_body: (V,3) mm, vertices of the part about its centre.
+        faces: (F,3) triangles of the part.
+        camera: intrinsics of the frames.
+        options: see `TextureOptions`.
+    """
 
     def __init__(
         self,
@@ -302,7 +344,6 @@ class TextureModality:
         camera: Camera,
         options: TextureOptions | None = None,
     ) -> None:
-        """Prepare for a part of vertices (V,3) mm about its centre and faces (F,3), and a camera."""
         self.options = options or TextureOptions()
         self.camera = camera
         self.keyframes: list[Keyframe] = []
@@ -313,17 +354,19 @@ class TextureModality:
         self._damping[3:] /= float((high - low) @ (high - low))
         pick = np.array(list(np.ndindex(2, 2, 2)), dtype=np.float64)
         self._box_corners = low + pick * (high - low)
-        self._intrinsics = np.array(
-            [camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0]
-        )
+        self._intrinsics = intrinsics_of(camera)
         self._clock = 0
         self._last: tuple[Keyframe, NDArray[np.intp], Array] | None = None
 
     def pyramid(self, gray: NDArray[np.uint8]) -> Pyramid:
-        """Pyramid of a gray image (H,W) as `measure` and `add_keyframe` take it."""
+        """Image pyramid of a grey picture (H,W) uint8 for `measure` and `add_keyframe`.
+
+        Raises:
+            InputError: a picture of another size than the camera's.
+        """
         if gray.shape != (self.camera.height, self.camera.width):
             raise InputError(
-                f"feature modality: image is {gray.shape[1]}×{gray.shape[0]}, "
+                f"texture modality: image is {gray.shape[1]}×{gray.shape[0]}, "
                 f"the camera {self.camera.width}×{self.camera.height}"
             )
         return build_pyramid(gray, self.options.levels)
@@ -334,7 +377,7 @@ class TextureModality:
         self._last = None
 
     def _nearest(self, cam_from_body: Array) -> tuple[Keyframe | None, float]:
-        """The keyframe nearest in view direction, roll and scale, and how far: 1 = a step of one of them."""
+        """Keyframe nearest in direction of view, roll and distance, and its distance in the steps of the options."""
         if not self.keyframes:
             return None, np.inf
         o = self.options
@@ -351,16 +394,24 @@ class TextureModality:
         return self.keyframes[best], float(steps[best])
 
     def wants_keyframe(self, cam_from_body: Array, tracked_count: int) -> bool:
-        """Whether a keyframe here would help: the view is new, or a bit new and few features were found."""
+        """Whether a keyframe at a pose (4,4) would help.
+
+        It would where the view is new, or partly new and few corners were found.
+        """
         keyframe, distance = self._nearest(cam_from_body)
         if keyframe is None or distance > 1.0:
             return True
-        return tracked_count < self.options.min_corners and distance > 0.3
+        return tracked_count < self.options.min_corners and distance > self.options.replace_distance
 
     def add_keyframe(self, gray: NDArray[np.uint8] | Pyramid, cam_from_body: Array) -> int:
-        """Keep this frame, whose pose must be good; returns the number of features, 0 = too few.
+        """Make a keyframe of a frame whose pose is reliable.
 
-        ``gray`` is an image (H,W) uint8 or its pyramid. A keyframe nearer than 0.3 of a step is replaced.
+        Args:
+            gray: (H,W) uint8, or its pyramid.
+            cam_from_body: (4,4) pose of the part.
+
+        Returns:
+            Number of corners; 0 when they are too few and no keyframe was made.
         """
         pyramid = gray if isinstance(gray, tuple) else self.pyramid(gray)
         keyframe = make_keyframe(
@@ -371,7 +422,7 @@ class TextureModality:
         self._clock += 1
         keyframe.last_used = self._clock
         nearest, distance = self._nearest(cam_from_body)
-        if nearest is not None and distance < 0.3:
+        if nearest is not None and distance < self.options.replace_distance:
             self.keyframes.remove(nearest)
         elif len(self.keyframes) >= self.options.max_keyframes:
             self.keyframes.remove(min(self.keyframes, key=lambda old: old.last_used))
@@ -379,7 +430,7 @@ class TextureModality:
         return len(keyframe.anchors.points)
 
     def _outline(self, cam_from_body: Array) -> Array:
-        """Convex polygon (K,2) px around the part's box; the whole picture when that reaches behind."""
+        """Convex polygon (K,2) px around the part's box; the whole picture when the box reaches behind the camera."""
         pixels = self.camera.project(self._box_corners @ cam_from_body[:3, :3].T + cam_from_body[:3, 3])
         if not np.all(np.isfinite(pixels)):
             w, h = float(self.camera.width), float(self.camera.height)
@@ -387,11 +438,11 @@ class TextureModality:
         return np.asarray(cv2.convexHull(pixels.astype(np.float32))[:, 0], dtype=np.float64)
 
     def measure(self, pyramid: Pyramid, cam_from_body: Array) -> TextureMatches:
-        """Find the features of the nearest keyframe in a frame.
+        """Find the corners of the nearest keyframe in a frame.
 
         Args:
-            pyramid: of the frame, see `pyramid`.
-            cam_from_body: (4,4) predicted pose, to within about 30 px in the picture at 640×480.
+            pyramid: image pyramid of the frame, see `pyramid`.
+            cam_from_body: (4,4) predicted pose, off by at most about 30 px in a picture of 640×480.
         """
         o = self.options
         keyframe, _ = self._nearest(cam_from_body)
@@ -400,39 +451,43 @@ class TextureModality:
             return TextureMatches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
         self._clock += 1
         keyframe.last_used = self._clock
-        pixels, weights, expected = match_features(
+        matches = match_texture(
             keyframe.pyramid, pyramid, keyframe.anchors, self._caster.hierarchy, cam_from_body,
             self._intrinsics, self._damping, o.search_px, o.check_occlusion, o.min_facing, o.min_ncc,
             o.neighbour_px,
         )  # fmt: skip
-        found = np.flatnonzero(weights > 0.0)
-        self._last = (keyframe, found, pixels[found])
-        tried = int(np.count_nonzero(expected))
-        return TextureMatches(keyframe.anchors.points[found], pixels[found], weights[found], tried)
+        found = np.flatnonzero(matches.weights > 0.0)
+        self._last = (keyframe, found, matches.pixels[found])
+        tried = int(np.count_nonzero(matches.expected))
+        points = keyframe.anchors.points[found]
+        return TextureMatches(points, matches.pixels[found], matches.weights[found], tried)
 
     def align(self, matches: TextureMatches, cam_from_body: Array) -> Array:
-        """Pose (4,4) from the matches alone, started at and held towards a pose: a pre-alignment."""
-        points, pixels, weights, _ = matches
-        return np.asarray(_align_pose(points, cam_from_body, self._intrinsics, pixels, weights, self._damping, 1.0))
+        """Pose (4,4) from the matches only, started at a pose and damped towards it."""
+        aligned = _align_pose(
+            matches.points_in_body, cam_from_body, self._intrinsics, matches.pixels, matches.weights, self._damping, 1.0
+        )
+        return np.asarray(aligned)
 
-    def settle(self, cam_from_body: Array, limit_px: float = 2.0) -> None:
-        """Learn from the frame's accepted pose which features of the last `measure` can be trusted.
+    def update_trust(self, cam_from_body: Array) -> None:
+        """Learn from the accepted pose (4,4) of a frame which corners of the last `measure` are reliable.
 
-        A feature found more than ``limit_px`` from where the pose says (a reflection, a shadow, a hand that
-        was in the keyframe) loses trust, and below 0.2 it is left out for good; one that is not found may
-        be hidden and keeps it. A keyframe with too few features left is dropped.
+        A corner found away from where the pose places it (a reflection, a shadow, a hand in the keyframe) loses trust
+        and is no longer used when little is left. One that was not found may be hidden and keeps its trust. A keyframe
+        with too few trusted corners is dropped.
         """
+        o = self.options
         if self._last is None:
             return
         keyframe, found, pixels = self._last
         trust = keyframe.anchors.trust
         points = keyframe.anchors.points[found] @ cam_from_body[:3, :3].T + cam_from_body[:3, 3]
         with np.errstate(invalid="ignore"):
-            good = np.linalg.norm(self.camera.project(points) - pixels, axis=1) <= limit_px
-        # When most disagree, the pose may be at fault.
+            good = np.linalg.norm(self.camera.project(points) - pixels, axis=1) <= o.trusted_px
+        # When most corners disagree, the pose may be wrong.
         if 2 * np.count_nonzero(good) < len(found):
             return
-        trust[found] += 0.1 * (good - trust[found])
-        if np.count_nonzero(trust >= 0.2) < self.options.min_corners and keyframe in self.keyframes:
+        trust[found] += o.trust_rate * (good - trust[found])
+        if np.count_nonzero(trust >= o.min_trust) < o.min_corners and keyframe in self.keyframes:
             self.keyframes.remove(keyframe)
         self._last = None
