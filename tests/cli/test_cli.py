@@ -20,6 +20,7 @@ import trimesh
 from click.testing import CliRunner, Result
 
 import arview.evaluation.run
+import arview.guideviews.cache
 import arview.tracking
 from arview import __version__
 from arview.cad import load_part
@@ -81,7 +82,8 @@ def room(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     }
     (tmp_path / "camera.json").write_text(json.dumps(camera))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("ARVIEW_CACHE", str(cache))
+    # Guide views are kept away from the user's; compiled kernels stay where they are found.
+    monkeypatch.setattr(arview.guideviews.cache, "cache_folder", lambda: cache)
     monkeypatch.setattr(arview.tracking, "TrackingSession", FakeSession)
     monkeypatch.setattr(arview.evaluation.run, "TrackingSession", FakeSession)
     return tmp_path
@@ -192,7 +194,7 @@ def test_guideviews_are_written_and_used(room: Path) -> None:
 
 
 def test_guide_views_are_kept_and_damaged_ones_made_anew(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ARVIEW_CACHE", str(room / "cache"))
+    monkeypatch.setattr(arview.guideviews.cache, "cache_folder", lambda: room / "cache")
     arguments = ("annotate", "clip.mp4", *ANNOTATE, "--poses", "poses.jsonl")
     assert run(*arguments).exit_code == 0
     (kept,) = (room / "cache" / "guideviews").iterdir()
@@ -202,7 +204,7 @@ def test_guide_views_are_kept_and_damaged_ones_made_anew(room: Path, monkeypatch
     kept.write_bytes(kept.read_bytes()[:1000])
     assert run(*arguments).exit_code == 0
     assert kept.stat().st_size > 1000
-    monkeypatch.setenv("ARVIEW_CACHE", str(room / "part.toml" / "cache"))
+    monkeypatch.setattr(arview.guideviews.cache, "cache_folder", lambda: room / "part.toml" / "cache")
     assert run(*arguments).exit_code == 0
 
 

@@ -75,11 +75,10 @@ def part(folder: Path) -> Part:
 
 @pytest.fixture(scope="module")
 def found(folder: Path, part: Part, tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
-    cache = pytest.MonkeyPatch()
-    cache.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-    result = reconstruct(folder / "photos", folder / "out", part, options=OPTIONS)
-    cache.undo()
-    return result
+    cache = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("arview.guideviews.cache.cache_folder", lambda: cache)
+        return reconstruct(folder / "photos", folder / "out", part, options=OPTIONS)
 
 
 def frame_error(found: Reconstruction) -> tuple[float, Array]:
@@ -200,7 +199,7 @@ def test_a_broken_photo_among_good_ones_is_named(folder: Path, tmp_path: Path) -
 
 def test_photos_of_another_part_give_no_frame(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The photos are good, but the CAD is another part's: no scale, no frame, and it is said."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("arview.guideviews.cache.cache_folder", lambda: tmp_path)
     write_obj(tmp_path / "other.obj", bracket())
     shutil.copytree(folder / "out" / "sparse", tmp_path / "out" / "sparse")
     shutil.copy(folder / "out" / "stages.json", tmp_path / "out")

@@ -330,7 +330,8 @@ def test_rig() -> None:
 @pytest.fixture(autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Guide views of these tests are made once a session, away from the user's."""
-    monkeypatch.setenv("ARVIEW_CACHE", str(tmp_path_factory.getbasetemp() / "arview-cache"))
+    folder = tmp_path_factory.getbasetemp() / "arview-cache"
+    monkeypatch.setattr("arview.guideviews.cache.cache_folder", lambda: folder)
 
 
 FEW = CadOptions(subdivisions=2, first_detections=3)
