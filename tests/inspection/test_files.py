@@ -156,11 +156,11 @@ def _set(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("components/0/observable", [True] * 3), "components[0].observable"),
         (
             _set("components/0/observable/3", False),
-            "components[0].displacement_mm[0]: is 1.0, but observable[3]",
+            "components[0].displacement_mm[0]: is 1.0, but dx is undetermined",
         ),
         (
             _set("components/1/observable/5", True),
-            "components[1].displacement_mm[2]: is null, but observable[5]",
+            "components[1].displacement_mm[2]: is null, but dz is determined by observable[5]",
         ),
         (_set("components/0/observable", [False] * 3 + [True] * 3), "components[0].rotation"),
         (_set("components/0/uncertainty_mm", None), "components[0].uncertainty_mm: is null"),
@@ -201,7 +201,7 @@ def test_refuses_in_one_line(
         ("{", "is not JSON, line 1"),
         ("[]", "does not look like an arview inspection"),
         ("3", "does not look like an arview inspection"),
-        ('{"part": 1, "part": 2}', "'part' is given twice"),
+        ('{"part": 1, "part": 2}', "'part' occurs twice"),
         ("[" + "1" * 5000 + "]", "a number too long"),
         ("[" * 100_000, "nested too deeply"),
     ],

@@ -1,4 +1,4 @@
-"""What a measurement says beyond the label: placement, covariance, both methods, budget, datums, software."""
+"""Details of a measurement: pose, covariance, methods, uncertainty budget, datums, distances."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class MethodResult:
-    """What one way of measuring says of a component, in the datum frame; or why it says nothing.
+    """The result of one method for a component, in the datum frame, or the reason why there is none.
 
     Attributes:
         method: sweep, edges or cloud.
-        displacement_mm: along the model's axes; undetermined ones None; None when not measured.
-        rotation_deg: rotation vector, likewise.
-        std_mm: standard uncertainty of each of ``displacement_mm`` by this method's noise.
+        displacement_mm: displacement along the axes of the model, None where undetermined; None if not measured.
+        rotation_deg: rotation vector, with the same conventions.
+        std_mm: standard uncertainty of each component of ``displacement_mm`` due to the noise of this method.
         used: number of measurements.
-        residual_mm: their robust standard deviation.
-        support: share of what should be seen that was.
-        reason: why it was not measured; empty when it was.
-        notes: in words, what speaks against it.
+        residual_mm: robust standard deviation of their residuals.
+        support: fraction of the expected measurements that were found.
+        reason: why the component was not measured; empty if it was.
+        notes: doubts about the result.
     """
 
     method: str
@@ -41,7 +41,14 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class MethodAgreement:
-    """Two methods compared: length of their difference, and what 95 % of such differences stay below."""
+    """The comparison of two methods.
+
+    Attributes:
+        methods: their names.
+        difference_mm: length of the difference of their displacements.
+        joint_mm: bound below which 95 % of such differences are expected.
+        agree: whether the difference is below that bound.
+    """
 
     methods: tuple[str, str]
     difference_mm: float
@@ -51,7 +58,7 @@ class MethodAgreement:
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """A contribution to the uncertainty: its standard uncertainty along the displacement, mm."""
+    """A contribution to the uncertainty, with its standard uncertainty along the displacement, mm."""
 
     name: str
     std_mm: float
@@ -59,24 +66,24 @@ class BudgetLine:
 
 @dataclass(frozen=True)
 class Details:
-    """A component's measurement in full. Angles in degrees, lengths in mm, model axes, in the datum frame.
+    """The full measurement of a component in the datum frame, with the axes of the model; degrees and mm.
 
     Attributes:
-        center_mm: nominal place of what ``displacement_mm`` is the displacement of: the middle of its bounding box.
-        measured_from_nominal: (4,4) row-major, undetermined directions taken as nominal.
-        covariance: (6,6) of rotation vector (rad) and displacement (mm).
-        undetermined: (K,6) orthonormal directions that are not determined, rotations times ``radius_mm``.
+        center_mm: nominal position of the point that ``displacement_mm`` refers to: the centre of the bounding box.
+        measured_from_nominal: (4,4) row-major pose relative to the nominal one; undetermined directions are nominal.
+        covariance: (6,6) covariance of rotation vector (rad) and displacement (mm).
+        undetermined: (K,6) orthonormal undetermined directions; rotations are multiplied by ``radius_mm``.
         radius_mm: half the diagonal of the bounding box.
-        k: coverage factor that U stands for along the displacement.
+        k: coverage factor of U along the displacement.
         interval_mm: ends of the 95 % coverage interval of the distance.
-        corrected_distance_mm: most likely true distance: near zero, noise makes the measured one too large (Rice).
+        corrected_distance_mm: most likely true distance; near zero, noise makes the measured one too large (Rice).
         zone_diameter_mm: diameter of the smallest position tolerance zone that holds the component (ISO 1101).
-        angle_deg, angle_uncertainty_deg: of the determined rotation, with its U; None when undetermined.
-        angle_tolerance_deg: largest rotation allowed; None when there is no such tolerance.
-        methods: each way of measuring for itself.
-        agreement: each pair of them.
+        angle_deg, angle_uncertainty_deg: angle of the determined rotation and its U; None when undetermined.
+        angle_tolerance_deg: largest rotation allowed; None without such a tolerance.
+        methods: results of the methods.
+        agreement: comparisons of the pairs of methods.
         budget: contributions to the uncertainty of the distance, largest first; their squares sum to its square.
-        notes: in words.
+        notes: remarks on the measurement.
     """
 
     center_mm: Vector3
@@ -99,16 +106,16 @@ class Details:
 
 @dataclass(frozen=True)
 class DatumReport:
-    """How a datum was met.
+    """The measurement of a datum.
 
     Attributes:
-        label, feature, component: of the part file.
-        locked: in words, which degrees of freedom it decided.
-        used, of: measurements that agree on it, and how many there should be.
-        residual_mm: robust standard deviation about its own best place.
-        rest_mm: rms after the alignment: what it contradicts the datums before it.
-        radius_mm: how much larger a hole or pin looks; None of others.
-        method: by which it was measured.
+        label, feature, component: definition in the part file.
+        locked: description of the degrees of freedom that it constrains.
+        used, of: number of consistent measurements, and of possible ones.
+        residual_mm: robust standard deviation about its own best fit.
+        rest_mm: rms in the datum frame, which shows contradictions to the datums of higher precedence.
+        radius_mm: by how much the radius of a hole or pin is larger than nominal; None for other features.
+        method: measurement method.
     """
 
     label: str
@@ -128,14 +135,14 @@ class DatumSystem:
     """The frame of the deviations.
 
     Attributes:
-        datums: in order of precedence.
-        rough_from_datum: (4,4) row-major: the frame of the reconstruction from the datum frame, mm.
-        covariance: (7,7) of rotation vector (rad), shift (mm) about ``origin_mm`` and relative scale.
-        origin_mm: (3,) model frame.
+        datums: the datums in order of precedence.
+        rough_from_datum: (4,4) row-major transform from the datum frame to the frame of the reconstruction, mm.
+        covariance: (7,7) covariance of rotation vector (rad), shift (mm) about ``origin_mm`` and relative scale.
+        origin_mm: (3,) point in the model frame.
         mm_per_unit: scale of the reconstruction; None when not recorded.
-        scale_std: its relative standard uncertainty.
-        scale_from: in words.
-        notes: in words, what decided what.
+        scale_std: relative standard uncertainty of the scale.
+        scale_from: sources of the scale.
+        notes: remarks on the alignment.
     """
 
     datums: tuple[DatumReport, ...]
@@ -150,7 +157,14 @@ class DatumSystem:
 
 @dataclass(frozen=True)
 class ForeignReport:
-    """A surface that belongs to nothing in the CAD: box in the datum frame, mm, area, how far from what, in words."""
+    """A foreign object: a surface that belongs to no component of the CAD model.
+
+    Attributes:
+        center_mm, size_mm: its bounding box in the datum frame.
+        area_mm2: its area.
+        nearest_component, distance_mm: the component nearest to it, and the distance of its farthest point to the CAD.
+        text: description.
+    """
 
     center_mm: Vector3
     size_mm: Vector3
@@ -162,13 +176,13 @@ class ForeignReport:
 
 @dataclass(frozen=True)
 class DistanceStatistics:
-    """Of the signed distances of the cloud's points to one component's nominal surface, or to all: mm.
+    """Statistics of the signed distances of cloud points to the nominal surface of a component, or of all.
 
     Attributes:
-        name: of the component, or ``all``.
-        count: points.
-        mean_mm, sigma_mm, median_mm: of the distances within the reach of the map.
-        fwhm_mm: full width at half maximum of their distribution: the width of its core, however long its tails.
+        name: name of the component, or ``all``.
+        count: number of points.
+        mean_mm, sigma_mm, median_mm: mean, standard deviation and median of the distances within the reach of the map.
+        fwhm_mm: full width at half maximum of their distribution, which does not depend on its tails.
     """
 
     name: str
@@ -181,7 +195,13 @@ class DistanceStatistics:
 
 @dataclass(frozen=True)
 class DistanceReport:
-    """Distances of the aligned cloud to the CAD: points within ``reach_mm`` alone; files beside the inspection."""
+    """Distances of the aligned cloud to the CAD model.
+
+    Attributes:
+        reach_mm: points at larger distances are ignored.
+        statistics: statistics of all points and of each component.
+        files: names of the coloured cloud and the pictures, relative to the inspection.
+    """
 
     reach_mm: float
     statistics: tuple[DistanceStatistics, ...]
@@ -189,17 +209,17 @@ class DistanceReport:
 
 
 def to_json(value: Any) -> Any:
-    """Dataclasses as objects, tuples as lists; fields that hold their default are left out."""
+    """Convert dataclasses to objects and tuples to lists; fields with their default value are omitted."""
     if is_dataclass(value) and not isinstance(value, type):
-        shown = {f.name: getattr(value, f.name) for f in fields(value)}
-        return {f.name: to_json(shown[f.name]) for f in fields(value) if shown[f.name] != f.default}
+        values = {f.name: getattr(value, f.name) for f in fields(value)}
+        return {f.name: to_json(values[f.name]) for f in fields(value) if values[f.name] != f.default}
     if isinstance(value, Mapping):
         return {key: to_json(item) for key, item in value.items()}
     return [to_json(item) for item in value] if isinstance(value, tuple) else value
 
 
 def from_json(kind: type[T], value: Any) -> T:
-    """The inverse of ``to_json`` for a document that the schema has accepted."""
+    """The inverse of `to_json`, for a document that complies with the schema."""
     hints = get_type_hints(kind)
     return kind(**{name: _read(hints[name], item) for name, item in value.items()})
 

@@ -33,12 +33,12 @@ _NUMBER_LIMIT = 1e9
 
 
 def load_inspection(path: str | Path, model: Model | None = None) -> Inspection:
-    """Inspection read from a JSON file and, when a model is given, checked to belong to it.
+    """Read an inspection from a JSON file and, if a model is given, check that it belongs to the model.
 
     Raises:
-        InputError: unreadable, no JSON, against the schema, NaN, of another schema version or contradictory;
-            one line that names the place in the file (``components[2].distance_mm``).
-        MismatchError: made against another model than ``model``.
+        InputError: the file cannot be read, is not JSON, violates the schema, has an unknown version, a value that is
+            not finite, or a contradiction; the message names the place in the file (``components[2].distance_mm``).
+        MismatchError: the inspection belongs to another model than ``model``.
     """
     check_type(path, PATH, "load_inspection: path")
     path = Path(path)
@@ -59,10 +59,10 @@ def load_inspection(path: str | Path, model: Model | None = None) -> Inspection:
 
 
 def save_inspection(inspection: Inspection, path: str | Path) -> None:
-    """Write the inspection as JSON; the file appears complete or not at all.
+    """Write the inspection as JSON, atomically.
 
     Raises:
-        OutputError: the folder is missing, read-only or full.
+        OutputError: the file cannot be written.
     """
     check_type(inspection, Inspection, "save_inspection: inspection")
     path = Path(path)
@@ -82,9 +82,9 @@ def _read_json(path: Path) -> Any:
     except OSError as error:
         raise InputError(f"cannot read inspection {path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not a text file, expected an inspection in JSON") from error
+        raise InputError(f"{path}: is not a text file; expected an inspection in JSON") from error
     try:
-        return json.loads(text, object_pairs_hook=_object_without_repeats)
+        return json.loads(text, object_pairs_hook=_object_with_unique_keys)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}: is not JSON, line {error.lineno} column {error.colno}: {error.msg}") from error
     except RecursionError as error:
@@ -92,15 +92,15 @@ def _read_json(path: Path) -> Any:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except ValueError as error:
-        raise InputError(f"{path}: holds a number too long to read") from error
+        raise InputError(f"{path}: contains a number too long to read") from error
 
 
-def _object_without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _object_with_unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) != len(pairs):
         keys = [key for key, _ in pairs]
         repeated = next(key for key in keys if keys.count(key) > 1)
-        raise InputError(f"{repeated!r} is given twice in one object")
+        raise InputError(f"{repeated!r} occurs twice in one object")
     return result
 
 

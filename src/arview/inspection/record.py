@@ -1,4 +1,4 @@
-"""The record of one inspection: verdict and measured displacement of each component against the CAD."""
+"""The record of an inspection: verdict and measured displacement of each component relative to the CAD model."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ SCHEMA_VERSION = "1.1"
 READABLE_VERSIONS = ("1.0", "1.1")
 
 _DISTANCE_SLACK_MM = 0.006
-"""Distance and displacement may each be rounded to 0.01 mm in a file; more than that is an inconsistency."""
+"""Tolerated difference between distance and displacement, which may both be rounded to 0.01 mm in a file."""
 
 
 class Verdict(StrEnum):
-    """Answer of the decision rule for one component."""
+    """Result of the decision rule for a component."""
 
     PASS = "pass"
     FAIL = "fail"
@@ -29,31 +29,31 @@ class Verdict(StrEnum):
 
 
 class Finding(StrEnum):
-    """What was found beyond a displacement."""
+    """A finding other than a displacement."""
 
     MISSING = "missing"
 
 
 @dataclass(frozen=True)
 class ComponentDeviation:
-    """What was measured of one component. A degree of freedom that was not determined is None, not a number.
+    """The measured deviation of a component. Undetermined degrees of freedom are None.
 
     Attributes:
-        name: the component's name in the model.
-        displacement_mm: measured minus design place along the model's x, y, z; None where undetermined.
+        name: name of the component in the model.
+        displacement_mm: measured minus design position along x, y, z of the model; None where undetermined.
         distance_mm: length of the determined part of the displacement; None when nothing is determined.
-        observable: which degrees of freedom are determined: rotation about x, y, z, translation along x, y, z
-            (the order of a twist in ``arview.geometry``).
+        observable: whether the degrees of freedom are determined: rotation about x, y, z, translation along x, y, z
+            (the order of a twist in `arview.geometry`).
         uncertainty_mm: expanded uncertainty U (k = 2) of ``distance_mm``; None when nothing is determined.
-        tolerance_mm: largest distance allowed; None when there is no tolerance.
-        verdict: answer of the decision rule.
+        tolerance_mm: largest distance allowed; None without a tolerance.
+        verdict: result of the decision rule.
         tilt_deg: angle between measured and design axis of the component; None where undetermined.
-        twist_deg: turn about that axis; None where undetermined.
-        finding: ``missing`` when the component is not there.
-        details: the measurement in full; None in files of version 1.0.
+        twist_deg: rotation about that axis; None where undetermined.
+        finding: ``missing`` if the component is absent.
+        details: details of the measurement; None in files of version 1.0.
 
     Raises:
-        InputError: when the fields contradict each other; the message starts with the field's name.
+        InputError: the fields contradict each other; the message starts with the name of the field.
     """
 
     name: str
@@ -89,19 +89,19 @@ class ComponentDeviation:
                 raise InputError(f"{field}: is {value}, must not be negative")
 
     def _check_observable(self) -> None:
-        for axis, value, seen in zip("xyz", self.displacement_mm, self.observable[3:], strict=True):
+        for axis, value, is_observable in zip("xyz", self.displacement_mm, self.observable[3:], strict=True):
             index = "xyz".index(axis)
-            if value is not None and not seen:
+            if value is not None and not is_observable:
                 raise InputError(
-                    f"displacement_mm[{index}]: is {value}, but observable[{index + 3}] says that d{axis} is"
-                    " undetermined; an undetermined value must be null"
+                    f"displacement_mm[{index}]: is {value}, but d{axis} is undetermined by observable[{index + 3}];"
+                    " undetermined values must be null"
                 )
-            if value is None and seen:
+            if value is None and is_observable:
                 raise InputError(
-                    f"displacement_mm[{index}]: is null, but observable[{index + 3}] says that d{axis} is determined"
+                    f"displacement_mm[{index}]: is null, but d{axis} is determined by observable[{index + 3}]"
                 )
         if not any(self.observable[:3]) and (self.tilt_deg is not None or self.twist_deg is not None):
-            raise InputError("rotation: holds a number, but observable says that no rotation is determined")
+            raise InputError("rotation: is a number, but no rotation is determined by observable")
 
     def _check_distance(self) -> None:
         known = [value for value in self.displacement_mm if value is not None]
@@ -140,17 +140,17 @@ class ComponentDeviation:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where the numbers come from.
+    """The origin of the numbers.
 
     Attributes:
-        tool, version: what measured.
-        method: how the numbers came about.
-        note: shown on the picture, e.g. "example, written by hand".
-        photos_hash: SHA-256 (hexadecimal) of the photos measured in; empty when there are none.
-        photos: number of them.
-        software: names and versions of the libraries that did the work.
-        options: what was asked for, by name.
-        cpu_s: processor time it took.
+        tool, version: program that measured.
+        method: measurement method.
+        note: text that is shown with the overlay, e.g. "example, written by hand".
+        photos_hash: SHA-256 (hexadecimal) of the photos; empty without photos.
+        photos: number of photos.
+        software: names and versions of the libraries.
+        options: options of the measurement, by name.
+        cpu_s: processor time.
     """
 
     tool: str
@@ -170,15 +170,15 @@ class Inspection:
 
     Attributes:
         part: name of the part.
-        serial: serial number of the built part; may be empty.
-        model_hash: ``Model.source_hash`` of the CAD model measured against.
-        created: when it was measured, UTC.
-        components: one entry per inspected component; components of the model may be left out.
-        provenance: where the numbers come from.
+        serial: serial number of the part; may be empty.
+        model_hash: ``Model.source_hash`` of the CAD model.
+        created: time of the measurement, UTC.
+        components: an entry for each inspected component; components of the model may be omitted.
+        provenance: origin of the numbers.
         datum_system: the frame of the deviations; None in files of version 1.0.
-        warnings: in words, what speaks against the whole.
-        foreign_objects: what is there beside the components, the largest first.
-        distance_map: of the cloud, where there is one.
+        warnings: doubts about the inspection as a whole.
+        foreign_objects: objects that are not in the CAD model, the largest first.
+        distance_map: distances of the cloud to the CAD model, if there is a cloud.
 
     Raises:
         InputError: a component appears twice, or ``created`` has no time zone.
@@ -198,11 +198,11 @@ class Inspection:
     def __post_init__(self) -> None:
         if self.created.utcoffset() != timedelta(0):
             raise InputError(f"created: {self.created.isoformat()} is not a UTC time")
-        seen: set[str] = set()
+        names: set[str] = set()
         for index, component in enumerate(self.components):
-            if component.name in seen:
+            if component.name in names:
                 raise InputError(f"components[{index}].name: {component.name!r} appears twice")
-            seen.add(component.name)
+            names.add(component.name)
 
     def __repr__(self) -> str:
         counts = Counter(component.verdict.value.replace("_", " ") for component in self.components)
@@ -210,18 +210,18 @@ class Inspection:
         return f"<Inspection {f'{self.part} {self.serial}'.rstrip()}: {found}>"
 
     def find(self, name: str) -> ComponentDeviation | None:
-        """The entry of the component of that name, or None when it was not inspected."""
+        """The entry of the component with this name, or None if it was not inspected."""
         return next((component for component in self.components if component.name == name), None)
 
     def age_s(self, now: datetime | None = None) -> float:
-        """Seconds from the measurement to ``now`` (default: this moment); negative when it lies ahead."""
+        """Seconds from the measurement to ``now`` (default: the present time); negative if it is in the future."""
         return ((now or datetime.now(UTC)) - self.created).total_seconds()
 
     def check_model(self, model: Model) -> None:
-        """Make sure that this is an inspection of ``model``.
+        """Check that this is an inspection of ``model``.
 
         Raises:
-            MismatchError: another geometry was measured, or a component does not exist in the model.
+            MismatchError: the inspection belongs to another geometry, or a component does not exist in the model.
         """
         names = {component.name for component in model.components}
         unknown = sorted({component.name for component in self.components} - names)

@@ -1,4 +1,4 @@
-"""What an inspection says of the part as a whole."""
+"""Overall verdict and summary of an inspection."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _WORDS = {
 
 
 def overall_verdict(inspection: Inspection) -> Verdict:
-    """Of the whole part.
+    """Verdict of the whole part.
 
-    Fail when one component fails; not measured when none was measured; undecided when one is undecided or was not
-    measured, or something foreign is there; else pass.
+    Fail if one component fails; not measured if none was measured; undecided if a component is undecided or was not
+    measured, or if there are foreign objects; otherwise pass.
     """
     verdicts = {component.verdict for component in inspection.components}
     if Verdict.FAIL in verdicts:
@@ -29,7 +29,7 @@ def overall_verdict(inspection: Inspection) -> Verdict:
 
 
 def verdict_sentence(inspection: Inspection) -> str:
-    """The counts in words, what matters most first: ``2 of 16 components out of tolerance, 1 missing, …``."""
+    """Number of components by verdict, the most severe first: ``16 components: 1 missing, 2 out of tolerance, …``."""
     total = len(inspection.components)
     counts = Counter(component.verdict for component in inspection.components)
     missing = sum(component.finding is Finding.MISSING for component in inspection.components)

@@ -1,4 +1,4 @@
-"""An inspection in the formats of the trade: CSV, QIF, Q-DAS DFQ, GLB."""
+"""Export of inspections to CSV, QIF, Q-DAS DFQ and GLB."""
 
 from arview.inspection.export.csv_table import to_csv
 from arview.inspection.export.dfq import to_dfq

@@ -1,4 +1,4 @@
-"""One line a component, as spreadsheets and scripts like it: RFC 4180, UTF-8, point as decimal sign."""
+"""CSV with a line for each component: RFC 4180, decimal point."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ HEADER = (
     "dx_mm", "dy_mm", "dz_mm", "distance_mm", "U_mm", "k", "low_95_mm", "high_95_mm", "tolerance_mm",
     "position_diameter_mm", "tilt_deg", "twist_deg", "angle_deg", "angle_U_deg", "angle_tolerance_deg", "notes",
 )  # fmt: skip
-"""Columns. What is undetermined or was not measured is empty."""
+"""Columns. Cells of undetermined or unmeasured values are empty."""
 
 
 def to_csv(inspection: Inspection) -> str:
-    """The inspection as CSV, see HEADER; lines end with CR LF."""
+    """The inspection as CSV with the columns of `HEADER`; lines end with CR LF."""
     out = io.StringIO(newline="")
     writer = csv.writer(out)
     writer.writerow(HEADER)
@@ -33,7 +33,7 @@ def _row(inspection: Inspection, one: ComponentDeviation) -> list[str | float | 
     low, high = (None, None) if details is None or details.interval_mm is None else details.interval_mm
     zone = None if details is None else details.zone_diameter_mm
     if None in one.displacement_mm:
-        zone = None  # an undetermined axis would make it larger
+        zone = None  # a displacement along the undetermined axis would enlarge it
     angles: list[float | None] = [None] * 3
     if details is not None:
         angles = [details.angle_deg, details.angle_uncertainty_deg, details.angle_tolerance_deg]
@@ -46,7 +46,7 @@ def _row(inspection: Inspection, one: ComponentDeviation) -> list[str | float | 
 
 
 def _text(cell: str | float | None) -> str:
-    """Numbers to a nanometre; texts that a spreadsheet would take for a formula are quoted by an apostrophe."""
+    """Numbers with six decimals; texts that a spreadsheet would read as a formula are prefixed with an apostrophe."""
     if cell is None:
         return ""
     if isinstance(cell, str):

@@ -1,7 +1,7 @@
-"""Q-DAS ASCII transfer format (AQDEF), DFQ: description and values in one file of K-fields.
+"""Q-DAS ASCII transfer format (AQDEF), DFQ: description and values as K-fields in one file.
 
-Of each component the distance from its design place (one-sided, limit 0 natural), dx, dy, dz and the tilt are
-characteristics. A value that is undetermined is not written: its characteristic is there without a value.
+The characteristics of each component are its distance from the design position (one-sided with natural limit 0), dx,
+dy, dz and the tilt. The characteristic of an undetermined value has no value.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from arview.inspection.record import ComponentDeviation, Inspection
 
 _LIMIT, _NATURAL_LIMIT = "1", "2"
-"""K2120, K2121: kind of the lower and the upper limit."""
+"""Values of K2120 and K2121, the kinds of the lower and upper limit."""
 _CLASS_SIGNIFICANT = "3"
-"""K2005."""
+"""Value of K2005, the class of the characteristic."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class _Characteristic:
 
 
 def to_dfq(inspection: Inspection) -> bytes:
-    """The inspection as DFQ: one part, five characteristics a component, one value each.
+    """The inspection as DFQ: one part, with five characteristics for each component and one value for each of them.
 
-    Windows-1252 where its letters suffice, else UTF-8 with a byte order mark. Times are UTC.
+    The encoding is Windows-1252 if possible, else UTF-8 with a byte order mark. Times are UTC.
     """
     rows = [row for component in inspection.components for row in _characteristics(component)]
     source = inspection.provenance
@@ -96,5 +96,5 @@ def _description(index: int, row: _Characteristic) -> list[tuple[str, str]]:
 
 
 def _line(text: str) -> str:
-    """On one line, without the control characters that separate values."""
+    """A text as one line without control characters, which separate values in DFQ."""
     return " ".join("".join(c if c >= " " else " " for c in text).split())

@@ -1,4 +1,4 @@
-"""The deviations as glTF 2.0 (GLB): components at their design and measured places, and arrows, for any 3D viewer."""
+"""The deviations as glTF 2.0 (GLB): components at their design and measured poses, with displacement arrows."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ _COLORS = {
     Verdict.UNDECIDED: (0.80, 0.52, 0.05, 1.0),
     Verdict.NOT_MEASURED: (0.36, 0.42, 0.50, 1.0),
 }
-"""sRGB and opacity."""
+"""Colours of the components: sRGB and opacity."""
 _M_PER_MM = 1e-3
 _ARROW_SHARE = 0.14
-"""The longest arrow, of the model's diameter."""
+"""Length of the longest arrow as a fraction of the diameter of the model."""
 _ROUND_SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 def to_glb(inspection: Inspection, model: Model, arrow_scale: float | None = None) -> bytes:
-    """A scene in metres with the nodes ``design``, ``measured`` and ``arrows``, and below them one node a component.
+    """A scene in metres with the nodes ``design``, ``measured`` and ``arrows``, each with a node for each component.
 
-    glTF's +Y is the model's +Z. Each node carries its numbers in ``extras``: verdict, displacement (null where
-    undetermined), distance, U, tolerance.
+    +Y of glTF is +Z of the model. The ``extras`` of a node hold verdict, displacement (null where undetermined),
+    distance, U and tolerance.
 
     Args:
-        inspection: what was measured.
-        model: nominal.
-        arrow_scale: how much longer than the displacements the arrows are; default: a round number by the largest one.
+        inspection: the inspection.
+        model: the CAD model.
+        arrow_scale: exaggeration of the arrows; default: a round number chosen by the largest displacement.
 
     Raises:
         MismatchError: the inspection belongs to another model.
@@ -50,31 +50,31 @@ def to_glb(inspection: Inspection, model: Model, arrow_scale: float | None = Non
     for component in model.components:
         deviation = inspection.find(component.name)
         color = _CONTEXT if deviation is None else _GHOST
-        _put(scene, f"design/{component.name}", "design", _mesh(component, color), np.eye(4), {})
+        _add_node(scene, f"design/{component.name}", "design", _mesh(component, color), np.eye(4), {})
         if deviation is None:
             continue
-        facts = _facts(deviation)
+        extras = _extras(deviation)
         place = None if deviation.details is None else deviation.details.measured_from_nominal
         if place is not None and deviation.finding is not Finding.MISSING:
             moved = np.array(place)
             moved[:3, 3] *= _M_PER_MM
             solid = _mesh(component, _COLORS[deviation.verdict])
-            _put(scene, f"measured/{component.name}", "measured", solid, moved, facts)
+            _add_node(scene, f"measured/{component.name}", "measured", solid, moved, extras)
         tail = component.bounds_in_model.mean(axis=0)
         arrow = _arrow(deviation, tail, scale, 0.008 * model.diameter_mm)
         if arrow is not None:
-            _put(scene, f"arrows/{component.name}", "arrows", arrow, np.eye(4), facts | {"times": scale})
+            _add_node(scene, f"arrows/{component.name}", "arrows", arrow, np.eye(4), extras | {"times": scale})
     return bytes(scene.export(file_type="glb"))
 
 
-def _put(scene: Any, name: str, parent: str, mesh: Any, matrix: Array, extras: dict[str, Any]) -> None:
+def _add_node(scene: Any, name: str, parent: str, mesh: Any, matrix: Array, extras: dict[str, Any]) -> None:
     scene.add_geometry(
         mesh, node_name=name, geom_name=name, parent_node_name=parent, transform=matrix, metadata=extras or None
     )
 
 
 def _mesh(component: Component, color: tuple[float, float, float, float]) -> Any:
-    """A component in metres with flat shading where it has edges."""
+    """The mesh of a component in metres, with flat shading."""
     import trimesh
 
     corners = component.vertices_in_model[component.faces].reshape(-1, 3) * _M_PER_MM
@@ -96,7 +96,7 @@ def _material(color: tuple[float, float, float, float]) -> Any:
 
 
 def _arrow(deviation: ComponentDeviation, tail: Array, scale: float, width_mm: float) -> Any:
-    """From the design place along the displacement, undetermined axes left out; None when it is within U of zero."""
+    """An arrow from the design position along the determined displacement; None if that is within U of zero."""
     import trimesh
 
     if deviation.distance_mm is None or deviation.distance_mm <= (deviation.uncertainty_mm or 0.0):
@@ -115,7 +115,7 @@ def _arrow(deviation: ComponentDeviation, tail: Array, scale: float, width_mm: f
     return arrow
 
 
-def _facts(one: ComponentDeviation) -> dict[str, Any]:
+def _extras(one: ComponentDeviation) -> dict[str, Any]:
     return {
         "verdict": one.verdict.value,
         "displacement_mm": list(one.displacement_mm),

@@ -1,7 +1,7 @@
-"""QIF 3.0 results (ISO 23952, DMSC): characteristics with their nominals, and what was measured of them.
+"""QIF 3.0 results (ISO 23952, DMSC): characteristics with their nominal and measured values.
 
-The position of a component's middle is a position characteristic with a spherical zone, whose diameter is twice the
-tolerance; its x, y, z are linear coordinate characteristics without tolerance; its rotation is a user defined angular
+The position of the centre of a component is a position characteristic with a spherical zone, whose diameter is twice
+the tolerance. Its x, y, z are linear coordinate characteristics without tolerance. Its rotation is a user-defined angular
 characteristic. Structure and order of the elements follow QIFDocument.xsd, QIFResults.xsd, Characteristics.xsd,
 Units.xsd and PrimitivesPMI.xsd of QIF 3.0.0.
 """
@@ -34,12 +34,12 @@ _DIRECTION = ("XAXIS", "YAXIS", "ZAXIS")
 
 
 def to_qif(inspection: Inspection) -> bytes:
-    """The inspection as a QIF 3.0 document, UTF-8. The same inspection always gives the same document."""
+    """The inspection as a QIF 3.0 document, UTF-8. The same inspection always yields the same document."""
     return _Document(inspection).encoded()
 
 
 class _Document:
-    """Builds the document; ids are numbered as elements are made."""
+    """Builds the document; elements are numbered in the order of their creation."""
 
     def __init__(self, inspection: Inspection) -> None:
         self.inspection = inspection
@@ -56,7 +56,7 @@ class _Document:
             self._add(component)
 
     def encoded(self) -> bytes:
-        """The whole, after everything was added."""
+        """The complete document as UTF-8."""
         results_id = self._next_id()
         root = etree.Element(_name("QIFDocument"), nsmap={None: NAMESPACE})
         root.set("versionQIF", "3.0.0")
@@ -103,7 +103,7 @@ class _Document:
             item = self._item("Position", one.name, f"{one.name} position", self._position(one.tolerance_mm), [])
             value = None if one.distance_mm is None else 2.0 * one.distance_mm
             if None in one.displacement_mm:
-                value = None  # an undetermined axis would make it larger
+                value = None  # a displacement along the undetermined axis would enlarge it
             self._measurement("Position", item, _STATUS[one.verdict], value, None if std is None else 2.0 * std)
         self._add_coordinates(one)
         self._add_angle(one)
@@ -120,7 +120,7 @@ class _Document:
             more = [("TargetValue", _decimal(nominal)), ("Direction", _DIRECTION[axis])]
             name = f"{one.name} {what} {'xyz'[axis]}"
             item = self._item("LinearCoordinate", one.name, name, self._coordinates, more)
-            status = _open_status(one) if moved is None else "BASIC_OR_TED"
+            status = _status_without_value(one) if moved is None else "BASIC_OR_TED"
             std = None if covariance is None else max(covariance[3 + axis][3 + axis], 0.0) ** 0.5
             value = None if moved is None else nominal + moved
             self._measurement("LinearCoordinate", item, status, value, std)
@@ -144,7 +144,7 @@ class _Document:
         self._measurement("UserDefinedAngular", item, _angle_status(one), details.angle_deg, std)
 
     def _position(self, tolerance_mm: float) -> str:
-        """Id of the definition with this tolerance."""
+        """Id of the definition of a position characteristic with this tolerance, which is added if needed."""
         if tolerance_mm not in self._positions:
             self._positions[tolerance_mm], definition = self._definition("Position")
             _add(definition, "ToleranceValue", _decimal(2.0 * tolerance_mm))
@@ -159,7 +159,7 @@ class _Document:
         return number, definition
 
     def _item(self, kind: str, component: str, name: str, definition: str, more: list[tuple[str, str]]) -> str:
-        """A nominal of a definition and its item; the item's id."""
+        """Add a nominal value of a definition and its item; returns the id of the item."""
         nominal = etree.Element(_name(f"{kind}CharacteristicNominal"), id=self._next_id())
         _add(nominal, "CharacteristicDefinitionId", definition)
         for tag, text in more:
@@ -204,21 +204,21 @@ class _Document:
         return str(self._last_id)
 
 
-def _open_status(one: ComponentDeviation) -> str:
-    """Of a value that is not there."""
+def _status_without_value(one: ComponentDeviation) -> str:
+    """Status of a characteristic without a value."""
     if one.finding is Finding.MISSING or one.verdict is Verdict.NOT_MEASURED:
         return "NOT_ANALYZED"
     return "INDETERMINATE"
 
 
 def _angle_status(one: ComponentDeviation) -> str:
-    """By the same rule as the position, with all of U kept from the tolerance."""
+    """Status of the rotation by the same decision rule as the position, with the full U as guard band."""
     assert one.details is not None
     limit, angle, uncertainty = (
         one.details.angle_tolerance_deg, one.details.angle_deg, one.details.angle_uncertainty_deg,
     )  # fmt: skip
     if angle is None:
-        return _open_status(one)
+        return _status_without_value(one)
     if limit is None:
         return "BASIC_OR_TED"
     if angle + (uncertainty or 0.0) <= limit:
@@ -238,7 +238,7 @@ def _add(parent: Any, tag: str, text: str | None = None) -> Any:
 
 
 def _list(parent: Any, tag: str, members: list[Any]) -> None:
-    """A list with its number of members; left out when it is empty."""
+    """Add a list element with its number of members, unless it is empty."""
     if members:
         holder = _add(parent, tag)
         holder.set("n", str(len(members)))
@@ -253,11 +253,11 @@ def _unit(parent: Any, tag: str, si_name: str, name: str, factor: str) -> None:
 
 
 def _decimal(value: float) -> str:
-    """An xs:decimal, which knows no exponents."""
+    """An xs:decimal, which has no exponent."""
     text = f"{value:.6f}".rstrip("0").rstrip(".")
     return "0" if text in ("-0", "") else text
 
 
 def _printable(text: str) -> str:
-    """Without the control characters that XML cannot hold."""
+    """A text without the control characters that XML does not allow."""
     return "".join(c if c >= " " and c not in "\ufffe\uffff" else " " for c in text)
