@@ -1,8 +1,8 @@
 """QIF 3.0 results (ISO 23952, DMSC): characteristics with their nominal and measured values.
 
 The position of the centre of a component is a position characteristic with a spherical zone, whose diameter is twice
-the tolerance. Its x, y, z are linear coordinate characteristics without tolerance. Its rotation is a user-defined angular
-characteristic. Structure and order of the elements follow QIFDocument.xsd, QIFResults.xsd, Characteristics.xsd,
+the tolerance. Its x, y, z are linear coordinate characteristics without tolerance. Its rotation is a user-defined
+angular characteristic. Structure and order of the elements follow QIFDocument.xsd, QIFResults.xsd, Characteristics.xsd,
 Units.xsd and PrimitivesPMI.xsd of QIF 3.0.0.
 """
 
