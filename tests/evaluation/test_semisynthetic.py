@@ -406,7 +406,7 @@ def test_what_is_there_is_kept_and_other_options_replace_it(tmp_path: Path, phot
 
 def test_folder_of_something_else_is_left_alone(tmp_path: Path, photos: tuple[Path, ...]) -> None:
     (tmp_path / "block_regular").mkdir()
-    with pytest.raises(OutputError, match="no sequence made by arview"):
+    with pytest.raises(OutputError, match="not a sequence made by arview"):
         make_sequence(shape_job("block", SequenceOptions(frames=1), photos), tmp_path)
 
 

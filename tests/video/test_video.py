@@ -167,9 +167,9 @@ BAD_FILES = {
     "text.txt": (lambda path: path.write_text("not a video\n" * 100), "is a text file, not a video"),
     "noise.mp4": (lambda path: path.write_bytes(bytes(range(256)) * 8), "is not a readable video"),
     "no_frames.mp4": (write_without_frames, "no frame that can be decoded|no video stream|cut-short"),
-    "sound.mp4": (write_sound_only, "holds no video stream"),
+    "sound.mp4": (write_sound_only, "contains no video stream"),
     "empty.png": (lambda path: path.write_bytes(b""), "none of the 1 pictures can be read"),
-    "folder": (lambda path: path.mkdir(), "holds no pictures"),
+    "folder": (lambda path: path.mkdir(), "contains no pictures"),
     "missing.mp4": (lambda path: None, "no such file or folder"),
     "missing*.png": (lambda path: None, "no picture .* matches"),
 }
@@ -385,7 +385,7 @@ def test_camera_that_is_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
         frames = list(source)
     assert 1 <= len(frames) <= 5
     np.testing.assert_array_equal(frames[0].image, quarters(160, 120))
-    assert source.ended_reason == "camera 0: the camera gives no more frames; was it unplugged?"
+    assert source.ended_reason == "camera 0: the camera delivers no more frames; was it unplugged?"
     with open_source("0", start=2, end=4) as source:
         indices = [frame.index for frame in source]
     assert indices and set(indices) <= {2, 3}

@@ -1,4 +1,4 @@
-"""Overlay: what is drawn on each frame: CAD ghosts, edges, measured deviations, arrows and a status line."""
+"""Overlay: ghosts, edges, measured deviations, arrows and a status line, drawn on each frame."""
 
 from arview.overlay.options import OverlayOptions
 from arview.overlay.renderer import OverlayRenderer

@@ -1,8 +1,8 @@
-"""Feature edges of a model: creases found once, silhouettes found per pose, hidden parts removed by z-buffer.
+"""Feature edges of a model: creases are found once, silhouettes per pose; hidden edges are removed by z-buffer.
 
-Silhouette of a mesh: edges between a face that looks at the camera and one that looks away (e.g. Isenberg
-et al., "A developer's guide to silhouette algorithms", IEEE CG&A 2003). Lines are drawn by walking along the
-major axis and weighing pixels by their distance from the line (Gupta & Sproull, SIGGRAPH 1981).
+The silhouette of a mesh are the edges between a face towards the camera and one away from it (Isenberg et al., "A
+developer's guide to silhouette algorithms", IEEE CG&A 2003). Lines are rasterised along their major axis, with pixels
+weighted by their distance from the line (Gupta and Sproull, SIGGRAPH 1981).
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from arview.overlay.ghost import NEAR_MM, Ghost, GhostView
 from arview.overlay.mesh import Topology
 
 _CREASE_COS = float(np.cos(np.deg2rad(30.0)))
-"""Faces that meet at a larger angle form a crease."""
+"""Cosine of the angle above which two faces form a crease."""
 _FLAT_COS = float(np.cos(np.deg2rad(0.05)))
-"""Faces that meet at a smaller angle lie in one plane: no silhouette can run between them."""
+"""Cosine of the angle below which two faces are coplanar: no silhouette can lie between them."""
 _HIDDEN_COVER = 0.4
-"""Strength of a hidden edge against a visible one."""
+"""Opacity of a hidden edge, relative to a visible one."""
 _DASH_PX = 5
+"""Length of the dashes of hidden edges, and of the gaps between them."""
 
 
 class Edges:
-    """The edges of a model worth drawing: creases, open borders and candidates for the silhouette."""
+    """The edges of a model that may be drawn: creases, open borders and candidates for the silhouette."""
 
     def __init__(self, shapes: list[Topology], pieces_mm: float | None = None) -> None:
-        """From one topology per component; edges are cut to ``pieces_mm`` where the lens bends them."""
+        """Edges of one topology per component; cut into pieces of ``pieces_mm`` if the lens distorts."""
         points, normals, face_points, ends, faces, creases, closed, owners = [], [], [], [], [], [], [], []
         vertex_offset = face_offset = 0
         for index, shape in enumerate(shapes):
@@ -54,7 +55,7 @@ class Edges:
             self._split(pieces_mm)
 
     def _split(self, longest_mm: float) -> None:
-        """Cut edges into pieces no longer than ``longest_mm``, so that distortion can bend them."""
+        """Cut edges into pieces no longer than ``longest_mm``, so that they can follow the distortion."""
         a, b = self._points[self._ends[:, 0]], self._points[self._ends[:, 1]]
         pieces = np.maximum(1, np.ceil(np.linalg.norm(b - a, axis=1) / longest_mm)).astype(np.int64)
         edge = np.repeat(np.arange(len(pieces)), pieces)
@@ -70,7 +71,11 @@ class Edges:
     def draw(
         self, ghost: Ghost, view: GhostView, cam_from_model: Array, width_px: float, with_hidden: bool
     ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-        """Edges in the window of ``view``: coverage (h,w) 0–255 and index of the owning component (h,w)."""
+        """Rasterise the edges in the window of a view.
+
+        Returns:
+            coverage (h,w) 0–255, and index (h,w) of the component that each edge belongs to.
+        """
         camera = ghost.camera
         eye_in_model = invert(cam_from_model)[:3, 3]
         points = ghost.bent(apply(cam_from_model, self._points))
@@ -96,7 +101,7 @@ def _faces_camera(normals, face_points, eye, face):  # type: ignore[no-untyped-d
 
 @kernel(fastmath=True)
 def _is_visible(column, row, limit, inverse_depth):  # type: ignore[no-untyped-def]
-    """True when a surface within one pixel is no nearer than the inverse depth ``limit``."""
+    """Whether some surface within one pixel is no nearer than the inverse depth ``limit``."""
     height, width = inverse_depth.shape
     if 0 <= row < height and 0 <= column < width and inverse_depth[row, column] <= limit:
         return True
@@ -113,7 +118,7 @@ def _draw_edges(  # type: ignore[no-untyped-def]
     fx, fy, cx, cy, inverse_depth, width_px, with_hidden, cover, owner,
 ):  # fmt: skip
     height, width = inverse_depth.shape
-    # One pixel of slack, in the image and in depth, keeps edges whole on faces seen at a grazing angle.
+    # One pixel of tolerance, in the image and in depth, keeps edges complete on faces at a grazing angle.
     slack = 1.0 / (1.0 - 1.0 / fx - 5e-4)
     for edge in range(ends.shape[0]):
         front_a = _faces_camera(normals, face_points, eye, faces[edge, 0])

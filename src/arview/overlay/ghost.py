@@ -1,4 +1,4 @@
-"""The ghost: the model's z-buffer in a window around the part, shaded and blended over the frame."""
+"""The ghost: the model rendered by z-buffer in a window around the part, shaded and blended over the frame."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from arview.rendering.rasterizer import rasterise
 NEAR_MM = 1.0
 """Geometry nearer to the camera is clipped."""
 CELL_PX = 8
-"""Size of a cell of the coverage grid that the label layout avoids."""
+"""Cell size of the coverage grid that the label layout uses."""
 _WINDOW_MARGIN_PX = 4
+"""Margin of the window around the projected part."""
 
 
 @dataclass(frozen=True)
 class GhostView:
-    """The model as one frame's camera sees it.
+    """The model as rendered for one frame.
 
     Attributes:
         u0, v0: first column and row of the window in the image, px.
         inverse_depth: (h,w) 1/mm, 0 off the part.
-        face_ids: (h,w) int32 into the faces drawn, -1 off the part.
-        shade: (D,) float32 of the faces drawn, |cos| of the angle between normal and line of sight.
-        components: (D,) int32 component of the faces drawn.
+        face_ids: (h,w) int32 index into the drawn faces, -1 off the part.
+        shade: (D,) float32 of the drawn faces, |cos| of the angle between normal and line of sight.
+        components: (D,) int32 component of the drawn faces.
     """
 
     u0: int
@@ -42,27 +43,26 @@ class GhostView:
 
 
 class Ghost:
-    """Z-buffer of a model at a pose, in the window of the image that the part covers.
+    """Renders a model at a pose, in the window of the image that the part covers.
 
-    Lens distortion is honoured by drawing with the ideal camera and looking up, for every pixel of the real
-    image, the pixel of the ideal one.
+    With lens distortion the model is rendered with the ideal camera and resampled to the pixels of the real image.
     """
 
     def __init__(self, model: Model, camera: Camera, shapes: list[Topology]) -> None:
-        """For a model and the topology of each of its components."""
+        """Prepare a model, given the topology of each of its components."""
         self.camera = camera
         self._vertices_in_model, self._faces, self._component_of_face = model.mesh
-        # Of a closed mesh only faces turned to the camera can be seen: 1, -1 where it is wound inside out.
+        # Of a closed mesh only faces towards the camera are visible: 1, or -1 if it is wound inside out.
         winding = [(-1 if shape.is_inside_out else 1) if shape.is_closed else 0 for shape in shapes]
         self._winding = np.array(winding, dtype=np.int8)[self._component_of_face]
         self._distortion_limit_r2 = _monotone_limit_r2(camera)
         self._ideal_pixels = _ideal_pixels(camera) if camera.is_distorted else None
 
     def bent(self, points_in_cam: Array) -> Array:
-        """Points (N,3) moved sideways so that a pinhole projects them where the real lens would.
+        """Points (N,3) displaced sideways, so that a pinhole camera projects them where the real lens does.
 
-        Beyond the field of view, where the polynomial of the lens may fold back, the displacement factor is
-        kept at its value on the limit.
+        Beyond the field of view, where the lens polynomial may fold back, the factor of the displacement is kept at its
+        value on the border.
         """
         if not self.camera.is_distorted:
             return points_in_cam
@@ -74,12 +74,12 @@ class Ghost:
         return np.stack([xd / shrink * safe_z, yd / shrink * safe_z, z], axis=-1)
 
     def project(self, points_in_cam: Array) -> Array:
-        """Pixels (..., 2) of points (..., 3), as the camera sees them; NaN for points not in front of it."""
+        """Pixels (..., 2) of points (..., 3) in the real image; NaN for points that are not in front of the camera."""
         points = self.bent(points_in_cam.reshape(-1, 3)).reshape(points_in_cam.shape)
         return self.camera.without_distortion().project(points)
 
     def view(self, cam_from_model: Array) -> GhostView | None:
-        """What the camera sees from this pose; None when the part is outside the image."""
+        """Render the model at a pose (4,4); None if the part is outside the image."""
         camera = self.camera
         points = apply(cam_from_model, self._vertices_in_model)
         window = _window(self.bent(points), camera)
@@ -99,7 +99,7 @@ class Ghost:
     def _ideal_window(
         self, ideal_pixels: NDArray[np.int16], window: tuple[int, int, int, int]
     ) -> tuple[int, int, int, int]:
-        """Window of the ideal image that holds all pixels of a window of the real one."""
+        """Window of the ideal image that contains all pixels of a window of the real one."""
         u0, v0, u1, v1 = window
         part = ideal_pixels[v0:v1, u0:u1]
         rim = np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]])
@@ -108,7 +108,7 @@ class Ghost:
 
 
 def _window(points: Array, camera: Camera) -> tuple[int, int, int, int] | None:
-    """Window (u0, v0, u1, v1) of the image around projected points, end exclusive; None when empty."""
+    """Window (u0, v0, u1, v1) of the image around projected points, end exclusive; None if it is empty."""
     z = points[:, 2]
     in_front = z > NEAR_MM
     if not in_front.any():
@@ -127,7 +127,7 @@ def _window(points: Array, camera: Camera) -> tuple[int, int, int, int] | None:
 
 
 def _monotone_limit_r2(camera: Camera) -> float:
-    """Largest squared normalised radius, to 1.5 × the corner's radius, where the lens does not fold back."""
+    """Largest squared normalised radius, up to 1.5 × the corner's, up to which the lens does not fold back."""
     corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], dtype=float)
     rays = (corners - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     r2 = np.linspace(0.0, 2.25 * float(np.max(np.sum(rays * rays, axis=1))), 400)
@@ -140,14 +140,14 @@ def _monotone_limit_r2(camera: Camera) -> float:
 def _ideal_pixels(camera: Camera) -> NDArray[np.int16]:
     """For every pixel of the image, the nearest pixel (H,W,2) u, v of a lens without distortion.
 
-    Worked out at nodes CELL_PX apart and interpolated between them.
+    Computed at nodes CELL_PX apart and interpolated between them.
     """
     nodes_u = np.arange(0, camera.width + CELL_PX, CELL_PX, dtype=np.float64)
     nodes_v = np.arange(0, camera.height + CELL_PX, CELL_PX, dtype=np.float64)
     with np.errstate(all="ignore"):
         rays = camera.unproject(np.stack(np.meshgrid(nodes_u, nodes_v), axis=-1))
         ideal = rays[..., :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    # Where the lens model folds back no ray exists; such pixels are kept near the image.
+    # Where the lens model folds back there is no ray; such pixels are kept near the image.
     size = np.array([camera.width, camera.height])
     ideal = np.clip(np.nan_to_num(ideal, nan=-1.0), -0.5 * size, 1.5 * size)
     v, fraction_v = np.divmod(np.arange(camera.height), CELL_PX)
@@ -161,7 +161,7 @@ def _ideal_pixels(camera: Camera) -> NDArray[np.int16]:
 
 @kernel
 def _look_up(ideal_pixels, window, origin, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
-    """Depth and faces of a window of the real image from those of the ideal image."""
+    """Inverse depth and faces of a window of the real image, from those of the ideal image."""
     u0, v0, u1, v1 = window
     depth = np.zeros((v1 - v0, u1 - u0))
     faces = np.full((v1 - v0, u1 - u0), -1, dtype=np.int32)
@@ -177,7 +177,7 @@ def _look_up(ideal_pixels, window, origin, inverse_depth, face_ids):  # type: ig
 
 @kernel(fastmath=True)
 def _faces_to_draw(points, faces, winding, component_of_face, shade):  # type: ignore[no-untyped-def]
-    """Faces that may be seen (first ``count`` rows), their components and ``count``; fills ``shade``."""
+    """Faces that may be visible (first ``count`` rows), their components, and ``count``; fills ``shade``."""
     kept = np.empty_like(faces)
     components = np.empty_like(component_of_face)
     count = 0
@@ -202,8 +202,8 @@ def _faces_to_draw(points, faces, winding, component_of_face, shade):  # type: i
 def blend(image, u0, v0, face_ids, shade, components, ghost_style, edge_cover, edge_owner, edge_style):  # type: ignore[no-untyped-def]
     """Blend ghost and edges over the image in place.
 
-    ``ghost_style`` and ``edge_style`` are (C,4) float32: r, g, b in 0–255 and alpha in 0–1 per component;
-    ``edge_cover`` (h,w) uint8 and ``edge_owner`` (h,w) int16 come from ``arview.overlay.edges``.
+    ``ghost_style`` and ``edge_style`` are (C,4) float32: r, g, b in 0–255 and alpha in 0–1 of each component;
+    ``edge_cover`` (h,w) uint8 and ``edge_owner`` (h,w) int16 are from `Edges.draw`.
     """
     height, width = face_ids.shape
     for row in range(height):
@@ -220,7 +220,7 @@ def blend(image, u0, v0, face_ids, shade, components, ghost_style, edge_cover, e
             g = np.float32(image[v0 + row, u0 + column, 1])
             b = np.float32(image[v0 + row, u0 + column, 2])
             if alpha > 0:
-                # Grazing faces a little denser, like glass; faces towards the camera brighter.
+                # Faces at a grazing angle are a little denser, like glass; faces towards the camera are brighter.
                 facing = shade[face]
                 alpha = min(np.float32(1.0), alpha * (np.float32(1.25) - np.float32(0.35) * facing))
                 light = np.float32(0.45) + np.float32(0.55) * facing
@@ -240,9 +240,9 @@ def blend(image, u0, v0, face_ids, shade, components, ghost_style, edge_cover, e
 
 @kernel
 def count_cells(u0, v0, face_ids, components, weight, cells, seen_px):  # type: ignore[no-untyped-def]
-    """Add ``weight`` (C,) per cell of the image (in pixel areas) and visible pixels per component.
+    """Add the weighted area (``weight`` (C,) times pixels) to each cell, and the visible pixels to each component.
 
-    Every second pixel of every second row stands for four.
+    Every second pixel of every second row is counted as four.
     """
     height, width = face_ids.shape
     for row in range(0, height, 2):

@@ -1,4 +1,4 @@
-"""The outline that the user brings the part into, two-tone so that it shows on bright and on dark pictures."""
+"""The outline with which the user aligns the part, in two tones to be visible on bright and dark pictures."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ from arview.overlay.options import PANEL_RGB, Rgb
 from arview.overlay.paint import Image
 
 GUIDE_RGB: Rgb = (255, 221, 87)
+"""Colour of the outline."""
 _INNER_ALPHA, _HALO_ALPHA = 0.75, 0.7
+"""Opacity of the inner edges, and of the dark halo around all lines."""
 
 
 class GuideOutline:
-    """Draws a model's outline and its visible edges at a guide pose; the last drawing is kept."""
+    """Draws a model's outline and its visible edges at a guide pose; the last drawing is cached."""
 
     def __init__(self, ghost: Ghost, edges: Edges, line_px: float) -> None:
         self._ghost, self._edges, self._line_px = ghost, edges, line_px
@@ -26,7 +28,7 @@ class GuideOutline:
         self._line = self._halo = np.zeros((0, 0, 1), dtype=np.float32)
 
     def draw(self, image: Image, guide_cam_from_model: Array) -> None:
-        """Blend the outline over the image in place; nothing where it is outside the image."""
+        """Blend the outline over the image in place; draws nothing if the part is outside the image."""
         if self._pose is None or not np.array_equal(self._pose, guide_cam_from_model):
             self._make(guide_cam_from_model)
         if self._place is None:
@@ -57,5 +59,5 @@ def _rim(mask: NDArray[np.bool_], width_px: float) -> Array:
     inside = np.pad(mask, 1).astype(np.uint8)
     depth_px = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
     rim = np.where(mask, np.clip(width_px + 0.5 - depth_px, 0.0, 1.0), 0.0)
-    # The mask has hard steps; a breath of blur rounds them.
+    # A slight blur smooths the steps of the mask.
     return np.asarray(cv2.GaussianBlur(rim, (3, 3), 0.6), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What a label says and how it looks. Everything on it comes from the inspection, never from a pose."""
+"""Text and appearance of labels. Everything on them is from the inspection, never from a pose."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ _MUTED = (176, 186, 200)
 _RANK = {Verdict.FAIL: 0, Verdict.UNDECIDED: 1, Verdict.NOT_MEASURED: 3, Verdict.PASS: 2}
 _ARROW_SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _ARROW_FRACTION = 0.14
-"""The largest arrow is at most this fraction of the part's diameter."""
+"""Length of the longest arrow, at most, in diameters of the part."""
 
 
 def _number(value_mm: float, options: OverlayOptions, signed: bool = False) -> str:
-    """A length in the unit of the labels, with a typographic minus."""
+    """A length in the unit of the labels, with a typographic minus sign."""
     value = value_mm / _MM_PER_UNIT[options.unit]
     sign = "+" if signed else ""
     return f"{value:{sign}.{options.decimals}f}".replace("-", "−")
 
 
 def by_urgency(inspection: Inspection) -> list[ComponentDeviation]:
-    """Components in the order in which they deserve a label: failures first, the worst of them foremost."""
+    """Components by urgency of their labels: failures first, in order of their excess over the tolerance."""
 
     def key(deviation: ComponentDeviation) -> tuple[int, float, str]:
         if deviation.distance_mm is None or deviation.tolerance_mm is None:
@@ -41,7 +41,7 @@ def by_urgency(inspection: Inspection) -> list[ComponentDeviation]:
 
 
 def value_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
-    """The distance with its unit, ``missing``, or an empty text when nothing was measured."""
+    """The distance with its unit, ``missing``, ``undetermined``, or an empty text if nothing was measured."""
     if deviation.finding is Finding.MISSING:
         return "missing"
     if deviation.distance_mm is None:
@@ -52,7 +52,7 @@ def value_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
 def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
     """Displacement per axis, rotation and U; axes within U of zero are left out.
 
-    An undetermined axis is named as such.
+    Undetermined axes are shown with a question mark.
     """
     if deviation.distance_mm is None:
         return ""
@@ -73,7 +73,7 @@ def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
 
 
 def arrow_scale(inspection: Inspection, diameter_mm: float, options: OverlayOptions) -> float:
-    """Exaggeration of the arrows: as asked for, or the roundest number that keeps the longest one short."""
+    """Exaggeration of the arrows: from the options, or the largest round number that keeps the longest one short."""
     if options.arrow_scale is not None:
         return options.arrow_scale
     longest_mm = max((component.distance_mm or 0.0 for component in inspection.components), default=0.0)
@@ -82,7 +82,7 @@ def arrow_scale(inspection: Inspection, diameter_mm: float, options: OverlayOpti
 
 
 def arrow_in_model(deviation: ComponentDeviation) -> tuple[float, float, float] | None:
-    """Displacement (3,) mm that an arrow shows, undetermined axes as 0; None when it is within U of zero."""
+    """Displacement (3,) mm that an arrow shows, with undetermined axes as 0; None if it is within U of zero."""
     if deviation.distance_mm is None or deviation.distance_mm <= (deviation.uncertainty_mm or 0.0):
         return None
     dx, dy, dz = (value or 0.0 for value in deviation.displacement_mm)
@@ -90,12 +90,12 @@ def arrow_in_model(deviation: ComponentDeviation) -> tuple[float, float, float] 
 
 
 def text_size_px(image_height: int) -> int:
-    """Size of the label text: legible at 480 rows and in proportion above."""
+    """Size of the label text: legible at 480 rows, and in proportion to the height above."""
     return max(11, round(4.5 + image_height / 72))
 
 
 def label_sprite(deviation: ComponentDeviation, options: OverlayOptions, size_px: int, widest_px: int) -> paint.Sprite:
-    """Picture of a label: name, distance and verdict; a second line of details unless it passed."""
+    """Sprite of a label: name, distance and verdict, and a second line of details unless it passed."""
     color = VERDICT_RGB[deviation.verdict]
     small_px = max(10, round(0.86 * size_px))
     pad, bar = round(0.5 * size_px), max(3, round(0.28 * size_px))

@@ -1,10 +1,10 @@
-"""Where labels go: two columns beside the part, with memory, so that they stay readable in a moving picture.
+"""Placement of labels: two columns beside the part, stable from frame to frame so that they stay readable.
 
-Boundary labelling (Bekos et al., "Boundary labeling", 2007) with two columns. Within a column the order is
-kept from frame to frame and the rows are found by dynamic programming over what a label would cover, how far
-it is from its component and how far it would have to move. As all old rows and all new rows of a column are
-apart and in the same order, rows in between are apart too, so labels can glide without crossing. A label that
-must change column or order fades out and comes back at its new place.
+Boundary labelling (Bekos et al., "Boundary labeling", 2007) with two columns. Within a column the order is kept from
+frame to frame; the rows are found by dynamic programming over the area that a label covers, its distance from its
+component and the distance it would have to move. Because the old and the new rows of a column do not overlap and have
+the same order, rows in between do not overlap either, so labels can glide without crossing. A label that must change
+column or order fades out and reappears at its new place.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ from arview.geometry import Array
 from arview.overlay.ghost import CELL_PX
 
 _ROW_PX = 4
-"""Step of the rows that are tried; goals nearer than this are not followed."""
+"""Grid of the rows that are tried; a label does not move to a row nearer than this."""
 _FADE_FRAMES = 6
+"""Frames in which a label fades in or out."""
 _REST_FRAMES = 30
-"""A label that has just moved to another column or order stays there for this long."""
+"""Frames for which a label stays in a new column or order."""
 _GLIDE = 0.16
-"""Fraction of the way to its goal that a label moves in a frame."""
+"""Fraction of the remaining way that a label moves in a frame."""
 _COVER_COST = 60.0
-"""Cost of covering components wholly; in comparison a tenth of the image's height off costs 1."""
+"""Cost of a label that covers components with its whole area; a distance of a tenth of the image's height costs 1."""
 _SIDE_HYSTERESIS = 1.5
-"""How much better the other column must be, in the costs of ``_choose_side``."""
+"""Advantage that the other column must have before a label changes, in the costs of ``_choose_side``."""
 
 
 @dataclass(frozen=True)
 class LabelRequest:
-    """A label that wants a place; requests come in order of urgency.
+    """A label to be placed; requests are in order of urgency.
 
     Attributes:
         key: identifies the label from frame to frame.
         width, height: of its box, px.
-        anchor_px: (2,) the point of the image it speaks of.
+        anchor_px: (2,) image point of its component.
     """
 
     key: str
@@ -63,7 +64,7 @@ class PlacedLabel:
 
 @dataclass
 class _Slot:
-    """Memory of one label."""
+    """State of one label from frame to frame."""
 
     request: LabelRequest
     urgency: int
@@ -79,10 +80,10 @@ class _Slot:
 
 
 class LabelLayout:
-    """Places labels in an image and remembers them from frame to frame.
+    """Places labels in an image, stable from frame to frame.
 
-    Labels lie inside ``top_px`` to ``bottom_px`` of an image ``width`` px wide and never cover each other.
-    None of them is wider than ``widest_px``, which must leave room for two side by side.
+    Labels lie between ``top_px`` and ``bottom_px`` of an image ``width`` px wide and never overlap. None is wider than
+    ``widest_px``, which must leave room for two side by side.
     """
 
     def __init__(self, width: int, top_px: int, bottom_px: int, margin_px: int, gap_px: int, widest_px: int) -> None:
@@ -95,7 +96,7 @@ class LabelLayout:
         self._edges: tuple[float, float] | None = None
 
     def reset(self) -> None:
-        """Forget all labels: the next ones appear at once where they belong."""
+        """Forget all labels: the next ones appear at once at their places."""
         self._left, self._right, self._edges = [], [], None
 
     def place(
@@ -106,10 +107,10 @@ class LabelLayout:
         Args:
             requests: labels wanted, the most urgent first.
             part_px: first and last column of the image that the part covers.
-            cells: covered area per cell of CELL_PX × CELL_PX of the image, weighted, px².
+            cells: weighted covered area, px², of each cell of CELL_PX × CELL_PX of the image.
 
         Returns:
-            Labels to draw, in any order. Those for which there is no room are left out.
+            Labels to draw, in any order; those for which there is no room are left out.
         """
         is_first = not (self._left or self._right)
         self._move_edges(part_px)
@@ -151,7 +152,7 @@ class LabelLayout:
         return PlacedLabel(request.key, x, y, request.width, request.height, slot.on_left, slot.opacity)
 
     def _update_slots(self, requests: list[LabelRequest]) -> None:
-        """Renew the anchors, choose columns, mark labels that must leave, insert new ones."""
+        """Update the anchors, choose columns, mark labels that must leave, insert new ones."""
         known = {slot.request.key: slot for slot in (*self._left, *self._right)}
         wanted = {request.key for request in requests}
         for key, slot in known.items():
@@ -171,13 +172,13 @@ class LabelLayout:
                 self._insert(_Slot(request, urgency, on_left, np.nan, 0.0))
                 continue
             present.request, present.urgency = request, urgency
-            # A label on its way out goes all the way, and comes back as a new one.
+            # A label that is fading out disappears completely, and reappears as a new one.
             present.is_leaving = present.is_leaving or present.on_left != on_left
         for column in (self._left, self._right):
             self._mark_disorder(column)
 
     def _choose_side(self, request: LabelRequest, present: _Slot | None, free_px: dict[bool, float]) -> bool | None:
-        """True for left, False for right, None when neither column has room."""
+        """True for left, False for right, None if neither column has room."""
         assert self._edges is not None
         room = [side for side in (True, False) if free_px[side] >= request.height + self._gap]
         if present is not None and present.age < _REST_FRAMES and present.on_left in room:
@@ -200,7 +201,7 @@ class LabelLayout:
         column.insert(place, slot)
 
     def _mark_disorder(self, column: list[_Slot]) -> None:
-        """Let the less urgent of two neighbours leave when their anchors have clearly changed places."""
+        """Let the less urgent of two neighbours leave if the order of their anchors has clearly changed."""
         for upper, lower in pairwise(column):
             by = upper.anchor_y - lower.anchor_y
             if by < 1.5 * max(upper.request.height, lower.request.height):
@@ -211,7 +212,7 @@ class LabelLayout:
             return
 
     def _solve(self, column: list[_Slot], integral: Array, is_first: bool) -> None:
-        """Set y of every label of a column."""
+        """Set the row of every label of a column."""
         self._drop_overflow(column)
         if not column:
             return
@@ -237,13 +238,13 @@ class LabelLayout:
                 slot.opacity = 1.0 if is_first else 1.0 / _FADE_FRAMES
 
     def _drop_overflow(self, column: list[_Slot]) -> None:
-        """Labels on their way out may overfill a column: the newcomers then wait."""
+        """Remove new labels while labels that are fading out still fill the column."""
         while sum(s.request.height + self._gap for s in column) > self._bottom - self._top - _ROW_PX * len(column):
             hidden = [slot for slot in column if slot.opacity == 0]
             column.remove(max(hidden or column, key=lambda slot: slot.urgency))
 
     def _part(self, drawn: list[_Slot]) -> None:
-        """Push labels of a column apart where they touch, and back inside."""
+        """Move labels of a column apart where they touch, and back inside the column."""
         low = float(self._top)
         for slot in drawn:
             slot.y = max(slot.y, low)
@@ -268,10 +269,10 @@ class LabelLayout:
 
 @kernel
 def _best_rows(rows, heights, gap, bottom, x0, widths, anchors, previous, integral, cover_cost):  # type: ignore[no-untyped-def]
-    """Rows (N,) of labels in a column, in order and apart, of least total cost (dynamic programming).
+    """Rows (N,) of the labels of a column, in order and without overlap, of least total cost (dynamic programming).
 
-    ``heights`` include the gap below. Costs per label: area covered, squared distance from the anchor,
-    distance from the previous row (NaN: none).
+    ``heights`` include the gap below. The costs of a label are for the area that it covers, its squared distance from
+    the anchor and its distance from the previous row (NaN: none).
     """
     count, steps = len(heights), len(rows)
     grid_h, grid_w = integral.shape[0] - 1, integral.shape[1] - 1

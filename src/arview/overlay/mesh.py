@@ -1,4 +1,4 @@
-"""Topology of a component's mesh: which faces share an edge, and whether the mesh encloses a volume."""
+"""Topology of a component's mesh: faces that share an edge, and whether the mesh encloses a volume."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from arview.cad.model import Component
 from arview.geometry import Array
 
 _WELD_MM = 1e-4
-"""Vertices closer than this are one: exporters repeat vertices at creases and seams."""
+"""Vertices closer than this are merged, because exporters repeat vertices at creases and seams."""
 
 
 @dataclass(frozen=True)
 class Topology:
-    """A component with its repeated vertices welded.
+    """A component's mesh with repeated vertices merged.
 
     Attributes:
         vertices: (V,3) mm.
-        faces: (F,3) of the faces that have an area, wound as in the file.
-        normals: (F,3) unit; outward when the mesh is closed, as wound otherwise.
-        ends: (E,2) vertices of every edge.
+        faces: (F,3) faces with an area, wound as in the file.
+        normals: (F,3) unit normals, outward if the mesh is closed, else as wound.
+        ends: (E,2) vertices of each edge.
         edge_faces: (E,2) the two faces at an edge; the second is -1 at a border or where more than two meet.
-        is_closed: every edge has two faces, wound consistently.
+        is_closed: all edges have two faces, wound consistently.
         is_inside_out: closed, with all faces wound clockwise seen from outside.
     """
 
@@ -38,7 +38,7 @@ class Topology:
 
 
 def topology(component: Component) -> Topology:
-    """Weld a component's vertices and find its edges."""
+    """Merge a component's vertices and find its edges."""
     keys = np.round(component.vertices_in_model / _WELD_MM).astype(np.int64)
     _, first, welded = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     vertices = component.vertices_in_model[first]
@@ -65,10 +65,10 @@ def topology(component: Component) -> Topology:
 
 
 def anchor_in_model(component: Component, shape: Topology) -> Array:
-    """Point (3,) of a component that its label points at; it projects onto the component from everywhere.
+    """Point (3,) of a component to which its label points; it projects onto the component from all directions.
 
-    The centre of area where that lies inside the solid (winding number by solid angles: van Oosterom and
-    Strackee, IEEE TBME 1983), else the point of the surface nearest to it.
+    The centroid of the surface if it lies inside the solid (winding number by solid angles: van Oosterom and Strackee,
+    IEEE TBME 1983), else the surface point nearest to it.
     """
     corners = component.vertices_in_model[component.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -1,4 +1,4 @@
-"""What the overlay shows, and its colours."""
+"""Options and colours of the overlay."""
 
 from __future__ import annotations
 
@@ -26,31 +26,43 @@ VERDICT_WORD: dict[Verdict, str] = {
     Verdict.NOT_MEASURED: "NOT MEASURED",
 }
 NEUTRAL_RGB: Rgb = (70, 196, 255)
-"""Ghost and edges while there is no inspection."""
+"""Colour of ghost and edges without an inspection."""
 CONTEXT_RGB: Rgb = (226, 232, 240)
-"""Edges of components that the inspection does not mention."""
+"""Colour of the edges of components that are not in the inspection."""
 PANEL_RGB: Rgb = (16, 20, 27)
-"""Background of labels and status line."""
+"""Background of labels and of the status line."""
 
 
 @dataclass(frozen=True)
 class OverlayOptions:
-    """What is drawn and how.
+    """What is drawn, and how.
+
+    Attributes:
+        show_ghost: draw the components translucent and shaded.
+        show_edges: crease and silhouette edges: ``none``, ``visible`` ones, or ``all`` with hidden ones dashed.
+        opacity: of the ghost, 0–1; the real part must stay recognisable through it.
+        show_labels: draw a label for each component.
+        show_arrows: draw displacements as arrows.
+        show_status: draw the status line.
+        unit: of the numbers on labels.
+        decimals: of the numbers on labels, 0–4.
+        arrow_scale: exaggeration of displacements; None: chosen from the largest one.
+        max_labels: more would hide the part; failures come first.
 
     Raises:
         InputError: a value is outside its range.
     """
 
-    show_ghost: bool = True  # translucent shaded components
-    show_edges: EdgeMode = "visible"  # crease and silhouette edges; "all" adds hidden ones, dashed
-    opacity: float = 0.42  # of the ghost, 0–1: the real part must stay readable through it
+    show_ghost: bool = True
+    show_edges: EdgeMode = "visible"
+    opacity: float = 0.42
     show_labels: bool = True
     show_arrows: bool = True
     show_status: bool = True
-    unit: Unit = "mm"  # of the numbers on labels
-    decimals: int = 2  # of the numbers on labels, 0–4
-    arrow_scale: float | None = None  # exaggeration of displacements; None: chosen from the largest one
-    max_labels: int = 12  # more would hide the part; failures come first
+    unit: Unit = "mm"
+    decimals: int = 2
+    arrow_scale: float | None = None
+    max_labels: int = 12
 
     def __post_init__(self) -> None:
         if self.show_edges not in get_args(EdgeMode):

@@ -1,4 +1,4 @@
-"""Text, panels and lines: small anti-aliased drawings on RGB images."""
+"""Drawing of anti-aliased text, panels and lines on RGB images."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from arview.overlay.options import PANEL_RGB, Rgb
 Image = NDArray[np.uint8]
 
 _SHIFT = 4
-"""Fractional bits of OpenCV's drawing functions: sixteenths of a pixel."""
+"""Fractional bits of coordinates in OpenCV's drawing functions: sixteenths of a pixel."""
 _OUTLINE_RGB: Rgb = (12, 14, 18)
 _HERSHEY_ASCII = str.maketrans({"−": "-", "±": "~", "×": "x", "·": "|", "…": "~"})
 
 
 @dataclass(frozen=True)
 class Sprite:
-    """A small picture with transparency: rgb (h,w,3) uint8, alpha (h,w) uint8."""
+    """A small picture with transparency: rgb (h,w,3) uint8 and alpha (h,w) uint8."""
 
     rgb: Image
     alpha: NDArray[np.uint8]
@@ -42,9 +42,9 @@ class Sprite:
 
 @lru_cache(maxsize=512)
 def text_mask(text: str, size_px: int, bold: bool = False) -> NDArray[np.uint8]:
-    """Coverage (h,w) uint8 of a line of text; h depends on the size alone, so that base lines agree.
+    """Coverage (h,w) uint8 of a line of text; h depends only on the size, so that baselines agree.
 
-    OpenCV 5 draws its built-in TrueType font; OpenCV 4 has only Hershey's letters, where signs outside ASCII
+    OpenCV 5 draws its built-in TrueType font; OpenCV 4 has only the Hershey fonts, where characters outside ASCII
     are replaced.
     """
     baseline, height = round(1.08 * size_px), round(1.42 * size_px)
@@ -67,7 +67,7 @@ def _font() -> Any:
 
 
 def shortened(text: str, size_px: int, width_px: int, bold: bool = False) -> str:
-    """The text, cut in its middle by an ellipsis where it is wider than ``width_px``."""
+    """The text, shortened in its middle by an ellipsis if it is wider than ``width_px``."""
     if text_mask(text, size_px, bold).shape[1] <= width_px:
         return text
     for kept in range(len(text) - 1, 1, -1):
@@ -78,7 +78,7 @@ def shortened(text: str, size_px: int, width_px: int, bold: bool = False) -> str
 
 
 def panel(width: int, height: int, radius_px: float, opacity: float, rgb: Rgb = PANEL_RGB) -> Sprite:
-    """A rectangle with round corners."""
+    """A rectangle with rounded corners."""
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     across = np.abs(u - 0.5 * (width - 1)) - (0.5 * width - radius_px)
     down = np.abs(v - 0.5 * (height - 1)) - (0.5 * height - radius_px)
@@ -90,7 +90,7 @@ def panel(width: int, height: int, radius_px: float, opacity: float, rgb: Rgb = 
 
 
 def write(sprite: Sprite, mask: NDArray[np.uint8], x: int, y: int, rgb: Rgb) -> None:
-    """Put a text mask on a sprite in place; it is opaque where the text covers it."""
+    """Draw a text mask on a sprite in place, opaque where the text covers it."""
     height = min(mask.shape[0], sprite.height - y)
     width = min(mask.shape[1], sprite.width - x)
     part = (slice(y, y + height), slice(x, x + width))
@@ -101,12 +101,12 @@ def write(sprite: Sprite, mask: NDArray[np.uint8], x: int, y: int, rgb: Rgb) -> 
 
 
 def put_text(image: Image, mask: NDArray[np.uint8], x: int, y: int, rgb: Rgb) -> None:
-    """Blend a text mask over the image in place, its upper left at (x, y)."""
+    """Blend a text mask over the image in place, with its upper left corner at (x, y)."""
     _blend_mask(image, mask, x, y, rgb[0], rgb[1], rgb[2])
 
 
 def put_sprite(image: Image, sprite: Sprite, x: int, y: int, opacity: float = 1.0) -> None:
-    """Blend a sprite over the image in place, its upper left at (x, y)."""
+    """Blend a sprite over the image in place, with its upper left corner at (x, y)."""
     _blend_sprite(image, sprite.rgb, sprite.alpha, x, y, np.float32(opacity))
 
 

@@ -1,4 +1,4 @@
-"""OverlayRenderer: frame, pose and inspection in, annotated frame out."""
+"""OverlayRenderer: draws model, inspection and status over a frame."""
 
 from __future__ import annotations
 
@@ -25,24 +25,25 @@ from arview.overlay.status import StatusLine
 from arview.pose import Pose, TrackingState
 
 _CONTEXT_WEIGHT = 0.25
-"""How bad it is for a label to cover a component that was not inspected, against one that was."""
+"""Cost of covering a component that was not inspected with a label, relative to one that was."""
 _CONTEXT_EDGE_ALPHA = 0.5
+"""Opacity of the edges of components that were not inspected."""
 _CRITICAL_DIMMING = 0.55
-"""Ghost and edges fade while the tracker is not sure of the pose."""
+"""Factor of the opacity of ghost and edges in the state `critical`."""
 _PASS_DIMMING = 0.65
-"""Ghosts of components that passed are fainter, so that the others stand out."""
+"""Factor of the opacity of components that passed, so that the others stand out."""
 _PIECES = 16
-"""A lens bends edges, so they are cut to this fraction of the part's diameter: true to about 0.2 px."""
+"""Pieces per diameter of the part into which edges are cut for a distorting lens: exact to about 0.2 px."""
 _ARROW_RGB = (255, 255, 255)
 _SEEN_PX = 12
-"""A component that shows fewer pixels gets a label only if it did not pass."""
+"""Visible pixels below which a component that passed gets no label."""
 
 
 class OverlayRenderer:
     """Draws ghosts, edges, labels, arrows and the status line for one model, camera and inspection.
 
-    It remembers where labels were, so one renderer belongs to one video; it is not safe to share by threads.
-    All numbers on the picture are the inspection's; the pose only says where to draw.
+    The places of labels depend on earlier frames, so each video needs a renderer of its own; it is not thread-safe. All
+    numbers in the picture are from the inspection; the pose only determines where they are drawn.
 
     Raises:
         MismatchError: the inspection belongs to another model.
@@ -107,11 +108,11 @@ class OverlayRenderer:
 
         Args:
             image: (H,W,3) uint8 RGB, of the camera's size.
-            pose: of this frame; without ``cam_from_model`` only the status line is drawn, and the outline of its
+            pose: of this frame; without ``cam_from_model`` only the status line is drawn, and the outline at its
                 ``guide_cam_from_model`` if it has one.
-            fps: frames per second to show, if any.
-            now: moment that the age of the inspection refers to; default: this moment.
-            in_place: draw on the given image, which must be writable, instead of on a copy of it.
+            fps: frame rate to show; None: not shown.
+            now: time from which the age of the inspection is computed; None: the current time.
+            in_place: draw on the image itself, which must be writable, instead of a copy.
 
         Raises:
             MismatchError: the image is not of the camera's size.
@@ -134,7 +135,7 @@ class OverlayRenderer:
         return canvas
 
     def _styles(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Ghost and edge style (C,4) r g b alpha, and weight (C,) in the layout, of every component."""
+        """Ghost and edge style (C,4) r, g, b, alpha of all components, and their weight (C,) in the layout."""
         ghost_style, edge_style, weight = [], [], []
         for component in self.model.components:
             deviation = self.inspection.find(component.name) if self.inspection else None
@@ -182,7 +183,7 @@ class OverlayRenderer:
             paint.put_sprite(canvas, self._sprites[label.key], label.x, label.y, label.opacity)
 
     def _place_labels(self, view: GhostView, anchors_px: Array) -> tuple[NDArray[np.int64], list[PlacedLabel]]:
-        """Visible pixels (C,) per component, and the boxes of the labels."""
+        """Visible pixels (C,) of the components, and the placed labels."""
         camera = self.camera
         cells = np.zeros((-(-camera.height // CELL_PX), -(-camera.width // CELL_PX)), dtype=np.float32)
         seen_px = np.zeros(len(self.model.components), dtype=np.int64)
@@ -200,7 +201,7 @@ class OverlayRenderer:
         return seen_px, self._layout.place(requests, part_px, cells)
 
     def _deserves_label(self, deviation: ComponentDeviation, anchor_px: Array, seen_px: int) -> bool:
-        """Whether the component is in the picture, and seen in it if it passed; with some inertia."""
+        """Whether the component is in the picture, and visible if it passed; with hysteresis."""
         was_seen = deviation.name in self._was_seen
         slack = 0.02 * self.camera.height if was_seen else 0.0
         u, v = anchor_px
@@ -225,7 +226,7 @@ class OverlayRenderer:
         paint.dot(canvas, anchor, color, 0.2 * self._size_px, bool(seen_px[index] == 0))
 
     def _leader_start(self, label: PlacedLabel, anchor_px: Array) -> list[tuple[float, float]]:
-        """Where a leader leaves its box: sideways with a short stub, else up or down."""
+        """First points of a leader line: sideways from its box with a short stub, else from its top or bottom."""
         stub = 0.8 * self._size_px if label.on_left else -0.8 * self._size_px
         x = float(label.x + label.width if label.on_left else label.x)
         if (anchor_px[0] - x - stub) * stub > 0:
@@ -235,7 +236,7 @@ class OverlayRenderer:
         return [(inside, float(label.y if anchor_px[1] < label.y else label.y + label.height))]
 
     def _arrow_list(self, deviations: list[ComponentDeviation]) -> list[Array]:
-        """Tail and exaggerated tip (2,3) in the model, mm, of every arrow, the most urgent last."""
+        """Tail and exaggerated tip (2,3) of all arrows in the model frame, mm, the most urgent last."""
         arrows = []
         for deviation in reversed(deviations):
             displacement = labels.arrow_in_model(deviation)

@@ -1,4 +1,4 @@
-"""The status line: state of the tracking, part and serial number, inspection age, scale of arrows."""
+"""The status line: state of the tracking, part and serial number, age of the inspection, scale of the arrows."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _STATE_RGB: dict[TrackingState, Rgb] = {
 }
 _WHITE = (240, 244, 248)
 _MUTED = (176, 186, 200)
-LEAST_REMARK = 6
-"""In less room than so many letters' height a remark that gives way is left out."""
+MIN_REMARK = 6
+"""Room, in letter heights, below which a remark of a tracked part is left out."""
 _COUNT_ORDER = (Verdict.FAIL, Verdict.UNDECIDED, Verdict.PASS, Verdict.NOT_MEASURED)
 
 
 def age_text(age_s: float) -> str:
-    """Age in the largest unit that gives a whole number above one, e.g. ``3 h``."""
+    """Age in the largest unit in which it is at least two (minutes: one), e.g. ``3 h ago``."""
     if age_s < 0:
         return "in the future"
     for unit, length_s in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
@@ -33,7 +33,7 @@ def age_text(age_s: float) -> str:
 
 
 class StatusLine:
-    """A bar at the lower edge of the image; what does not fit in one row goes to a second."""
+    """A bar at the lower border of the image, of two rows if one is too short."""
 
     def __init__(self, width: int, height: int, size_px: int, inspection: Inspection | None, scale: float | None):
         self._width, self._height, self._size = width, height, size_px
@@ -41,7 +41,7 @@ class StatusLine:
         self._row_px = round(1.75 * size_px)
         self._pad = round(0.7 * size_px)
         self._fixed = self._inspection_items(None)
-        # The longest age decides once how many rows there are, so that the bar does not change its height.
+        # The number of rows is decided once for the longest text of the age, so that the height stays the same.
         sample = [("searching  q 0.00  00.0 fps", _WHITE), *self._fixed, ("inspected in the future", _MUTED)]
         self.rows = 1 if self._length(sample) <= width - 3 * size_px else 2
         self.height_px = self.rows * self._row_px
@@ -52,7 +52,7 @@ class StatusLine:
         top = self._height - self.height_px
         paint.put_sprite(image, self._panel, 0, top)
         about_part = self._inspection_items(now or datetime.now(UTC))
-        # What has not been seen yet gives way to the part's errors; why it is not tracked matters more than these.
+        # Of a tracked part the remark gives way to the inspection; else it says why the part is not tracked.
         gives_way = self.rows == 1 and pose.state is TrackingState.TRACKED
         tracking = self._tracking_items(pose, fps, self._length(about_part) + self._gap() if gives_way else 0)
         if self.rows == 1 and self._length([*tracking, *about_part]) > self._width - 3 * self._size:
@@ -72,14 +72,14 @@ class StatusLine:
             self._row(image, about_part, self._pad, y + self._row_px)
 
     def _tracking_items(self, pose: Pose, fps: float | None, taken_px: int) -> list[tuple[str, Rgb]]:
-        """State, quality, rate and, as far as there is room beside what is taken, a remark."""
+        """State, quality, frame rate, and a remark if there is room beside ``taken_px``."""
         items = [(pose.state.value.upper(), _STATE_RGB[pose.state])]
         if pose.cam_from_model is not None:
             items.append((f"quality {pose.quality:.2f}", _WHITE))
         if fps is not None:
             items.append((f"{fps:.0f} fps", _WHITE))
         room = self._width - self._length(items) - 4 * self._size - taken_px
-        if pose.remark and (not taken_px or room > LEAST_REMARK * self._size):
+        if pose.remark and (not taken_px or room > MIN_REMARK * self._size):
             items.append((paint.shortened(pose.remark, self._size, room), _MUTED))
         return items
 

@@ -1,4 +1,4 @@
-"""The compiled loop of ``color.tone_map``, apart so that numba is loaded only when an HDR clip comes."""
+"""The compiled loop of ``color.tone_map``; a module of its own, so that numba is loaded only for HDR clips."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def apply_tables(
 ) -> None:
     """Write ``code_of_light[matrix @ light_of_signal[signal]]`` per pixel of (H,W,3) into ``image``.
 
-    ``signal`` is 16 bit, its upper 12 bits index ``light_of_signal``; ``matrix`` (3,3) is scaled to the
-    length of ``code_of_light``.
+    ``signal`` has 16 bits, of which the upper 12 index ``light_of_signal``; ``matrix`` (3,3) is scaled to the length of
+    ``code_of_light``.
     """
     last = code_of_light.shape[0] - 1
     for row in range(signal.shape[0]):

@@ -1,9 +1,9 @@
-"""Decoded video frames to 8-bit RGB, high dynamic range (HLG, PQ) included.
+"""Conversion of decoded video frames to 8-bit RGB, including high dynamic range (HLG, PQ).
 
-HDR is brought to BT.709 in three steps, each pixel by itself: the transfer curve is undone to linear light in
-which diffuse white (HLG 75 %, PQ 203 cd/m², ITU-R BT.2408) is 1; BT.2020 primaries become BT.709; highlights
-are rolled off above 0.8 and a curve to 8 bit is applied: that of BT.709 for HLG, since both describe the
-scene (no display gamma is needed between them), that of sRGB for PQ, since both describe the display.
+HDR is converted to BT.709 in three steps per pixel: the transfer curve is inverted to linear light in which diffuse
+white (HLG 75 %, PQ 203 cd/m², ITU-R BT.2408) is 1; BT.2020 primaries become BT.709; highlights are rolled off above
+0.8 and encoded in 8 bits, with the curve of BT.709 for HLG, since both describe the scene (no display gamma is needed
+between them), and with that of sRGB for PQ, since both describe the display.
 """
 
 from __future__ import annotations
@@ -18,22 +18,26 @@ from numpy.typing import NDArray
 
 from arview.video.frame import Image
 
-UNSPECIFIED_COLORSPACE = 2  # AVCOL_SPC_UNSPECIFIED
-LINEAR_LEVELS = 4096  # entries of the table from signal to light, 12 bit
-ENCODED_LEVELS = 65536  # entries of the table from light to 8 bit: under half a code value near black
-PEAK_LIGHT = 8.0  # brightest light told apart, in units of diffuse white
-KNEE = 0.8  # light above which highlights are rolled off
-
-# ITU-R BT.2087: linear BT.2020 to linear BT.709.
+UNSPECIFIED_COLORSPACE = 2
+"""FFmpeg's AVCOL_SPC_UNSPECIFIED."""
+LINEAR_LEVELS = 4096
+"""Entries of the table from signal to light: 12 bits."""
+ENCODED_LEVELS = 65536
+"""Entries of the table from light to 8 bits: steps of less than half a code value near black."""
+PEAK_LIGHT = 8.0
+"""Light at which the tables end, in units of diffuse white."""
+KNEE = 0.8
+"""Light above which highlights are rolled off."""
 RGB709_FROM_RGB2020 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], dtype=np.float32
 )
+"""Linear BT.2020 to linear BT.709 (ITU-R BT.2087)."""
 
 
 def rgb_from_video_frame(frame: VideoFrame) -> Image:
     """(H,W,3) uint8 RGB of a decoded frame of any pixel format; HLG and PQ are tone-mapped.
 
-    Frames that do not say their matrix are taken as BT.709 from 720 lines on, else as BT.601, as players do.
+    Frames without a declared colour matrix are taken as BT.709 from 720 lines on, else as BT.601, as players do.
     """
     if frame.color_trc in (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084):
         signal = frame.to_ndarray(format="rgb48le", src_colorspace=Colorspace.BT2020, threads=1)
@@ -41,7 +45,7 @@ def rgb_from_video_frame(frame: VideoFrame) -> Image:
     options: dict[str, Any] = {}
     if frame.colorspace == UNSPECIFIED_COLORSPACE and frame.height >= 720:
         options["src_colorspace"] = Colorspace.ITU709
-    # One conversion thread: at video sizes starting more costs longer than the conversion.
+    # One conversion thread, because at video sizes starting more takes longer than the conversion.
     return np.ascontiguousarray(frame.to_ndarray(format="rgb24", threads=1, **options))
 
 

@@ -24,12 +24,12 @@ _CV2_ROTATIONS = {1: cv2.ROTATE_90_CLOCKWISE, 2: cv2.ROTATE_180, 3: cv2.ROTATE_9
 
 
 def turns_of(frame: VideoFrame) -> int:
-    """Quarter turns clockwise that the frame's display matrix asks for, 0–3."""
+    """Quarter turns clockwise, 0–3, that the frame's display matrix declares."""
     return round(-frame.rotation / 90.0) % 4
 
 
 def upright_image(frame: VideoFrame, quarter_turns_clockwise: int) -> Image:
-    """(H,W,3) uint8 RGB of a decoded frame after the turn."""
+    """(H,W,3) uint8 RGB of a decoded frame, rotated by quarter turns."""
     image = rgb_from_video_frame(frame)
     if quarter_turns_clockwise:
         image = cv2.rotate(image, _CV2_ROTATIONS[quarter_turns_clockwise])
@@ -37,13 +37,14 @@ def upright_image(frame: VideoFrame, quarter_turns_clockwise: int) -> Image:
 
 
 class VideoFileSource(FrameSource):
-    """Frames of a video file with its time stamps (variable frame rates included).
+    """Frames of a video file with its time stamps, also of variable frame rate.
 
-    The turn of the display matrix is applied, 10-bit and HDR clips come as 8-bit BT.709. Packets and frames
-    that cannot be decoded are skipped and counted. A mirroring display matrix is not applied: the stored
-    picture is what the lens saw. Pixels are taken as square.
+    The rotation of the display matrix is applied; 10-bit and HDR clips are converted to 8-bit BT.709. Packets and
+    frames that cannot be decoded are skipped and counted. A mirroring display matrix is not applied, because the stored
+    picture is what the lens saw. Pixels are assumed to be square.
 
-    Raises InputError on construction when no frame can be had from the file.
+    Raises:
+        InputError: on construction, if no frame of the file can be decoded.
     """
 
     def __init__(self, path: Path, wanted: FrameRange) -> None:
@@ -54,7 +55,7 @@ class VideoFileSource(FrameSource):
         with self._opened() as (container, stream):
             first = next(self._decoded(container, stream), None)
             if first is None:
-                raise InputError(f"{path}: the video holds no frame that can be decoded; record or copy it again")
+                raise InputError(f"{path}: the video contains no frame that can be decoded; record or copy it again")
             frame = first[1]
             rate = stream.average_rate or stream.guessed_rate
             self.fps = float(rate) if rate else None
@@ -93,28 +94,28 @@ class VideoFileSource(FrameSource):
 
     @contextmanager
     def _opened(self) -> Iterator[tuple[InputContainer, VideoStream]]:
-        """Open the container and pick its video stream, or raise InputError."""
+        """The opened container and its video stream; raises InputError."""
         try:
-            # Absolute, since FFmpeg takes what stands before a colon in a relative name for a protocol.
+            # Absolute, because FFmpeg takes the text before a colon in a relative name for a protocol.
             container = av.open(str(self._path.absolute()))
         except (av.FFmpegError, OSError, ValueError) as error:
             raise InputError(f"{self.name}: {_why_unreadable(self._path, error)}") from error
         with container:
-            # A cover picture in a music file is a video stream too, but not one to track in.
+            # The cover picture of a music file is a video stream too, but not one to track in.
             streams = [
                 stream
                 for stream in container.streams.video
                 if not stream.disposition & av.stream.Disposition.attached_pic
             ]
             if not streams:
-                raise InputError(f"{self.name}: holds no video stream; give a video file")
+                raise InputError(f"{self.name}: contains no video stream; give a video file")
             if container.format.name == "tty":
                 raise InputError(f"{self.name}: is a text file, not a video; give a video file")
             streams[0].thread_type = "AUTO"
             yield container, streams[0]
 
     def _decoded(self, container: InputContainer, stream: VideoStream) -> Iterator[tuple[int, VideoFrame]]:
-        """Index and frame of all that can be decoded; what cannot is counted in ``skipped``."""
+        """Index and frame of all frames that can be decoded; the others are counted in ``skipped``."""
         index = 0
         packets = container.demux(stream)
         while True:
@@ -140,7 +141,7 @@ class VideoFileSource(FrameSource):
 
 
 def _why_unreadable(path: Path, error: Exception) -> str:
-    """What is wrong with a file that the demuxer refuses, and what to do."""
+    """What is wrong with a file that the demuxer rejects, and what to do."""
     try:
         size = path.stat().st_size
         with path.open("rb") as file:
@@ -157,10 +158,12 @@ def _why_unreadable(path: Path, error: Exception) -> str:
 
 
 class PictureSource(FrameSource):
-    """Frames from picture files in the given order; EXIF orientation is applied.
+    """Frames from picture files in the given order; the EXIF orientation is applied.
 
-    Pictures that cannot be read or differ in size from the first are skipped and counted. The time stamp is
-    index / fps. Raises InputError on construction when no picture can be read.
+    Pictures that cannot be read or differ in size from the first are skipped and counted. Time stamps are index / fps.
+
+    Raises:
+        InputError: on construction, if no picture can be read.
     """
 
     def __init__(self, name: str, paths: Sequence[Path], wanted: FrameRange, fps: float) -> None:
@@ -201,7 +204,7 @@ def picture_paths(folder: Path) -> list[Path]:
 
 
 def sorted_naturally(paths: Iterator[Path]) -> list[Path]:
-    """Paths ordered with runs of digits taken as numbers."""
+    """Paths in an order that takes runs of digits as numbers."""
 
     def key(path: Path) -> list[tuple[int, str]]:
         parts = re.split(r"([0-9]+)", str(path).lower())
@@ -211,7 +214,7 @@ def sorted_naturally(paths: Iterator[Path]) -> list[Path]:
 
 
 def _read_picture(path: Path) -> Image | None:
-    """(H,W,3) uint8 RGB upright, or None when the file is no readable picture."""
+    """(H,W,3) uint8 RGB, upright; None if the file is not a readable picture."""
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError:

@@ -12,12 +12,12 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture.
+    """One picture with its time stamp.
 
     Attributes:
         image: (H,W,3) uint8 RGB, upright, contiguous.
-        index: place in the source counted from 0, frames that were skipped or left out included.
-        time_s: time stamp in the source; for live sources seconds since its first frame.
+        index: position in the source, from 0, counting skipped frames as well.
+        time_s: time stamp in the source, seconds; of live sources since the first frame.
     """
 
     image: Image

@@ -18,7 +18,7 @@ from arview.video.source import FrameRange, FrameSource
 
 
 class StreamEnded(Exception):
-    """The device or stream gives no more frames; the message says why."""
+    """The device or stream delivers no more frames; the message says why."""
 
 
 class Grabber(Protocol):
@@ -28,20 +28,21 @@ class Grabber(Protocol):
     quarter_turns_clockwise: int
 
     def read(self) -> Image | None:
-        """Next frame as (H,W,3) uint8 RGB, None for a broken one; raises StreamEnded when there is none."""
+        """Next frame (H,W,3) uint8 RGB, None for a broken one; raises StreamEnded if there are no more."""
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
 
 
 class LiveSource(FrameSource):
     """The newest frame of a camera or stream at each step of the iteration; frames in between are dropped.
 
-    A thread opens the device and reads it. ``Frame.index`` counts all received frames, so that a gap tells
-    how many were dropped, and ``Frame.time_s`` is the arrival time since the first one. The iteration ends,
-    with ``ended_reason`` set, when the stream ends or no frame has come for ``read_timeout_s``.
+    A thread opens and reads the device. ``Frame.index`` counts all received frames, so that gaps show how many were
+    dropped; ``Frame.time_s`` is the arrival time since the first one. The iteration ends, with ``ended_reason`` set,
+    when the stream ends or no frame arrives for ``read_timeout_s``.
 
-    Raises InputError on construction when no first frame comes within ``open_timeout_s``.
+    Raises:
+        InputError: on construction, if no frame arrives within ``open_timeout_s``.
     """
 
     is_live = True
@@ -60,7 +61,7 @@ class LiveSource(FrameSource):
         self._read_timeout_s = read_timeout_s
         self._changed = threading.Condition()
         self._newest: Frame | None = None
-        self._heard_s = 0.0  # monotonic time at which the last frame came
+        self._arrived_s = 0.0  # monotonic time of the last frame
         self._opened = False
         self._finished = False
         self._closing = False
@@ -77,10 +78,10 @@ class LiveSource(FrameSource):
             yield frame
 
     def _next_frame(self) -> Frame | None:
-        """The newest wanted frame, waited for while others come; None at the end or after a long silence."""
+        """The next wanted frame, the newest; None at the end or after ``read_timeout_s`` without a frame."""
         with self._changed:
             while self._newest is None and not self._finished:
-                patience_s = self._heard_s + self._read_timeout_s - time.monotonic()
+                patience_s = self._arrived_s + self._read_timeout_s - time.monotonic()
                 if patience_s <= 0:
                     self.ended_reason = f"{self.name}: no frame for {self._read_timeout_s:g} s; is it still connected?"
                     self._closing = True
@@ -97,7 +98,7 @@ class LiveSource(FrameSource):
             self._changed.notify_all()
 
     def _run(self) -> None:
-        """Body of the reader thread: open, read until the end, tell why it ended."""
+        """Body of the reader thread: open, read until the end, keep the reason of the end."""
         try:
             grabber = self._open_grabber()
         except StreamEnded as ended:
@@ -117,7 +118,7 @@ class LiveSource(FrameSource):
             image = grabber.read()
             now_s = time.monotonic()
             with self._changed:
-                self._heard_s = now_s
+                self._arrived_s = now_s
                 if not self._opened and image is not None:
                     first_s = now_s
                     self.height, self.width = image.shape[:2]
@@ -143,7 +144,7 @@ class LiveSource(FrameSource):
 
 
 class UrlGrabber:
-    """Reads an RTSP, HTTP or other network stream; opening and reading give up after their timeouts."""
+    """Reads an RTSP, HTTP or other network stream; opening and reading end after their timeouts."""
 
     def __init__(self, url: str, open_timeout_s: float, read_timeout_s: float) -> None:
         options = {"rtsp_transport": "tcp", "fflags": "nobuffer"} if url.startswith("rtsp") else {}
@@ -153,9 +154,9 @@ class UrlGrabber:
             raise StreamEnded(f"cannot be opened: {_reason(error)}") from error
         if not self._container.streams.video:
             self._container.close()
-            raise StreamEnded("holds no video stream")
+            raise StreamEnded("contains no video stream")
         stream = self._container.streams.video[0]
-        stream.thread_type = "SLICE"  # frame threads would hold frames back
+        stream.thread_type = "SLICE"  # frame threads would delay frames
         rate = stream.average_rate
         self.fps = float(rate) if rate else None
         self.quarter_turns_clockwise = 0
@@ -163,7 +164,7 @@ class UrlGrabber:
         self._decoded: list[av.VideoFrame] = []
 
     def read(self) -> Image | None:
-        """Next frame, None for a broken one; raises StreamEnded at the end or when the line is dead."""
+        """Next frame, None for a broken one; raises StreamEnded at the end or when the connection fails."""
         while not self._decoded:
             try:
                 packet = next(self._packets, None)
@@ -199,10 +200,10 @@ class CameraGrabber:
         self.fps = self._capture.get(cv2.CAP_PROP_FPS) or None
 
     def read(self) -> Image | None:
-        """Next frame; raises StreamEnded when the camera was unplugged."""
+        """Next frame; raises StreamEnded if the camera was unplugged."""
         read, bgr = self._capture.read()
         if not read:
-            raise StreamEnded("the camera gives no more frames; was it unplugged?")
+            raise StreamEnded("the camera delivers no more frames; was it unplugged?")
         return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
     def close(self) -> None:
@@ -218,7 +219,7 @@ def _reason(error: Exception) -> str:
 
 @contextmanager
 def _quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV's own warnings off the terminal: the error raised says the same in one line."""
+    """Suppress OpenCV's own warnings: the error raised says the same in one line."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

@@ -1,4 +1,4 @@
-"""VideoSink: annotated frames to an H.264 file with the source's time stamps and sound."""
+"""VideoSink: writes annotated frames to an H.264 file with the source's time stamps and sound."""
 
 from __future__ import annotations
 
@@ -27,21 +27,25 @@ from arview.video.frame import Image
 from arview.video.source import FrameSource
 
 CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov"}
-TICKS_PER_S = 90_000  # fine enough that 30, 29.97, 25 and 24 fps and odd camera stamps keep their time
-QUEUED_FRAMES = 4  # frames waiting for the encoder; 25 MB at 1080p
-_AUDIO_LEAD_S = 0.05  # sound this much before the first frame is kept (AAC starts with a silent packet)
+"""Container format by file suffix."""
+TICKS_PER_S = 90_000
+"""Time base, fine enough for 30, 29.97, 25 and 24 fps and irregular time stamps of cameras."""
+QUEUED_FRAMES = 4
+"""Frames that may wait for the encoder; 25 MB at 1080p."""
+_AUDIO_LEAD_S = 0.05
+"""Sound this long before the first frame is kept, because AAC starts with a silent packet."""
 
 
 class VideoSink:
-    """Writes H.264 (yuv420p, BT.709, index in front) in a thread of its own; a context manager.
+    """Context manager that writes H.264 (yuv420p, BT.709, index in front) in a thread of its own.
 
-    The file grows under a temporary name beside the target and takes its name when it is complete.
-    Leaving the ``with`` block finishes the file, also on Ctrl-C, so that what was written can be played;
-    any other exception removes it. The first frame is at time 0 of the file, the others keep their distance
-    from it; sound is copied from the source without decoding, from the first to the last frame.
+    The file is written under a temporary name beside the target and renamed when it is complete. Leaving the ``with``
+    block finishes the file, also on Ctrl-C, so that what was written can be played; any other exception removes it. The
+    first frame is at time 0 of the file and the others keep their distance from it. Sound is copied from the source
+    without decoding, from the first to the last frame.
 
     Attributes:
-        frames_written: frames handed over so far.
+        frames_written: frames queued so far.
         audio_note: why the source's sound is not in the file, or empty.
     """
 
@@ -61,13 +65,13 @@ class VideoSink:
             path: target, ending in .mp4, .m4v or .mov; an existing file is replaced at the end.
             width: width of the frames in px; odd sizes are padded by a pixel.
             height: height of the frames in px.
-            fps_hint: nominal rate for the header and the duration of the last frame.
-            source: source or file whose sound is copied; None for none.
+            fps_hint: nominal frame rate, for the header and the duration of the last frame.
+            source: source or file whose sound is copied; None: no sound.
             crf: quality of x264, 0 (lossless) to 51; 18–23 is usual.
-            preset: speed of x264; "veryfast" makes files some 6 % smaller in twice the time.
+            preset: speed of x264; "veryfast" makes files about 6 % smaller in twice the time.
 
         Raises:
-            OutputError: the name or the folder cannot be written to.
+            OutputError: the name is not valid, or the folder cannot be written to.
         """
         self.path = Path(path)
         self.frames_written = 0
@@ -95,9 +99,9 @@ class VideoSink:
         self._encoder.start()
 
     def write(self, image: Image, time_s: float) -> None:
-        """Add a frame (H,W,3) uint8 RGB with its time stamp in the source; the array may be reused after.
+        """Add a frame (H,W,3) uint8 RGB with its time stamp in the source; the array may be reused afterwards.
 
-        A time stamp that does not grow is moved to just after the one before.
+        A time stamp that does not increase is moved to just after the previous one.
 
         Raises:
             ValueError: the image has another size than the sink.
@@ -114,9 +118,10 @@ class VideoSink:
         self.frames_written += 1
 
     def close(self) -> None:
-        """Finish the file and give it its name; further calls do nothing.
+        """Finish and rename the file; further calls do nothing.
 
-        Raises OutputError when no frame was written or the file cannot be completed; nothing is left then.
+        Raises:
+            OutputError: no frame was written, or the file cannot be completed; no file is left then.
         """
         if self._closed:
             return
@@ -184,13 +189,13 @@ class VideoSink:
         return container.add_stream_from_template(template)
 
     def _stop_encoder(self) -> None:
-        """Let the encoder work off what is queued and end."""
+        """Wait until the encoder has written the queued frames and ended."""
         self._frames.put(None)
         self._encoder.join()
 
     def _discard(self) -> None:
-        """Close what is still open and remove what is left of the temporary file."""
-        # A second Ctrl-C can leave the encoder at work: its container must not be closed under it then.
+        """Close what is still open and remove the temporary file."""
+        # After a second Ctrl-C the encoder may still be running; its container must not be closed then.
         if not self._encoder.is_alive():
             with suppress(av.FFmpegError, OSError):
                 self._container.close()
@@ -203,7 +208,7 @@ class VideoSink:
             self._part.unlink(missing_ok=True)
 
     def _encode_all(self) -> None:
-        """Body of the encoder thread; after an error it empties the queue so that no writer waits."""
+        """Body of the encoder thread; after an error it empties the queue, so that no writer waits."""
         queued = iter(self._frames.get, None)
         try:
             self._encode(queued)
@@ -234,21 +239,21 @@ class VideoSink:
             )
             frame.pts, frame.time_base, frame.duration = ticks, Fraction(1, TICKS_PER_S), frame_ticks
             self._container.mux(self._video.encode(frame))
-            # Sound follows the picture, so that the muxer never holds much of either.
+            # Sound follows the picture closely, so that the muxer never buffers much of either.
             while waiting is not None and _end_s(waiting) <= (ticks + frame_ticks) / TICKS_PER_S:
                 self._container.mux(waiting)
                 waiting = next(sound, None)
         self._container.mux(self._video.encode(None))
 
     def _sound_packets(self, origin_s: float) -> Iterator[Packet[AudioStream]]:
-        """Sound packets from the time of the first frame on, moved to the clock of the file."""
+        """Sound packets from the time of the first frame on, shifted to the time of the file."""
         if self._sound is None or self._audio is None:
             return
         stream = self._sound.streams.audio[0]
         if origin_s > 1.0:
             with suppress(av.FFmpegError):
                 self._sound.seek(int((origin_s - 1.0) * av.time_base))
-        with suppress(av.FFmpegError):  # a file that breaks off has sound up to there
+        with suppress(av.FFmpegError):  # a truncated file has sound up to its end
             for packet in self._sound.demux(stream):
                 if packet.pts is None or packet.dts is None or packet.time_base is None:
                     continue
@@ -270,7 +275,7 @@ class VideoSink:
 
 
 def _open_sound(source: FrameSource | str | Path | None) -> InputContainer | None:
-    """The file whose sound is to be copied, opened; None when there is none to open."""
+    """The opened file whose sound is copied; None if there is none."""
     path = source.audio_path if isinstance(source, FrameSource) else source
     if path is None:
         return None
@@ -281,6 +286,6 @@ def _open_sound(source: FrameSource | str | Path | None) -> InputContainer | Non
 
 
 def _end_s(packet: Packet[AudioStream]) -> float:
-    """Time at which a sound packet has been played, seconds."""
+    """End time of a sound packet, seconds."""
     assert packet.pts is not None and packet.time_base is not None
     return float((packet.pts + (packet.duration or 0)) * packet.time_base)

@@ -1,4 +1,4 @@
-"""FrameSource: what every source of frames offers, and the thread that reads ahead of the consumer."""
+"""FrameSource: the interface of all sources of frames, and the thread that reads ahead of the consumer."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from typing import Self
 from arview.errors import InputError
 from arview.video.frame import Frame
 
-READ_AHEAD_FRAMES = 4  # enough to smooth out key frames; 25 MB at 1080p
-_POLL_S = 0.1  # how soon a blocked reader notices that its consumer has gone
+READ_AHEAD_FRAMES = 4
+"""Frames decoded ahead, enough to smooth over key frames; 25 MB at 1080p."""
+_POLL_S = 0.1
+"""Time after which a blocked reader notices that its consumer has stopped."""
 
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Which frames of a source are wanted: start <= index < end, every stride-th from start.
+    """Wanted frames of a source: every stride-th from start on, start <= index < end.
 
-    Raises InputError for a negative index, an empty range or a stride under 1.
+    Raises:
+        InputError: a negative index, an empty range or a stride under 1.
     """
 
     start: int = 0
@@ -36,15 +39,15 @@ class FrameRange:
             raise InputError(f"end {self.end} is not after start {self.start}: no frame is left")
 
     def wants(self, index: int) -> bool:
-        """True when the frame of this index is wanted."""
+        """Whether the frame of an index is wanted."""
         return index >= self.start and (index - self.start) % self.stride == 0 and not self.is_past(index)
 
     def is_past(self, index: int) -> bool:
-        """True when no frame from this index on is wanted."""
+        """Whether no frame from an index on is wanted."""
         return self.end is not None and index >= self.end
 
     def count(self, total: int) -> int:
-        """How many frames of a source with ``total`` frames are wanted."""
+        """Number of wanted frames of a source with ``total`` frames."""
         end = total if self.end is None else min(self.end, total)
         return len(range(self.start, end, self.stride))
 
@@ -55,14 +58,14 @@ class FrameSource(ABC):
     Attributes:
         name: the source as the user gave it.
         width, height: size in px of the upright frames.
-        fps: nominal frames per second, None when unknown; the time stamps of the frames are what counts.
-        frame_count: how many frames an iteration yields at most, None when unknown.
-        quarter_turns_clockwise: turn already applied to the frames; hand it to ``load_camera`` or
+        fps: nominal frames per second, None if unknown; the time stamps of the frames are decisive.
+        frame_count: largest number of frames that an iteration yields, None if unknown.
+        quarter_turns_clockwise: rotation already applied to the frames; pass it to ``load_camera`` or
             ``Camera.rotated``.
-        skipped: frames so far that were broken or of another size, and left out.
-        ended_reason: after the iteration, why it ended before its time, in one sentence; else empty.
-        is_live: True when frames come in real time and those that nobody fetched are dropped.
-        audio_path: file whose sound belongs to the frames, or None.
+        skipped: frames so far that were left out because they are broken or of another size.
+        ended_reason: after the iteration, why it ended early, in one sentence; else empty.
+        is_live: frames arrive in real time, and those that are not fetched are dropped.
+        audio_path: file with the sound of the frames, or None.
     """
 
     name: str
@@ -78,10 +81,10 @@ class FrameSource(ABC):
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:
-        """Frames in order; files start anew with each iteration."""
+        """Frames in order; files start again with each iteration."""
 
-    def close(self) -> None:  # noqa: B027 - files have nothing to let go of
-        """Let go of devices and connections."""
+    def close(self) -> None:  # noqa: B027 - files have nothing to release
+        """Release devices and connections."""
 
     def __enter__(self) -> Self:
         return self
@@ -93,10 +96,9 @@ class FrameSource(ABC):
 
 
 def read_ahead(read: Callable[[], Iterator[Frame]], depth: int = READ_AHEAD_FRAMES) -> Iterator[Frame]:
-    """Frames of ``read()``, run in a thread that keeps at most ``depth`` frames ready.
+    """Frames of ``read()``, which runs in a thread that keeps at most ``depth`` frames ready.
 
-    An exception of the reader is raised here, after the frames before it. The thread ends when the
-    iteration is left early.
+    An exception of the reader is raised here, after the frames before it. The thread ends when the iteration is left.
     """
     ready: queue.Queue[Frame | BaseException | None] = queue.Queue(maxsize=depth)
     left = threading.Event()

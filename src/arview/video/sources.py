@@ -1,4 +1,4 @@
-"""open_source: a FrameSource for whatever the user names."""
+"""open_source: the FrameSource of a file, folder, camera or address."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ def open_source(
     open_timeout_s: float = 10.0,
     read_timeout_s: float = 5.0,
 ) -> FrameSource:
-    """Source of frames: video file, picture, folder or glob of pictures, camera index, RTSP or HTTP URL.
+    """Open a source of frames: video file, picture, folder or glob of pictures, camera index, RTSP or HTTP URL.
 
     Args:
         spec: path, glob ("shots/*.png"), camera index ("0") or URL ("rtsp://…").
         start: index of the first wanted frame in the source; None is 0.
-        end: index before which to stop; None is the end of the source.
-        stride: take every stride-th frame from ``start`` on.
-        fps: frames per second by which pictures get their time stamps.
-        open_timeout_s: how long to wait for the first frame of a camera or URL.
-        read_timeout_s: how long a camera or URL may be silent before its iteration ends.
+        end: index of the first frame that is not wanted any more; None is the end of the source.
+        stride: interval between wanted frames.
+        fps: frames per second from which the time stamps of pictures are made.
+        open_timeout_s: longest wait for the first frame of a camera or URL.
+        read_timeout_s: longest wait for the next frame of a camera or URL before its iteration ends.
 
     Raises:
-        InputError: nothing there, or nothing that can be read; the message says what and what to do.
+        InputError: the source does not exist or cannot be read.
     """
     check_type(spec, PATH, "open_source: spec")
     wanted = FrameRange(start or 0, end, stride)
@@ -62,7 +62,7 @@ def open_source(
     if path.is_dir():
         pictures = picture_paths(path)
         if not pictures:
-            raise InputError(f"{path}: the folder holds no pictures ({_suffixes()}); give another folder or file")
+            raise InputError(f"{path}: the folder contains no pictures ({_suffixes()}); give another folder or file")
         return PictureSource(text, pictures, wanted, fps)
     if path.exists():
         if path.suffix.lower() in PHOTO_SUFFIXES:
@@ -80,10 +80,10 @@ def open_source(
 
 
 def check_source(spec: str | Path) -> None:
-    """Make sure that a file, folder or glob can be read; a camera or address need not be there yet.
+    """Check that a file, folder or glob can be read; a camera or address need not be available yet.
 
     Raises:
-        InputError: as `open_source`.
+        InputError: as in `open_source`.
     """
     text = str(spec)
     is_url = _URL.match(text) and not text.startswith("file://")
