@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from arview.errors import ArviewError
+from arview.version import __version__
 
 if TYPE_CHECKING:
     from arview.annotation import annotate
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from arview.video import VideoSink, open_source
     from arview.workflow.job import InspectJob
     from arview.workflow.run import inspect_part
-
-__version__ = "0.1.0"
 
 __all__ = [
     "ArviewError",

@@ -22,13 +22,13 @@ from click.testing import CliRunner, Result
 import arview.evaluation.run
 import arview.guideviews.cache
 import arview.tracking
-from arview import __version__
 from arview.cad import load_part
 from arview.cad.viewpoint import viewpoint
 from arview.cli import ExitCode, main
 from arview.geometry import look_at
 from arview.inspection import Inspection, Provenance, save_inspection
 from arview.pose import Pose, TrackingState
+from arview.version import __version__
 from helpers.bop_scene import write_scene
 from helpers.cad_files import box
 from helpers.fake_session import POSE, FakeSession

@@ -59,10 +59,7 @@ def modules() -> dict[str, Path]:
 
 @cache
 def imports(name: str) -> frozenset[str]:
-    """Modules of the package that a module imports anywhere: in functions and for type checking, too.
-
-    ``from arview import __version__`` does not count: the version is a constant that every room may name.
-    """
+    """Modules of the package that a module imports anywhere: in functions and for type checking, too."""
     found: set[str] = set()
     for node in ast.walk(tree(modules()[name])):
         if isinstance(node, ast.ImportFrom):
@@ -73,7 +70,7 @@ def imports(name: str) -> frozenset[str]:
                 full = f"{node.module}.{alias.name}"
                 if full in modules():
                     found.add(full)
-                elif node.module != "arview" or alias.name != "__version__":
+                else:
                     found.add(node.module)
         elif isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names if alias.name.split(".")[0] == "arview"}

@@ -7,6 +7,7 @@ from helpers.source_tree import imports, modules
 
 ROOMS = (
     ("errors",),
+    ("version",),
     ("geometry",),
     ("pose",),
     ("core",),

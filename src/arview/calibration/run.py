@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from arview import __version__
 from arview.calibration.choose import ChoiceOptions, choose_views
 from arview.calibration.solve import PARAMETERS, K, Solution, SolveOptions, solve
 from arview.calibration.verdict import CalibrationVerdict, VerdictOptions, assess
@@ -20,6 +19,7 @@ from arview.camera.profiles import lens_record
 from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.fiducials.board import Board, spec_of
+from arview.version import __version__
 
 
 @dataclass(frozen=True)

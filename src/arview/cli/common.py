@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from arview import __version__
 from arview.cli.exit_codes import ExitCode, help_rows
 from arview.core.atomic import is_device, replacing
 from arview.core.progress import Progress, StepProgress
 from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError
+from arview.version import __version__
 
 if TYPE_CHECKING:
     from arview.camera import Camera

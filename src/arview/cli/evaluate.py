@@ -6,7 +6,6 @@ import json
 
 import click
 
-from arview import __version__
 from arview.cli.common import (
     MODALITY,
     RENDERER,
@@ -18,6 +17,7 @@ from arview.cli.common import (
     session_options,
     write_bytes,
 )
+from arview.version import __version__
 
 
 def _parse_init(ctx: click.Context, parameter: click.Parameter, value: str) -> str:

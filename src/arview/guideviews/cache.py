@@ -7,13 +7,13 @@ from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
-from arview import __version__
 from arview.cad.model import Model
 from arview.cad.view_range import ViewRange
 from arview.core.cache_folder import cache_folder
 from arview.core.progress import StepProgress
 from arview.errors import ArviewError
 from arview.guideviews import GuideViewOptions, GuideViewSet, load_guide_views, make_guide_views
+from arview.version import __version__
 
 
 def cached_path(model: Model, view_range: ViewRange, options: GuideViewOptions) -> Path:

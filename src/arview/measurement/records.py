@@ -10,7 +10,6 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from arview import __version__
 from arview.cad.part import ComponentSettings, Part
 from arview.core.stage_cache import content_key
 from arview.geometry import Array, exp_so3, rigid
@@ -34,6 +33,7 @@ from arview.measurement.uncertainty.budget import Placement, place, relative_twi
 from arview.measurement.uncertainty.combine import Agreement, CombinedMove, agreements
 from arview.measurement.uncertainty.decision import decide, worst, zone_diameter_mm
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
+from arview.version import __version__
 
 _SOFTWARE = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "numba")
 """Packages whose versions are recorded."""

@@ -24,7 +24,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from arview import __version__
 from arview.cad import Part
 from arview.core.atomic import replacing
 from arview.core.checks import PATH, check_type
@@ -40,6 +39,7 @@ from arview.reconstruction.quality import Quality, quality_of
 from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
 from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
 from arview.reconstruction.types import DenseCloud, Photo, SparseModel
+from arview.version import __version__
 
 Stage = Literal["photos", "sparse", "scale", "dense"]
 STAGES: tuple[Stage, ...] = ("photos", "sparse", "scale", "dense")

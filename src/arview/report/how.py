@@ -5,10 +5,10 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from arview import __version__
 from arview.cad.part import Part
 from arview.inspection import Inspection, MethodResult
 from arview.report.words import NONE, determined, number
+from arview.version import __version__
 
 LEGEND = (
     "Nominal and measured are the place of the middle of the component's bounding box in the datum frame, deviation is"

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from arview import __version__
 from arview.core.progress import Progress
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Details, Inspection, Verdict
@@ -34,6 +33,7 @@ from arview.report.words import (
     verdict_word,
     zone_text,
 )
+from arview.version import __version__
 
 _FONTS = (("Inter", "400", "inter-400"), ("Inter", "600", "inter-600"), ('"Inter Greek"', "400", "inter-greek-400"))
 _EXAGGERATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)

@@ -17,9 +17,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from arview import __version__
 from arview.core.stage_cache import write_json
 from arview.errors import ArviewError, CannotMeasureError, InputError, MismatchError, MissingDependencyError
+from arview.version import __version__
 from arview.workflow.jobs_file import LOCATION_FIELDS, BatchJob
 from arview.workflow.lock import exclusive_access
 from arview.workflow.storage import download, is_url, read, upload

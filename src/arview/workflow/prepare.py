@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from arview import __version__
 from arview.cad import Part, load_part
 from arview.camera.read import load_camera
 from arview.core.stage_cache import content_key, key_of
@@ -18,6 +17,7 @@ from arview.reconstruction.intake.reading import photo_paths
 from arview.reconstruction.run import ReconstructOptions
 from arview.reconstruction.scale import ScaleSources, load_scale_file
 from arview.reconstruction.sparse import SparseOptions
+from arview.version import __version__
 from arview.video import open_source
 from arview.workflow.job import InspectJob
 

@@ -18,7 +18,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from arview import __version__
 from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of
@@ -26,6 +25,7 @@ from arview.errors import CannotMeasureError, InputError, MismatchError, Missing
 from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.reconstruction.run import Reconstruction, reconstruct
+from arview.version import __version__
 from arview.workflow.film import camera_of_video, make_film
 from arview.workflow.job import InspectJob
 from arview.workflow.lock import exclusive_access

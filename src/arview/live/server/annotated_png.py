@@ -6,11 +6,11 @@ import io
 import json
 from datetime import UTC, datetime
 
-from arview import __version__
 from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.documents import Document, camera_document
 from arview.live.stream.feed import TrackedFrame
 from arview.live.stream.subject import Subject
+from arview.version import __version__
 
 CHUNK = "arview"
 """Name of the text chunk of the PNG that holds the data as JSON."""
