@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from arview.cad import Part
     from arview.camera import Camera
     from arview.geometry import Array
+    from arview.overlay import OverlayOptions
     from arview.overlay.options import EdgeMode
     from arview.tracking import TrackingSession
 
@@ -141,7 +143,7 @@ def annotate(
     from arview import annotation
     from arview.cad import load_part
     from arview.inspection import load_inspection
-    from arview.overlay import OverlayOptions, OverlayRenderer
+    from arview.overlay import OverlayRenderer
     from arview.tracking.guide_pose import GUIDE_PREFIX
     from arview.video import VideoSink, open_source
 
@@ -153,16 +155,9 @@ def annotate(
     init_path = init if guide_name is None else None
     first_pose = load_pose(init_path) if init_path else None
     inspection = load_inspection(inspection_path, part.model) if inspection_path else None
-    inputs: list[str | Path | None] = [
-        source,
-        part.path,
-        part.cad_path,
-        views_path,
-        camera_spec,
-        inspection_path,
-        init_path,
-    ]
+    inputs = (source, part.path, part.cad_path, views_path, camera_spec, inspection_path, init_path)
     outputs = _check_outputs(output, poses_path, learned_path, inputs)
+    drawing = _drawing_options(show_edges, no_ghost, no_labels, opacity)
     first = start if isinstance(start, int) else None
     last = end if isinstance(end, int) else None
     with open_source(source, start=first, end=last, stride=stride, fps=fps) as frames:
@@ -172,12 +167,6 @@ def annotate(
             session.appearance_memory.load(outputs.learned)
         overlay = sink = None
         if outputs.video is not None:
-            drawing = OverlayOptions(
-                show_ghost=not no_ghost,
-                show_labels=not no_labels,
-                show_edges=cast("EdgeMode", show_edges),
-                opacity=OverlayOptions.opacity if opacity is None else opacity,
-            )
             overlay = OverlayRenderer(part.model, camera, inspection, drawing)
             sink = VideoSink(outputs.video, frames.width, frames.height, frames.fps, frames)
         with progress_bar("frames", frames.frame_count) as progress:
@@ -202,12 +191,23 @@ def annotate(
         ctx.exit(ExitCode.INTERRUPTED)
 
 
+def _drawing_options(show_edges: str, no_ghost: bool, no_labels: bool, opacity: float | None) -> OverlayOptions:
+    from arview.overlay import OverlayOptions
+
+    return OverlayOptions(
+        show_ghost=not no_ghost,
+        show_labels=not no_labels,
+        show_edges=cast("EdgeMode", show_edges),
+        opacity=OverlayOptions.opacity if opacity is None else opacity,
+    )
+
+
 def _check_outputs(
-    video: str | None, poses: str | None, learned: str | None, inputs: list[str | Path | None]
+    video: str | None, poses: str | None, learned: str | None, inputs: Sequence[str | Path | None]
 ) -> _Outputs:
     """The paths of the outputs, none of which overwrites an input or another output."""
     return _Outputs(
-        output_path(video, inputs) if video else None,
+        output_path(video, [*inputs]) if video else None,
         output_path(poses, [*inputs, video]) if poses else None,
         output_path(learned, [*inputs, video, poses]) if learned else None,
     )

@@ -109,8 +109,8 @@ def _print(test: Verification, shows_all: bool) -> None:
     if len(test.lengths) < FULL_TEST:
         click.echo(f"note: VDI/VDE 2634 part 1 asks for {FULL_TEST} lengths, five on each of seven lines")
     counts = [f"{sum(one.verdict.value == v for one in test.lengths)} {v}" for v in ("pass", "fail", "undecided")]
-    judged = f" ({', '.join(counts)})" if test.limit is not None else " (U alone: no --mpe was given)"
-    click.echo(f"verdict: {test.verdict.value}{judged}")
+    counted = f" ({', '.join(counts)})" if test.limit is not None else " (U alone: no --mpe was given)"
+    click.echo(f"verdict: {test.verdict.value}{counted}")
 
 
 def _row(one: LengthResult, width: int) -> str:
