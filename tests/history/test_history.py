@@ -327,7 +327,7 @@ def test_postgresql_that_is_not_there() -> None:
 def test_wrong_stores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "text").write_text("no database at all, but long enough to have a header" * 10)
     for where, error, message in (
-        (tmp_path / "text", OutputError, "is no results store"),
+        (tmp_path / "text", OutputError, "is not a results store"),
         (tmp_path, InputError, "is a folder"),
         ("mysql://x/y", InputError, "mysql is not supported"),
         ("nonsense://", InputError, "not supported"),
@@ -424,9 +424,9 @@ def test_refusals_and_doubts() -> None:
     for values, lower, upper, message in (
         (NIST[:9], 0.0, 60.0, "need at least 10 values, there are 9"),
         (NIST, None, None, "there is no tolerance"),
-        ([1.0] * 20, 0.0, 2.0, "the same"),
+        ([1.0] * 20, 0.0, 2.0, "are equal"),
         ([*NIST, float("nan")], 0.0, 60.0, "NaN"),
-        (NIST, 60.0, 40.0, "is not below"),
+        (NIST, 60.0, 40.0, "is not less than"),
     ):
         with pytest.raises(InputError, match=message):
             capability(values, lower, upper)
@@ -472,7 +472,7 @@ def test_a_series(filled: HistoryStore, tmp_path: Path) -> None:
     other = replace(built(999, 0.0), model_hash="0" * 64)
     filled.add(saved(tmp_path, "other", other))
     newest = series_of(filled, "block_1")
-    assert newest.left_out == ("32 measured against another CAD than the newest",)
+    assert newest.left_out == ("32 measured against another CAD model than the newest",)
     assert len(newest.values) == 1
     with pytest.raises(InputError, match="no component 'nut'"):
         series_of(filled, "nut")

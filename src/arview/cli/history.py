@@ -13,7 +13,7 @@ from arview.cli.exit_codes import ExitCode
 from arview.errors import ArviewError, InputError
 
 if TYPE_CHECKING:
-    from arview.history import HistoryStore, Listed
+    from arview.history import HistoryStore, StoredResult
 
 _QUANTITIES = ("distance", "dx", "dy", "dz", "tilt", "twist")
 
@@ -295,7 +295,7 @@ def _moment(text: str | None) -> datetime | None:
     return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
 
 
-def _about(one: Listed) -> None:
+def _about(one: StoredResult) -> None:
     click.echo(f"no. {one.id}, {one.part} {one.serial}, {one.verdict.replace('_', ' ')}")
     click.echo(f"measured {one.measured:%Y-%m-%d %H:%M:%S} UTC at {one.station} by {one.tool}")
     click.echo(f"added    {one.added:%Y-%m-%d %H:%M:%S} UTC, content {one.content_hash}")

@@ -1,17 +1,17 @@
-"""History: a store of inspections that only grows, and what it says of a component over time."""
+"""History: an append-only store of inspections, and statistics of a component over the parts that were built."""
 
-from arview.history.series import Series, Value, series_of
+from arview.history.series import ComponentSeries, SeriesValue, series_of
 from arview.history.statistics import Capability, ControlChart, capability, control_chart
-from arview.history.store import Added, HistoryStore, Listed
+from arview.history.store import AddedResult, HistoryStore, StoredResult
 
 __all__ = [
-    "Added",
+    "AddedResult",
     "Capability",
+    "ComponentSeries",
     "ControlChart",
     "HistoryStore",
-    "Listed",
-    "Series",
-    "Value",
+    "SeriesValue",
+    "StoredResult",
     "capability",
     "control_chart",
     "series_of",

@@ -1,4 +1,4 @@
-"""The trend of a component as a picture: individuals and moving ranges, with limits, tolerance and signals."""
+"""Control chart of a component: individual values and moving ranges, with limits, tolerance and signals."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import numpy as np
 
 from arview.core.figures import INK, figure
 from arview.errors import InputError
-from arview.history.series import Series
+from arview.history.series import ComponentSeries
 from arview.history.statistics import Capability, ControlChart
 
 FORMATS = ("svg", "png", "pdf")
 _BLUE, _RED = "#2b5c8a", "#c22f2b"
 
 
-def draw(series: Series, chart: ControlChart | None, ability: Capability | None, kind: str = "svg") -> bytes:
-    """The series as a picture of the kind svg, png or pdf.
+def draw(series: ComponentSeries, chart: ControlChart | None, ability: Capability | None, kind: str = "svg") -> bytes:
+    """Draw the series as a picture in one of `FORMATS`.
 
     Args:
-        series: values.
+        series: the values.
         chart: control limits; None when there are too few values for them.
-        ability: written into the title; None when it is not known.
-        kind: see FORMATS.
+        ability: capability for the title; None when unknown.
+        kind: format of the picture.
 
     Raises:
-        InputError: no values, or an unknown kind.
+        InputError: there are no values, or the format is unknown.
     """
     if kind not in FORMATS:
         raise InputError(f"chart: {kind!r}: expected one of {', '.join(FORMATS)}")
@@ -43,7 +43,7 @@ def draw(series: Series, chart: ControlChart | None, ability: Capability | None,
     return out.getvalue()
 
 
-def _individuals(axes: Any, series: Series, chart: ControlChart | None) -> None:
+def _individuals(axes: Any, series: ComponentSeries, chart: ControlChart | None) -> None:
     x = np.array([one.value for one in series.values])
     places = np.arange(1, len(x) + 1)
     for limit in (series.lower, series.upper):
@@ -64,18 +64,18 @@ def _individuals(axes: Any, series: Series, chart: ControlChart | None) -> None:
         axes.errorbar(places, x, yerr=2.0 * stds, fmt="none", ecolor="#c3ccd6", elinewidth=1.4, zorder=1)
     axes.plot(places, x, color="#9db4cb", linewidth=0.9, zorder=2)
     signals = set(chart.signals) if chart is not None else set()
-    calm = [i for i in range(len(x)) if i not in signals]
-    axes.plot(places[calm], x[calm], "o", color=_BLUE, markersize=4.5, zorder=3)
-    odd = sorted(signals)
-    axes.plot(places[odd], x[odd], "D", color=_RED, markersize=6, zorder=4)
-    for index in odd[:12]:
+    in_control = [i for i in range(len(x)) if i not in signals]
+    axes.plot(places[in_control], x[in_control], "o", color=_BLUE, markersize=4.5, zorder=3)
+    marked = sorted(signals)
+    axes.plot(places[marked], x[marked], "D", color=_RED, markersize=6, zorder=4)
+    for index in marked[:12]:
         axes.annotate(series.values[index].serial or f"#{series.values[index].result_id}", (places[index], x[index]),
                       xytext=(5, 6), textcoords="offset points", fontsize=8, color=_RED)  # fmt: skip
     axes.set_ylabel(f"{series.quantity}, {series.unit}")
     axes.margins(x=0.02, y=0.14)
 
 
-def _ranges(axes: Any, series: Series, chart: ControlChart | None) -> None:
+def _ranges(axes: Any, series: ComponentSeries, chart: ControlChart | None) -> None:
     x = np.array([one.value for one in series.values])
     places = np.arange(2, len(x) + 1)
     axes.plot(places, np.abs(np.diff(x)), "-o", color="#9db4cb", markerfacecolor=_BLUE, markeredgecolor=_BLUE,
@@ -88,19 +88,19 @@ def _ranges(axes: Any, series: Series, chart: ControlChart | None) -> None:
     axes.set_ylabel("moving range")
     first, last = series.values[0], series.values[-1]
     axes.set_xlabel(
-        f"{len(x)} parts in the order in which they were measured, {first.measured:%Y-%m-%d} to"
-        f" {last.measured:%Y-%m-%d}; diamond: out of the ordinary"
+        f"{len(x)} parts in the order of their measurement, {first.measured:%Y-%m-%d} to"
+        f" {last.measured:%Y-%m-%d}; diamond: signal"
     )
 
 
 def _label(axes: Any, y: float, text: str, color: str) -> None:
-    """At the right end of a line."""
+    """Label a horizontal line at its right end."""
     text = text.replace("-", "−")
     axes.annotate(text, (1.0, y), xycoords=("axes fraction", "data"), xytext=(4, 0), textcoords="offset points",
                   va="center", fontsize=8, color=color, annotation_clip=False)  # fmt: skip
 
 
-def _title(series: Series, ability: Capability | None) -> str:
+def _title(series: ComponentSeries, ability: Capability | None) -> str:
     title = f"{series.part}: {series.component}, {series.quantity}"
     if ability is not None:
         name_cp, name_cpk = ability.names

@@ -1,4 +1,4 @@
-"""Results of a store as files: a line for each component (CSV), or the whole inspections (JSON lines)."""
+"""Export of stored results: a line for each component (CSV), or complete inspections (JSON lines)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Sequence
 
-from arview.history.store import HistoryStore, Listed
+from arview.history.store import HistoryStore, StoredResult
 
 HEADER = (
     "result", "content_hash", "part", "serial", "station", "measured_utc", "added_utc", "part_verdict", "component",
@@ -15,8 +15,8 @@ HEADER = (
 _COLUMNS = ("dx_mm", "dy_mm", "dz_mm", "distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg", "twist_deg")
 
 
-def to_csv(store: HistoryStore, found: Sequence[Listed]) -> bytes:
-    """UTF-8, RFC 4180; what is undetermined is empty."""
+def to_csv(store: HistoryStore, found: Sequence[StoredResult]) -> bytes:
+    """The components of results as CSV, UTF-8, RFC 4180; cells of undetermined values are empty."""
     out = io.StringIO(newline="")
     writer = csv.writer(out)
     writer.writerow(HEADER)
@@ -32,11 +32,11 @@ def to_csv(store: HistoryStore, found: Sequence[Listed]) -> bytes:
     return out.getvalue().encode("utf-8")
 
 
-def to_json_lines(store: HistoryStore, found: Sequence[Listed]) -> bytes:
-    """The inspections themselves, one a line, in the order given."""
+def to_json_lines(store: HistoryStore, found: Sequence[StoredResult]) -> bytes:
+    """The inspections as JSON, one per line, in the given order."""
     return "".join(f"{store.find(one.content_hash)[1]}\n" for one in found).encode("utf-8")
 
 
 def _text(cell: str) -> str:
-    """Not to be taken for a formula by a spreadsheet."""
+    """A cell, with an apostrophe before a text that a spreadsheet would read as a formula."""
     return f"'{cell}" if cell[:1] in ("=", "+", "-", "@", "\t") else cell

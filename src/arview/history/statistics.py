@@ -1,4 +1,4 @@
-"""Individuals and moving-range chart (ISO 7870-2), capability (ISO 22514-2) with its confidence interval."""
+"""Individuals and moving-range charts (ISO 7870-2), and capability with confidence intervals (ISO 22514-2)."""
 
 from __future__ import annotations
 
@@ -12,22 +12,32 @@ from arview.errors import InputError
 from arview.geometry import Array
 
 _D2, _D4 = 1.128, 3.267
-"""Of moving ranges of two: mean range over standard deviation; upper limit over mean range (ISO 7870-2, table 2)."""
-LEAST_CHART, LEAST_CAPABILITY, ENOUGH = 8, 10, 50
-"""Values below which limits and indices are refused, and below which they are given with a warning."""
-_SAME_SIDE, _TREND = 8, 6
+"""Factors of moving ranges of two: mean range over standard deviation; upper limit over mean range (ISO 7870-2)."""
+
+
+@dataclass(frozen=True)
+class StatisticsOptions:
+    """Numbers of values and thresholds of charts and capability indices."""
+
+    min_chart_values: int = 8  # values needed for control limits
+    min_capability_values: int = 10  # values needed for capability indices
+    enough_values: int = 50  # with fewer values the indices come with a warning
+    same_side_run: int = 8  # consecutive values on one side of the mean that are a signal
+    trend_run: int = 6  # consecutive rising or falling values that are a signal
+    normality_level: float = 0.01  # significance level of the Shapiro-Wilk test
+    max_measurement_share: float = 0.3  # share of the variance due to the measurement above which there is a warning
 
 
 @dataclass(frozen=True)
 class ControlChart:
-    """Limits of the values and of their moving ranges, and what is out of the ordinary.
+    """Control limits of the values and of their moving ranges, and the signals.
 
     Attributes:
-        values: (N,).
-        center, lower, upper: of the values: mean, and ± 3 standard deviations by the mean moving range.
-        ranges: (N-1,) differences of neighbours.
-        range_center, range_upper: of the ranges.
-        signals: index of a value → why; empty when the process is in control.
+        values: (N,) values.
+        center, lower, upper: mean of the values, and limits at ± 3 standard deviations from the mean moving range.
+        ranges: (N-1,) absolute differences of consecutive values.
+        range_center, range_upper: mean and upper limit of the ranges.
+        signals: reasons by index of the value; empty when the process is in control.
     """
 
     values: Array
@@ -41,22 +51,22 @@ class ControlChart:
 
     @property
     def is_in_control(self) -> bool:
-        """No value is out of the ordinary."""
+        """Whether there are no signals."""
         return not self.signals
 
 
 @dataclass(frozen=True)
 class Capability:
-    """Capability, or performance when the process is not in control (ISO 22514-2 tells them apart by that alone).
+    """Capability indices, or performance indices when the process is not in control (ISO 22514-2).
 
     Attributes:
-        count, mean, std: of the values; ``std`` is that of the sample.
-        lower, upper: limits; one of them may be None.
-        cp, cp_interval: None without both limits.
-        cpk, cpk_interval: to the nearer limit; intervals are two-sided, 95 %.
-        is_in_control: False: the indices are Pp and Ppk.
-        measurement_share: of the variance that the measurement itself causes; None when unknown.
-        warnings: in words.
+        count, mean, std: number, mean and sample standard deviation of the values.
+        lower, upper: tolerance limits; one of them may be None.
+        cp, cp_interval: Cp and its two-sided 95 % confidence interval; None without both limits.
+        cpk, cpk_interval: Cpk, with the nearer limit, and its two-sided 95 % confidence interval.
+        is_in_control: whether the process is in control; if not, the indices are Pp and Ppk.
+        measurement_share: share of the variance that is due to the measurement; None when unknown.
+        warnings: doubts about the indices.
     """
 
     count: int
@@ -74,35 +84,38 @@ class Capability:
 
     @property
     def names(self) -> tuple[str, str]:
-        """What the indices are called."""
+        """Names of the indices."""
         return ("Cp", "Cpk") if self.is_in_control else ("Pp", "Ppk")
 
 
-def control_chart(values: ArrayLike, is_length: bool = False) -> ControlChart:
-    """Limits from the mean moving range: they do not widen when the process wanders, as its standard deviation would.
+def control_chart(values: ArrayLike, is_length: bool = False, options: StatisticsOptions | None = None) -> ControlChart:
+    """Control limits from the mean moving range, which, unlike the standard deviation, is insensitive to drift.
 
-    Signals: a value beyond 3 standard deviations, 8 values in a row on one side of the mean, 6 in a row that rise or
-    fall (ISO 7870-2; Nelson, J. Quality Technology 16, 1984). A range beyond its limit is none: ranges of neighbours
-    share a value and are not normal, every fourth series of 40 good values has one.
+    Signals are a value beyond 3 standard deviations, 8 consecutive values on one side of the mean, and 6 consecutive
+    rising or falling values (ISO 7870-2; Nelson, J. Quality Technology 16, 1984). A range beyond its limit is no
+    signal: consecutive ranges share a value and are not normally distributed, so such ranges are frequent by chance.
 
     Args:
-        values: (N,) in order.
-        is_length: they cannot be negative, and neither is the lower limit.
+        values: (N,) values in their order.
+        is_length: whether the values, and thus the lower limit, cannot be negative.
+        options: see `StatisticsOptions`.
 
     Raises:
-        InputError: fewer than 8 values, or one that is not finite.
+        InputError: there are fewer than 8 values, or one is not finite.
     """
-    x = _checked(values, LEAST_CHART, "control limits")
+    options = options or StatisticsOptions()
+    x = _checked(values, options.min_chart_values, "control limits")
     ranges = np.abs(np.diff(x))
     center, mean_range = float(x.mean()), float(ranges.mean())
     reach = 3.0 * mean_range / _D2
     signals: dict[int, str] = {}
     for index in np.flatnonzero(np.abs(x - center) > reach):
         signals[int(index)] = "beyond the control limits"
-    _add_runs(signals, np.sign(x - center), _SAME_SIDE, f"{_SAME_SIDE} in a row on one side of the mean")
+    run = options.same_side_run
+    _add_runs(signals, np.sign(x - center), run, f"{run} in a row on one side of the mean")
     # Six points in a row that rise are five steps of one sign.
     steps = np.concatenate([[0.0], np.sign(np.diff(x))])
-    _add_runs(signals, steps, _TREND - 1, f"{_TREND} in a row that rise or fall")
+    _add_runs(signals, steps, options.trend_run - 1, f"{options.trend_run} in a row that rise or fall")
     lower = max(0.0, center - reach) if is_length else center - reach
     return ControlChart(
         x, center, lower, center + reach, ranges, mean_range, _D4 * mean_range, dict(sorted(signals.items()))
@@ -110,31 +123,38 @@ def control_chart(values: ArrayLike, is_length: bool = False) -> ControlChart:
 
 
 def capability(
-    values: ArrayLike, lower: float | None, upper: float | None, stds: Sequence[float | None] | None = None
+    values: ArrayLike,
+    lower: float | None,
+    upper: float | None,
+    stds: Sequence[float | None] | None = None,
+    options: StatisticsOptions | None = None,
 ) -> Capability:
-    """Cp and Cpk by the standard deviation of the sample, with 95 % confidence intervals.
+    """Cp and Cpk from the sample standard deviation, with 95 % confidence intervals.
 
-    Interval of Cp by the chi-squared distribution of the variance (exact for normal values); of Cpk by Bissell's
-    approximation (Applied Statistics 39, 1990).
+    The interval of Cp follows from the chi-squared distribution of the variance (exact for normal values), that of Cpk
+    from Bissell's approximation (Applied Statistics 39, 1990).
 
     Args:
-        values: (N,).
-        lower, upper: limits; at least one.
-        stds: standard uncertainty of each value's measurement, as far as known.
+        values: (N,) values.
+        lower, upper: tolerance limits, of which at least one is needed.
+        stds: standard uncertainties of the measurements, as far as they are known.
+        options: see `StatisticsOptions`.
 
     Raises:
-        InputError: no limit, fewer than 10 values, one that is not finite, or all the same.
+        InputError: there is no limit, there are fewer than 10 values, one is not finite, or all are equal.
     """
     from scipy import stats
+
+    options = options or StatisticsOptions()
 
     if lower is None and upper is None:
         raise InputError("capability: there is no tolerance; give a limit with --lower or --upper")
     if lower is not None and upper is not None and lower >= upper:
-        raise InputError(f"capability: the lower limit {lower:g} is not below the upper one {upper:g}")
-    x = _checked(values, LEAST_CAPABILITY, "Cp and Cpk")
+        raise InputError(f"capability: the lower limit {lower:g} is not less than the upper one {upper:g}")
+    x = _checked(values, options.min_capability_values, "Cp and Cpk")
     count, mean, std = len(x), float(x.mean()), float(x.std(ddof=1))
     if std < 1e-12:
-        raise InputError(f"capability: all {count} values are the same")
+        raise InputError(f"capability: all {count} values are equal")
     free = count - 1
     cp = cp_interval = None
     if lower is not None and upper is not None:
@@ -146,41 +166,42 @@ def capability(
     cpk = min(sides)
     spread = float(stats.norm.ppf(0.975)) * float(np.sqrt(1.0 / (9.0 * count) + cpk**2 / (2.0 * free)))
     warnings = []
-    if count < ENOUGH:
-        warnings.append(f"only {count} values: the indices are rough, see their intervals ({ENOUGH} are enough)")
-    chart = control_chart(x)
+    if count < options.enough_values:
+        enough = options.enough_values
+        warnings.append(f"only {count} values: the indices are rough, see their intervals ({enough} are enough)")
+    chart = control_chart(x, options=options)
     if not chart.is_in_control:
-        warnings.append("the process is not in control: Pp and Ppk say what was, not what will be")
-    if float(stats.shapiro(x[:5000]).pvalue) < 0.01:
+        warnings.append("the process is not in control: Pp and Ppk describe the past, not the future")
+    if float(stats.shapiro(x[:5000]).pvalue) < options.normality_level:
         warnings.append(
-            "the values are not normally distributed (Shapiro–Wilk, 1 %): the indices say little of rejects"
+            "the values are not normally distributed (Shapiro–Wilk, 1 %): the indices do not predict reject rates"
         )
     known = [one for one in stds or () if one is not None]
     share = None
     if known:
         share = min(1.0, float(np.mean(np.square(known))) / std**2)
-        if share > 0.3:
-            warnings.append(f"{share:.0%} of the variance is of the measurement, not of the parts")
+        if share > options.max_measurement_share:
+            warnings.append(f"{share:.0%} of the variance is due to the measurement, not to the parts")
     return Capability(
         count, mean, std, lower, upper, cp, cp_interval, cpk, (cpk - spread, cpk + spread), chart.is_in_control, share,
         tuple(warnings),
     )  # fmt: skip
 
 
-def _checked(values: ArrayLike, least: int, what: str) -> Array:
+def _checked(values: ArrayLike, minimum: int, what: str) -> Array:
     x = np.asarray(values, dtype=np.float64).ravel()
     if not np.isfinite(x).all():
         raise InputError(f"{what}: a value is NaN or infinite")
-    if len(x) < least:
-        raise InputError(f"{what}: need at least {least} values, there {'is 1' if len(x) == 1 else f'are {len(x)}'}")
+    if len(x) < minimum:
+        raise InputError(f"{what}: need at least {minimum} values, there {'is 1' if len(x) == 1 else f'are {len(x)}'}")
     return x
 
 
-def _add_runs(signals: dict[int, str], signs: Array, length: int, why: str) -> None:
-    """Mark the values at which a run of one sign has become long."""
-    run, last = 0, 0.0
+def _add_runs(signals: dict[int, str], signs: Array, length: int, reason: str) -> None:
+    """Add the values at which a run of one sign has reached a length."""
+    count, last = 0, 0.0
     for index, sign in enumerate(signs):
-        run = run + 1 if sign == last and sign != 0.0 else int(sign != 0.0)
+        count = count + 1 if sign == last and sign != 0.0 else int(sign != 0.0)
         last = float(sign)
-        if run >= length:
-            signals.setdefault(index, why)
+        if count >= length:
+            signals.setdefault(index, reason)

@@ -1,7 +1,7 @@
-"""The results store: inspections are added and read, never changed; two stations may write at once.
+"""The results store: inspections are added and read, never changed; several stations can write at the same time.
 
-SQLite keeps a write-ahead log and lets writers wait for each other; PostgreSQL does so by itself. What is added is
-known by the hash of its content: adding it twice, or again after an interruption, leaves it there once.
+SQLite uses a write-ahead log, and its writers wait for each other; PostgreSQL does so by itself. Results are identified
+by a hash of their content, so that adding one twice, or again after an interruption, stores it once.
 """
 
 from __future__ import annotations
@@ -35,17 +35,19 @@ from arview.inspection import Inspection, load_inspection
 from arview.inspection.summary import overall_verdict
 
 _BUSY_S = 30.0
-"""How long a writer waits for others; a result is written in milliseconds."""
+"""Time that a writer waits for others; a result is written in milliseconds."""
 _TRIES = 6
-_PASSING = ("locked", "busy", "deadlock", "serialize", "could not connect", "server closed", "terminating connection")
+"""Attempts after errors that may be temporary."""
+_TEMPORARY = ("locked", "busy", "deadlock", "serialize", "could not connect", "server closed", "terminating connection")
 _NETWORK_FILE_SYSTEMS = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "glusterfs", "ceph")
-_LOCK = 0x61727669  # of PostgreSQL's advisory lock while tables are made
+_LOCK = 0x61727669
+"""Number of the advisory lock of PostgreSQL that is held while tables are created."""
 Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
-class Added:
-    """What became of an inspection: its number and hash, and whether it was new."""
+class AddedResult:
+    """An added inspection: its number and hash, and whether it was new."""
 
     id: int
     content_hash: str
@@ -53,8 +55,8 @@ class Added:
 
 
 @dataclass(frozen=True)
-class Listed:
-    """One result without its document; times are UTC."""
+class StoredResult:
+    """A stored result without its document; times are UTC."""
 
     id: int
     content_hash: str
@@ -69,7 +71,7 @@ class Listed:
 
 
 def default_store() -> str:
-    """``ARVIEW_STORE``, or a file in the user's data folder."""
+    """The store of ``ARVIEW_STORE``, else a file in the data folder of the user."""
     named = os.environ.get("ARVIEW_STORE")
     if named:
         return named
@@ -78,20 +80,20 @@ def default_store() -> str:
 
 
 def default_station() -> str:
-    """``ARVIEW_STATION``, or the name of this machine."""
+    """The name of ``ARVIEW_STATION``, else that of this machine."""
     return os.environ.get("ARVIEW_STATION") or socket.gethostname()
 
 
 class HistoryStore:
-    """A results store, made when it is not there yet.
+    """A results store, which is created if it does not exist.
 
     Args:
         where: a file (SQLite), or the URL of a PostgreSQL database: ``postgresql://user@host/database``.
-        must_exist: refuse to make a new file, for reading.
+        must_exist: do not create a new file.
 
     Raises:
-        InputError: no such file or database, no store, or one of a newer arview.
-        OutputError: the file cannot be made.
+        InputError: the file or database does not exist, is no store, or is that of a newer arview.
+        OutputError: the file cannot be created.
         MissingDependencyError: the driver of the database is not installed.
     """
 
@@ -122,15 +124,15 @@ class HistoryStore:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def add(self, inspection: str | Path, station: str | None = None) -> Added:
-        """Add the inspection in a file, unless it is there already.
+    def add(self, inspection: str | Path, station: str | None = None) -> AddedResult:
+        """Add the inspection in a file unless the store contains it.
 
         Args:
-            inspection: ``inspection.json``; it is checked before.
-            station: where it was measured; default: ``ARVIEW_STATION`` or the name of this machine.
+            inspection: ``inspection.json``, which is checked first.
+            station: station that measured; default: `default_station`.
 
         Raises:
-            InputError: the file is no inspection.
+            InputError: the file is not an inspection.
             OutputError: the store cannot be written to.
         """
         path = Path(inspection)
@@ -148,32 +150,32 @@ class HistoryStore:
             "tool": f"{loaded.provenance.tool} {loaded.provenance.version}",
             "document": json.dumps(document, ensure_ascii=False, allow_nan=False),
         }
-        return self._again(lambda: self._insert(row, loaded))
+        return self._retried(lambda: self._insert(row, loaded))
 
-    def _insert(self, row: dict[str, Any], inspection: Inspection) -> Added:
+    def _insert(self, row: dict[str, Any], inspection: Inspection) -> AddedResult:
         same = sa.select(results.c.id).where(results.c.content_hash == row["content_hash"])
         with self._begin(writes=True) as connection:
-            known = connection.scalar(same)
-            if known is None:
+            existing = connection.scalar(same)
+            if existing is None:
                 try:
                     with connection.begin_nested():
                         number = connection.execute(sa.insert(results).values(row).returning(results.c.id)).scalar()
-                except IntegrityError:  # another station added it a moment ago (PostgreSQL)
+                except IntegrityError:  # another station added it in the meantime (PostgreSQL)
                     number = None
                 if number is not None:
                     rows = [_component_row(number, component) for component in inspection.components]
                     if rows:
                         connection.execute(sa.insert(components), rows)
-                    return Added(int(number), row["content_hash"], True)
-                known = connection.scalar(same)
-            return Added(int(known or 0), row["content_hash"], False)
+                    return AddedResult(int(number), row["content_hash"], True)
+                existing = connection.scalar(same)
+            return AddedResult(int(existing or 0), row["content_hash"], False)
 
     def listed(
         self, part: str | None = None, serial: str | None = None, station: str | None = None,
         verdict: str | None = None, since: datetime | None = None, model_hash: str | None = None,
         limit: int | None = None,
-    ) -> list[Listed]:  # fmt: skip
-        """Results in the order in which they were measured; of a ``limit``, the newest ones."""
+    ) -> list[StoredResult]:  # fmt: skip
+        """Results in the order of their measurement; with a ``limit``, the newest ones."""
         wanted = {"part": part, "serial": serial, "station": station, "verdict": verdict, "model_hash": model_hash}
         query = sa.select(*(c for c in results.c if c.name != "document"))
         for name, value in wanted.items():
@@ -187,15 +189,15 @@ class HistoryStore:
         with self._begin() as connection:
             return [_listed(row) for row in reversed(connection.execute(query).all())]
 
-    def find(self, key: str) -> tuple[Listed, str]:
-        """A result and its document by its number, or by the beginning of its hash (at least six digits).
+    def find(self, key: str) -> tuple[StoredResult, str]:
+        """A result and its document, found by its number or the first digits of its hash (at least six).
 
         Raises:
-            InputError: there is none, or more than one begins so.
+            InputError: there is no such result, or more than one.
         """
         is_hash = len(key) >= 6 and set(key.lower()) <= set("0123456789abcdef")
         if not is_hash and not key.isdigit():
-            raise InputError(f"{key!r}: expected the number of a result or at least six digits of its hash")
+            raise InputError(f"{key!r}: expected the number of a result or the first digits of its hash (at least six)")
         rows: Sequence[Any] = ()
         with self._begin() as connection:
             if key.isdigit() and len(key) <= 18:
@@ -210,7 +212,7 @@ class HistoryStore:
         return _listed(rows[0]), str(rows[0].document)
 
     def components(self, ids: list[int] | None = None, name: str | None = None) -> Iterator[dict[str, Any]]:
-        """Rows of the components of results, of all or of one name, in the order of ``ids`` or of their numbers."""
+        """Rows of the components of results, all or those of one name, in the order of ``ids`` or of the numbers."""
         query = sa.select(components).order_by(components.c.result_id, components.c.name)
         if name is not None:
             query = query.where(components.c.name == name)
@@ -226,42 +228,42 @@ class HistoryStore:
             yield from by_result.get(number, ())
 
     def check(self) -> tuple[int, list[str]]:
-        """How many results there are, and in words what is not as it was added."""
+        """The number of results, and descriptions of those that were altered after they were added."""
         faults = []
         count = 0
         query = sa.select(results.c.id, results.c.content_hash, results.c.document).order_by(results.c.id)
-        held = sa.select(components.c.result_id, sa.func.count()).group_by(components.c.result_id)
+        counted = sa.select(components.c.result_id, sa.func.count()).group_by(components.c.result_id)
         with self._begin() as connection:
-            of_result = {int(number): int(rows) for number, rows in connection.execute(held)}
+            of_result = {int(number): int(rows) for number, rows in connection.execute(counted)}
             for row in connection.execute(query.execution_options(yield_per=200)):
                 count += 1
                 document = json.loads(row.document)
                 if content_hash(document) != row.content_hash:
                     faults.append(f"result {row.id}: its document does not have the hash {row.content_hash[:12]}…")
                 elif len(document["components"]) != of_result.get(row.id, 0):
-                    faults.append(f"result {row.id}: components are missing or too many")
+                    faults.append(f"result {row.id}: its number of components has changed")
         return count, faults
 
     # ---- connections
 
     @contextmanager
     def _begin(self, writes: bool = False) -> Iterator[sa.Connection]:
-        """A transaction; errors of the database as ours, in one line and without a password."""
+        """A transaction; errors of the database become errors of arview, in one line and without passwords."""
         try:
             with self._engine.connect().execution_options(arview_writes=writes) as connection, connection.begin():
                 yield connection
         except (InputError, OutputError):
             raise
         except SQLAlchemyError as error:
-            raise _Failure(self._in_words(error), _is_passing(error)) from error
+            raise _Failure(self._message(error), _is_temporary(error)) from error
 
-    def _again(self, work: Callable[[], Found]) -> Found:
-        """Do the work; when others hold the store, wait and do it again: what is added is added once all the same."""
+    def _retried(self, work: Callable[[], Found]) -> Found:
+        """Do the work, and repeat it after temporary errors; adding a result repeatedly stores it once."""
         for attempt in range(_TRIES):
             try:
                 return work()
             except _Failure as failure:
-                if not failure.is_passing or attempt == _TRIES - 1:
+                if not failure.is_temporary or attempt == _TRIES - 1:
                     raise
                 time.sleep(0.05 * 2**attempt * random.uniform(0.5, 1.5))
         raise AssertionError("unreachable")
@@ -278,61 +280,65 @@ class HistoryStore:
                 if version is None:
                     connection.execute(sa.insert(about).values(version=STORE_VERSION))
                 elif version > STORE_VERSION:
-                    raise InputError(f"{self.name}: is a store of a newer arview (version {version}); update arview")
+                    raise InputError(
+                        f"{self.name}: the store was written by a newer arview (version {version}); update arview"
+                    )
 
-        def look() -> bool:
+        def has_tables() -> bool:
             with self._begin() as connection:
                 if not sa.inspect(connection).has_table(about.name):
                     return False
                 version = connection.scalar(sa.select(sa.func.max(about.c.version)))
             if version is not None and version > STORE_VERSION:
-                raise InputError(f"{self.name}: is a store of a newer arview (version {version}); update arview")
+                raise InputError(
+                    f"{self.name}: the store was written by a newer arview (version {version}); update arview"
+                )
             return version is not None
 
-        if not self._again(look):
-            self._again(make)
+        if not self._retried(has_tables):
+            self._retried(make)
 
     def _check_file(self, path: Path, must_exist: bool) -> None:
         if not path.exists():
             if must_exist:
-                raise InputError(f"{path}: no such store; `arview history add` makes it")
+                raise InputError(f"{path}: no such store; `arview history add` creates it")
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise OutputError(f"{path.parent}: cannot be made ({error.strerror or error})") from error
+                raise OutputError(f"{path.parent}: cannot be created ({error.strerror or error})") from error
         elif path.is_dir():
-            raise InputError(f"{path}: is a folder; give the file of a store")
+            raise InputError(f"{path}: is a folder; expected the file of a store")
         kind = _file_system(path)
         if kind in _NETWORK_FILE_SYSTEMS:
             raise InputError(
-                f"{path}: lies on a network file system ({kind}), where SQLite is not safe when two stations write; use"
-                " PostgreSQL (--store postgresql://…)"
+                f"{path}: is on a network file system ({kind}), on which SQLite is not safe with several writers;"
+                " use PostgreSQL (--store postgresql://…)"
             )
 
-    def _in_words(self, error: SQLAlchemyError) -> str:
+    def _message(self, error: SQLAlchemyError) -> str:
         cause = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
         text = " ".join(str(cause).split())
         if "not a database" in text:
-            return f"{self.name}: is no results store"
+            return f"{self.name}: is not a results store"
         return f"{self.name}: {text[:240]}"
 
 
 class _Failure(OutputError):
-    """The database refused; ``is_passing`` when trying again may help."""
+    """An error of the database; ``is_temporary`` if another attempt may succeed."""
 
-    def __init__(self, message: str, is_passing: bool) -> None:
+    def __init__(self, message: str, is_temporary: bool) -> None:
         super().__init__(message)
-        self.is_passing = is_passing
+        self.is_temporary = is_temporary
 
 
 def content_hash(document: Any) -> str:
-    """SHA-256 of a JSON document however it was written: of its text with sorted keys and no spaces, UTF-8."""
+    """SHA-256 of a JSON document independent of its formatting: of its UTF-8 text with sorted keys and no spaces."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _is_passing(error: SQLAlchemyError) -> bool:
-    return isinstance(error, OperationalError | DBAPIError) and any(word in str(error).lower() for word in _PASSING)
+def _is_temporary(error: SQLAlchemyError) -> bool:
+    return isinstance(error, OperationalError | DBAPIError) and any(word in str(error).lower() for word in _TEMPORARY)
 
 
 def _url(where: str) -> sa.URL:
@@ -341,7 +347,7 @@ def _url(where: str) -> sa.URL:
     try:
         url = sa.make_url(where)
     except ArgumentError as error:
-        raise InputError("store: is no URL of a database; expected postgresql://user@host/database") from error
+        raise InputError("store: is not a URL of a database; expected postgresql://user@host/database") from error
     kind = url.get_backend_name()
     if kind == "postgresql":
         return url.set(drivername="postgresql+psycopg")
@@ -351,7 +357,7 @@ def _url(where: str) -> sa.URL:
 
 
 def _prepare_sqlite(connection: Any, record: Any) -> None:
-    connection.isolation_level = None  # transactions are begun below, not by the driver
+    connection.isolation_level = None  # transactions are started below, not by the driver
     for pragma in (
         "journal_mode = WAL",
         "synchronous = FULL",
@@ -362,13 +368,13 @@ def _prepare_sqlite(connection: Any, record: Any) -> None:
 
 
 def _begin_sqlite(connection: sa.Connection) -> None:
-    # A writer takes the lock at once: one that reads first and writes then could not wait for another.
+    # A writer takes the lock immediately; a transaction that reads first could not wait for another writer.
     writes = connection.get_execution_options().get("arview_writes")
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
 
 def _file_system(path: Path) -> str:
-    """Kind of the file system that a path lies on, as /proc/mounts names it; empty where that is unknown."""
+    """Type of the file system of a path as in /proc/mounts; empty when unknown."""
     try:
         mounts = Path("/proc/mounts").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -397,8 +403,8 @@ def _stamp(moment: datetime) -> str:
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
-def _listed(row: Any) -> Listed:
-    return Listed(
+def _listed(row: Any) -> StoredResult:
+    return StoredResult(
         int(row.id), row.content_hash, row.part, row.serial, row.station, row.model_hash,
         datetime.fromisoformat(row.measured), datetime.fromisoformat(row.added), row.verdict, row.tool,
     )  # fmt: skip

@@ -6,7 +6,7 @@ from sqlalchemy import BigInteger, Column, Float, ForeignKey, Index, Integer, Me
 
 STORE_VERSION = 1
 metadata = MetaData()
-_Number = BigInteger().with_variant(Integer, "sqlite")  # only INTEGER counts up by itself in SQLite
+_Number = BigInteger().with_variant(Integer, "sqlite")  # SQLite increments only INTEGER keys automatically
 
 results = Table(
     "arview_results",
@@ -17,7 +17,7 @@ results = Table(
     Column("serial", Text, nullable=False),
     Column("station", Text, nullable=False),
     Column("model_hash", String(64), nullable=False),
-    Column("measured", String(27), nullable=False),  # UTC, 2026-03-01T12:00:00.000000Z: sorts as text
+    Column("measured", String(27), nullable=False),  # UTC, 2026-03-01T12:00:00.000000Z, which sorts as text
     Column("added", String(27), nullable=False),
     Column("verdict", String(16), nullable=False),
     Column("tool", Text, nullable=False),
@@ -50,7 +50,7 @@ _MESSAGE = "the results store is append-only"
 
 
 def guards(dialect: str) -> list[str]:
-    """Statements that make every change of what is there fail; they may be run again."""
+    """Statements that make changes of existing rows fail; they can be executed repeatedly."""
     tables = (results.name, components.name, about.name)
     return _sqlite_guards(tables) if dialect == "sqlite" else _postgresql_guards(tables)
 
@@ -62,7 +62,7 @@ def _sqlite_guards(tables: tuple[str, ...]) -> list[str]:
         for table in tables
         for verb in ("UPDATE", "DELETE")
     ]
-    # INSERT OR REPLACE deletes without calling delete triggers: what is there already is not inserted again.
+    # INSERT OR REPLACE deletes without firing delete triggers, so existing rows are not inserted again.
     same = {
         results.name: "content_hash = NEW.content_hash OR id = NEW.id",
         components.name: "result_id = NEW.result_id AND name = NEW.name",
