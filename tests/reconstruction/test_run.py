@@ -159,7 +159,7 @@ def command(*arguments: object) -> Result:
 
 
 def says(result: Result, *words: str) -> bool:
-    """One line on stderr with the words, exit code 2, no traceback."""
+    """One line on stderr with the words, exit code 64, no traceback."""
     lines = result.stderr.strip().splitlines()
     return result.exit_code == 64 and "Traceback" not in result.stderr and all(word in lines[-1] for word in words)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from arview.camera import Camera
-from arview.errors import InputError
+from arview.errors import CannotMeasureError
 from arview.geometry import Array, invert, skew
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of
 from arview.reconstruction.features import FeatureOptions, Features, find_features
@@ -110,13 +110,13 @@ def test_photos_of_another_part_are_named(paths: list[Path], tmp_path: Path) -> 
 def test_no_texture_is_said(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     walls = [np.clip(rng.normal(200, 1.0, (480, 640, 3)), 0, 255).astype(np.uint8) for _ in range(4)]
-    with pytest.raises(InputError, match="texture"):
+    with pytest.raises(CannotMeasureError, match="texture"):
         reconstruct_sparse(photos_of(write_photos(tmp_path, walls)), tmp_path / "sparse", OPTIONS)
 
 
 def test_photos_with_nothing_in_common_are_refused(tmp_path: Path) -> None:
     strangers = [photograph(bench(i), ring(12)[3 * i], seed=i) for i in range(4)]
-    with pytest.raises(InputError, match="in common"):
+    with pytest.raises(CannotMeasureError, match="in common"):
         reconstruct_sparse(photos_of(write_photos(tmp_path, strangers)), tmp_path / "sparse", OPTIONS)
 
 

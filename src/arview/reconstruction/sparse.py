@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from arview.camera import Camera
 from arview.core.progress import Progress
-from arview.errors import InputError
+from arview.errors import CannotMeasureError
 from arview.geometry import Array, invert, skew
 from arview.reconstruction.colmap import CALIBRATED_MODEL, HALF_PX, colmap_camera, import_pycolmap, sparse_model_of
 from arview.reconstruction.covariance import pose_covariance
@@ -58,7 +58,7 @@ def reconstruct_sparse(
 ) -> SparseModel:
     """Poses and points of the photos; COLMAP's database and model are left in ``folder``.
 
-    Raises InputError when fewer than three photos can be placed together, with the likely reason.
+    Raises CannotMeasureError when fewer than three photos can be placed together, with the likely reason.
     """
     options = options or SparseOptions()
     tell = progress or (lambda stage, done, total: None)
@@ -70,7 +70,7 @@ def reconstruct_sparse(
     _write_database(database_path, photos, features, pairs, options)
     models = _map(database_path, folder, options, len(photos), tell)
     if not models or max(model.num_reg_images() for model in models) < 3:
-        raise InputError(_why_nothing(photos, features, pairs))
+        raise CannotMeasureError(_why_nothing(photos, features, pairs))
     chosen = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
     unplaced = _unplaced(photos, features, pairs, models, chosen)
     matches = _match_along_lines(chosen, photos, features, options, threads, tell)
