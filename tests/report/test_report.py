@@ -369,7 +369,7 @@ def test_distances_are_read_back(model: Model, reconstruction: MetricReconstruct
     assert np.abs(again.points_in_model - made.points_in_model).max() < 1e-4
     assert np.abs(again.distances - made.distances).max() < 1e-6
     (tmp_path / "cut.ply").write_bytes((tmp_path / "d.ply").read_bytes()[:-5])
-    with pytest.raises(Exception, match="cut short"):
+    with pytest.raises(Exception, match="truncated"):
         read_distance_ply(tmp_path / "cut.ply", 3.0, ())
 
 

@@ -1,4 +1,4 @@
-"""Posed photos → dense cloud: multi-view PatchMatch on the part's region, polished and fused.
+"""Dense reconstruction of posed photos: multi-view PatchMatch in the part's region, refinement and fusion.
 
 views → depth maps (kernels, patchmatch, polish) → fusion
 """
@@ -38,21 +38,22 @@ def reconstruct_dense(
     folder: Path | None = None,
     progress: Progress | None = None,
 ) -> DenseCloud:
-    """The dense cloud of posed photos, in the frame and unit of ``sparse``.
+    """Reconstruct the dense cloud of posed photos, in the frame and unit of ``sparse``.
 
     Args:
         sparse: poses with distorted cameras, points and observations; in mm when ``cad`` is given.
-        options: see DenseOptions.
-        cad: the part's model and its rough place. Limits the work to the part's region and starts the search at its
-            surface; where a surface is found is decided by the photos alone.
+        options: see `DenseOptions`.
+        cad: the part's model and its approximate pose. It limits the work to the part's region and provides start
+            values;
+            the photos alone decide where the surface is.
         folder: depth and normal maps of each photo are written below it in COLMAP's format.
         progress: called with a stage's name, photos done and photos in all.
 
     Returns:
-        The cloud; with no points where the photos show no texture. Same input and seed, same cloud.
+        The cloud, empty where the photos show no texture. The same input and seed give the same cloud.
 
     Raises:
-        InputError: fewer than ``options.min_views`` photos have others to compare with, or a photo cannot be read.
+        InputError: fewer than ``options.min_views`` photos have sources, or a photo cannot be read.
         OutputError: the folder cannot be written to.
     """
     from arview.reconstruction.intake import read_photo

@@ -1,6 +1,6 @@
-"""Depth maps of all views, coarse to fine: PatchMatch at a quarter and at half of the working size, then polishing.
+"""Depth maps of all views, coarse to fine: PatchMatch at a quarter and at half of the working size, then refinement.
 
-Views are independent within a stage, so threads take one each; the second stage reads the first one's maps.
+Views are independent within a stage, so each thread takes one; the second stage reads the maps of the first.
 """
 
 from __future__ import annotations
@@ -26,10 +26,13 @@ from arview.reconstruction.dense.views import Cad, DenseView, Floats, Planes, ca
 from arview.reconstruction.types import SparseModel
 
 STEPS = (4, 2)
-"""Pixels of the working size per pixel of each PatchMatch stage; the depth maps have the last one's grid."""
+"""Pixels of the working size per pixel of each PatchMatch stage; the depth maps have the grid of the last stage."""
 SWEEPS = (2, 1)
+"""Checkerboard sweeps in each stage."""
 RANDOMS = 6
+"""Random hypotheses for each pixel in the first stage."""
 POLISH_ITERATIONS = 5
+"""Iterations of the least-squares refinement."""
 T = TypeVar("T")
 
 
@@ -38,11 +41,12 @@ class DepthMap:
     """Surface elements of one view.
 
     Attributes:
-        camera: ideal camera of the map's grid. cam_from_scan: (4,4).
+        camera: ideal camera of the map's grid.
+        cam_from_scan: (4,4).
         planes: (H,W,3) float32, see `views.Planes`; w = 0 where there is none.
-        scores: (H,W) mean correlation with the sources that see it.
+        scores: (H,W) mean correlation with the sources that see the element.
         sigmas: (H,W) standard deviation of w.
-        unit_w: change of w that moves a pixel of the map by one in the sources.
+        unit_w: change of w that moves a pixel of the map by one pixel in the sources.
     """
 
     camera: Camera
@@ -74,6 +78,7 @@ def depth_maps(
 
 
 def _each(pool: ThreadPoolExecutor, job: Callable[[int], T], count: int, name: str, progress: Progress) -> list[T]:
+    """Run a job for each index on the pool and report progress."""
     results = []
     for done, result in enumerate(pool.map(job, range(count)), start=1):
         results.append(result)
@@ -82,6 +87,7 @@ def _each(pool: ThreadPoolExecutor, job: Callable[[int], T], count: int, name: s
 
 
 def _shrunk(grey: Floats, step: int) -> Floats:
+    """The picture reduced by an integer factor."""
     if step == 1:
         return grey
     size = (grey.shape[1] // step, grey.shape[0] // step)
@@ -102,6 +108,7 @@ def _grown(planes: Planes, factor: int) -> Planes:
 def _problem(
     views: list[DenseView], index: int, greys: list[Floats], maps: list[Planes], step: int, options: DenseOptions
 ) -> Problem:
+    """The arrays of one view and its sources at one resolution; ``maps`` are the sources' depth maps, or empty."""
     view = views[index]
     camera = view.camera.scaled(greys[index].shape[1], greys[index].shape[0])
     sources = view.sources
@@ -139,7 +146,7 @@ def _problem(
 
 
 def _layout(images: list[NDArray[np.float32]]) -> NDArray[np.int32]:
-    """(S,3) first pixel, width and height of images that lie one after another."""
+    """(S,3) first pixel, width and height of images that lie one after another in an array."""
     sizes = np.array([image.shape[:2] for image in images])
     first = np.concatenate([[0], np.cumsum(sizes[:, 0] * sizes[:, 1])[:-1]])
     return np.stack([first, sizes[:, 1], sizes[:, 0]], axis=1).astype(np.int32)
@@ -149,7 +156,7 @@ def _search(
     views: list[DenseView], greys: list[Floats], maps: list[Planes], sparse: SparseModel, cad: Cad | None,
     options: DenseOptions, stage: int, device: str | None, index: int,
 ) -> Planes:  # fmt: skip
-    """PatchMatch of one view at one level; ``maps`` are those of the level before, or empty."""
+    """PatchMatch of one view at one level; ``maps`` are those of the previous level, or empty."""
     view, step = views[index], STEPS[stage]
     height, width = greys[index].shape
     camera = view.camera.scaled(width, height)
@@ -184,6 +191,7 @@ def _search(
 def _polished(
     views: list[DenseView], greys: list[Floats], maps: list[Planes], options: DenseOptions, index: int
 ) -> DepthMap:
+    """Refine the depth map of one view at the working size."""
     planes = maps[index].copy()
     height, width = planes.shape[:2]
     problem = _problem(views, index, greys, [], 1, options)

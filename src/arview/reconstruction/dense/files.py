@@ -1,4 +1,4 @@
-"""Files of the dense reconstruction: depth and normal maps in COLMAP's format, the cloud as PLY."""
+"""Files of the dense reconstruction: depth and normal maps in COLMAP's format, and the cloud as PLY."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _PROPERTIES = [f"property {kind} {name}" for name, (_, kind) in _FIELDS.items()]
 
 
 def write_map(path: Path, image: NDArray[np.float32]) -> None:
-    """Write a (H,W) or (H,W,C) float32 array as COLMAP does: ``width&height&channels&``, then channel by channel.
+    """Write a (H,W) or (H,W,C) float32 array in COLMAP's format: ``width&height&channels&``, then channel by channel.
 
     Raises:
-        OutputError: the folder cannot be made or written to.
+        OutputError: the folder cannot be created or written to.
     """
     channels = image.reshape(*image.shape[:2], -1)
     header = f"{channels.shape[1]}&{channels.shape[0]}&{channels.shape[2]}&".encode()
@@ -41,7 +41,7 @@ def write_map(path: Path, image: NDArray[np.float32]) -> None:
 
 
 def read_map(path: Path) -> Floats:
-    """The (H,W) or (H,W,C) float32 array of a file that `write_map` or COLMAP wrote. Raises InputError."""
+    """Read the (H,W) or (H,W,C) float32 array of a file written by `write_map` or COLMAP. Raises InputError."""
     try:
         data = path.read_bytes()
         width, height, channels = (int(number) for number in data[:64].split(b"&", 3)[:3])
@@ -50,12 +50,14 @@ def read_map(path: Path) -> Floats:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except ValueError as error:
-        raise InputError(f"{path}: is no COLMAP map, or was cut short") from error
+        raise InputError(f"{path}: is not a COLMAP map, or is truncated") from error
     return np.ascontiguousarray(values[0] if channels == 1 else values.transpose(1, 2, 0), dtype=np.float32)
 
 
 def write_maps(folder: Path, name: str, m: DepthMap) -> None:
-    """Depth (0: none) and normals in the camera, towards it, below ``folder/stereo``. Raises OutputError."""
+    """Write depth (0: none) and normals in the camera frame, towards the camera, below ``folder/stereo``. Raises
+    OutputError.
+    """
     camera, w = m.camera, m.planes[..., 0]
     is_known = (w > 0) & (m.scores > 0)
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
@@ -86,10 +88,10 @@ def write_ply(cloud: DenseCloud, path: str | Path) -> None:
 
 
 def read_ply(path: str | Path) -> DenseCloud:
-    """The cloud of a PLY file that `write_ply` wrote.
+    """Read the cloud of a PLY file written by `write_ply`.
 
     Raises:
-        InputError: the file cannot be read, is cut short or holds other properties.
+        InputError: the file cannot be read, is truncated or has other properties.
     """
     path = Path(path)
     try:
@@ -100,10 +102,10 @@ def read_ply(path: str | Path) -> DenseCloud:
     lines = header.decode("ascii", "replace").split("\n")
     properties = [line for line in lines if line.startswith("property ")]
     if not found or lines[0] != "ply" or properties != _PROPERTIES:
-        raise InputError(f"{path}: is not a cloud that arview wrote")
+        raise InputError(f"{path}: is not a cloud written by arview")
     count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex ")), -1)
     if len(body) != count * _VERTEX.itemsize:
-        raise InputError(f"{path}: is cut short; reconstruct again")
+        raise InputError(f"{path}: is truncated; reconstruct again")
     rows = np.frombuffer(body, dtype=_VERTEX)
 
     def columns(names: str) -> NDArray[np.generic]:

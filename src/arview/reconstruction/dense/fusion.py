@@ -1,8 +1,8 @@
-"""Depth maps of several views → one cloud of the points that enough of them agree on.
+"""Fusion of the depth maps of several views into one cloud of the points that enough of them confirm.
 
-Each pixel's element is looked up in the maps of the views around (forward-backward check: Schönberger 2016,
-Galliani 2015); those that agree are merged along the pixel's own ray, weighted by how well each is known. Views are
-independent in this, so threads take one each; of all points in a small cell the best known one stays.
+Each pixel's element is looked up in the maps of neighbouring views (forward-backward check: Schönberger 2016, Galliani
+2015); those that agree are merged along the pixel's own ray, weighted by their variances. Views are independent here,
+so each thread takes one; of all points in a small cell the one with the smallest standard deviation is kept.
 """
 
 from __future__ import annotations
@@ -23,32 +23,35 @@ from arview.reconstruction.dense.options import DenseOptions
 from arview.reconstruction.dense.views import Image
 from arview.reconstruction.types import DenseCloud
 
-FELLOWS = 8
-"""Other views that a view is checked against."""
+MAX_NEIGHBOURS = 8
+"""Other views against which a view is checked."""
 _RELATIVE_DEPTH = 0.01
-"""Depths differ by more than this share: another surface, whatever the pixels say."""
+"""Depths that differ by more than this share belong to different surfaces."""
 _CELL_PX = 0.5
-"""Side of the cells, of which each holds one point, in pixels of the maps (as wide as they are on the surface)."""
+"""Side of the cells, each of which keeps one point, in pixels of the maps at the surface."""
 _CELL_LENGTH = 5.0
-"""Length of the cells along the normal, in their sides: what is less well known than the surface there goes."""
+"""Length of the cells along the normal, in units of their sides; it removes less accurate points near a surface."""
 _LEANING = 0.7
 """Cosine between ray and normal below which a pixel gives more than one point."""
 _ISOLATED = 3
-"""A pixel with fewer neighbours (of 8) on its surface is a crumb."""
+"""A pixel with fewer neighbours (of 8) on its surface is removed as isolated."""
 
 
 _Points = tuple[Array, NDArray[np.float32], Image, NDArray[np.float32], NDArray[np.uint8]]
-"""Points (N,3), normals (N,3), colours (N,3), deviations (N,), view counts (N,)."""
+"""Points (N,3), normals (N,3), colours (N,3), standard deviations (N,), view counts (N,)."""
 
 
 @dataclass(frozen=True)
 class _Stack:
-    """All maps one after another: elements in the scan frame for numba.
+    """All maps one after another, as arrays for kernels.
 
-    ``elements`` (P,6) float32: normal form n·X = 1 in the camera (n divided by the plane's distance), variance of w,
-    w at the pixel (0: none), and 1 where it may become a point, not only bear out others.
-    ``layout`` (V,3): first pixel, width, height. ``cameras`` (V,4): fx fy cx cy.
-    ``poses`` (V,3,4): cam_from_scan.
+    Attributes:
+        elements: (P,6) float32: plane n·X = 1 in the camera (normal divided by the plane's distance), variance of w, w
+            at
+            the pixel (0: none), and 1 where the element may become a point itself instead of only confirming others.
+        layout: (V,3) first pixel, width, height.
+        cameras: (V,4) fx fy cx cy.
+        poses: (V,3,4) cam_from_scan.
     """
 
     elements: NDArray[np.float32]
@@ -61,14 +64,17 @@ def fuse(
     maps: Sequence[DepthMap], images: Sequence[Image], options: DenseOptions, threads: int,
     progress: Progress,
 ) -> DenseCloud:  # fmt: skip
-    """The cloud of all points that ``options.min_views`` maps agree on; empty when there are none.
+    """Fuse depth maps into the cloud of all points that ``options.min_views`` maps agree on.
 
     Args:
         maps: depth maps of the views.
         images: (H,W,3) uint8 RGB of each map's size.
-        options: thresholds.
-        threads: views at a time.
+        options: see `DenseOptions`.
+        threads: number of views worked on at a time.
         progress: called with the stage's name, views done and views in all.
+
+    Returns:
+        The cloud; empty when no points agree.
     """
     stack = _stacked(maps, options)
     limits = np.array(
@@ -80,11 +86,11 @@ def fuse(
             options.max_spread_px,
         ]
     )
-    fellows = [_fellows(maps, i) for i in range(len(maps))]
+    neighbours = [_neighbour_views(maps, i) for i in range(len(maps))]
     merged = np.zeros((len(stack.elements), 3), dtype=np.float32)
 
     def merge(i: int) -> None:
-        _merge(i, fellows[i], stack.elements, stack.layout, stack.cameras, stack.poses, limits, merged)
+        _merge(i, neighbours[i], stack.elements, stack.layout, stack.cameras, stack.poses, limits, merged)
 
     def points_of(i: int) -> _Points:
         first, width, height = stack.layout[i]
@@ -105,10 +111,11 @@ def fuse(
 def _best_of_cells(
     points: Array, normals: NDArray[np.float32], sigma: NDArray[np.float32], side: float
 ) -> NDArray[np.int64]:
-    """Indices of the best known point of each cell; cells are longer along the axis nearest to the normal.
+    """Indices of the most accurate point of each cell; cells are longer along the axis nearest to the normal.
 
-    Where two cells one behind the other hold points of one surface, the better known one stays: how many points a
-    surface gets does not depend on where the cells' borders cut it.
+    Where two cells behind each other hold points of one surface, only the more accurate point is kept, so that the
+    density
+    of points does not depend on where a surface crosses the borders of cells.
     """
     if len(points) == 0:
         return np.empty(0, dtype=np.int64)
@@ -117,9 +124,9 @@ def _best_of_cells(
     facing = 2 * axis + (normals[everyone, axis] > 0)
     sides = side * np.where(np.arange(3) == axis[:, None], _CELL_LENGTH, 1.0)
     cell = np.floor((points - points.min(axis=0)) / sides).astype(np.int64)
-    counts = cell.max(axis=0) + 2  # one to spare: the cell behind the last one is not the next row's first
+    counts = cell.max(axis=0) + 2  # plus one, so that the cell behind the last one of a row is not the next row's first
     key = ((facing * counts[0] + cell[:, 0]) * counts[1] + cell[:, 1]) * counts[2] + cell[:, 2]
-    # One number holds both, by cell and then by deviation in 65,536 steps: one sort of integers, the quickest there is.
+    # One integer holds cell and deviation (in 65,536 steps), so that a single sort of integers orders by both.
     step = (np.minimum(sigma / max(float(sigma.max()), 1e-30), 1.0) * 65535).astype(np.int64)
     order = np.argsort((key << 16) + step, kind="stable")
     best = order[np.flatnonzero(np.diff(key[order], prepend=-1))]
@@ -133,6 +140,7 @@ def _best_of_cells(
 
 
 def _stacked(maps: Sequence[DepthMap], options: DenseOptions) -> _Stack:
+    """All maps as arrays for kernels."""
     elements = []
     for m in maps:
         camera, planes = m.camera, m.planes
@@ -155,18 +163,18 @@ def _stacked(maps: Sequence[DepthMap], options: DenseOptions) -> _Stack:
     )
 
 
-def _fellows(maps: Sequence[DepthMap], index: int) -> NDArray[np.int64]:
-    """The views whose direction is nearest to a view's, its own left out."""
+def _neighbour_views(maps: Sequence[DepthMap], index: int) -> NDArray[np.int64]:
+    """The views with the most similar viewing directions, without the view itself."""
     axes = np.stack([m.cam_from_scan[2, :3] for m in maps])
     likeness = axes @ axes[index]
     likeness[index] = -2.0
-    order = np.argsort(-likeness, kind="stable")[: min(FELLOWS, len(maps) - 1)]
+    order = np.argsort(-likeness, kind="stable")[: min(MAX_NEIGHBOURS, len(maps) - 1)]
     return order[likeness[order] > 0.0]
 
 
 @kernel(inline=True)
 def _seen_at(j, p0, p1, p2, layout, cameras, poses):  # type: ignore[no-untyped-def]
-    """Index of the pixel of map j that a point falls on (-1: none) and the point in that camera."""
+    """Index of the pixel of map j onto which a point projects (-1: none), and the point in that camera."""
     m = poses
     x = m[j, 0, 0] * p0 + m[j, 0, 1] * p1 + m[j, 0, 2] * p2 + m[j, 0, 3]
     y = m[j, 1, 0] * p0 + m[j, 1, 1] * p1 + m[j, 1, 2] * p2 + m[j, 1, 3]
@@ -180,13 +188,15 @@ def _seen_at(j, p0, p1, p2, layout, cameras, poses):  # type: ignore[no-untyped-
 
 
 @kernel(numpy_errors=True)
-def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # type: ignore[no-untyped-def]
-    """Merged depth, its standard deviation and the number of views of each pixel of view i that enough agree on."""
+def _merge(i, neighbours, elements, layout, cameras, poses, limits, merged):  # type: ignore[no-untyped-def]
+    """Write merged depth, its standard deviation and the number of views of each pixel of view i that enough confirm.
+
+    ``limits``: agreement in px, relative depth, cosine of the normals' angle, number of views, spread in px.
+    """
     first, width, height = layout[i]
     agreement, relative, min_cosine, min_views, spread_px = limits
     fx, fy, cx, cy = cameras[i]
-    count = fellows.shape[0]
-    depths, weights = np.empty(count + 1), np.empty(count + 1)
+    depths, weights = np.empty(neighbours.shape[0] + 1), np.empty(neighbours.shape[0] + 1)
     r, t = poses[i, :, :3].copy(), poses[i, :, 3].copy()
     centre = -(r.T @ t)
     for at in range(first, first + width * height):
@@ -207,68 +217,101 @@ def _merge(i, fellows, elements, layout, cameras, poses, limits, merged):  # typ
         length = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
         depths[0], weights[0] = z, 1.0 / max(elements[at, 3] * z**4, 1e-18 * z * z)
         views, against = 1, 0
-        for f in range(count):
-            j = fellows[f]
+        for f in range(neighbours.shape[0]):
+            j = neighbours[f]
             q, x, y, depth = _seen_at(
                 j, centre[0] + z * ray0, centre[1] + z * ray1, centre[2] + z * ray2, layout, cameras, poses
             )
             if q < 0 or not elements[q, 4] > 0.0:
                 continue
-            # The other element: where its plane lies on the line of sight of j through the point, and on this ray.
-            e0, e1, e2 = elements[q, 0], elements[q, 1], elements[q, 2]
-            there = (e0 * x + e1 * y) / depth + e2
+            # Where the other element's plane lies on the line of sight of view j through the point.
+            there = (elements[q, 0] * x + elements[q, 1] * y) / depth + elements[q, 2]
             if not there > 0.0:
                 continue
             shift = 1.0 / there - depth
             if abs(shift) > relative * depth:
-                # Seen through: the other view looks past the point at something behind it.
+                # View j sees something behind the point, so the point is contradicted.
                 against += shift > 0.0
                 continue
-            m0 = poses[j, 0, 0] * e0 + poses[j, 1, 0] * e1 + poses[j, 2, 0] * e2
-            m1 = poses[j, 0, 1] * e0 + poses[j, 1, 1] * e1 + poses[j, 2, 1] * e2
-            m2 = poses[j, 0, 2] * e0 + poses[j, 1, 2] * e1 + poses[j, 2, 2] * e2
-            cosine = (m0 * n0 + m1 * n1 + m2 * n2) / (length * np.sqrt(m0 * m0 + m1 * m1 + m2 * m2))
-            if cosine < min_cosine:
-                continue
-            # Moved along the other's ray onto its plane, the point moves in this view by so many pixels.
-            stretch = 1.0 + shift / depth
-            x, y, depth = x * stretch - poses[j, 0, 3], y * stretch - poses[j, 1, 3], depth * stretch - poses[j, 2, 3]
-            p0 = poses[j, 0, 0] * x + poses[j, 1, 0] * y + poses[j, 2, 0] * depth
-            p1 = poses[j, 0, 1] * x + poses[j, 1, 1] * y + poses[j, 2, 1] * depth
-            p2 = poses[j, 0, 2] * x + poses[j, 1, 2] * y + poses[j, 2, 2] * depth
-            q0 = r[0, 0] * p0 + r[0, 1] * p1 + r[0, 2] * p2 + t[0]
-            q1 = r[1, 0] * p0 + r[1, 1] * p1 + r[1, 2] * p2 + t[1]
-            q2 = r[2, 0] * p0 + r[2, 1] * p1 + r[2, 2] * p2 + t[2]
-            if not q2 > 0.0 or (fx * (q0 / q2 - xn)) ** 2 + (fy * (q1 / q2 - yn)) ** 2 > agreement * agreement:
-                continue
-            offset = 1.0 - (e0 * poses[j, 0, 3] + e1 * poses[j, 1, 3] + e2 * poses[j, 2, 3])
-            along = m0 * ray0 + m1 * ray1 + m2 * ray2
-            here = (offset - (m0 * centre[0] + m1 * centre[1] + m2 * centre[2])) / along
-            if not abs(here - z) < relative * z:
-                continue
-            depths[views], weights[views] = here, 1.0 / max(elements[q, 3] * here**4, 1e-18 * z * z)
-            views += 1
+            here = _confirmed_depth(
+                elements, q, poses, i, j, (x, y, depth, shift), (ray0, ray1, ray2), (n0, n1, n2, length), centre,
+                (fx, fy, xn, yn, z), (agreement, relative, min_cosine),
+            )  # fmt: skip
+            if here > 0.0:
+                depths[views], weights[views] = here, 1.0 / max(elements[q, 3] * here**4, 1e-18 * z * z)
+                views += 1
         if views < min_views or against >= views:
             continue
-        total, mean = 0.0, 0.0
-        for k in range(views):
-            total += weights[k]
-            mean += weights[k] * depths[k]
-        mean /= total
-        spread = 0.0
-        for k in range(views):
-            spread += weights[k] * (depths[k] - mean) ** 2
-        # Two maps share a photo on average: they count as half as many independent ones.
-        variance = 2.0 * max(1.0 / total, spread / total / (views - 1))
-        # Along the normal, which the ray meets at an angle.
+        mean, variance = _weighted_mean(depths, weights, views)
+        # The standard deviation along the normal, which the ray meets at an angle.
         sigma = np.sqrt(variance) * abs(n0 * ray0 + n1 * ray1 + n2 * ray2) / length
         if sigma <= spread_px * z / fx:
             merged[at, 0], merged[at, 1], merged[at, 2] = mean, sigma, views
 
 
+@kernel(numpy_errors=True, inline=True)
+def _confirmed_depth(elements, q, poses, i, j, seen, ray, normal, centre, pixel, limits):  # type: ignore[no-untyped-def]
+    """Depth along a pixel's ray at which the element of another view lies, or -1 where the two disagree.
+
+    Args:
+        elements, poses: of all views, see `_Stack`.
+        q: index of the element of the other view.
+        i, j: the pixel's view and the other view.
+        seen: the point in the other camera, and how far behind it the element's plane is.
+        ray, normal: of the pixel in the scan frame; the normal with its length.
+        centre: camera centre of view i.
+        pixel: fx, fy, normalised coordinates, and depth of the pixel.
+        limits: agreement in px, relative depth, cosine of the normals' angle.
+    """
+    e0, e1, e2 = elements[q, 0], elements[q, 1], elements[q, 2]
+    x, y, depth, shift = seen
+    ray0, ray1, ray2 = ray
+    n0, n1, n2, length = normal
+    fx, fy, xn, yn, z = pixel
+    agreement, relative, min_cosine = limits
+    m0 = poses[j, 0, 0] * e0 + poses[j, 1, 0] * e1 + poses[j, 2, 0] * e2
+    m1 = poses[j, 0, 1] * e0 + poses[j, 1, 1] * e1 + poses[j, 2, 1] * e2
+    m2 = poses[j, 0, 2] * e0 + poses[j, 1, 2] * e1 + poses[j, 2, 2] * e2
+    cosine = (m0 * n0 + m1 * n1 + m2 * n2) / (length * np.sqrt(m0 * m0 + m1 * m1 + m2 * m2))
+    if cosine < min_cosine:
+        return -1.0
+    # Moving the point along the other view's ray onto the plane displaces it in this view by a number of pixels.
+    stretch = 1.0 + shift / depth
+    x, y, depth = x * stretch - poses[j, 0, 3], y * stretch - poses[j, 1, 3], depth * stretch - poses[j, 2, 3]
+    p0 = poses[j, 0, 0] * x + poses[j, 1, 0] * y + poses[j, 2, 0] * depth
+    p1 = poses[j, 0, 1] * x + poses[j, 1, 1] * y + poses[j, 2, 1] * depth
+    p2 = poses[j, 0, 2] * x + poses[j, 1, 2] * y + poses[j, 2, 2] * depth
+    q0 = poses[i, 0, 0] * p0 + poses[i, 0, 1] * p1 + poses[i, 0, 2] * p2 + poses[i, 0, 3]
+    q1 = poses[i, 1, 0] * p0 + poses[i, 1, 1] * p1 + poses[i, 1, 2] * p2 + poses[i, 1, 3]
+    q2 = poses[i, 2, 0] * p0 + poses[i, 2, 1] * p1 + poses[i, 2, 2] * p2 + poses[i, 2, 3]
+    if not q2 > 0.0 or (fx * (q0 / q2 - xn)) ** 2 + (fy * (q1 / q2 - yn)) ** 2 > agreement * agreement:
+        return -1.0
+    offset = 1.0 - (e0 * poses[j, 0, 3] + e1 * poses[j, 1, 3] + e2 * poses[j, 2, 3])
+    along = m0 * ray0 + m1 * ray1 + m2 * ray2
+    here = (offset - (m0 * centre[0] + m1 * centre[1] + m2 * centre[2])) / along
+    return here if abs(here - z) < relative * z else -1.0
+
+
+@kernel(numpy_errors=True)
+def _weighted_mean(depths, weights, count):  # type: ignore[no-untyped-def]
+    """Weighted mean of the first depths, and its variance.
+
+    Two maps share one photo on average, so they count as half as many independent ones.
+    """
+    total, mean = 0.0, 0.0
+    for k in range(count):
+        total += weights[k]
+        mean += weights[k] * depths[k]
+    mean /= total
+    spread = 0.0
+    for k in range(count):
+        spread += weights[k] * (depths[k] - mean) ** 2
+    return mean, 2.0 * max(1.0 / total, spread / total / (count - 1))
+
+
 @kernel
 def _drop_crumbs(merged):  # type: ignore[no-untyped-def]
-    """Set pixels to 0 that hardly any neighbour is on a surface with."""
+    """Clear pixels that share a surface with hardly any of their neighbours."""
     height, width = merged.shape[:2]
     depth = merged[..., 0].copy()
     for y in range(height):
@@ -284,7 +327,7 @@ def _drop_crumbs(merged):  # type: ignore[no-untyped-def]
 
 
 def _points(m: DepthMap, image: Image, stack: _Stack, merged: NDArray[np.float32], index: int) -> _Points:
-    """Points, normals, colours, deviations and view counts of the merged pixels of one view."""
+    """Points, normals, colours, standard deviations and view counts of the merged pixels of one view."""
     first, width, height = stack.layout[index]
     here = slice(first, first + width * height)
     (chosen,) = np.nonzero(merged[here, 0] > 0)
@@ -297,7 +340,7 @@ def _points(m: DepthMap, image: Image, stack: _Stack, merged: NDArray[np.float32
     scan_from_cam = invert(m.cam_from_scan)
     normals = -element @ scan_from_cam[:3, :3].T
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # Where the surface leans, a pixel covers a long piece of it: a point for each quarter of the pixel.
+    # On an inclined surface a pixel covers a long piece of it, so each quarter of the pixel gives a point.
     places, of = [rays[~is_leaning] * depth[~is_leaning, None]], [np.flatnonzero(~is_leaning)]
     (leaning,) = np.nonzero(is_leaning)
     for quarter in np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]):

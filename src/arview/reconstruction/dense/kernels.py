@@ -1,11 +1,12 @@
-"""What one surface element looks like in the sources: the kernels that PatchMatch and the polishing share.
+"""Kernels that PatchMatch and the refinement share: the appearance of one surface element in the sources.
 
-A surface element at pixel (x, y) is the plane w(x + dx, y + dy) = w + dx du + dy dv of inverse depth. In a source
-with p = A (x, y, 1) + w t its window is warped exactly (a homography), sampled bilinearly and compared with the
-view's window by a weighted, normalised correlation (ZNCC). All float32: positions are good to 1e-4 px.
+A surface element at pixel (x, y) is the plane w(x + dx, y + dy) = w + dx du + dy dv of inverse depth. In a source with
+p = A (x, y, 1) + w t its window is warped exactly (a homography), sampled bilinearly and compared with the view's
+window
+by a weighted normalised cross-correlation (ZNCC). Everything is float32, which places pixels within 1e-4 px.
 
-The kernels take plain arrays, the fields of `Problem` and the scratch: numba counts references of a tuple's arrays
-at each use, which took half of the time.
+The kernels take plain arrays, the fields of `Problem` and the scratch: numba counts references of the arrays in a tuple
+at each use, which would double the time.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 
 RADIUS = 5
+"""Radius of the window in pixels."""
 SAMPLES = 40
-"""Of a window: a multiple of 8, which the processor works on at once."""
+"""Samples of a window: a multiple of 8, which SIMD instructions process together."""
 # Rows of the scratch.
 DX, DY, FALLOFF, WEIGHT, CENTRED, FU, FV, A, B, C, D, GREY, JACOBIAN, COSTS = range(14)
 # Columns of `Problem.sizes` and, after the twelve of the warp, of `Problem.warps`.
@@ -30,25 +32,29 @@ PARALLAX = 12
 NOISE, GEOMETRIC, MAP_STEP, BEST, FX, FY, CX, CY = range(8)
 
 MAX_ERROR_PX = float32(3.0)
+"""Largest disagreement with a depth map that counts, in pixels."""
 MIN_SQUARED_COSINE = float32(0.025)
-"""Of the angle at which an element is seen: 81°."""
+"""Squared cosine of the largest angle between ray and normal: 81°."""
 _WORST = float32(2.0)
+"""Cost of an element that no source sees."""
 _ZERO, _HALF, _ONE = float32(0.0), float32(0.5), float32(1.0)
 COLOR_SCALE = float32(1.0 / 25.0)
-"""One by the difference in grey at which a pixel of the window counts half: it may be another surface's."""
+"""Inverse of the grey difference to the window's centre at which a pixel has half its weight."""
 
 
 class Problem(NamedTuple):
-    """One view with its sources at one level, as flat arrays for numba.
+    """One view with its sources at one level, as flat arrays for kernels.
 
     Attributes:
-        grey: (H,W) float32. region: (H,W) uint8.
-        pixels: (sum of h·w,) float32, the sources' greys one after another.
-        maps: (sum of h·w,3) float32, the sources' depth maps (planes), or (0,3).
-        sizes: (S,6) int32: first pixel, width and height of the grey and of the map.
-        warps: (S,13) float32: A row by row, t, and the px that a point moves per unit of w.
-        numbers: (8,) float32: variance of the noise, cost of one pixel of disagreement, pixels of this level per
-            pixel of the maps, number of best sources, fx, fy, cx, cy.
+        grey: (H,W) float32.
+        region: (H,W) uint8, pixels to reconstruct.
+        pixels: (sum of h·w,) float32, grey levels of the sources one after another.
+        maps: (sum of h·w,3) float32, depth maps of the sources (planes), or (0,3).
+        sizes: (S,6) int32, first pixel, width and height of the picture and of the map.
+        warps: (S,13) float32, A row by row, t, and the parallax in px per unit of w.
+        numbers: (8,) float32, variance of the noise, cost of one pixel of disagreement, pixels of this level per pixel
+            of
+            the maps, number of best sources, fx, fy, cx, cy.
     """
 
     grey: NDArray[np.float32]
@@ -61,11 +67,11 @@ class Problem(NamedTuple):
 
 
 def make_scratch(shift: float = 0.0, is_dense: bool = False) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Working memory of one thread: (14,SAMPLES) with the samples' offsets and fall-off set, and (SAMPLES,) indices.
+    """Working memory of one thread: (14,SAMPLES) with offsets and fall-off of the samples, and (SAMPLES,) indices.
 
-    Samples lie on every other pixel of a disc, or on every pixel of a smaller one (``is_dense``).
-    ``shift`` is where the pixels are from the middle: 0, or 0.5 for a
-    middle between four pixels.
+    Args:
+        shift: position of pixels relative to the centre: 0, or 0.5 for a centre between four pixels.
+        is_dense: samples lie on every pixel of a small disc; otherwise on every other pixel of a larger one.
     """
     v, u = np.mgrid[-RADIUS - 1 : RADIUS + 2, -RADIUS - 1 : RADIUS + 2]
     is_sample = ((u + v) % 2 == 0) | is_dense
@@ -81,9 +87,9 @@ def make_scratch(shift: float = 0.0, is_dense: bool = False) -> tuple[NDArray[np
 
 @kernel(fastmath=True, numpy_errors=True)
 def take_window(grey, s, x, y):  # type: ignore[no-untyped-def]
-    """Weights (sum 1) and weighted, centred greys of the view's window into the scratch; returns its variance.
+    """Write weights (sum 1) and weighted, centred grey levels of the view's window to the scratch; return its variance.
 
-    Pixels unlike the middle one count less (bilateral). (x, y) lies where samples are pixels.
+    Pixels unlike the centre have less weight (bilateral). (x, y) lies such that samples are pixels.
     """
     height, width = grey.shape
     middle = grey[int(y), int(x)]
@@ -111,7 +117,7 @@ def take_window(grey, s, x, y):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath=True)
 def warp(m, k, x, y, w, du, dv):  # type: ignore[no-untyped-def]
-    """The homography of the window into source k as three linear forms of (dx, dy): (value, slopes) each."""
+    """The homography of the window into source k, as three linear forms of (dx, dy): value and two slopes each."""
     tx, ty, tz = m[k, 9], m[k, 10], m[k, 11]
     x0 = m[k, 0] * x + m[k, 1] * y + m[k, 2] + w * tx
     y0 = m[k, 3] * x + m[k, 4] * y + m[k, 5] + w * ty
@@ -140,7 +146,7 @@ def falls_inside(sizes, k, h):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath=True, numpy_errors=True)
 def sample(pixels, sizes, s, index, k, h):  # type: ignore[no-untyped-def]
-    """The window in source k: four neighbours (A to D) and fractions (FU, FV) of each sample into the scratch."""
+    """Write four neighbours (A to D) and fractions (FU, FV) of each sample of the window in source k to the scratch."""
     x0, xu, xv, y0, yu, yv, z0, zu, zv = h
     first, width = sizes[k, FIRST], sizes[k, WIDTH]
     for i in range(SAMPLES):
@@ -163,7 +169,7 @@ def sample(pixels, sizes, s, index, k, h):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath=True, numpy_errors=True)
 def zncc(pixels, sizes, s, index, k, h, variance, noise):  # type: ignore[no-untyped-def]
-    """Correlation of the window with source k; noise counts as contrast that does not agree."""
+    """Correlation of the window with source k; noise adds to the contrast and so lowers it."""
     sample(pixels, sizes, s, index, k, h)
     first, second, both = _ZERO, _ZERO, _ZERO
     for i in range(SAMPLES):
@@ -180,7 +186,7 @@ def zncc(pixels, sizes, s, index, k, h, variance, noise):  # type: ignore[no-unt
 
 @kernel(fastmath=True, numpy_errors=True)
 def disagreement_px(maps, sizes, warps, step, k, h, w):  # type: ignore[no-untyped-def]
-    """How far the element lies from the depth map of source k, in px of parallax, at most 3."""
+    """Distance of the element from the depth map of source k in px of parallax, at most 3."""
     u, v = (h[0] / h[6] + _HALF) / step, (h[3] / h[6] + _HALF) / step
     column, row = int(u), int(v)
     if column < 0 or row < 0 or column >= sizes[k, MAP_WIDTH] or row >= sizes[k, MAP_HEIGHT]:
@@ -194,7 +200,7 @@ def disagreement_px(maps, sizes, warps, step, k, h, w):  # type: ignore[no-untyp
 
 @kernel(fastmath=True)
 def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
-    """Whether the element is in front of the camera and seen at less than 81°."""
+    """Whether the element is in front of the camera and seen at less than 81° from its normal."""
     if not w > _ZERO:
         return False
     xn, yn = (x - numbers[CX]) / numbers[FX], (y - numbers[CY]) / numbers[FY]
@@ -205,9 +211,9 @@ def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath=True, numpy_errors=True)
 def element_cost(pixels, maps, sizes, warps, numbers, s, index, x, y, w, du, dv, variance, limit):  # type: ignore[no-untyped-def]
-    """Mean of the best sources' 1 - ZNCC, plus their disagreement with its depth: 0 (best) to 2.
+    """Mean of the best sources' 1 - ZNCC plus disagreement with their depth maps: 0 (best) to 2.
 
-    Sources are left out, and 2 returned, as soon as the mean cannot get below ``limit``.
+    It returns 2 without the remaining sources as soon as the mean cannot fall below ``limit``.
     """
     if not is_facing(numbers, x, y, w, du, dv):
         return _WORST
@@ -225,11 +231,11 @@ def element_cost(pixels, maps, sizes, warps, numbers, s, index, x, y, w, du, dv,
             s[COSTS, j] = s[COSTS, j - 1]
             j -= 1
         s[COSTS, j] = cost
-        # The sources to come can cost nothing at best.
-        surest = _ZERO
+        # Lower bound: the remaining sources may cost nothing.
+        bound = _ZERO
         for i in range(best - (count - 1 - k)):
-            surest += s[COSTS, i]
-        if surest > limit * float32(best):
+            bound += s[COSTS, i]
+        if bound > limit * float32(best):
             return _WORST
     total = _ZERO
     for k in range(best):

@@ -12,28 +12,29 @@ class DenseOptions:
     """Options of the dense reconstruction.
 
     Attributes:
-        max_region_px: photos are scaled so that the part's region has no more pixels than this. Work and memory
-            grow with it; 500,000 are 0.4 mm pixels on a part of 300 mm, 4 CPU-s a photo.
-        sources: photos that each photo is compared with. More cost time, fewer lose surfaces that are hidden.
-        best_sources: of these, the mean of the best is the cost: the others may not see the surface.
-        good_angle_deg: range of angles between two views at a point that count fully. Smaller ones do not
-            measure depth, larger ones do not look alike.
-        max_angle_deg: a view farther round than this is no source.
-        band_mm: displacements looked for around a CAD model; the region is its silhouette widened by this.
-        cad_hypotheses: start from the CAD's surface too. It never decides: only photo-consistency does.
-        noise: standard deviation of the photos' noise in grey values; contrast below it is no texture.
+        max_region_px: photos are scaled so that the part's region has at most this many pixels, with which time and
+            memory grow. 500,000 give pixels of 0.4 mm on a part of 300 mm.
+        sources: photos with which each photo is compared. More cost time; fewer lose surfaces that are partly hidden.
+        best_sources: the cost is the mean over this many best sources, since the others may not see the surface.
+        good_angle_deg: angles between two views of a point that count fully. Smaller angles do not determine depth, and
+            at larger ones the surface looks different.
+        max_angle_deg: views at a larger angle are no sources.
+        band_mm: largest displacement from the CAD that is found; the region is the CAD's silhouette widened by this.
+        cad_hypotheses: also start from the surface of the CAD. It is only a hypothesis: photo-consistency decides.
+        noise: standard deviation of the photos' noise in grey levels; less contrast does not count as texture.
         geometric_weight: cost of one pixel of disagreement with the depth map of a source.
-        min_zncc: mean correlation with the sources below which a pixel is not used.
-        max_sigma_px: standard deviation in pixels of parallax above which a pixel is not used: no texture.
-        max_spread_px: standard deviation of a merged point along its normal, in pixels of the maps as wide as
-            they are there, above which it is dropped.
-        min_views: photos that must agree on a point of the cloud, its own included. Each was matched with several.
-        agreement_px: depth maps agree when the point moves by less than this in the photo, in pixels of the maps
-            (half the working size).
-        normal_angle_deg: and when their normals differ by less than this.
+        min_zncc: pixels with a lower mean correlation with the sources are not used.
+        max_sigma_px: pixels with a larger standard deviation, in pixels of parallax, are not used: no texture.
+        max_spread_px: largest standard deviation of a merged point along its normal, in pixels of the maps at the
+            point.
+        min_views: photos that must agree on a point of the cloud, including its own. Each was matched with several.
+        agreement_px: two depth maps agree if the point moves by less than this in the photo, in pixels of the maps
+            (half
+            the working size) …
+        normal_angle_deg: … and their normals differ by less than this.
         grazing_deg: surfaces seen at a larger angle from their normal are not used.
         threads: photos worked on at a time; 0 for one per core.
-        device: where the search is done: ``auto`` takes CUDA where torch sees it, ``cpu``, or a torch device.
+        device: where PatchMatch runs: ``auto`` takes CUDA if torch finds it; else ``cpu`` or a torch device.
         seed: of the random hypotheses; the same seed gives the same cloud.
     """
 

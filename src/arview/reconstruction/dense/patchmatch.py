@@ -1,9 +1,9 @@
-"""Multi-view PatchMatch with slanted planes: which surface element makes each pixel look alike in the other photos.
+"""Multi-view PatchMatch with slanted planes: for each pixel, the surface element that looks alike in the other photos.
 
-Random and given hypotheses, spread to neighbours on a checkerboard and perturbed (Barnes 2009, Bleyer 2011, Shen
-2012; the parallel scheme and its far neighbours: Galliani 2015, Xu & Tao 2019), coarse to fine, with the sources'
-depth maps as a second witness (Schönberger 2016). Every random number is hashed from pixel and seed, and a sweep
-reads the other colour only, so that the result does not depend on threads.
+Random and given hypotheses are propagated to neighbours on a checkerboard and perturbed (Barnes 2009, Bleyer 2011, Shen
+2012; parallel scheme and far neighbours: Galliani 2015, Xu & Tao 2019), coarse to fine, with the sources' depth maps as
+additional evidence (Schönberger 2016). Every random number is hashed from pixel and seed, and a sweep reads only the
+other colour of the checkerboard, so that the result does not depend on threads.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ NEIGHBOURS = np.array(
         [[5, 0], [7, 0], [9, 0], [11, 0]],
     ]
 )
-"""Near and far neighbours of the other colour, (dx, dy); the best of each row is tried."""
+"""Near and far neighbours of the other colour as (dx, dy); the best of each row is tried."""
 
 
 @kernel
 def draw(seed, x, y, turn):  # type: ignore[no-untyped-def]
-    """A number in [-1, 1) hashed from its arguments (the mixing step of MurmurHash3)."""
+    """A number in [-1, 1) hashed from the arguments (mixing step of MurmurHash3)."""
     h = uint32(seed) ^ (uint32(x) * uint32(0x9E3779B1)) ^ (uint32(y) * uint32(0x85EBCA77))
     h = uint32(h ^ (uint32(turn) * uint32(0xC2B2AE3D)))
     h = uint32(h ^ (h >> uint32(16))) * uint32(0x85EBCA6B)
@@ -45,9 +45,9 @@ def draw(seed, x, y, turn):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath=True)
 def try_hypotheses(p, s, index, planes, costs, hypotheses, spread, randoms, lowest, highest, seed):  # type: ignore[no-untyped-def]
-    """Set each pixel to the best of hypotheses (C,H,W,3) and of random ones.
+    """Set each pixel to the best of given hypotheses (C,H,W,3) and of random ones.
 
-    Random ones are drawn ``spread`` (in w) around the first hypothesis that exists and between lowest and highest.
+    Random hypotheses are drawn within ``spread`` (in w) of the first given one, and between ``lowest`` and ``highest``.
     """
     grey, region, pixels, maps, sizes, warps, numbers = p
     height, width = costs.shape
@@ -87,7 +87,7 @@ def try_hypotheses(p, s, index, planes, costs, hypotheses, spread, randoms, lowe
 
 @kernel(fastmath=True)
 def sweep(p, s, index, planes, costs, regions, color, step_w, step_tilt, seed):  # type: ignore[no-untyped-def]
-    """One half of a checkerboard iteration: the best neighbours' planes, then a perturbation.
+    """Half a checkerboard iteration: planes of the best neighbours, then a perturbation.
 
     ``step_w`` is the perturbation of w, ``step_tilt`` that of the slope (tangent).
     """

@@ -1,7 +1,8 @@
-"""Least-squares matching: the surface element that explains the sources' greys best, and how well it is known.
+"""Least-squares matching: refines a surface element to the grey levels of the sources, with its standard deviation.
 
-Gauss-Newton on inverse depth and its two slopes over all sources that see the element, each with a gain and an offset
-of its own (Gruen 1985; Furukawa & Ponce 2010). Whatever hypothesis an element came from, it ends where the photos say.
+Gauss-Newton on inverse depth and its two slopes over all sources that see the element, each with its own gain and
+offset
+(Gruen 1985; Furukawa & Ponce 2010). The result depends on the photos, not on the hypothesis it started from.
 """
 
 from __future__ import annotations
@@ -35,16 +36,18 @@ from arview.reconstruction.dense.kernels import (
 
 _ZERO, _ONE = float32(0.0), float32(1.0)
 _SEES = float32(0.5)
-"""Correlation from which a source is taken to see the element."""
+"""Correlation from which a source counts as seeing the element."""
 _MAX_LAST_STEP = 0.1
-"""Last step in px that an element may still make: what has not settled shows where it started, not what is there."""
+"""Largest last step in px of an element that is kept; one still moving depends on its start."""
 _SLOPE_PRIOR = 0.05
-"""Weight of the slopes' start, as a share of the evidence for w: keeps them where texture is poor."""
+"""Weight of the slopes' start values as a share of the information on w; it stabilises slopes where texture is poor."""
 
 
 @kernel(fastmath=True, numpy_errors=True)
 def _normal_equations(pixels, sizes, warps, s, index, k, h, variance, noise, system):  # type: ignore[no-untyped-def]
-    """Add source k to the system (H upper, gradient, squares); returns its correlation. Gain and offset eliminated."""
+    """Add source k to the system (upper half of H, gradient, squares) with gain and offset eliminated; return its
+    correlation.
+    """
     sample(pixels, sizes, s, index, k, h)
     tx, ty, tz = warps[k, 9], warps[k, 10], warps[k, 11]
     x0, xu, xv, y0, yu, yv, z0, zu, zv = h
@@ -68,7 +71,7 @@ def _normal_equations(pixels, sizes, warps, s, index, k, h, variance, noise, sys
     if score < _SEES:
         return score
     gain = both / (contrast + noise)
-    # The means and the parts along the grey itself go into offset and gain: they say nothing about the surface.
+    # Eliminate offset and gain: the means, and the components along the grey levels.
     m0, m1, m2, g0, g1, g2 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
     for i in range(SAMPLES):
         w, j, away = s[WEIGHT, i], s[JACOBIAN, i], s[GREY, i] - first
@@ -87,7 +90,7 @@ def _normal_equations(pixels, sizes, warps, s, index, k, h, variance, noise, sys
         j0 = gain * (j - m0 - g0 * share * away)
         j1 = gain * (j * s[DX, i] / float32(RADIUS) - m1 - g1 * share * away)
         j2 = gain * (j * s[DY, i] / float32(RADIUS) - m2 - g2 * share * away)
-        # centred holds weight times value: the residual is weighted once.
+        # CENTRED holds weight times value, so the residual is weighted once.
         residual = s[CENTRED, i] - w * gain * away
         h00 += w * j0 * j0
         h01 += w * j0 * j1
@@ -116,7 +119,7 @@ def _normal_equations(pixels, sizes, warps, s, index, k, h, variance, noise, sys
 
 @kernel(numpy_errors=True)
 def _solve(q):  # type: ignore[no-untyped-def]
-    """Step (3,) of the damped system and the variance of its first unknown for unit noise."""
+    """Step (3,) of the damped system, and the variance of its first unknown for unit noise."""
     a, b, c = q[0], q[1], q[2]
     d, e, f = q[3] + _SLOPE_PRIOR * q[0], q[4], q[5] + _SLOPE_PRIOR * q[0]
     c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
@@ -135,11 +138,11 @@ def _solve(q):  # type: ignore[no-untyped-def]
 
 @kernel(numpy_errors=True)
 def polish(p, s, index, planes, scores, sigmas, step_px, iterations, unit_w):  # type: ignore[no-untyped-def]
-    """Refine the planes (H,W,3) in place; mean correlation (H,W) and standard deviation of w (H,W) out.
+    """Refine the planes (H,W,3) in place; write mean correlation (H,W) and standard deviation of w (H,W).
 
-    The problem is ``step_px`` (1 or 2) times as fine as the planes.
-    ``unit_w`` is the change of w that moves a pixel by one in the sources. A pixel that no two sources see, or that
-    moves by more than two pixels, gets score 0.
+    The problem is ``step_px`` (1 or 2) times as fine as the planes, and ``unit_w`` is the change of w that moves a
+    pixel by
+    one in the sources. A pixel that fewer than two sources see, or that moves by more than two pixels, gets score 0.
     """
     grey, region, pixels, _, sizes, warps, numbers = p
     height, width = scores.shape

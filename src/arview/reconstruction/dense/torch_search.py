@@ -1,8 +1,7 @@
-"""The search of `patchmatch.py` for a GPU: the same hypotheses, costs and random numbers, all pixels at once in torch.
+"""PatchMatch for GPUs: the hypotheses, costs and random numbers of `patchmatch`, for all pixels at once in torch.
 
-What the numba kernels do for one pixel after another is done here for all pixels of a colour of the checkerboard
-together; numbers agree to float32 rounding, so that both give the same depth maps but for ties. Nothing else of the
-dense stage is slow enough to be worth a second path.
+What the numba kernels do pixel by pixel is done here for all pixels of one colour of the checkerboard together. Results
+agree to float32 rounding, so both give the same depth maps except for ties.
 """
 
 from __future__ import annotations
@@ -38,17 +37,17 @@ from arview.reconstruction.dense.patchmatch import NEIGHBOURS
 from arview.reconstruction.dense.views import Planes
 
 _CHUNK = 1 << 17
-"""Pixels worked on at a time: windows of 40 float32 for each of them are 20 MB, times some ten arrays."""
+"""Pixels processed at a time: a window of 40 float32 for each takes 20 MB, and there are about ten such arrays."""
 
 
 def torch_device(device: str) -> str | None:
-    """The torch device that ``device`` means, None for the processor's own kernels.
+    """The torch device that ``device`` means, or None for the numba kernels.
 
     Args:
-        device: ``auto`` (CUDA where torch sees it), ``cpu``, or a torch device such as ``cuda`` or ``cuda:1``.
+        device: ``auto`` (CUDA if torch finds it), ``cpu``, or a torch device such as ``cuda`` or ``cuda:1``.
 
     Raises:
-        InputError: torch is not installed, or does not see the device.
+        InputError: torch is not installed, or cannot use the device.
     """
     if device == "cpu" or (device == "auto" and importlib.util.find_spec("torch") is None):
         return None
@@ -77,12 +76,13 @@ def search_torch(
     Args:
         problem: the view and its sources.
         given: (C,H,W,3) hypotheses, w = 0 where there is none.
-        spread: of random hypotheses in w around the first given one. randoms: their number.
+        spread: range in w of random hypotheses around the first given one.
+        randoms: number of random hypotheses.
         low, high: w of the farthest and the nearest surface.
-        steps: of each sweep, perturbation of w and of the slope.
-        is_dense: windows of all pixels, see ``make_scratch``.
+        steps: perturbation of w and of the slope in each sweep.
+        is_dense: windows of all pixels, see `make_scratch`.
         seed: of the random numbers.
-        device: of torch.
+        device: torch device.
     """
     import torch
 
@@ -119,12 +119,12 @@ class _Search:
         return self.torch.as_tensor(np.ascontiguousarray(array), device=self.device)
 
     def _chunks(self, mask: Any) -> list[tuple[Any, Any]]:
-        """(y, x) of the pixels of a mask, some at a time."""
+        """(y, x) of the pixels of a mask, in chunks."""
         y, x = self.torch.nonzero(mask, as_tuple=True)
         return list(zip(y.split(_CHUNK), x.split(_CHUNK), strict=True))
 
     def _draw(self, seed: int, x: Any, y: Any, turn: int) -> Any:
-        """See ``patchmatch.draw``: products of 32-bit numbers wrap in int64, whose low half is what uint32 gives."""
+        """See `patchmatch.draw`: products of 32-bit numbers wrap in int64, whose low half equals that of uint32."""
         low = 0xFFFFFFFF
         h = seed ^ ((x * 0x9E3779B1) & low) ^ ((y * 0x85EBCA77) & low)
         h = h ^ ((turn * 0xC2B2AE3D) & low)
@@ -134,7 +134,7 @@ class _Search:
         return (h.double() / 2147483648.0 - 1.0).float()
 
     def _window(self, y: Any, x: Any) -> tuple[Any, Any, Any]:
-        """Weights (N,S) of sum 1, weighted centred greys (N,S) and variance (N,) of the view's windows."""
+        """Weights (N,S) of sum 1, weighted centred grey levels (N,S) and variance (N,) of the view's windows."""
         height, width = self.grey.shape
         rows = (y[:, None] + self.dy.long()).clamp(0, height - 1)
         columns = (x[:, None] + self.dx.long()).clamp(0, width - 1)
@@ -146,7 +146,7 @@ class _Search:
         return weight, weight * away, (weight * away * away).sum(dim=1)
 
     def _cost(self, y: Any, x: Any, plane: Any, window: tuple[Any, Any, Any]) -> Any:
-        """(N,) cost of planes (N,3): see ``kernels.element_cost``."""
+        """(N,) cost of planes (N,3), see `kernels.element_cost`."""
         torch, numbers = self.torch, self.numbers
         w, du, dv = plane.unbind(dim=1)
         u, v = x.float(), y.float()
@@ -160,6 +160,7 @@ class _Search:
         return torch.where(facing, mean, torch.full_like(mean, 2.0))
 
     def _source_cost(self, k: int, x: Any, y: Any, plane: Any, window: tuple[Any, Any, Any]) -> Any:
+        """(N,) cost of planes (N,3) in source k."""
         torch, (weight, centred, variance) = self.torch, window
         first, width, height, *map_size = self.sizes[k]
         m = self.warps[k]
@@ -190,7 +191,7 @@ class _Search:
         return torch.where(inside, cost, torch.full_like(cost, 2.0))
 
     def _disagreement(self, parallax: float, map_size: list[int], forms: Any, w: Any) -> Any:
-        """(N,) see ``kernels.disagreement_px``."""
+        """(N,) see `kernels.disagreement_px`."""
         torch, step = self.torch, self.numbers[MAP_STEP]
         first, width, height = map_size
         (p, _, _), (q, _, _), (z, _, _) = forms
@@ -227,12 +228,15 @@ class _Search:
             self.planes[y, x], self.costs[y, x] = best, costs
 
     def _better(self, y: Any, x: Any, window: Any, plane: Any, best: Any, costs: Any) -> tuple[Any, Any]:
+        """The better of the current planes and one more hypothesis, with their costs."""
         cost = self._cost(y, x, plane, window)
         is_better = cost < costs
         return self.torch.where(is_better[:, None], plane, best), self.torch.where(is_better, cost, costs)
 
     def sweep(self, color: int, step_w: float, step_tilt: float, seed: int) -> None:
-        """See ``patchmatch.sweep``. A sweep reads the other colour only: all pixels of one may go at once."""
+        """See `patchmatch.sweep`. A sweep reads only the other colour, so all pixels of one colour can be processed at
+        once.
+        """
         torch, numbers = self.torch, self.numbers
         height, width = self.costs.shape
         rows, columns = (torch.arange(n, device=self.device) for n in (height, width))

@@ -1,4 +1,4 @@
-"""The photos as the dense reconstruction needs them: ideal, cropped to the part, with the views to compare with.
+"""The photos in the form that the dense reconstruction uses: undistorted, cropped to the part, each with its sources.
 
 A `DenseView` is an undistorted window of a photo, scaled to the working size. The inverse depth w = 1/z of a plane is
 linear in its pixels, so a surface element is (w, dw/du, dw/dv) everywhere in this package.
@@ -24,17 +24,17 @@ from arview.rendering.rasterizer import rasterise
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 Planes = NDArray[np.float32]
-"""(H,W,3): inverse depth at the pixel and its change per pixel along u and v; w = 0 where there is none."""
+"""(H,W,3): inverse depth at the pixel, and its change per pixel along u and v; w = 0 where there is none."""
 
 COARSEST = 4
-"""Windows have sides that this divides: pixels of the coarser levels are whole blocks."""
+"""Divisor of the windows' sides, so that pixels of the coarser levels are whole blocks."""
 MARGIN_PX = 12
-"""Room around the region for the windows of the correlation."""
+"""Margin around the region for the windows of the correlation."""
 
 
 @dataclass(frozen=True)
 class Cad:
-    """The part's CAD model and where it roughly is: ``scan_from_model`` (4,4), mm."""
+    """The part's CAD model and its approximate pose ``scan_from_model`` (4,4), mm."""
 
     model: Model
     scan_from_model: Array
@@ -45,13 +45,14 @@ class DenseView:
     """One photo, undistorted and cropped.
 
     Attributes:
-        index: of the photo in the sparse model. name: of the photo.
-        camera: ideal camera of the window (its size, no distortion).
+        index: of the photo in the sparse model.
+        name: of the photo.
+        camera: ideal camera of the window: its size, no distortion.
         cam_from_scan: (4,4).
         color: (H,W,3) uint8 RGB.
         region: (H,W) bool, pixels to reconstruct.
-        nearest, farthest: depths between which the region's surfaces are.
-        sources: indices of the photos, later of the views, to compare with, best first.
+        nearest, farthest: range of depth of the region's surfaces.
+        sources: indices of the photos (later of the views) to compare with, best first.
     """
 
     index: int
@@ -66,10 +67,10 @@ class DenseView:
 
 
 def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int, ...]]:
-    """For each photo the photos to compare with, best first: many points in common, seen from useful angles.
+    """For each photo the photos to compare with, best first: many common points, seen from useful angles.
 
-    Each choice makes photos close to it less wanted, so that the sources lie all around (after Schönberger 2016 and
-    Goesele 2007). Photos without a fellow get an empty tuple.
+    Every choice lowers the score of photos close to it, so that the sources lie all around (after Schönberger 2016 and
+    Goesele 2007). Photos without a source get an empty tuple.
     """
     count = len(sparse.photos)
     seen = np.zeros((count, len(sparse.points_in_scan)), dtype=bool)
@@ -111,12 +112,13 @@ def make_view(
     options: DenseOptions,
     read: Callable[[PosedPhoto], Image],
 ) -> DenseView | None:
-    """The window of one photo around the region to reconstruct; None where the photo does not show it.
+    """The window of one photo around the region to reconstruct; None if the photo does not show it.
 
-    The region is the CAD's silhouette widened by the band, else the hull of the sparse points that were seen.
+    The region is the silhouette of the CAD widened by the band; without a CAD it is the hull of the visible sparse
+    points.
 
     Raises:
-        InputError: the photo is not of its camera's size, or cannot be read.
+        InputError: the photo cannot be read, or its size differs from its camera's.
     """
     photo = sparse.photos[index]
     ideal = photo.camera.without_distortion()
@@ -135,7 +137,7 @@ def make_view(
     if image.shape[:2] != (photo.camera.height, photo.camera.width):
         raise InputError(
             f"{photo.path}: is {image.shape[1]}×{image.shape[0]} px, its camera {photo.camera.width}×"
-            f"{photo.camera.height}; was the photo changed since the reconstruction began?"
+            f"{photo.camera.height}; the photo may have been changed since the reconstruction began"
         )
     inside = np.zeros((height, width), dtype=bool)
     part = region[max(v0, 0) : v0 + height, max(u0, 0) : u0 + width]
@@ -147,7 +149,7 @@ def make_view(
 
 
 def _window(region: NDArray[np.bool_]) -> tuple[int, int, int, int]:
-    """(u0, v0, width, height) of the region with a margin, of sides that the coarsest level divides."""
+    """(u0, v0, width, height) of the region with a margin, with sides that COARSEST divides."""
     rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
     u0, v0 = int(columns[0]) - MARGIN_PX, int(rows[0]) - MARGIN_PX
     sides = [int(columns[-1]) + MARGIN_PX + 1 - u0, int(rows[-1]) + MARGIN_PX + 1 - v0]
@@ -156,7 +158,7 @@ def _window(region: NDArray[np.bool_]) -> tuple[int, int, int, int]:
 
 
 def _undistorted(image: Image, camera: Camera, ideal: Camera) -> tuple[Image, NDArray[np.bool_]]:
-    """The photo as the ideal camera sees it, and where the photo has been there at all."""
+    """The photo as the ideal camera sees it, and which of its pixels the photo covers."""
     if ideal.fx < 0.99 * camera.fx:
         camera = camera.scaled(round(camera.width * ideal.fx / camera.fx), round(camera.height * ideal.fy / camera.fy))
         image = np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
@@ -171,6 +173,7 @@ def _undistorted(image: Image, camera: Camera, ideal: Camera) -> tuple[Image, ND
 
 
 def _cad_region(photo: PosedPhoto, cad: Cad, band_mm: float) -> tuple[NDArray[np.bool_], float, float]:
+    """Region (H,W) and range of depth from the silhouette of the CAD."""
     camera = photo.camera
     inverse_depth, _ = render_cad(cad, photo.cam_from_scan, camera)
     seen = inverse_depth > 0
@@ -183,6 +186,7 @@ def _cad_region(photo: PosedPhoto, cad: Cad, band_mm: float) -> tuple[NDArray[np
 
 
 def _points_region(sparse: SparseModel, index: int) -> tuple[NDArray[np.bool_], float, float]:
+    """Region (H,W) and range of depth from the visible sparse points."""
     photo = sparse.photos[index]
     camera = photo.camera.without_distortion()
     region = np.zeros((camera.height, camera.width), dtype=np.uint8)
@@ -196,7 +200,7 @@ def _points_region(sparse: SparseModel, index: int) -> tuple[NDArray[np.bool_], 
 
 
 def seen_points(sparse: SparseModel, index: int, camera: Camera) -> tuple[Array, Array]:
-    """Pixels (N,2) in an ideal camera and depths (N,) of the sparse points seen in a photo."""
+    """Pixels (N,2) in an ideal camera and depths (N,) of the sparse points observed in a photo."""
     points = sparse.points_in_scan[sparse.observed_point[sparse.observed_photo == index]]
     in_cam = apply(sparse.photos[index].cam_from_scan, points)
     in_cam = in_cam[in_cam[:, 2] > 0]
@@ -204,7 +208,7 @@ def seen_points(sparse: SparseModel, index: int, camera: Camera) -> tuple[Array,
 
 
 def render_cad(cad: Cad, cam_from_scan: Array, camera: Camera) -> tuple[Array, NDArray[np.int32]]:
-    """Inverse depth (H,W), 0 off the part, and face ids of the CAD seen by an ideal camera."""
+    """Inverse depth (H,W), 0 off the part, and face ids (H,W) of the CAD in an ideal camera."""
     vertices, faces, _ = cad.model.mesh
     return rasterise(
         apply(cam_from_scan @ cad.scan_from_model, vertices), faces,
@@ -213,7 +217,7 @@ def render_cad(cad: Cad, cam_from_scan: Array, camera: Camera) -> tuple[Array, N
 
 
 def cad_planes(cad: Cad, cam_from_scan: Array, camera: Camera) -> Planes:
-    """The CAD's surface seen by an ideal camera: a plane for each pixel, w = 0 off the part."""
+    """Planes (H,W,3) of the CAD's surface in an ideal camera; w = 0 off the part."""
     inverse_depth, face_ids = render_cad(cad, cam_from_scan, camera)
     vertices, faces, _ = cad.model.mesh
     corners = apply(cam_from_scan @ cad.scan_from_model, vertices)[faces]
@@ -229,7 +233,7 @@ def cad_planes(cad: Cad, cam_from_scan: Array, camera: Camera) -> Planes:
 
 
 def sparse_planes(sparse: SparseModel, index: int, camera: Camera) -> Planes:
-    """Planes through the triangles (Delaunay, in the image) of the sparse points seen in a photo; w = 0 outside."""
+    """Planes through the triangles (Delaunay, in the image) of the sparse points observed in a photo; w = 0 outside."""
     from scipy.spatial import Delaunay, QhullError
 
     planes = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
