@@ -1,4 +1,4 @@
-"""Fitting the probability that the best hypothesis of a picture is right."""
+"""Fitting of the confidence: the probability that the best hypothesis of a picture is right."""
 
 from __future__ import annotations
 
@@ -18,28 +18,29 @@ from arview.evaluation.protocols import spread_frames
 from arview.evaluation.semisynthetic import frames_without_part
 from arview.geometry import Array
 from photos import all_photos
-from profile_ranker_examples import ALIKE, REFINED_NEAR, is_alike, is_near, pictures_of
+from profile_ranker_examples import ALIKE_PIXELS, REFINED_NEAR, is_alike, is_near, pictures_of
 from recordings import scenes
 from suites.detection import Sections, recorded_views
 
 RECORDED_EACH, PHOTOS_EACH, RECORDED_WEIGHT = 40, 60, 2.0
-"""Frames of each recording, and photos without its part; each counts for so many."""
+"""Frames of each recording, photos without its part, and the weight of each."""
 OTHERS_EACH, OTHERS_WEIGHT = 91, 0.5
-"""Pictures without it of each shape and recorded part, and what each counts."""
+"""Further pictures without the part, for each shape and recorded part, and their weight."""
 PHOTOS_SEED, OTHERS_SEED = 1001, 5000
-"""Others than those of the evaluation."""
-SHRINK = 0.02
-"""Penalty on squared weights, in deviations of what they are of."""
+"""Seeds that differ from those of the evaluation."""
+RIDGE = 0.02
+"""Ridge penalty on the weights of the standardised terms."""
 FOLDS = 5
-FALSE = (15, 10, 5, 3)
-"""Numbers of false alarms to say the found ones for."""
+"""Of the cross-validation, over parts."""
+FALSE_ALARMS = (15, 10, 5, 3)
+"""Numbers of false alarms for which the report states detections."""
 
-Seen = tuple[Detector, NDArray[np.uint8], Array | None]
+LabelledPicture = tuple[Detector, NDArray[np.uint8], Array | None]
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """The best hypothesis of a picture: what speaks for it, whether it is right, its part, how much it counts."""
+class BestHypothesis:
+    """The best hypothesis of a picture: its terms, whether it is right, its part, and the weight of the picture."""
 
     terms: tuple[float, ...]
     is_right: bool
@@ -47,40 +48,39 @@ class Outcome:
     weight: float
 
 
-def fit_probability(seeds: range, photos: Sequence[Path]) -> None:
-    """Print the weights of what speaks for a pose, in the order of `confidence_terms`, and how many are told then.
+def fit_confidence(seeds: range, photos: Sequence[Path]) -> None:
+    """Print the weights of the terms of a pose, and the detections at some numbers of false alarms.
 
-    The bias in use is lowered from that of the fit until pictures like those of `_others` give hardly a false alarm.
-
-    Pictures with the part in which the best hypothesis is wrong are left out: most are twins of the right pose.
+    The bias in the package is lower than the fitted one, so that pictures like those of `_others` give hardly any
+    false alarms. Pictures with the part whose best hypothesis is wrong are left out: most are near-symmetric poses.
     """
     budgets = DetectorOptions().budgets
     solids = ((str(seed), 1.0, pictures_of(seed, photos, budgets)) for seed in tqdm(seeds, desc="solids", disable=None))
     recorded = ((name, RECORDED_WEIGHT, _recorded(name)) for name in scenes())
     outcomes = [outcome for part in chain(solids, recorded, _others()) for outcome in _outcomes(*part)]
     if len({outcome.is_right for outcome in outcomes}) < 2:
-        raise InputError("fit_judge: too few pictures to fit a probability to; ask for more solids")
+        raise InputError("fit.py: too few pictures to fit the confidence to; ask for more solids")
     terms = np.array([outcome.terms for outcome in outcomes])
     is_right = np.array([outcome.is_right for outcome in outcomes])
     weights = np.array([outcome.weight for outcome in outcomes])
     parts = np.array([outcome.part for outcome in outcomes])
     fold_of = {part: k % FOLDS for k, part in enumerate(dict.fromkeys(parts.tolist()))}
     folds = np.array([fold_of[part] for part in parts])
-    told = np.zeros(len(outcomes))
+    predicted = np.zeros(len(outcomes))
     for fold in range(FOLDS):
         fitted = _fitted(terms[folds != fold], is_right[folds != fold], weights[folds != fold])
-        told[folds == fold] = terms[folds == fold] @ fitted[:-1] + fitted[-1]
+        predicted[folds == fold] = terms[folds == fold] @ fitted[:-1] + fitted[-1]
     final = _fitted(terms, is_right, weights)
     print("weights", np.round(final[:-1], 2).tolist(), "bias", round(float(final[-1]), 2))
     print(f"in {FOLDS} folds, of {is_right.sum()} right and {(~is_right).sum()} pictures without the part:")
-    others = np.sort(told[~is_right])[::-1]
-    for most in FALSE:
-        if most < len(others):
-            found = int(np.sum(told[is_right] > others[most]))
-            print(f"  {found} found with {most} false alarms with the bias lowered by {others[most]:.2f}")
+    others = np.sort(predicted[~is_right])[::-1]
+    for alarms in FALSE_ALARMS:
+        if alarms < len(others):
+            found = int(np.sum(predicted[is_right] > others[alarms]))
+            print(f"  {found} found with {alarms} false alarms with the bias lowered by {others[alarms]:.2f}")
 
 
-def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Outcome]:
+def _outcomes(part: str, weight: float, pictures: Iterator[LabelledPicture]) -> Iterator[BestHypothesis]:
     for detector, image, truth in pictures:
         found = detector.hypotheses(detector.local.pyramid(image))
         if not found:
@@ -88,15 +88,15 @@ def _outcomes(part: str, weight: float, pictures: Iterator[Seen]) -> Iterator[Ou
         best = found[0]
         terms = detector.terms(best, found[1:])
         if truth is None:
-            yield Outcome(terms, False, part, weight)
+            yield BestHypothesis(terms, False, part, weight)
             continue
         pose = best.cam_from_body[None]
         near = is_near(detector, pose, truth, detector.turns, *REFINED_NEAR)
-        if near[0] or is_alike(detector, pose, truth, REFINED_NEAR[1], ALIKE)[0]:
-            yield Outcome(terms, True, part, weight)
+        if near[0] or is_alike(detector, pose, truth, REFINED_NEAR[1], ALIKE_PIXELS)[0]:
+            yield BestHypothesis(terms, True, part, weight)
 
 
-def _recorded(name: str) -> Iterator[Seen]:
+def _recorded(name: str) -> Iterator[LabelledPicture]:
     scene = scenes()[name]
     detector = Detector(recorded_views(scene), scene.camera)
     for frame in spread_frames(scene, RECORDED_EACH):
@@ -108,8 +108,8 @@ def _recorded(name: str) -> Iterator[Seen]:
         yield detector, image, None
 
 
-def _others() -> Iterator[tuple[str, float, Iterator[Seen]]]:
-    """Every shape and recorded part, with pictures without it such as those of the evaluation."""
+def _others() -> Iterator[tuple[str, float, Iterator[LabelledPicture]]]:
+    """Pictures without each shape and recorded part, like those of the evaluation."""
     sections = Sections(scenes(), {}, Path("out/sequences"))
     for number, name in enumerate([*sections.shapes, *sections.recorded]):
         without = sections.pictures_without(name, OTHERS_EACH, OTHERS_SEED + number)
@@ -117,7 +117,7 @@ def _others() -> Iterator[tuple[str, float, Iterator[Seen]]]:
 
 
 def _fitted(terms: Array, is_right: NDArray[np.bool_], weights: Array) -> Array:
-    """Logistic regression: weights, none negative, and the bias last."""
+    """Weights of a logistic regression, none of them negative, and the bias last."""
     scale = terms.std(axis=0) + 1e-9
     columns = np.column_stack([terms / scale, np.ones(len(terms))])
     sign = np.where(is_right, 1.0, -1.0)
@@ -126,7 +126,7 @@ def _fitted(terms: Array, is_right: NDArray[np.bool_], weights: Array) -> Array:
         margin = sign * (columns @ w)
         value = np.sum(weights * np.logaddexp(0.0, -margin)) / weights.sum()
         slope = -columns.T @ (weights * sign / (1.0 + np.exp(margin))) / weights.sum()
-        shrink = SHRINK / (len(w) - 1) * np.append(w[:-1], 0.0)
+        shrink = RIDGE / (len(w) - 1) * np.append(w[:-1], 0.0)
         return float(value + 0.5 * shrink @ w), slope + shrink
 
     bounds = [(0.0, None)] * terms.shape[1] + [(None, None)]

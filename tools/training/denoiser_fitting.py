@@ -1,4 +1,4 @@
-"""Fitting the denoiser: pictures of random solids before photos, made noisy in many ways, and as they were."""
+"""Training of the denoiser on pictures of random solids in front of photos, with and without noise of many kinds."""
 
 from __future__ import annotations
 
@@ -13,53 +13,56 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from arview.detection.features.denoiser import INPUT_MEAN, INPUT_SCALE
-from edge_net_examples import read_lined_pictures
-from edge_net_fitting import compressed, with_flat_things
-from networks.layers import write_picture_network
-from networks.net2net import GONE_ON, begin_as, in_use, torch_with_onnx
-from networks.prefetch import made_ahead
-from networks.unet import pyramid
+from edge_net_examples import read_edge_pictures
+from edge_net_fitting import compressed, with_flat_shapes
+from networks.layers import write_image_network
+from networks.net2net import CONTINUED_RATE_SHARE, packaged_weights, torch_with_onnx, widen_from
+from networks.prefetch import prefetched
+from networks.unet import unet
 
 WIDTHS = (24, 32, 48)
-"""Of the levels, at half the picture's size and each half as large as that before."""
-DEEPER = (1, 2)
-"""So many more convolutions on those after the first."""
+"""Channels of the levels, the first at half the size of the picture, each of half the size of the one before."""
+EXTRA_CONVOLUTIONS = (1, 2)
+"""Further convolutions on each level after the first."""
 CROP_PX, CROPS = 192, 16
-"""A step looks at so many squares of pictures."""
-RATE, DECAY, WARM_UP, LARGEST_GRADIENT = 2e-3, 1e-3, 0.05, 1.0
+"""Side and number of the square crops of a batch."""
+RATE, DECAY, WARM_UP, MAX_GRADIENT_NORM = 2e-3, 1e-3, 0.05, 1.0
 HELD_OUT = 40
-"""Every so manieth picture is not fitted to."""
-NOISE, HARDLY_ANY = (3.0, 22.0), (0.0, 4.0)
-"""Deviations in grey levels, of most squares and of the others."""
-RESIDUAL_UNIT, ROUND = 16.0, 0.1
-"""Errors count as they are, in such grey levels; below this share as their square."""
-TOLD_NOISE = 6.0, 12.0, 20.0
-"""Of which it is said how much is left."""
+"""One picture in this many is held out for the report."""
+NOISE, LOW_NOISE = (3.0, 22.0), (0.0, 4.0)
+"""Ranges of the standard deviation of the noise, grey levels, in most crops and in the others."""
+RESIDUAL_UNIT, ROUNDING = 16.0, 0.1
+"""Scale of the errors in the loss, grey levels; below this share of it the loss is quadratic instead of linear."""
+REPORTED_NOISE = 6.0, 12.0, 20.0
+"""Standard deviations of noise for which the report states what is left."""
 
-Pair = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""A square as it is shown and as it was (3,S,S), grey levels."""
+NoisyPair = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""A crop (3,S,S) with and without noise, grey levels."""
 
 
-def fit_denoiser(folder: Path, epochs: int, is_anew: bool = True) -> None:
-    """Fit the network to the pictures in a folder, write denoiser.onnx there, and say how much noise it leaves.
+def fit_denoiser(folder: Path, epochs: int, from_scratch: bool = True) -> None:
+    """Train the network on the pictures in a folder, write denoiser.onnx there, and report the noise that it leaves.
 
-    ``is_anew``: not going on from the network in use.
+    Args:
+        folder: with pictures, see `collect_edge_pictures`.
+        epochs: passes over the pictures.
+        from_scratch: False continues from the network in the package.
 
     Raises:
-        InputError: no pictures, no torch or onnx, or the network in use is wider.
+        InputError: no pictures, no torch or onnx, or the network in the package is wider.
     """
     torch = torch_with_onnx()
-    pictures = [picture.image() for picture in read_lined_pictures(folder)]
+    pictures = [picture.image() for picture in read_edge_pictures(folder)]
     torch.manual_seed(0)
     network = _network(torch)
-    if not is_anew:
-        shown = torch.zeros(1, 3, CROP_PX, CROP_PX)
-        begin_as(network, in_use("denoiser.onnx"), lambda: network(shown), torch)
+    if not from_scratch:
+        noisy = torch.zeros(1, 3, CROP_PX, CROP_PX)
+        widen_from(network, packaged_weights("denoiser.onnx"), lambda: network(noisy), torch)
     fitted = [p for k, p in enumerate(pictures) if k % HELD_OUT]
-    _fit(network, fitted, epochs, RATE if is_anew else GONE_ON * RATE, torch)
+    _fit(network, fitted, epochs, RATE if from_scratch else CONTINUED_RATE_SHARE * RATE, torch)
     network.eval()
     _report(network, pictures[::HELD_OUT], torch)
-    write_picture_network(network, folder / "denoiser.onnx", "clean", torch)
+    write_image_network(network, folder / "denoiser.onnx", "clean", torch)
 
 
 def _fit(network: Any, pictures: Sequence[NDArray[np.uint8]], epochs: int, rate: float, torch: Any) -> None:
@@ -73,45 +76,45 @@ def _fit(network: Any, pictures: Sequence[NDArray[np.uint8]], epochs: int, rate:
         return _stacked([_pair(pictures[k], rng) for k in rng.integers(len(pictures), size=CROPS)], torch)
 
     total = epochs * steps
-    for shown, truth in tqdm(made_ahead(made, total), total=total, desc="denoiser", disable=None):
+    for noisy, truth in tqdm(prefetched(made, total), total=total, desc="denoiser", disable=None):
         with torch.autocast("cpu", torch.bfloat16):
-            said = network(_as_shown(shown).contiguous(memory_format=torch.channels_last))
-        error = (_cleaned(shown, said.float(), torch) - truth) / RESIDUAL_UNIT
-        loss = torch.sqrt(error**2 + ROUND**2).mean()
+            predicted = network(_normalised(noisy).contiguous(memory_format=torch.channels_last))
+        error = (_cleaned(noisy, predicted.float(), torch) - truth) / RESIDUAL_UNIT
+        loss = torch.sqrt(error**2 + ROUNDING**2).mean()
         optimiser.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT_NORM)
         optimiser.step()
         schedule.step()
 
 
-def _stacked(pairs: Sequence[Pair], torch: Any) -> tuple[Any, Any]:
-    shown, truth = (torch.from_numpy(np.stack(part)) for part in zip(*pairs, strict=True))
-    return shown, truth
+def _stacked(pairs: Sequence[NoisyPair], torch: Any) -> tuple[Any, Any]:
+    noisy, truth = (torch.from_numpy(np.stack(part)) for part in zip(*pairs, strict=True))
+    return noisy, truth
 
 
-def _as_shown(picture: Any) -> Any:
+def _normalised(picture: Any) -> Any:
     return (picture - INPUT_MEAN) / INPUT_SCALE
 
 
-def _cleaned(shown: Any, said: Any, torch: Any) -> Any:
-    return shown + INPUT_SCALE * torch.nn.functional.pixel_shuffle(said, 2)
+def _cleaned(noisy: Any, predicted: Any, torch: Any) -> Any:
+    return noisy + INPUT_SCALE * torch.nn.functional.pixel_shuffle(predicted, 2)
 
 
-def _pair(image: NDArray[np.uint8], rng: np.random.Generator, noise: float | None = None) -> Pair:
-    """A square of a picture, blurred and noisy and compressed now and then, and as it was."""
+def _pair(image: NDArray[np.uint8], rng: np.random.Generator, noise: float | None = None) -> NoisyPair:
+    """A random crop of a picture with noise, perhaps blurred and compressed, and without."""
     scale = rng.uniform(0.5, 1.1) if rng.random() < 0.4 else 1.0
     taken_px = min(round(CROP_PX / scale), *image.shape[:2])
     top, left = (int(rng.integers(side - taken_px + 1)) for side in image.shape[:2])
     square = image[top : top + taken_px, left : left + taken_px]
     if rng.random() < 0.15:
-        square = with_flat_things(square, rng)
+        square = with_flat_shapes(square, rng)
     square = square.astype(np.float32)
     way = cv2.INTER_AREA if taken_px > CROP_PX else cv2.INTER_LINEAR
     truth = cv2.resize(square, (CROP_PX, CROP_PX), interpolation=way) if taken_px != CROP_PX else square
     if rng.random() < 0.5:
         if rng.random() < 0.6:
-            # More saturated, or less.
+            # A random change of saturation.
             truth = truth + rng.uniform(-1.2, 1.0) * (truth.mean(axis=2, keepdims=True) - truth)
         truth = 255.0 * (np.clip(truth, 0.0, 255.0) / 255.0) ** rng.uniform(0.6, 1.6)
         truth = truth * (rng.uniform(0.5, 1.15) * rng.uniform(0.8, 1.2, 3))
@@ -121,16 +124,16 @@ def _pair(image: NDArray[np.uint8], rng: np.random.Generator, noise: float | Non
     if rng.random() < 0.5:
         truth = truth.swapaxes(0, 1)
     truth = np.ascontiguousarray(truth, np.float32)
-    shown = cv2.GaussianBlur(truth, (0, 0), rng.uniform(0.3, 1.2)) if rng.random() < 0.7 else truth
-    drawn = rng.uniform(*NOISE) if rng.random() < 0.85 else rng.uniform(*HARDLY_ANY)
-    shown = np.clip(np.round(shown + _noise(shown, noise or drawn, rng)), 0.0, 255.0)
+    noisy = cv2.GaussianBlur(truth, (0, 0), rng.uniform(0.3, 1.2)) if rng.random() < 0.7 else truth
+    drawn = rng.uniform(*NOISE) if rng.random() < 0.85 else rng.uniform(*LOW_NOISE)
+    noisy = np.clip(np.round(noisy + _noise(noisy, noise or drawn, rng)), 0.0, 255.0)
     if rng.random() < 0.2:
-        shown = compressed(shown.astype(np.uint8), int(rng.integers(70, 96)))
-    return shown.transpose(2, 0, 1).astype(np.float32), truth.transpose(2, 0, 1)
+        noisy = compressed(noisy.astype(np.uint8), int(rng.integers(70, 96)))
+    return noisy.transpose(2, 0, 1).astype(np.float32), truth.transpose(2, 0, 1)
 
 
 def _noise(picture: NDArray[np.float32], deviation: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """(S,S,3) noise: now and then the same in all colours, of some width, or more of it in bright places."""
+    """(S,S,3) noise, perhaps correlated between the channels or between pixels, or stronger in bright places."""
     noise = rng.standard_normal(picture.shape, dtype=np.float32)
     if rng.random() < 0.3:
         common = rng.uniform(0.2, 1.0)
@@ -145,13 +148,15 @@ def _noise(picture: NDArray[np.float32], deviation: float, rng: np.random.Genera
 
 
 def _report(network: Any, pictures: Sequence[NDArray[np.uint8]], torch: Any) -> None:
-    for noise in TOLD_NOISE:
+    for noise in REPORTED_NOISE:
         rng = np.random.default_rng(1)
-        shown, truth = _stacked([_pair(picture, rng, noise) for picture in pictures], torch)
+        noisy, truth = _stacked([_pair(picture, rng, noise) for picture in pictures], torch)
         with torch.no_grad():
-            clean = _cleaned(shown, network(_as_shown(shown)), torch)
-        before, after = (float(((some - truth) ** 2).mean().sqrt()) for some in (shown, clean))
-        print(f"  noise of {noise:.0f}: {before:.1f} grey levels off the picture as it was, cleaned {after:.1f}")
+            clean = _cleaned(noisy, network(_normalised(noisy)), torch)
+        before, after = (float(((some - truth) ** 2).mean().sqrt()) for some in (noisy, clean))
+        print(
+            f"  noise of {noise:.0f}: {before:.1f} grey levels rms from the clean picture, {after:.1f} after denoising"
+        )
 
 
 def _network(torch: Any) -> Any:
@@ -164,9 +169,9 @@ def _network(torch: Any) -> Any:
     pairs = list(pairwise(WIDTHS))
     down = [
         nn.Sequential(convolution(a, b, 3, 2), *(convolution(b, b) for _ in range(more)))
-        for (a, b), more in zip(pairs, DEEPER, strict=True)
+        for (a, b), more in zip(pairs, EXTRA_CONVOLUTIONS, strict=True)
     ]
     narrow = [nn.Conv2d(b, a, 1) for a, b in pairs]
     up = [convolution(a, a) for a, _ in pairs]
     first, last = convolution(3, WIDTHS[0], 5, 2), nn.Conv2d(WIDTHS[0], 12, 3, padding=1)
-    return pyramid(torch, first, down, narrow, up, last)
+    return unet(torch, first, down, narrow, up, last)

@@ -1,4 +1,4 @@
-"""Examples for the line network: random solids before photos, with the lines of them that are seen."""
+"""Examples for the edge net: random solids in front of photos, with their visible edges."""
 
 from __future__ import annotations
 
@@ -24,71 +24,71 @@ from arview.evaluation.semisynthetic.solids import box
 from arview.geometry import Array, apply, rigid
 from arview.rendering.rasterizer import rasterise
 from arview.video import Image
-from seeded_files import still_to_make
+from seeded_files import missing_files
 
 SOLIDS_EACH, PICTURES_EACH = 14, 60
-"""A file holds so many pictures of so many solids."""
-FEWEST_PICTURES = 20
-"""To fit a network to."""
+"""Solids and pictures of each example file."""
+MIN_PICTURES = 20
+"""Smallest number of pictures to train on."""
 RADIUS_PX, OTHER_RADIUS_PX = (38.0, 300.0), (30.0, 120.0)
-"""Half diameters of the first solid in a picture and of those beside it."""
-ALONE, NOT_ALONE = (0.55, 0.3, 0.15), (1, 2, 3)
-"""Shares of pictures with so many solids."""
-CROWDED = 0.45
-"""Share of pictures with a crowd of solids, as on a bench: one that knows lone ones only is sure of nothing there."""
-CROWD, CROWD_RADIUS_PX, MEMBER_RADIUS_PX = (4, 11), (45.0, 180.0), (14.0, 75.0)
-"""So many are there, and half diameters of the first and of the others."""
-ON_BOARD, BOARD_RADIUS_PX = 0.6, (180.0, 330.0)
-"""Share of crowds before a board, and half its diameter."""
-OF_STEEL = 0.5
-"""Share of crowds of which most are of about one grey."""
-UNHIDDEN = 0.5
-"""Share of pictures in which a certain solid is in front of the crowd."""
-PATTERNED = 0.35
-"""Share of crowds before a surface with dots or stripes, which are no lines of solids."""
+"""Ranges of the half diameters of the first solid of a picture, and of the others."""
+COUNT_SHARES, COUNTS = (0.55, 0.3, 0.15), (1, 2, 3)
+"""Shares of the pictures with one, two and three solids."""
+CLUTTERED_SHARE = 0.45
+"""Share of pictures cluttered with solids, as a workbench is: without them the network is uncertain there."""
+CLUTTER_COUNT, CLUTTER_RADIUS_PX, MEMBER_RADIUS_PX = (4, 11), (45.0, 180.0), (14.0, 75.0)
+"""Ranges of the number of solids in clutter, and of the half diameters of the first and of the others."""
+BOARD_SHARE, BOARD_RADIUS_PX = 0.6, (180.0, 330.0)
+"""Share of cluttered pictures with a board behind, and the range of its half diameter."""
+STEEL_SHARE = 0.5
+"""Share of cluttered pictures in which most solids have about the same grey."""
+UNOCCLUDED_SHARE = 0.5
+"""Share of pictures in which the solid of interest stands in front of the clutter."""
+PATTERNED_SHARE = 0.35
+"""Share of cluttered pictures on a surface with dots or stripes, which are not edges of solids."""
 PATTERN_SIZE = 1200, 900
-"""Of such a surface, px."""
-LEAST_DISTANCE = 0.75
-"""No nearer than this, in diameters."""
-RECOLOURED, PLAIN, PRINTED = 0.5, 0.4, 0.35
-"""Shares of solids in other colours, of the surface that sequences have, with a photo that shines through them."""
+"""Size of that surface, px."""
+MIN_DISTANCE = 0.75
+"""Smallest distance of a solid from the camera, in diameters."""
+RECOLOURED_SHARE, PLAIN_SHARE, PRINTED_SHARE = 0.5, 0.4, 0.35
+"""Shares of the solids in other colours, with the surface of the sequences, and with a photo printed on."""
 PHOTO_SCALE = 0.35, 1.2
-"""Smallest and largest zoom of a photo, as far as it fills the picture."""
+"""Range of the zoom of a photo, as far as it still fills the picture."""
 FINE = 2
-"""Lines are found on a grid so many times as fine as the picture."""
+"""Resolution of the grid on which edges are found, relative to the picture."""
 JUMP = 0.035
-"""A jump in depth, in diameters, is a line."""
+"""Smallest jump in depth that is an edge, in diameters."""
 CREASE_DEG = 38.0
-"""So is an edge at which faces meet at more than this: hardly less than where shading is smooth."""
+"""Smallest dihedral angle of an edge, little more than where shading is smooth."""
 RIDGE_PX = 2.0
-"""Scale at which a line's direction is found."""
+"""Scale at which the direction of an edge is found."""
 JPEG_QUALITY = 97
 
 
 @dataclass(frozen=True)
-class LinedPicture:
-    """A picture without noise, and the lines of the solids in it.
+class EdgePicture:
+    """A picture without noise, and the edges of the solids in it.
 
     Attributes:
-        jpeg: of it.
-        lines: (N,3) uint16: row and column on the fine grid, direction of the normal, 256 to the half turn.
+        jpeg: the picture.
+        edges: (N,3) uint16: row and column on the fine grid, and direction of the normal, 256 to the half turn.
         inside: PNG of the share of each pixel that solids cover, 0–255.
     """
 
     jpeg: bytes
-    lines: NDArray[np.uint16]
+    edges: NDArray[np.uint16]
     inside: bytes
 
     def image(self) -> Image:
-        """It decoded, (H,W,3) RGB."""
+        """The decoded picture, (H,W,3) RGB."""
         bgr = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)
         assert bgr is not None
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def collect_lined_pictures(seeds: range, photos: Sequence[Path], folder: Path) -> None:
-    """Write some pictures of some solids to a file for each seed, unless it is there."""
-    for seed, path in still_to_make(seeds, folder, "lines_{}.pkl", "pictures with lines"):
+def collect_edge_pictures(seeds: range, photos: Sequence[Path], folder: Path) -> None:
+    """Write some pictures of some solids for each seed, unless its file exists."""
+    for seed, path in missing_files(seeds, folder, "edges_{}.pkl", "edge pictures"):
         rng = np.random.default_rng([seed, 3])
         solids = []
         for k in range(SOLIDS_EACH):
@@ -96,30 +96,30 @@ def collect_lined_pictures(seeds: range, photos: Sequence[Path], folder: Path) -
                 solids.append(random_solid(SOLIDS_EACH * seed + k))
             except ValueError:  # outlines that cross each other
                 continue
-        pictures = [_lined_picture(solids, photos, rng) for _ in range(PICTURES_EACH if solids else 0)]
+        pictures = [_edge_picture(solids, photos, rng) for _ in range(PICTURES_EACH if solids else 0)]
         with replacing(path) as file:
             pickle.dump(pictures, file)
 
 
-def read_lined_pictures(folder: Path) -> list[LinedPicture]:
-    """All that were written to a folder.
+def read_edge_pictures(folder: Path) -> list[EdgePicture]:
+    """All pictures in a folder.
 
     Raises:
-        InputError: hardly any.
+        InputError: fewer than `MIN_PICTURES`.
     """
-    pictures = [picture for path in sorted(folder.glob("lines_*.pkl")) for picture in pickle.loads(path.read_bytes())]
-    if len(pictures) < FEWEST_PICTURES:
-        raise InputError(f"{folder}: too few pictures; run tools/training/fit.py pictures first")
+    pictures = [picture for path in sorted(folder.glob("edges_*.pkl")) for picture in pickle.loads(path.read_bytes())]
+    if len(pictures) < MIN_PICTURES:
+        raise InputError(f"{folder}: too few pictures; run: fit.py edge-examples")
     return pictures
 
 
-def _lined_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.random.Generator) -> LinedPicture:
+def _edge_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.random.Generator) -> EdgePicture:
     photo = read_photo(photos[rng.integers(len(photos))])
     picture = _crop(photo, rng).astype(np.float32)
-    is_crowded = rng.random() < CROWDED
-    if is_crowded and rng.random() < PATTERNED:
+    is_cluttered = rng.random() < CLUTTERED_SHARE
+    if is_cluttered and rng.random() < PATTERNED_SHARE:
         picture = _patterned(picture, rng)
-    placed = _crowd(solids, rng) if is_crowded else _placed(solids, rng)
+    placed = _clutter(solids, rng) if is_cluttered else _placed(solids, rng)
     picture, covers = drawn_before(picture, photo, placed, photos, rng)
     height, width = FINE * CAMERA.height, FINE * CAMERA.width
     depth = np.zeros((height, width), np.float32)
@@ -128,48 +128,48 @@ def _lined_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.rand
     for number, ((solid, pose), cover) in enumerate(zip(placed, covers, strict=True), 1):
         if cover.any():
             _draw_geometry(solid, pose, number, depth, normals, owners)
-    lines = _lines(depth, normals, owners, max(solid.diameter_mm for solid, _ in placed))
+    edges = _edges(depth, normals, owners, max(solid.diameter_mm for solid, _ in placed))
     image = np.clip(np.round(picture), 0, 255).astype(np.uint8)[..., ::-1]
     jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
     inside = np.max(covers, axis=0)
-    return LinedPicture(jpeg, lines, cv2.imencode(".png", (255.0 * inside).astype(np.uint8))[1].tobytes())
+    return EdgePicture(jpeg, edges, cv2.imencode(".png", (255.0 * inside).astype(np.uint8))[1].tobytes())
 
 
-def crowded_picture(
+def cluttered_picture(
     solids: Sequence[Model], among: tuple[Model, Array] | None, photos: Sequence[Path], rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], float]:
-    """A picture (H,W,3), without noise, of a crowd of solids, and which share of a certain one is seen in it.
+    """A picture (H,W,3), without noise, cluttered with solids, and the visible share of a solid of interest.
 
     Args:
-        solids: to choose from.
-        among: a solid that stands among them at a ``cam_from_model``, as it is; None for none.
-        photos: to stand behind them.
+        solids: for the clutter.
+        among: the solid of interest with its ``cam_from_model``; None for none.
+        photos: for the background.
         rng: random numbers.
     """
     photo = read_photo(photos[rng.integers(len(photos))])
     picture = _crop(photo, rng).astype(np.float32)
-    if rng.random() < PATTERNED:
+    if rng.random() < PATTERNED_SHARE:
         picture = _patterned(picture, rng)
     if among is None:
-        return drawn_before(picture, photo, _crowd(solids, rng), photos, rng)[0], 0.0
+        return drawn_before(picture, photo, _clutter(solids, rng), photos, rng)[0], 0.0
     center = apply(among[1], among[0].center_in_model)
-    placed = _crowd(solids, rng, CAMERA.project(center[None])[0] + rng.normal(0.0, 40.0, 2))
-    # A board may be the first; some of the others stand in front.
-    place = len(placed) if rng.random() < UNHIDDEN else int(rng.integers(1, len(placed) + 1))
+    placed = _clutter(solids, rng, CAMERA.project(center[None])[0] + rng.normal(0.0, 40.0, 2))
+    # The first may be a board; some of the others stand in front.
+    place = len(placed) if rng.random() < UNOCCLUDED_SHARE else int(rng.integers(1, len(placed) + 1))
     picture, covers = drawn_before(picture, photo, [*placed[:place], among, *placed[place:]], photos, rng)
-    seen = covers[place]
+    corners_px = covers[place]
     for cover in covers[place + 1 :]:
-        seen = seen * (1.0 - cover)
-    return picture, float(seen.sum() / max(covers[place].sum(), 1.0))
+        corners_px = corners_px * (1.0 - cover)
+    return picture, float(corners_px.sum() / max(covers[place].sum(), 1.0))
 
 
 def lone_picture(solid: Model, pose: Array, photos: Sequence[Path], rng: np.random.Generator) -> NDArray[np.float32]:
-    """A picture (H,W,3), without noise, of one solid at a ``cam_from_model`` before one of some photos."""
+    """A picture (H,W,3), without noise, of one solid at a ``cam_from_model`` in front of a photo."""
     photo = read_photo(photos[rng.integers(len(photos))])
     return drawn_before(_crop(photo, rng).astype(np.float32), photo, [(solid, pose)], photos, rng)[0]
 
 
-def covered_picture(
+def occluded_picture(
     picture: NDArray[np.float32],
     place_px: Array,
     radius_px: float,
@@ -177,9 +177,9 @@ def covered_picture(
     photos: Sequence[Path],
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """A picture with one of some solids, of whatever colour, drawn over a place."""
+    """A picture with one of some solids, perhaps in other colours, drawn over a place."""
     solid = solids[rng.integers(len(solids))]
-    if rng.random() < RECOLOURED:
+    if rng.random() < RECOLOURED_SHARE:
         solid = recoloured(solid, rng)
     photo = read_photo(photos[rng.integers(len(photos))])
     placed = [(solid, _pose_at(solid, place_px, radius_px, rng))]
@@ -197,7 +197,7 @@ def drawn_before(
     photos: Sequence[Path],
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
-    """A picture with solids drawn over it in their order, in some light; and what each covers (H,W), 0–1."""
+    """A picture with solids drawn over it in order, under a random light, and the coverage (H,W) of each, 0–1."""
     key = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
     if rng.random() < 0.6:
         key = Rotation.from_rotvec(rng.normal(0.0, 0.8, 3)).apply(key)
@@ -206,7 +206,7 @@ def drawn_before(
     covers = []
     for solid, pose in placed:
         surface = Reflectance()
-        if rng.random() > PLAIN:
+        if rng.random() > PLAIN_SHARE:
             surface = Reflectance(*(rng.uniform(*of) for of in ((0.4, 0.95), (0.0, 0.7), (0.0, 0.45), (6.0, 60.0))))
         layer = ShadedModel(solid, surface).draw(pose, CAMERA, light)
         cover = np.zeros((CAMERA.height, CAMERA.width), np.float32)
@@ -217,7 +217,7 @@ def drawn_before(
         stacked = np.dstack([layer.color, layer.coverage])
         paste(cv2.GaussianBlur(stacked, (0, 0), JOIN_BLUR_PX, borderType=cv2.BORDER_CONSTANT), layer, both)
         paste(layer.coverage, layer, cover)
-        if rng.random() < PRINTED:
+        if rng.random() < PRINTED_SHARE:
             share = rng.uniform(0.2, 1.0)
             print_on = _crop(read_photo(photos[rng.integers(len(photos))]), rng).astype(np.float32) / 110.0
             both[..., :3] *= 1.0 - share + share * print_on
@@ -226,13 +226,13 @@ def drawn_before(
 
 
 def _placed(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Model, Array]]:
-    """Some solids and their poses, the far ones first: one anywhere, others near it or anywhere."""
+    """Some solids and their poses, the farthest first: one anywhere, others near it or anywhere."""
     size = np.array([CAMERA.width, CAMERA.height])
     placed: list[tuple[Model, Array]] = []
     first_px, first_radius_px = np.zeros(2), 0.0
-    for number in range(rng.choice(NOT_ALONE, p=ALONE)):
+    for number in range(rng.choice(COUNTS, p=COUNT_SHARES)):
         solid = solids[rng.integers(len(solids))]
-        if rng.random() < RECOLOURED:
+        if rng.random() < RECOLOURED_SHARE:
             solid = recoloured(solid, rng)
         radius_px = float(np.exp(rng.uniform(*np.log(OTHER_RADIUS_PX if number else RADIUS_PX))))
         center_px = rng.uniform(-20.0, size + 20.0)
@@ -242,55 +242,55 @@ def _placed(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Mod
         if not number:
             first_px, first_radius_px = center_px, radius_px
         placed.append((solid, _pose_at(solid, center_px, radius_px, rng)))
-    return _far_first(placed)
+    return _by_distance(placed)
 
 
-def _crowd(
+def _clutter(
     solids: Sequence[Model], rng: np.random.Generator, middle_px: Array | None = None
 ) -> list[tuple[Model, Array]]:
-    """Many solids and their poses, the far ones first, about one place, anywhere if none; perhaps before a board."""
+    """Many solids and their poses, the farthest first, around a place (random if None), perhaps on a board."""
     size = np.array([CAMERA.width, CAMERA.height])
-    has_board = rng.random() < ON_BOARD
+    has_board = rng.random() < BOARD_SHARE
     if middle_px is None:
         middle_px = rng.uniform(0.25, 0.75, 2) * size
     spread_px = rng.uniform(45.0, 110.0) if has_board else rng.uniform(60.0, 190.0)
-    steel = rng.uniform(0.15, 0.8) if rng.random() < OF_STEEL else None
+    steel = rng.uniform(0.15, 0.8) if rng.random() < STEEL_SHARE else None
     placed = []
-    for number in range(rng.integers(*CROWD)):
+    for number in range(rng.integers(*CLUTTER_COUNT)):
         solid = solids[rng.integers(len(solids))]
         if steel is not None and rng.random() < 0.7:
             colors = steel * rng.uniform(0.7, 1.3, (len(solid.components), 1)) + rng.normal(0.0, 0.03, 3)
             solid = coloured(solid, colors)
-        elif rng.random() < RECOLOURED:
+        elif rng.random() < RECOLOURED_SHARE:
             solid = recoloured(solid, rng)
-        radius_px = float(np.exp(rng.uniform(*np.log(MEMBER_RADIUS_PX if number else CROWD_RADIUS_PX))))
+        radius_px = float(np.exp(rng.uniform(*np.log(MEMBER_RADIUS_PX if number else CLUTTER_RADIUS_PX))))
         center_px = np.clip(rng.normal(middle_px, spread_px), 0.08 * size, 0.92 * size)
         placed.append((solid, _pose_at(solid, center_px, radius_px, rng)))
-    placed = _far_first(placed)
+    placed = _by_distance(placed)
     if not has_board:
         return placed
     half = np.array([rng.uniform(120.0, 190.0), rng.uniform(80.0, 160.0), 8.0])
     vertices, faces = box(-half, half)
     color = tuple(np.clip(rng.uniform(0.2, 0.8) + rng.normal(0.0, 0.05, 3), 0.03, 0.97).tolist())
     board = make_model("board", (Component("board", vertices, faces.astype(np.int32), color),))
-    # Drawn first, wherever it is.
+    # The board is drawn first, whatever its distance.
     return [(board, _pose_at(board, middle_px, rng.uniform(*BOARD_RADIUS_PX), rng)), *placed]
 
 
 def _pose_at(solid: Model, center_px: Array, radius_px: float, rng: np.random.Generator) -> Array:
-    """A random ``cam_from_model`` that shows a solid at a place, so large or, if that is too near, smaller."""
-    distance_mm = max(0.5 * CAMERA.fx * solid.diameter_mm / radius_px, LEAST_DISTANCE * solid.diameter_mm)
+    """A random ``cam_from_model`` that shows a solid at a place with a radius, smaller where it would be too near."""
+    distance_mm = max(0.5 * CAMERA.fx * solid.diameter_mm / radius_px, MIN_DISTANCE * solid.diameter_mm)
     rotation = Rotation.random(random_state=rng).as_matrix()
     center = CAMERA.unproject(center_px[None])[0] * distance_mm
     return rigid(rotation, center - rotation @ solid.center_in_model)
 
 
-def _far_first(placed: list[tuple[Model, Array]]) -> list[tuple[Model, Array]]:
+def _by_distance(placed: list[tuple[Model, Array]]) -> list[tuple[Model, Array]]:
     return sorted(placed, key=lambda of: -_distance_mm(*of))
 
 
 def _patterned(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """A picture with a surface before it, seen at a slant, that is dotted, striped or chequered."""
+    """A picture with a slanted surface drawn over it that has dots, stripes or checks."""
     width, height = PATTERN_SIZE
     surface = np.full((height, width, 3), rng.uniform(60.0, 230.0), np.float32)
     pitch, color = int(rng.integers(18, 60)), (float(rng.uniform(0.0, 255.0)),) * 3
@@ -308,15 +308,15 @@ def _patterned(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArra
     surface *= 1.0 + rng.uniform(0.02, 0.15) * (grain / grain.std())[..., None]
     corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
     inward = 1.0 - 2.0 * corners
-    seen = corners * (CAMERA.width, CAMERA.height) + inward * rng.uniform(-240.0, -5.0, (4, 2))
-    way = cv2.getPerspectiveTransform(corners * np.float32(PATTERN_SIZE), seen.astype(np.float32))
+    corners_px = corners * (CAMERA.width, CAMERA.height) + inward * rng.uniform(-240.0, -5.0, (4, 2))
+    homography = cv2.getPerspectiveTransform(corners * np.float32(PATTERN_SIZE), corners_px.astype(np.float32))
     size = CAMERA.width, CAMERA.height
-    share = cv2.warpPerspective(np.ones((height, width), np.float32), way, size)[..., None]
-    return np.asarray(picture * (1.0 - share) + cv2.warpPerspective(surface, way, size) * share)
+    share = cv2.warpPerspective(np.ones((height, width), np.float32), homography, size)[..., None]
+    return np.asarray(picture * (1.0 - share) + cv2.warpPerspective(surface, homography, size) * share)
 
 
 def recoloured(solid: Model, rng: np.random.Generator) -> Model:
-    """A solid in other colours, all of its components in one or some in their own."""
+    """A solid in other colours, one for all components or some for single ones."""
     base, gray = rng.uniform(0.15, 0.9, 3), rng.uniform()
     base = gray * base.mean() + (1.0 - gray) * base
     others = [rng.uniform(0.1, 0.9) + rng.normal(0.0, 0.1, 3) for _ in solid.components]
@@ -324,14 +324,14 @@ def recoloured(solid: Model, rng: np.random.Generator) -> Model:
 
 
 def coloured(solid: Model, colors: Array) -> Model:
-    """A solid with other colours (C,3) of its components."""
+    """A solid whose components have given colours (C,3)."""
     limited = [tuple(color) for color in np.clip(colors, 0.03, 0.97).tolist()]
     components = zip(solid.components, limited, strict=True)
     return make_model(solid.name, tuple(replace(component, color=color) for component, color in components))
 
 
 def _crop(photo: Image, rng: np.random.Generator) -> Image:
-    """A part of a photo, of the picture's size, at some zoom, perhaps mirrored or in other colours."""
+    """A part of a photo of the size of a picture, at a random zoom, perhaps mirrored or with permuted colours."""
     fill = max(CAMERA.width / photo.shape[1], CAMERA.height / photo.shape[0])
     zoom = np.exp(rng.uniform(np.log(max(1.01 * fill, PHOTO_SCALE[0])), np.log(max(1.06 * fill, PHOTO_SCALE[1]))))
     size = int(np.ceil(photo.shape[1] * zoom)), int(np.ceil(photo.shape[0] * zoom))
@@ -354,7 +354,7 @@ def _draw_geometry(
     normals: NDArray[np.float32],
     owners: NDArray[np.int16],
 ) -> None:
-    """Depth (H,W) mm, flat normals (H,W,3) and owners (H,W) on the fine grid, where a solid is drawn."""
+    """Write depth (H,W) mm, face normals (H,W,3) and the number of the solid (H,W) where it covers the fine grid."""
     vertices, faces, _ = solid.mesh
     points = apply(pose, vertices)
     height, width = depth.shape
@@ -370,21 +370,21 @@ def _draw_geometry(
     owners[is_on] = number
 
 
-def _lines(
+def _edges(
     depth: NDArray[np.float32], normals: NDArray[np.float32], owners: NDArray[np.int16], diameter_mm: float
 ) -> NDArray[np.uint16]:
-    """The lines of `LinedPicture`: where the owner changes, depth jumps or normals turn, with ridge directions."""
+    """The edges of an `EdgePicture`: where solid, depth or normals change abruptly, with the directions of ridges."""
     drawn = np.zeros(depth.shape, np.float32)
     for before, after in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         are_both = (owners[before] > 0) & (owners[after] > 0)
         jumps = np.abs(depth[before] - depth[after]) > JUMP * diameter_mm
         turns = np.sum(normals[before] * normals[after], axis=2) < np.cos(np.deg2rad(CREASE_DEG))
-        is_line = (owners[before] != owners[after]) | (are_both & (jumps | turns))
-        drawn[before] = np.maximum(drawn[before], is_line)
-        drawn[after] = np.maximum(drawn[after], is_line)
+        is_edge = (owners[before] != owners[after]) | (are_both & (jumps | turns))
+        drawn[before] = np.maximum(drawn[before], is_edge)
+        drawn[after] = np.maximum(drawn[after], is_edge)
     smooth = cv2.GaussianBlur(drawn, (0, 0), RIDGE_PX)
     xx, yy, xy = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=5) for order in ((2, 0), (0, 2), (1, 1)))
-    # Across a ridge the curvature is most negative.
+    # The curvature is most negative across a ridge.
     across = 0.5 * np.arctan2(2.0 * xy, xx - yy) + 0.5 * np.pi
     bins = np.round(np.mod(across, np.pi) / np.pi * 256.0).astype(np.uint16) % 256
     rows, columns = np.nonzero(drawn)

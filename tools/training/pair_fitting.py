@@ -1,4 +1,4 @@
-"""Fitting the network that tells twins apart to examples."""
+"""Training of the pair comparator."""
 
 from __future__ import annotations
 
@@ -10,130 +10,132 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.detection.scoring.pair_comparator import PAIR_CHANNELS, PAIR_SIDE_PX
-from networks.layers import exported, halving, normalised, write
+from networks.layers import convolution_and_norm, onnx_model, strided_convolutions, write_model
 from networks.net2net import torch_with_onnx
-from networks.score_nets import fit
-from pair_examples import Twins
+from networks.score_nets import train
+from pair_examples import NearSymmetricPoses
 from pose_verifier_fitting import network_input
 from profile_ranker_examples import read_examples
 
 WIDTHS, PAIR_WIDTHS = (16, 24, 32, 32), (32, 48, 48)
-"""Of the convolutions that see one pose, every other halving the picture, and of those that see two at once."""
-LAST_WIDTH, DROPPED = 32, 0.2
+"""Channels of the convolutions for each pose, every other of stride 2, and of those for the pair."""
+LAST_WIDTH, DROPOUT = 32, 0.2
 PICTURES, POSES = 6, 5
-"""A step looks at so many poses of so many pictures, at most half of them right."""
+"""Pictures of a batch and poses of each, of which at most half are right."""
 RATE, DECAY = 2e-3, 2e-2
 HELD_OUT = 8
-"""Every so manieth solid is not fitted to, but for telling how well others are told apart."""
+"""One solid in this many is held out for the report."""
 SURFACE = slice(6, 10)
-"""Channels with the surface's normal and depth."""
-LEAST_APART = (0.2, 0.2, 0.2, 0.03)
-"""Where these of two poses differ by less they show the same; by twice as much, they differ altogether."""
-LEADS = (0.0, 0.2, 0.4, 0.8, 1e3)
-"""Weights of what verifier and others say of each pose beside what the network says of two."""
+"""Channels with the normal and the depth of the surface."""
+MIN_DIFFERENCE = (0.2, 0.2, 0.2, 0.03)
+"""Differences of normal and depth below which two poses agree at a pixel; at twice as much they fully differ."""
+PAIR_WEIGHTS = (0.0, 0.2, 0.4, 0.8, 1e3)
+"""Weights of the network beside the logits of the single poses, for the report."""
 
 
-def fit_twins(folder: Path, epochs: int) -> None:
-    """Fit the network to the twins in a folder, write twins.onnx there, and say how well it does.
+def fit_pair_comparator(folder: Path, epochs: int) -> None:
+    """Train the network on the near-symmetric poses in a folder, write pair_comparator.onnx, and report its quality.
 
     Args:
-        folder: with twins, see `collect_twins`.
-        epochs: how often each picture is looked at.
+        folder: with near-symmetric poses, see `collect_pairs`; the network is written there.
+        epochs: passes over the pictures.
 
     Raises:
         InputError: no examples, or no torch or onnx.
     """
     torch = torch_with_onnx()
-    fitted, left = read_examples(folder, "twins_*.pkl", HELD_OUT)
+    fitted, held_out = read_examples(folder, "pairs_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    network = twin_network(torch).train().to(memory_format=torch.channels_last)
+    network = make_pair_comparator(torch).train().to(memory_format=torch.channels_last)
 
-    def shown(some: NDArray[np.intp], rng: np.random.Generator) -> Any:
-        seen, rights, wrongs, count = [], [], [], 0
-        for twins in (fitted[i] for i in some):
-            index = _chosen(twins, rng)
-            seen.append(network_input(twins, index, rng)[0])
-            right = twins.is_right[index]
+    def batch_of(some: NDArray[np.intp], rng: np.random.Generator) -> Any:
+        inputs, rights, wrongs, count = [], [], [], 0
+        for example in (fitted[i] for i in some):
+            index = _chosen(example, rng)
+            inputs.append(network_input(example, index, rng)[0])
+            right = example.is_right[index]
             pairs = [(count + a, count + b) for a in np.flatnonzero(right) for b in np.flatnonzero(~right)]
             rights += [a for a, _ in pairs]
             wrongs += [b for _, b in pairs]
             count += len(index)
-        looks = torch.from_numpy(np.concatenate(seen)).contiguous(memory_format=torch.channels_last)
-        return looks, torch.tensor(rights), torch.tensor(wrongs)
+        maps = torch.from_numpy(np.concatenate(inputs)).contiguous(memory_format=torch.channels_last)
+        return maps, torch.tensor(rights), torch.tensor(wrongs)
 
     def loss_of(some: Any) -> Any:
         with torch.autocast("cpu", torch.bfloat16):
             leads = network(*some).float()
         return torch.nn.functional.softplus(-leads).mean()
 
-    fit("twins", network.parameters(), (len(fitted), PICTURES, epochs), RATE, DECAY, shown, loss_of, torch)
+    train(
+        "pair comparator", network.parameters(), (len(fitted), PICTURES, epochs), RATE, DECAY, batch_of, loss_of, torch
+    )
     network.eval()
-    _report(network, left, torch)
+    _report(network, held_out, torch)
     example = {
         "seen": torch.zeros(3, PAIR_CHANNELS, PAIR_SIDE_PX, PAIR_SIDE_PX),
         "one": torch.tensor([0, 1]),
         "other": torch.tensor([2, 2]),
     }
     varying = {"seen": {0: "poses"}, **{name: {0: "pairs"} for name in ("one", "other", "lead")}}
-    write(exported(network, example, "lead", varying, torch), folder / "twins.onnx")
+    write_model(onnx_model(network, example, "lead", varying, torch), folder / "pair_comparator.onnx")
 
 
-def twin_network(torch: Any) -> Any:
-    """A network that is shown poses (N,PAIR_CHANNELS,S,S), and says of pairs of them (P,) how likely it is the one."""
+def make_pair_comparator(torch: Any) -> Any:
+    """A network from inputs (N,C,S,S) of poses and pairs of their indices (P,) to log odds for the first of each."""
     nn = torch.nn
 
-    class _TwinNetwork(nn.Module):  # type: ignore[misc, name-defined]
+    class _PairComparator(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
-            self.alone = nn.Sequential(*halving(PAIR_CHANNELS, WIDTHS, (), torch))
-            self.register_buffer("least_apart", torch.tensor(LEAST_APART).reshape(4, 1, 1))
+            self.alone = nn.Sequential(*strided_convolutions(PAIR_CHANNELS, WIDTHS, (), torch))
+            self.register_buffer("min_difference", torch.tensor(MIN_DIFFERENCE).reshape(4, 1, 1))
             first, second, third = PAIR_WIDTHS
             self.paired = nn.Sequential(
-                *normalised(2 * WIDTHS[-1], first, 1, 1, torch), nn.ReLU(),
-                *normalised(first, second, 3, 2, torch), nn.ReLU(),
-                *normalised(second, third, 3, 1, torch), nn.ReLU(),
+                *convolution_and_norm(2 * WIDTHS[-1], first, 1, 1, torch), nn.ReLU(),
+                *convolution_and_norm(first, second, 3, 2, torch), nn.ReLU(),
+                *convolution_and_norm(second, third, 3, 1, torch), nn.ReLU(),
             )  # fmt: skip
-            self.together = nn.Sequential(
-                nn.Linear(2 * third + 1, LAST_WIDTH), nn.ReLU(), nn.Dropout(DROPPED), nn.Linear(LAST_WIDTH, 1)
+            self.head = nn.Sequential(
+                nn.Linear(2 * third + 1, LAST_WIDTH), nn.ReLU(), nn.Dropout(DROPOUT), nn.Linear(LAST_WIDTH, 1)
             )
 
-        def forward(self, seen: Any, one: Any, other: Any) -> Any:
-            features, surface = self.alone(seen), seen[:, SURFACE]
-            apart = (surface[one] - surface[other]).abs() / self.least_apart
-            apart = (apart.amax(1, keepdim=True) - 1.0).clamp(0.0, 1.0)
-            apart = nn.functional.max_pool2d(apart, 8)
-            # All at once, both ways round: of pairs that are all right before wrong normalisation alone would tell.
-            a, b, apart = torch.cat([one, other]), torch.cat([other, one]), torch.cat([apart, apart])
-            hidden = self.paired(torch.cat([features[a], features[b]], 1)) * apart
-            count = apart.sum((2, 3))
+        def forward(self, inputs: Any, one: Any, other: Any) -> Any:
+            features, surface = self.alone(inputs), inputs[:, SURFACE]
+            difference = (surface[one] - surface[other]).abs() / self.min_difference
+            difference = (difference.amax(1, keepdim=True) - 1.0).clamp(0.0, 1.0)
+            difference = nn.functional.max_pool2d(difference, 8)
+            # Both orders in one batch: with the right pose always first, batch normalisation would reveal the label.
+            a, b, difference = torch.cat([one, other]), torch.cat([other, one]), torch.cat([difference, difference])
+            hidden = self.paired(torch.cat([features[a], features[b]], 1)) * difference
+            count = difference.sum((2, 3))
             pooled = [hidden.sum((2, 3)) / (count + 1.0), hidden.amax((2, 3)), (count + 1.0).log() / 4.0]
-            worth = self.together(torch.cat(pooled, 1))[:, 0]
-            forth, back = worth.chunk(2)
+            preference = self.head(torch.cat(pooled, 1))[:, 0]
+            forth, back = preference.chunk(2)
             return forth - back
 
-    return _TwinNetwork()
+    return _PairComparator()
 
 
-def _chosen(twins: Twins, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Some poses of a picture, right and wrong."""
-    right, wrong = (rng.permutation(np.flatnonzero(group)) for group in (twins.is_right, ~twins.is_right))
+def _chosen(example: NearSymmetricPoses, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Indices of some poses of a picture, right and wrong ones."""
+    right, wrong = (rng.permutation(np.flatnonzero(group)) for group in (example.is_right, ~example.is_right))
     right = right[: POSES // 2]
     return np.concatenate([right, wrong[: POSES - len(right)]])
 
 
-def _report(network: Any, examples: Sequence[Twins], torch: Any) -> None:
-    """Say in how many pictures a right pose is ahead of all others."""
+def _report(network: Any, examples: Sequence[NearSymmetricPoses], torch: Any) -> None:
+    """Print how many pairs are ordered right, and how often a right pose is first in its picture."""
     matrices = []
-    for twins in examples:
-        count = len(twins.logits)
+    for example in examples:
+        count = len(example.logits)
         one, other = np.triu_indices(count, 1)
         leads = np.zeros((count, count))
         with torch.no_grad():
-            seen = network_input(twins, range(count), None)[0]
-            leads[one, other] = network(*map(torch.from_numpy, (seen, one, other))).numpy()
-        matrices.append((leads - leads.T, twins.logits[:, None] - twins.logits, twins.is_right))
+            inputs = network_input(example, range(count), None)[0]
+            leads[one, other] = network(*map(torch.from_numpy, (inputs, one, other))).numpy()
+        matrices.append((leads - leads.T, example.logits[:, None] - example.logits, example.is_right))
     pairs = np.concatenate([found[right][:, ~right].ravel() for found, _, right in matrices])
     print(f"other solids: {np.mean(pairs > 0):.1%} of {len(pairs)} pairs, loss {np.logaddexp(0.0, -pairs).mean():.3f}")
-    for weight in LEADS:
+    for weight in PAIR_WEIGHTS:
         first = sum(bool(right[np.argmax((found + weight * lead).sum(axis=1))]) for found, lead, right in matrices)
-        print(f"  leads count {weight}: a right pose first in {first} of {len(matrices)} pictures")
+        print(f"  weight of the pairs {weight}: a right pose first in {first} of {len(matrices)} pictures")

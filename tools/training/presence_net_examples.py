@@ -1,4 +1,4 @@
-"""Examples for the component network: looks at components of random assemblies, right and wrong."""
+"""Examples for the presence net: crops at the components of random assemblies that are right or wrong."""
 
 from __future__ import annotations
 
@@ -21,67 +21,70 @@ from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews.surface import reduced_surface, surface_about
 from arview.refinement.projection import intrinsics_of
-from edge_net_examples import covered_picture, crowded_picture, lone_picture
+from edge_net_examples import cluttered_picture, lone_picture, occluded_picture
 from profile_ranker_examples import ANYWHERE, OCCLUDER, noisy, some_solids
-from seeded_files import still_to_make
+from seeded_files import missing_files
 
-LEAST_COMPONENTS = 4
-"""Solids of fewer are no assemblies."""
+MIN_COMPONENTS = 4
+"""Smallest number of components of an assembly."""
 PICTURES_EACH, RIGHT_SHARE = 36, 0.4
-"""Pictures of an assembly; such a share shows it as it is, the others a look-alike."""
+"""Pictures of an assembly, and the share of them that show it as designed; the others show a look-alike."""
 LOOK_ALIKES, RESIZED = 12, 6
-"""So many look-alikes, and so many more with a component of another size."""
-EXPECTED = 4
-"""In each picture so many look-alikes are expected, too, of which only what is changed is looked at."""
+"""Look-alikes of an assembly, and those with one component of another size."""
+EXPECTED_EACH = 4
+"""Look-alikes whose changed components are cropped in each picture, as if they were the design."""
 SIZES = (0.55, 0.8), (1.25, 1.7)
-"""Smaller or larger by such factors."""
+"""Ranges of the factors of smaller and of larger components."""
 MOVED_MM = (10.0, 30.0)
-BUILT_SHARE = 0.004
-"""Components of any are displaced by so much of the diameter, as in real ones."""
-TURNED_DEG, OFF_SHARE, OFF_MM = 0.35, 0.003, 0.6
-"""How far off the poses are: what tracking leaves; twice as far in WORSE of them."""
-WORSE = 0.3
-IN_CROWD = 0.3
-"""Share of pictures that show a crowd of other solids too."""
-COVERED, COVER_SIZE, COVER_OFF = 0.35, (0.5, 3.0), 0.6
-"""Share of pictures in which something is before some component, its half diameter in the component's larger sides, and
-how far its middle is off: what is hidden is neither right nor wrong."""
+"""Range of the displacement of moved components."""
+ASSEMBLY_SHARE = 0.004
+"""Standard deviation of the positions of all components, as a share of the diameter: real assemblies are not exact."""
+ERROR_DEG, ERROR_SHARE, ERROR_MM = 0.35, 0.003, 0.6
+"""Standard deviations of the poses, as of a tracker: rotation, share of the distance, and position."""
+WORSE_SHARE = 0.3
+"""Share of the pictures with twice these errors."""
+CLUTTERED_SHARE = 0.3
+"""Share of the pictures that are cluttered with other solids."""
+OCCLUDED_SHARE, OCCLUDER_SIZE, OCCLUDER_SHIFT = 0.35, (0.5, 3.0), 0.6
+"""Share of the pictures with a solid in front of a component, range of its radius relative to the size of the
+component, and standard deviation of its shift, in radii. An occluded component looks neither right nor wrong."""
 
 
 @dataclass(frozen=True)
-class Looked:
-    """Looks at the components in one picture.
+class ComponentCrops:
+    """Crops at the components in one picture.
 
     Attributes:
-        solid: its seed.
-        pixels, drawn, lines: (N,S,S,4) uint8, (N,6,S,S) int8, 127 for 1, and (N,3,S,S) uint8, see `ComponentCrop`.
-        sizes_px: (N,).
+        solid: seed of the assembly.
+        pixels, drawn, edges: (N,S,S,4) uint8, (N,6,S,S) int8, 127 for 1, and (N,3,S,S) uint8, see `ComponentCrop`.
+        sizes_px: (N,) size of each component in the picture.
         is_wrong: (N,) bool.
     """
 
     solid: int
     pixels: NDArray[np.uint8]
     drawn: NDArray[np.int8]
-    lines: NDArray[np.uint8]
+    edges: NDArray[np.uint8]
     sizes_px: Array
     is_wrong: NDArray[np.bool_]
 
 
 def collect_components(seeds: range, photos: Sequence[Path], folder: Path) -> None:
-    """Write the looks at the components of each assembly to a file of its own, unless it is there."""
-    for seed, path in still_to_make(seeds, folder, "components_{}.pkl", "assemblies"):
-        looked = list(_looked(seed, photos))
-        if looked:
+    """Write the crops at the components of each assembly, unless its file exists."""
+    for seed, path in missing_files(seeds, folder, "components_{}.pkl", "assemblies"):
+        examples = list(_component_crops(seed, photos))
+        if examples:
             with replacing(path) as file:
-                pickle.dump(looked, file)
+                pickle.dump(examples, file)
 
 
-def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
+def _component_crops(seed: int, photos: Sequence[Path]) -> Iterator[ComponentCrops]:
+    """Crops in all pictures of one assembly; none where the solid of the seed is not an assembly."""
     try:
         model, occluder = random_solid(seed), random_solid(seed + OCCLUDER)
     except ValueError:  # outlines that cross each other
         return
-    if len(model.components) < LEAST_COMPONENTS:
+    if len(model.components) < MIN_COMPONENTS:
         return
     rng = np.random.default_rng([seed, 5])
     found = look_alikes(model, rng.uniform(*MOVED_MM))
@@ -99,23 +102,23 @@ def _looked(seed: int, photos: Sequence[Path]) -> Iterator[Looked]:
         pose = trajectory(model, options)[0]
         shown = _displaced(built, model, rng)
         image = _picture(shown, model, pose, options, (occluder, *others), photos, rng)
-        cam_from_body = _off(pose, rng) @ rigid(np.eye(3), model.center_in_model)
+        cam_from_body = _perturbed(pose, rng) @ rigid(np.eye(3), model.center_in_model)
         picture = PartImage(image, network.predict(image), intrinsics_of(CAMERA), cam_from_body)
-        looks = component_crops(picture, surface, model.diameter_mm)
-        is_wrong = [model.components[look.index].name in changed for look in looks]
-        for k in rng.permutation(len(variants))[:EXPECTED]:
+        crops = component_crops(picture, surface, model.diameter_mm)
+        is_wrong = [model.components[crop.index].name in changed for crop in crops]
+        for k in rng.permutation(len(variants))[:EXPECTED_EACH]:
             expected, names = variants[k]
             only = [i for i, component in enumerate(expected.components) if component.name in names]
             more = component_crops(picture, surfaces[k], model.diameter_mm, only)
-            looks += more
+            crops += more
             is_wrong += [k != number] * len(more)
-        if looks:
-            yield Looked(
+        if crops:
+            yield ComponentCrops(
                 seed,
-                np.stack([look.pixels for look in looks]),
-                np.round(127.0 * np.stack([look.drawn for look in looks])).astype(np.int8),
-                np.stack([look.edge_responses for look in looks]),
-                np.array([look.size_px for look in looks]),
+                np.stack([crop.pixels for crop in crops]),
+                np.round(127.0 * np.stack([crop.drawn for crop in crops])).astype(np.int8),
+                np.stack([crop.edge_responses for crop in crops]),
+                np.array([crop.size_px for crop in crops]),
                 np.array(is_wrong),
             )
 
@@ -129,21 +132,30 @@ def _picture(
     photos: Sequence[Path],
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """A picture of what is built for an assembly, perhaps in a crowd, perhaps with something before a component.
+    """A picture of an assembly as built, perhaps cluttered, perhaps with a solid in front of a component.
 
-    The first of the others is what passes by in sequences with occlusion.
+    Args:
+        shown: the assembly as built.
+        model: the assembly as designed.
+        pose: (4,4) ``cam_from_model``.
+        options: of the sequence, where the picture is neither cluttered nor occluded.
+        others: further solids; the first is the one that passes by in sequences with occlusion.
+        photos: for the background.
+        rng: random numbers.
     """
-    is_crowded, is_covered = rng.random() < IN_CROWD, rng.random() < COVERED
-    if not (is_crowded or is_covered):
+    is_cluttered, is_occluded = rng.random() < CLUTTERED_SHARE, rng.random() < OCCLUDED_SHARE
+    if not (is_cluttered or is_occluded):
         photo = read_photo(photos[rng.integers(len(photos))])
         return next(iter(render_sequence(shown, pose[None], photo, options, CAMERA, others[0]))).image
     picture = (
-        crowded_picture(others, (shown, pose), photos, rng)[0] if is_crowded else lone_picture(shown, pose, photos, rng)
+        cluttered_picture(others, (shown, pose), photos, rng)[0]
+        if is_cluttered
+        else lone_picture(shown, pose, photos, rng)
     )
-    return noisy(_covered(picture, model, pose, others, photos, rng) if is_covered else picture, rng)
+    return noisy(_occluded(picture, model, pose, others, photos, rng) if is_occluded else picture, rng)
 
 
-def _covered(
+def _occluded(
     picture: NDArray[np.float32],
     model: Model,
     pose: Array,
@@ -151,37 +163,39 @@ def _covered(
     photos: Sequence[Path],
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """A picture of an assembly with something before one of its components."""
+    """A picture of an assembly with another solid in front of one of its components."""
     base = _base(model)
     small = [component for component in model.components if component is not base]
-    # Of those on the near side, if there are any: the base hides the others.
+    # A component on the near side, if there is any: the base hides the others.
     before = [one for one in small if _depth_mm(one, pose) < _depth_mm(base, pose)] or small
     chosen = before[rng.integers(len(before))]
-    seen_px = CAMERA.project(apply(pose, chosen.vertices_in_model))
-    low_px, high_px = seen_px.min(axis=0), seen_px.max(axis=0)
+    corners_px = CAMERA.project(apply(pose, chosen.vertices_in_model))
+    low_px, high_px = corners_px.min(axis=0), corners_px.max(axis=0)
     size_px = float(np.max(high_px - low_px))
-    radius_px = size_px * rng.uniform(*COVER_SIZE)
-    place_px = 0.5 * (low_px + high_px) + COVER_OFF * radius_px * rng.normal(size=2)
-    return covered_picture(picture, place_px, radius_px, others, photos, rng)
+    radius_px = size_px * rng.uniform(*OCCLUDER_SIZE)
+    place_px = 0.5 * (low_px + high_px) + OCCLUDER_SHIFT * radius_px * rng.normal(size=2)
+    return occluded_picture(picture, place_px, radius_px, others, photos, rng)
 
 
 def _depth_mm(component: Component, pose: Array) -> float:
     return float(apply(pose, np.mean(np.stack(component.bounds_in_model), axis=0))[2])
 
 
-def _off(pose: Array, rng: np.random.Generator) -> Array:
-    much = 2.0 if rng.random() < WORSE else 1.0
-    turn = exp_so3(np.deg2rad(rng.normal(0.0, much * TURNED_DEG, 3)))
-    place = pose[:3, 3] * (1.0 + rng.normal(0.0, much * OFF_SHARE)) + rng.normal(0.0, much * OFF_MM, 3)
+def _perturbed(pose: Array, rng: np.random.Generator) -> Array:
+    """A pose with the error of a tracker."""
+    much = 2.0 if rng.random() < WORSE_SHARE else 1.0
+    turn = exp_so3(np.deg2rad(rng.normal(0.0, much * ERROR_DEG, 3)))
+    place = pose[:3, 3] * (1.0 + rng.normal(0.0, much * ERROR_SHARE)) + rng.normal(0.0, much * ERROR_MM, 3)
     return rigid(turn @ pose[:3, :3], place)
 
 
 def _base(model: Model) -> Component:
+    """The component with the largest bounding box, which carries the others."""
     return max(model.components, key=lambda c: float(np.prod(np.ptp(c.bounds_in_model, axis=0) + 1e-3)))
 
 
 def _resized(model: Model, rng: np.random.Generator) -> tuple[Model, tuple[str, ...]]:
-    """An assembly with one component of another size about its foot on the base, and that one's name."""
+    """An assembly with one component scaled about its foot on the base, and the name of that component."""
     base = _base(model)
     others = [component for component in model.components if component is not base]
     chosen = others[rng.integers(len(others))]
@@ -199,9 +213,9 @@ def _resized(model: Model, rng: np.random.Generator) -> tuple[Model, tuple[str, 
 
 
 def _displaced(built: Model, model: Model, rng: np.random.Generator) -> Model:
-    """An assembly with all components but the base a little displaced."""
+    """An assembly whose components, except for the base, are slightly displaced."""
     base = _base(model).name
-    spread_mm = BUILT_SHARE * model.diameter_mm
+    spread_mm = ASSEMBLY_SHARE * model.diameter_mm
     shifted = [
         c
         if c.name == base

@@ -1,4 +1,4 @@
-"""Fitting the networks of the judge to examples."""
+"""Training of the networks of the profile ranker."""
 
 from __future__ import annotations
 
@@ -20,24 +20,27 @@ from arview.detection.scoring.profile_ranker import (
     ranker_layers,
 )
 from arview.errors import InputError
-from networks.net2net import GONE_ON
-from profile_ranker_examples import Group, read_examples
+from networks.net2net import CONTINUED_RATE_SHARE
+from profile_ranker_examples import PoseGroup, read_examples
 
 WIDTH, LAST_WIDTH = 16, 32
-"""Of the layers for each line, and of that for all together."""
-BATCH, WITHOUT_BATCH = 12, 8
-"""Pictures with and without the solid that a step looks at."""
-RATE, DECAY, DROPPED = 4e-3, 2e-2, 0.1
-CALIBRATION_WEIGHT, CALIBRATED = 0.5, 3
-"""Refined poses are to be told across pictures too: the best few of each are classified as well."""
+"""Widths of the layers for each profile, and of the layer for all together."""
+BATCH, BATCH_WITHOUT = 12, 8
+"""Pictures with and without the solid in a batch."""
+RATE, DECAY, DROPOUT = 4e-3, 2e-2, 0.1
+CALIBRATION_WEIGHT, CALIBRATED_POSES = 0.5, 3
+"""Weight of the classification across pictures, beside the ranking inside each, and poses of each that take part."""
 HELD_OUT = 10
-"""Every so manieth solid is not fitted to, but for telling how well others are judged."""
+"""One solid in this many is held out for the report."""
 
 
-def fit_networks(folder: Path, epochs: int, is_anew: bool = True) -> None:
-    """Fit all networks to the examples in a folder, write judge.npz there, and say how well they do.
+def fit_profile_ranker(folder: Path, epochs: int, from_scratch: bool = True) -> None:
+    """Train all networks on the examples in a folder, write profile_ranker.npz there, and report their quality.
 
-    ``is_anew``: not going on from those in use.
+    Args:
+        folder: with pose groups, see `collect_pose_examples`.
+        epochs: passes over the pictures.
+        from_scratch: False continues from the networks in the package.
 
     Raises:
         InputError: no examples, or no torch.
@@ -45,59 +48,64 @@ def fit_networks(folder: Path, epochs: int, is_anew: bool = True) -> None:
     try:
         import torch
     except ImportError as error:
-        raise InputError("fit_judge: torch is not installed; pip install torch") from error
-    fitted, left = read_examples(folder, "solid_*.pkl", HELD_OUT)
+        raise InputError("fit.py: torch is not installed; pip install torch") from error
+    fitted, left = read_examples(folder, "groups_*.pkl", HELD_OUT)
     torch.manual_seed(0)
     stored: dict[str, NDArray[np.float32]] = {}
     for stage, names in (("rough", ("rough",)), ("refined", ("fine", "close"))):
-        networks = {name: _network(torch) if is_anew else _as_in_use(name, torch) for name in names}
-        rate = RATE if is_anew else GONE_ON * RATE
+        networks = {name: _network(torch) if from_scratch else _from_package(name, torch) for name in names}
+        rate = RATE if from_scratch else CONTINUED_RATE_SHARE * RATE
         of_stage = ([g for g in groups if g.stage == stage] for groups in (fitted, left))
         weight = _fit(networks, *of_stage, epochs, rate, torch)
-        print(f"{stage}: weight of the hand-made evidence {weight:.2f}")
+        print(f"{stage}: weight of the evidence {weight:.2f}")
         for name, network in networks.items():
             for field, layer in zip(RankerLayers._fields[::2], network.layers(), strict=True):
                 stored[f"{name}_{field}"] = layer.weight.detach().numpy().T.copy()
                 stored[f"{name}_{field}_bias"] = layer.bias.detach().numpy().copy()
-    with replacing(folder / "judge.npz") as file:
+    with replacing(folder / "profile_ranker.npz") as file:
         np.savez_compressed(file, **stored)
-    print(f"wrote {folder / 'judge.npz'}")
+    print(f"wrote {folder / 'profile_ranker.npz'}")
 
 
 def _fit(
-    networks: dict[str, Any], fitted: Sequence[Group], left: Sequence[Group], epochs: int, rate: float, torch: Any
+    networks: dict[str, Any],
+    fitted: Sequence[PoseGroup],
+    left: Sequence[PoseGroup],
+    epochs: int,
+    rate: float,
+    torch: Any,
 ) -> float:
-    """Fit networks whose scores are added; the weight of the hand-made evidence beside them."""
-    shown = [g for g in fitted if g.is_right.any()]
+    """Train networks whose scores are added, and return the weight of the evidence beside them."""
+    with_solid = [g for g in fitted if g.is_right.any()]
     without = [g for g in fitted if not g.is_right.any()]
     weight, bias = (torch.nn.Parameter(torch.tensor(value)) for value in (0.7, -3.0))
     parameters = [weight, bias, *(p for network in networks.values() for p in network.parameters())]
     optimiser = torch.optim.AdamW(parameters, rate / 2, weight_decay=DECAY)
-    steps = max(1, len(shown) // BATCH)
+    steps = max(1, len(with_solid) // BATCH)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * steps)
     rng = np.random.default_rng(0)
 
-    def scores(group: Group) -> Any:
+    def scores(group: PoseGroup) -> Any:
         total = weight * torch.from_numpy(group.logits)
         for name, network in networks.items():
-            total = total + network(torch.from_numpy(group.lines[name]) / 255.0, torch.from_numpy(group.both[name]))
+            total = total + network(torch.from_numpy(group.edges[name]) / 255.0, torch.from_numpy(group.scalars[name]))
         return total
 
-    def calibration(found: Any, group: Group) -> Any:
-        best = found.detach().topk(min(CALIBRATED, len(found))).indices
+    def calibration(scored: Any, group: PoseGroup) -> Any:
+        best = scored.detach().topk(min(CALIBRATED_POSES, len(scored))).indices
         truth = torch.from_numpy(group.is_right[best.numpy()].astype(np.float32))
-        return torch.nn.functional.binary_cross_entropy_with_logits(found[best] + bias, truth)
+        return torch.nn.functional.binary_cross_entropy_with_logits(scored[best] + bias, truth)
 
     for epoch in range(epochs):
-        order, losses = rng.permutation(len(shown)), []
+        order, losses = rng.permutation(len(with_solid)), []
         for k in range(steps):
             loss = torch.zeros(())
             for i in order[k * BATCH : (k + 1) * BATCH]:
-                found = scores(shown[i])
-                right = torch.from_numpy(shown[i].is_right)
-                loss = loss + (found.logsumexp(0) - found[right].logsumexp(0)) / BATCH
-                loss = loss + CALIBRATION_WEIGHT / BATCH * calibration(found, shown[i])
-            for i in rng.integers(len(without), size=WITHOUT_BATCH if without else 0):
+                scored = scores(with_solid[i])
+                right = torch.from_numpy(with_solid[i].is_right)
+                loss = loss + (scored.logsumexp(0) - scored[right].logsumexp(0)) / BATCH
+                loss = loss + CALIBRATION_WEIGHT / BATCH * calibration(scored, with_solid[i])
+            for i in rng.integers(len(without), size=BATCH_WITHOUT if without else 0):
                 loss = loss + CALIBRATION_WEIGHT / BATCH * calibration(scores(without[i]), without[i])
             optimiser.zero_grad()
             loss.backward()
@@ -107,17 +115,17 @@ def _fit(
         print(f"{', '.join(networks)}, epoch {epoch + 1} of {epochs}: loss {np.mean(losses):.3f}", flush=True)
     for network in networks.values():
         network.eval()
-    told = [g for g in left if g.is_right.any()]
+    held_out = [g for g in left if g.is_right.any()]
     with torch.no_grad():
-        first = sum(bool(g.is_right[int(scores(g).argmax())]) for g in told)
-    by_hand = sum(bool(g.is_right[int(g.logits.argmax())]) for g in told)
-    others = f"{len(told)} pictures of {len({g.solid for g in left})} other solids"
-    print(f"{others}: a right pose first in {first}, by hand in {by_hand}")
+        first = sum(bool(g.is_right[int(scores(g).argmax())]) for g in held_out)
+    by_evidence = sum(bool(g.is_right[int(g.logits.argmax())]) for g in held_out)
+    others = f"{len(held_out)} pictures of {len({g.solid for g in left})} other solids"
+    print(f"{others}: a right pose first in {first}, by the evidence alone in {by_evidence}")
     return float(weight.detach())
 
 
-def _as_in_use(name: str, torch: Any) -> Any:
-    """One of the networks as it is in use."""
+def _from_package(name: str, torch: Any) -> Any:
+    """A network with the weights in the package."""
     network = _network(torch)
     stored = ranker_layers(name)
     with torch.no_grad():
@@ -128,7 +136,7 @@ def _as_in_use(name: str, torch: Any) -> Any:
 
 
 def _network(torch: Any) -> Any:
-    """The network of `arview.detection.scoring.profile_ranker` as torch fits it."""
+    """The network of `arview.detection.scoring.profile_ranker` in torch."""
     nn = torch.nn
 
     class _Network(nn.Module):  # type: ignore[misc, name-defined]
@@ -136,7 +144,7 @@ def _network(torch: Any) -> Any:
             super().__init__()
             self.first, self.second = nn.Linear(FEATURES, WIDTH), nn.Linear(WIDTH, WIDTH)
             self.third, self.last = nn.Linear(3 * WIDTH + RANKER_SCALARS, LAST_WIDTH), nn.Linear(LAST_WIDTH, 1)
-            self.dropout = nn.Dropout(DROPPED)
+            self.dropout = nn.Dropout(DROPOUT)
 
         def layers(self) -> tuple[Any, ...]:
             return self.first, self.second, self.third, self.last

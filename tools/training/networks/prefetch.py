@@ -1,4 +1,4 @@
-"""What the steps of a fit look at, each made while the one before is taken."""
+"""Training examples that are made in a thread while the network learns from those before."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-Made = TypeVar("Made")
+Item = TypeVar("Item")
 
 
-def made_ahead(make: Callable[[int], Made], count: int) -> Iterator[Made]:
-    """What a function makes of 0, 1, … below a count; of one after the other, in a thread of its own."""
+def prefetched(make: Callable[[int], Item], count: int) -> Iterator[Item]:
+    """``make(0)`` to ``make(count - 1)`` in order, each made in a thread while the caller uses the one before."""
     with ThreadPoolExecutor(1) as maker:
         following = maker.submit(make, 0)
         for step in range(count):

@@ -1,4 +1,4 @@
-"""Networks that see a picture level by level, each half as large as that before, and come up again to the first."""
+"""Networks in the manner of a U-Net."""
 
 from __future__ import annotations
 
@@ -6,31 +6,32 @@ from collections.abc import Sequence
 from typing import Any
 
 
-def pyramid(torch: Any, first: Any, down: Sequence[Any], narrow: Sequence[Any], up: Sequence[Any], last: Any) -> Any:
-    """A network of modules in the manner of a U-Net (Ronneberger et al., MICCAI 2015), levels added.
+def unet(torch: Any, first: Any, down: Sequence[Any], narrow: Sequence[Any], up: Sequence[Any], last: Any) -> Any:
+    """A U-Net (Ronneberger et al., MICCAI 2015) of given modules, whose levels are added instead of concatenated.
 
     Args:
         torch: the module.
-        first: makes the first level of a picture; last: tells of it what is wanted.
-        down: make each level of that before.
-        narrow: make what each of these saw as narrow as the level before.
-        up: see both together.
+        first: from the input to the first level.
+        down: from each level to the next, of half the size.
+        narrow: from the channels of each level after the first to those of the level before.
+        up: applied to each level after the next one has been added, the first level first.
+        last: from the first level to the output.
     """
     nn = torch.nn
 
-    class _Pyramid(nn.Module):  # type: ignore[misc, name-defined]
+    class _UNet(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
             self.first, self.last = first, last
             self.down, self.narrow, self.up = (nn.ModuleList(modules) for modules in (down, narrow, up))
 
-        def forward(self, shown: Any) -> Any:
-            levels = [self.first(shown)]
+        def forward(self, image: Any) -> Any:
+            levels = [self.first(image)]
             for level in self.down:
                 levels.append(level(levels[-1]))
-            seen = levels.pop()
+            features = levels.pop()
             for level, narrow, up in zip(reversed(levels), reversed(self.narrow), reversed(self.up), strict=True):
-                seen = up(level + nn.functional.interpolate(narrow(seen), scale_factor=2, mode="nearest"))
-            return self.last(seen)
+                features = up(level + nn.functional.interpolate(narrow(features), scale_factor=2, mode="nearest"))
+            return self.last(features)
 
-    return _Pyramid()
+    return _UNet()
