@@ -18,7 +18,7 @@ from arview.detection import Detector
 from arview.errors import ArviewError
 from arview.evaluation import Scene, load_scene, scene_guide_views
 from arview.evaluation.protocols import full_sphere_range
-from arview.evaluation.semisynthetic import SHAPES, SequenceOptions, make_sequence, shape_job
+from arview.evaluation.semisynthetic import SHAPES, SequenceOptions, Variant, make_sequence, shape_job
 from arview.geometry import Array
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose
@@ -57,7 +57,7 @@ Of inspection.json: numbers that differ, with the relative difference; times and
 exit code: 0 within the tolerances, 1 not, 2 bad input"""
 
 PARTS = (*SEQUENCES, "detect", "clips")
-DETECTED_VARIANTS = ("regular", "noise")
+DETECTED_VARIANTS: tuple[Variant, ...] = ("regular", "noise")
 DETECTED_LENGTH, DETECTED_STRIDE, DETECTED_SEED = 10, 2, 1
 """Of the semi-synthetic sequences: frames, every which of them is searched, and the seed."""
 MAX_DETECTIONS = 3
@@ -198,7 +198,7 @@ def record_clips(out: Path) -> None:
     samples = ROOT / "samples"
     bracket, plate = samples / "bracket_plate", samples / "plate"
     annotate(bracket, bracket / "inspection.json", out / "clip_bracket.jsonl")
-    arguments = ["--part", plate / "part.toml", "--photos", plate / "photos", "--video", plate / "clip.mp4"]
+    arguments: list[str | Path] = ["--part", plate / "part.toml", "--photos", plate / "photos", "--video", plate / "clip.mp4"]
     # Four components of the sample are out of tolerance: exit code 1, fail.
     run_arview("inspect", *arguments, "--no-pdf", "--force", "-o", out / "inspect", ends=(1,))
     content = (out / "inspect" / "inspection.json").read_text(encoding="utf-8")
@@ -209,7 +209,7 @@ def record_clips(out: Path) -> None:
 
 def annotate(sample: Path, inspection: Path, poses: Path) -> None:
     """Write the poses of a sample's clip."""
-    arguments = ["--part", sample / "part.toml", "--camera", sample / "camera.json", "--inspection", inspection]
+    arguments: list[str | Path] = ["--part", sample / "part.toml", "--camera", sample / "camera.json", "--inspection", inspection]
     run_arview("annotate", sample / "clip.mp4", *arguments, "--poses", poses)
 
 
@@ -287,7 +287,7 @@ def compare(chosen: argparse.Namespace) -> int:
         if missing:
             skip(name, f"{missing[0]} is not here")
             continue
-        found = difference(*map(lines_of, paths), compared_by(name))
+        found = difference(lines_of(paths[0]), lines_of(paths[1]), compared_by(name))
         compared += 1
         is_near = found.max_mm <= chosen.max_mm and found.max_deg <= chosen.max_deg
         is_same &= found.is_same_in_kind and is_near
@@ -312,8 +312,8 @@ def compare(chosen: argparse.Namespace) -> int:
     inspections = chosen.a / "inspection.json", chosen.b / "inspection.json"
     if all(path.is_file() for path in inspections):
         compared += 1
-        contents = (json.loads(path.read_text(encoding="utf-8")) for path in inspections)
-        is_same &= print_inspection(*contents, lists_all=chosen.all)
+        first, second = (json.loads(path.read_text(encoding="utf-8")) for path in inspections)
+        is_same &= print_inspection(first, second, lists_all=chosen.all)
     if not compared:
         print(f"error: {chosen.a} and {chosen.b} have no record in common", file=sys.stderr)
         return EXIT_INPUT

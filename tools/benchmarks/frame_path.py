@@ -21,7 +21,7 @@ from arview.camera.read import load_camera
 from arview.errors import ArviewError
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import TrackingState
-from arview.refinement import refiner
+from arview.refinement import kernels, refiner
 from arview.tracking import TrackingSession
 from arview.video import open_source
 from recordings import SAMPLE
@@ -64,7 +64,7 @@ def frame_path(session: TrackingSession, image: NDArray[np.uint8], index: int) -
         raise ArviewError(f"the part is {session.state}, not tracked, before the frame that is followed")
     entered: set[Path] = set()
     chains: list[tuple[str, ...]] = []
-    run_stages = refiner.run_stages
+    run_stages = kernels.run_stages
 
     def enter(frame: FrameType, event: str, _: object) -> None:
         if event == "call":

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from arview.cad import Part, load_part
+from arview.core.progress import StepProgress
 from arview.errors import ArviewError
 from arview.evaluation import Scene, find_scenes, load_scene
 from arview.evaluation.semisynthetic import (
@@ -131,7 +132,7 @@ def recorded_name(cad: Path | None) -> str:
 
 
 @contextmanager
-def progress_bar(label: str) -> Iterator[object]:
+def progress_bar(label: str) -> Iterator[StepProgress]:
     """A bar on stderr, shown only on a terminal; yields a function of (done, in all)."""
     from tqdm import tqdm
 

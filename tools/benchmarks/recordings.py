@@ -31,13 +31,13 @@ class PhotoSet:
 def photo_sets(more: Sequence[Path] = ()) -> list[PhotoSet]:
     """The sets that are here, and folders that samples/plate/generate.py wrote; what is missing is named on stderr."""
     found = []
-    for name, folder, part in (
+    for name, folder, file in (
         ("plate", SHARED / "plate", "plate.glb"),
         ("sample", ROOT / "samples" / "plate", "part.toml"),
     ):
         if (folder / "photos").is_dir():
             found.append(
-                PhotoSet(name, folder / "photos", folder / part, folder / "truth.json", folder / "as_built.ply")
+                PhotoSet(name, folder / "photos", folder / file, folder / "truth.json", folder / "as_built.ply")
             )
         else:
             skip(name, f"{folder / 'photos'} is not here")
@@ -73,7 +73,7 @@ def skip(what: str, reason: str) -> None:
     print(f"skipped {what}: {reason}", file=sys.stderr)
 
 
-def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     """A markdown table with aligned columns."""
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
     lines = [head, tuple("-" * width for width in widths), *rows]

@@ -195,7 +195,8 @@ class Sections:
         models = {"assembly": shape("assembly")} if "assembly" in self.shapes else {}
         if (SAMPLE / "part.toml").is_file() and self.frames is None:
             models[SAMPLE.name] = load_part(SAMPLE / "part.toml").model
-        results, walks = [], []
+        results: list[LookAlikeResult] = []
+        walks: list[LookAlikeResult] = []
         for name, model in models.items():
             variants = look_alikes(model)
             every = max(1, len(variants) // self.frames) if self.frames else 1

@@ -7,12 +7,13 @@ import time
 import numpy as np
 
 from arview.evaluation import PoseMeter, Scene, scene_guide_views
+from arview.evaluation.protocols import box_symmetries
 from arview.geometry import Array, apply, exp_so3, rigid, rotation_angle_rad
 from arview.tracking import SessionOptions
 from arview.tracking.guided_init import GuidedInit
 from arview.video import Image
 from rows import Line, timing, watched
-from suites.detection import BOXES, box_symmetries
+from suites.detection import BOXES
 
 NEAR_COUNT, FAR_COUNT = 60, 120
 FRAMES = 20

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from arview.evaluation import PoseMeter, Scene
+from arview.evaluation.protocols import box_symmetries
 from arview.evaluation.run import COARSE, IN_VIEW
 from arview.pose import TrackingState
 from arview.tracking import SessionOptions, TrackingSession
 from rows import Line, watched
-from suites.detection import BOXES, box_symmetries, recorded_views
+from suites.detection import BOXES, recorded_views
 
 LOSSES = 30
 
@@ -83,6 +84,7 @@ def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: 
             continue
         cpu_ms.append(1e3 * (time.process_time() - began))
         count += 1
+        assert frame.cam_from_model is not None
         is_right = pose.cam_from_model is not None and meter.measure(pose.cam_from_model, frame.cam_from_model).within(
             *COARSE
         )
