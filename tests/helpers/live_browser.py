@@ -160,7 +160,8 @@ def true_mask(shape: tuple[int, int], number: int) -> NDArray[np.uint8]:
     mask = ((ids >= 0) & (ids != names.index("base_plate"))).astype(np.uint8)
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 1, 2).astype(np.float64)
     ideal = cv2.undistortPoints(pixels, lens.matrix, lens.dist, P=lens.matrix).reshape(height, width, 2)
-    return np.asarray(cv2.remap(mask, *np.float32(ideal).transpose(2, 0, 1), cv2.INTER_NEAREST))
+    columns, rows = ideal.astype(np.float32).transpose(2, 0, 1)
+    return np.asarray(cv2.remap(mask, columns, rows, cv2.INTER_NEAREST))
 
 
 def outline_errors_px(found: NDArray[np.uint8], true: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -198,7 +198,14 @@ def record_clips(out: Path) -> None:
     samples = ROOT / "samples"
     bracket, plate = samples / "bracket_plate", samples / "plate"
     annotate(bracket, bracket / "inspection.json", out / "clip_bracket.jsonl")
-    arguments: list[str | Path] = ["--part", plate / "part.toml", "--photos", plate / "photos", "--video", plate / "clip.mp4"]
+    arguments: list[str | Path] = [
+        "--part",
+        plate / "part.toml",
+        "--photos",
+        plate / "photos",
+        "--video",
+        plate / "clip.mp4",
+    ]
     # Four components of the sample are out of tolerance: exit code 1, fail.
     run_arview("inspect", *arguments, "--no-pdf", "--force", "-o", out / "inspect", ends=(1,))
     content = (out / "inspect" / "inspection.json").read_text(encoding="utf-8")
@@ -209,7 +216,14 @@ def record_clips(out: Path) -> None:
 
 def annotate(sample: Path, inspection: Path, poses: Path) -> None:
     """Write the poses of a sample's clip."""
-    arguments: list[str | Path] = ["--part", sample / "part.toml", "--camera", sample / "camera.json", "--inspection", inspection]
+    arguments: list[str | Path] = [
+        "--part",
+        sample / "part.toml",
+        "--camera",
+        sample / "camera.json",
+        "--inspection",
+        inspection,
+    ]
     run_arview("annotate", sample / "clip.mp4", *arguments, "--poses", poses)
 
 

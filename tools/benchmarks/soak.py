@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -149,7 +150,7 @@ async def _drop(pid: int, port: int, token: str, count: int) -> bool:
     for number in range(count):
         phone = Phone(Http(port, token), Camera(images, FPS))
         await phone.__aenter__()
-        await phone.until(lambda phone=phone: phone.answers, 60)
+        await phone.until(partial(getattr, phone, "answers"), 60)
         await phone.vanish()
         await asyncio.sleep(0.5)
         memory_mb.append(_memory_mb(pid))
