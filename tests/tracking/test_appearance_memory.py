@@ -16,7 +16,9 @@ from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.pose import TrackingState
 from arview.refinement.evidence import PoseEvidence
 from arview.tracking import Estimate, SessionOptions, TrackingSession
-from arview.tracking.appearance_memory import SIDE, AppearanceMemory, AppearanceMemoryOptions
+from arview.tracking.appearance_memory import AppearanceMemory, AppearanceMemoryOptions
+from arview.tracking.ncc_search import NccSearchOptions
+from arview.tracking.view_crops import CROP_PX, ViewCropper
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, bracket, error, path, picture, pose_from
 
 SIDES = [(azimuth, elevation) for azimuth in (-40, 0, 40) for elevation in (30, 55)]
@@ -67,7 +69,7 @@ def test_kept_sides_are_found_anywhere_in_other_scenes_and_light() -> None:
         truth = moved(*SIDES[k % len(SIDES)], rng)
         image = picture(truth, seed=k, scene=k % 9, noise=6.0, gain=rng.uniform(0.7, 1.3))
         proposals = learned.propose(image)
-        assert len(proposals) <= learned.options.proposals
+        assert len(proposals) <= learned.options.search.max_results
         right += any(is_near(p.cam_from_model, truth) for p in proposals)
     assert right >= 16
 
@@ -77,7 +79,7 @@ def test_near_the_last_pose_it_is_found_in_little_time() -> None:
     for azimuth in range(-75, 76, 10):
         for elevation in (20, 42, 65):
             pose = pose_from(azimuth, elevation, 520)
-            learned._keep(picture(pose, scene=1), pose, is_new=True)
+            learned.add(picture(pose, scene=1), pose, is_new=True)
     assert len(learned) == learned.options.max_views
     right, seconds = 0, []
     for k in range(12):
@@ -132,20 +134,20 @@ def test_only_what_is_tracked_well_and_new_is_learned() -> None:
 
 
 def test_the_silhouette_is_that_of_the_part() -> None:
-    learned = AppearanceMemory(assembly_views(), CAMERA)
+    cropper = ViewCropper(assembly_views(), CAMERA)
     for azimuth, elevation in SIDES:
         pose = pose_from(azimuth, elevation, 480)
-        cut = learned._cut(picture(pose, scene=2), pose)
+        cut = cropper.crop(picture(pose, scene=2), pose)
         assert cut is not None
         shown, mask = cut
-        assert shown.shape == (SIDE, SIDE, 3)
-        empty = learned._cut(picture(None, scene=2), pose)
+        assert shown.shape == (CROP_PX, CROP_PX, 3)
+        empty = cropper.crop(picture(None, scene=2), pose)
         assert empty is not None
         is_part = np.abs(shown.astype(int) - empty[0]).max(axis=2) > 12
         inside = mask > 0
         assert np.count_nonzero(is_part & inside) > 0.8 * np.count_nonzero(is_part | inside)
     far = pose_from(0, 40, 20000)
-    assert learned._cut(picture(None, scene=2), far) is None
+    assert cropper.crop(picture(None, scene=2), far) is None
 
 
 def test_nothing_is_believed_where_there_is_no_part_or_another_side_of_it() -> None:
@@ -224,4 +226,4 @@ def test_options_without_sense_are_refused() -> None:
     with pytest.raises(InputError, match="max_views"):
         AppearanceMemoryOptions(max_views=0)
     with pytest.raises(InputError, match="stretch"):
-        AppearanceMemoryOptions(stretch=1.0)
+        NccSearchOptions(stretch=1.0)

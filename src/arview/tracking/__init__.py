@@ -2,6 +2,7 @@
 
 from arview.tracking.estimate import Estimate
 from arview.tracking.session import SessionOptions, TrackingSession
-from arview.tracking.tracker import Tracker, TrackerOptions
+from arview.tracking.tracker import Tracker
+from arview.tracking.tracker_options import TrackerOptions
 
 __all__ = ["Estimate", "SessionOptions", "Tracker", "TrackerOptions", "TrackingSession"]

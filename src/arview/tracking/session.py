@@ -30,7 +30,8 @@ from arview.tracking.estimate import Estimate
 from arview.tracking.guided_init import GuidedInit
 from arview.tracking.pose_recheck import LocalSearchRecheck
 from arview.tracking.session_state import Event, SessionState
-from arview.tracking.tracker import Tracker, TrackerOptions
+from arview.tracking.tracker import Tracker
+from arview.tracking.tracker_options import TrackerOptions
 
 ALIGN = "align the part with the outline"
 """Reason given while the session waits for the part at its guide pose."""

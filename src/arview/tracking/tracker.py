@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from types import NoneType
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,100 +19,22 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.core.checks import check_type
-from arview.errors import InputError
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
-from arview.refinement.evidence import MIN_IN_PICTURE, PoseEvidence, quality_of
+from arview.refinement.evidence import MIN_IN_PICTURE, quality_of
 from arview.refinement.gauss_newton import apply_twist, relative_twist
 from arview.refinement.kernels import median_brightness_ratio
 from arview.refinement.modalities.edge import smoothed
-from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.modalities.region import value_bins
-from arview.refinement.modalities.texture import TextureMatches, TextureModality
-from arview.refinement.refiner import NO_MATCHES, Appearance, PoseRefiner, RefinerOptions
-from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES, TRACK_STAGES, Stage
+from arview.refinement.modalities.texture import TextureModality
+from arview.refinement.refiner import NO_MATCHES, PoseRefiner
+from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES
 from arview.refinement.view_model import PartView
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import squared_motion_distance
+from arview.tracking.tracked_frame import Proposal, RefinedPose, TrackedFrame, TrackerState
+from arview.tracking.tracker_options import TrackerOptions
 from arview.tracking.wide_search import WideSearch
-
-
-@dataclass(frozen=True)
-class TrackerOptions(RefinerOptions):
-    """Options of the tracker, in addition to those of the refinement.
-
-    Attributes:
-        use_texture: match the part's own texture; needs the model's surface.
-        use_shading: use the brightness of curved surfaces.
-        stages: schedule of a usual frame.
-        min_matches: texture matches needed to use texture.
-        min_match_share: share of the expected texture that must be found to use texture.
-        texture_score: score that texture adds to the quality when all of it is found, because it supports the pose
-            where a hand hides the outline.
-        learning_rate: share by which the colour histograms follow each frame.
-        min_learning_quality: quality below which colours are not learned, and the part is searched for around the
-            predicted pose.
-        score_rate: share by which the usual score follows each frame.
-        other_schedules_share: share of the usual score below which other schedules are tried.
-        near_schedules_min_inner_share: share of design edges needed for schedules without colours, because the apparent
-            outline of a rounded part moves with the light.
-        far_schedules_share: share of the usual score below which schedules for a part that moved far are tried.
-        wide_search_share: share of the usual score below which the part is searched for around the predicted pose.
-        surprise_share: the same for a pose whose squared motion distance exceeds ``surprise``.
-        surprise: squared motion distance of a surprising pose; 0.02 is about 6°.
-        recheck_distance: squared motion distance from which a pose is rechecked; 0.005 is about 3°.
-        motion_penalty: score that a squared motion distance of 1 costs, because turned parts often look alike.
-        min_gain: score by which a pose found far from the predicted one must be better, and largest loss of score
-            accepted from the shading refinement.
-        min_keyframe_in_picture: share of the outline in the picture needed for a keyframe. A part that enters the
-            picture is located badly at first, and so would be all that is later matched with the keyframe.
-        min_keyframe_quality: quality needed for a keyframe.
-        min_keyframe_support: share of the best recent support of the outline needed for a keyframe; with less,
-            something is in front of the part.
-        support_decay: factor by which the best recent support of the outline decreases in each frame.
-        exposure_grid_px: distance of the pixels from which a change of exposure is measured.
-        exposure_decay: exponent by which the estimated exposure fades, because the histograms follow slow changes.
-        exposure_limits: smallest and largest exposure relative to the first frame.
-        window_margin_px: pixels around the part, in addition to ``window_reach`` half diameters, in which the grey
-            picture is computed.
-        window_reach: see ``window_margin_px``.
-        correlated_points: neighbouring edge points that share one error.
-        velocity_decay: share of the last frame's motion that is expected in the next frame.
-    """
-
-    use_texture: bool = True
-    use_shading: bool = True
-    stages: tuple[Stage, ...] = TRACK_STAGES
-    min_matches: int = 12
-    min_match_share: float = 0.4
-    texture_score: float = 0.5
-    learning_rate: float = 0.2
-    min_learning_quality: float = 0.4
-    score_rate: float = 0.1
-    other_schedules_share: float = 0.97
-    near_schedules_min_inner_share: float = 0.05
-    far_schedules_share: float = 0.9
-    wide_search_share: float = 0.8
-    surprise_share: float = 0.95
-    surprise: float = 0.02
-    recheck_distance: float = 0.005
-    motion_penalty: float = 0.15
-    min_gain: float = 0.02
-    min_keyframe_in_picture: float = 0.9
-    min_keyframe_quality: float = 0.6
-    min_keyframe_support: float = 0.85
-    support_decay: float = 0.99
-    exposure_grid_px: int = 16
-    exposure_decay: float = 0.9
-    exposure_limits: tuple[float, float] = (0.2, 5.0)
-    window_margin_px: float = 50.0
-    window_reach: float = 1.15
-    correlated_points: float = 8.0
-    velocity_decay: float = 0.9
-
-    def __post_init__(self) -> None:
-        if not (self.use_region or self.use_edge or self.use_texture):
-            raise InputError("tracker: at least one modality must be on")
 
 
 class PoseRecheck(Protocol):
@@ -125,97 +46,6 @@ class PoseRecheck(Protocol):
         The search starts at the tracked pose and at predicted ones, all (4,4).
         """
         ...
-
-
-@dataclass
-class TrackerState:
-    """What the tracker keeps between frames.
-
-    Attributes:
-        cam_from_body: (4,4) pose in the last frame.
-        velocity: (6,) twist (rad, mm) expected until the next frame.
-        usual_score: running mean of the score.
-        appearance: colours of part and background.
-        exposure: brightness relative to the frame in which colours were first learned.
-        sparse_gray: (rows,columns) brightness of the last frame on a coarse grid.
-        best_contour_support: best recent support of the outline.
-    """
-
-    cam_from_body: Array
-    velocity: Array = field(default_factory=lambda: np.zeros(6))
-    usual_score: float = 0.0
-    appearance: Appearance = field(default_factory=Appearance)
-    exposure: float = 1.0
-    sparse_gray: NDArray[np.float64] | None = None
-    best_contour_support: float = 0.0
-
-
-class RefinedPose(NamedTuple):
-    """A pose of one frame after refinement.
-
-    Attributes:
-        cam_from_body: (4,4) pose.
-        information: (6,6) of the twist on its right.
-        evidence: evidence of the picture for it.
-        matches: texture used; None without.
-    """
-
-    cam_from_body: Array
-    information: Array
-    evidence: PoseEvidence
-    matches: TextureMatches | None
-
-
-class Proposal(NamedTuple):
-    """A pose to be refined, and what it must gain to be selected.
-
-    Attributes:
-        cam_from_body: (4,4) start.
-        stages: schedule of its refinement; empty: the start is refined by shading.
-        matches: texture used in addition to colours and edges.
-        min_gain: by how much its score must exceed that of the best pose so far.
-        motion_penalty: score that a squared motion distance of 1 costs.
-        is_final: keep the start as the pose and use the stages only for its information.
-    """
-
-    cam_from_body: Array
-    stages: tuple[Stage, ...]
-    matches: TextureMatches | None = None
-    min_gain: float = 0.0
-    motion_penalty: float = 0.0
-    is_final: bool = False
-
-
-@dataclass
-class TrackedFrame:
-    """One frame while it is tracked.
-
-    Attributes:
-        image: (H,W,3) uint8 RGB.
-        gray, smooth: (H,W) grey levels and their smoothed copy, computed where the part may be.
-        predicted: (4,4) pose predicted from the motion so far.
-        start: (4,4) the predicted pose, aligned with the texture found.
-        pyramid: image pyramid of the grey picture; None without texture.
-        matches: texture found; None where it is too little.
-        found_share: share of the expected texture that was found.
-        best: the best pose so far; None before the first one.
-    """
-
-    image: NDArray[np.uint8]
-    gray: NDArray[np.uint8]
-    smooth: NDArray[np.uint8]
-    predicted: Array
-    start: Array
-    pyramid: Pyramid | None = None
-    matches: TextureMatches | None = None
-    found_share: float = 0.0
-    best: RefinedPose | None = None
-
-    @property
-    def found(self) -> RefinedPose:
-        """The best pose so far, which exists after the first proposal."""
-        assert self.best is not None
-        return self.best
 
 
 class Tracker:

@@ -1,0 +1,107 @@
+"""State of the tracker: what it keeps between frames, and one frame while it is tracked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.geometry import Array
+from arview.refinement.evidence import PoseEvidence
+from arview.refinement.modalities.patch_alignment import Pyramid
+from arview.refinement.modalities.texture import TextureMatches
+from arview.refinement.refiner import Appearance
+from arview.refinement.schedules import Stage
+
+
+@dataclass
+class TrackerState:
+    """What the tracker keeps between frames.
+
+    Attributes:
+        cam_from_body: (4,4) pose in the last frame.
+        velocity: (6,) twist (rad, mm) expected until the next frame.
+        usual_score: running mean of the score.
+        appearance: colours of part and background.
+        exposure: brightness relative to the frame in which colours were first learned.
+        sparse_gray: (rows,columns) brightness of the last frame on a coarse grid.
+        best_contour_support: best recent support of the outline.
+    """
+
+    cam_from_body: Array
+    velocity: Array = field(default_factory=lambda: np.zeros(6))
+    usual_score: float = 0.0
+    appearance: Appearance = field(default_factory=Appearance)
+    exposure: float = 1.0
+    sparse_gray: NDArray[np.float64] | None = None
+    best_contour_support: float = 0.0
+
+
+class RefinedPose(NamedTuple):
+    """A pose of one frame after refinement.
+
+    Attributes:
+        cam_from_body: (4,4) pose.
+        information: (6,6) of the twist on its right.
+        evidence: evidence of the picture for it.
+        matches: texture used; None without.
+    """
+
+    cam_from_body: Array
+    information: Array
+    evidence: PoseEvidence
+    matches: TextureMatches | None
+
+
+class Proposal(NamedTuple):
+    """A pose to be refined, and what it must gain to be selected.
+
+    Attributes:
+        cam_from_body: (4,4) start.
+        stages: schedule of its refinement; empty: the start is refined by shading.
+        matches: texture used in addition to colours and edges.
+        min_gain: by how much its score must exceed that of the best pose so far.
+        motion_penalty: score that a squared motion distance of 1 costs.
+        is_final: keep the start as the pose and use the stages only for its information.
+    """
+
+    cam_from_body: Array
+    stages: tuple[Stage, ...]
+    matches: TextureMatches | None = None
+    min_gain: float = 0.0
+    motion_penalty: float = 0.0
+    is_final: bool = False
+
+
+@dataclass
+class TrackedFrame:
+    """One frame while it is tracked.
+
+    Attributes:
+        image: (H,W,3) uint8 RGB.
+        gray, smooth: (H,W) grey levels and their smoothed copy, computed where the part may be.
+        predicted: (4,4) pose predicted from the motion so far.
+        start: (4,4) the predicted pose, aligned with the texture found.
+        pyramid: image pyramid of the grey picture; None without texture.
+        matches: texture found; None where it is too little.
+        found_share: share of the expected texture that was found.
+        best: the best pose so far; None before the first one.
+    """
+
+    image: NDArray[np.uint8]
+    gray: NDArray[np.uint8]
+    smooth: NDArray[np.uint8]
+    predicted: Array
+    start: Array
+    pyramid: Pyramid | None = None
+    matches: TextureMatches | None = None
+    found_share: float = 0.0
+    best: RefinedPose | None = None
+
+    @property
+    def found(self) -> RefinedPose:
+        """The best pose so far, which exists after the first proposal."""
+        assert self.best is not None
+        return self.best
