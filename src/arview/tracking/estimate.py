@@ -1,4 +1,4 @@
-"""The tracker's result for one frame."""
+"""Estimate: the result of the tracker for one frame."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from arview.refinement.evidence import PoseEvidence
 
 @dataclass(frozen=True)
 class Estimate:
-    """Pose of the part in one frame, before the session decides on its state.
+    """Pose of the part in one frame, before the session decides on the state.
 
     Attributes:
         cam_from_model: (4,4) mm.
-        information: (6,6) of the twist (rad, mm) about the model's centre.
+        information: (6,6) of the twist (rad, mm) on the right of the pose, about the model's centre.
         quality: 0–1, see `PoseEvidence.quality`.
-        evidence: of the picture for the pose.
+        evidence: evidence of the picture for the pose.
     """
 
     cam_from_model: Array

@@ -1,4 +1,4 @@
-"""Guide views by name: the poses that a user brings the part into so that the tracker snaps to it."""
+"""Guide views by name: poses into which a user brings the part, so that tracking starts there."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from arview.errors import InputError
 from arview.geometry import Array
 
 GUIDE_PREFIX = "guide:"
-"""Before the name of a guide view where a pose could be meant as well."""
+"""Prefix of the name of a guide view where a file with a pose could be meant as well."""
 STANDARD_GUIDES = (
     Guide("front", -90.0, 0.0),
     Guide("back", 90.0, 0.0),
@@ -26,37 +26,38 @@ STANDARD_GUIDES = (
     Guide("bottom", -90.0, -90.0),
     Guide("iso", -45.0, 35.26),
 )
-"""As CAD programs have them where +Z is up: front looks along +Y, right along -X; top has +Y up in the picture."""
+"""Standard views of CAD programs with +Z up: front looks along +Y, right along -X; top has +Y up in the picture."""
 MIDDLE = "middle"
-"""The middle of the declared range: every range has it."""
+"""Name of the middle of the declared range, which every range has."""
 FILL = 0.6
-"""Without a distance the part's diameter spans this share of the picture's smaller side, if the range allows."""
+"""Share of the picture's smaller side that the part's diameter spans where no distance is given, within the range."""
 ROOM = 1.15
+"""Ratio to both ends of the range that is kept there, so that the part can be brought nearer and farther."""
 MARGIN_DEG, MARGIN_SHARE = 1.0, 0.01
-"""So far outside the declared range still counts as inside."""
+"""Angle, and share of the distance, by which a guide view may exceed the declared range."""
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _DIRECTION = re.compile(rf"az{_NUMBER}_el{_NUMBER}(?:_d(\d+(?:\.\d+)?))?(?:_r{_NUMBER})?")
 
 
 def guide_names(part: Part, view_range: ViewRange) -> list[str]:
-    """Names that `guide_pose` knows for a part: those of its part file, then the standard ones within the range."""
+    """Names of the guide views of a part: those of its part file, then the standard ones within the declared range."""
     own = [guide.name for guide in part.guides]
     standard = [g.name for g in STANDARD_GUIDES if _in_range(g, view_range) is not None]
     return own + [name for name in [*standard, MIDDLE] if name not in own]
 
 
 def guide_pose(name: str, part: Part, view_range: ViewRange, camera: Camera) -> Array:
-    """``cam_from_model`` (4,4) of a guide view, the part's middle in the middle of the picture.
+    """``cam_from_model`` (4,4) of a guide view, with the part's centre in the centre of the picture.
 
     Args:
-        name: of the part file (``[guides.NAME]``), a standard name, ``middle``, or a direction like
-            ``az45_el30``, with ``_d650`` for the distance in mm and ``_r10`` for the roll in degrees if wanted.
-        part: whose guides are meant.
-        view_range: declared for the guide views in use.
-        camera: that will look.
+        name: a name from the part file (``[guides.NAME]``), a standard name, ``middle``, or a direction like
+            ``az45_el30``, optionally with ``_d650`` for the distance in mm and ``_r10`` for the roll in degrees.
+        part: the part with its guides.
+        view_range: declared range of the guide views in use.
+        camera: intrinsics of the frames.
 
     Raises:
-        InputError: no such guide view, or one outside the declared range.
+        InputError: the guide view does not exist or is outside the declared range.
     """
     guide = _find(name, part, view_range)
     placed = _in_range(guide, view_range)
@@ -70,7 +71,6 @@ def guide_pose(name: str, part: Part, view_range: ViewRange, camera: Camera) -> 
     distance_mm = placed.distance_mm
     if distance_mm is None:
         wanted = part.model.diameter_mm * camera.fx / (FILL * min(camera.width, camera.height))
-        # Off the ends of the range, so that there is room to bring the part nearer and farther.
         middle = np.sqrt(low * high)
         distance_mm = float(np.clip(wanted, min(ROOM * low, middle), max(high / ROOM, middle)))
     elif not low * (1 - MARGIN_SHARE) <= distance_mm <= high * (1 + MARGIN_SHARE):
@@ -111,8 +111,8 @@ def _find(name: str, part: Part, view_range: ViewRange) -> Guide:
 def _in_range(guide: Guide, view_range: ViewRange) -> Guide | None:
     """The guide if its direction is in the range, else None.
 
-    Straight above or below the azimuth only says how the part is turned in the picture; a standard view from there
-    takes one of the range.
+    Straight above or below, the azimuth only turns the part in the picture, so a standard view takes an azimuth of the
+    range.
     """
     azimuth, elevation = np.deg2rad([guide.azimuth_deg, guide.elevation_deg])
     direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -124,17 +124,18 @@ def _in_range(guide: Guide, view_range: ViewRange) -> Guide | None:
 
 
 def _usual_roll_deg(view_range: ViewRange) -> float:
-    """Upright where the range allows, else the middle of its rolls."""
+    """Roll 0 where the range allows it, else the middle of its rolls."""
     upright = _nearest_deg(0.0, view_range.roll_deg)
     return upright if abs(upright) < 1e-9 else 0.5 * sum(view_range.roll_deg)
 
 
 def _nearest_deg(angle_deg: float, interval_deg: tuple[float, float]) -> float:
-    """The angle of an interval that is nearest to a given one, modulo 360°."""
+    """Angle of an interval that is nearest to a given angle, modulo 360°."""
     middle, half = 0.5 * sum(interval_deg), 0.5 * (interval_deg[1] - interval_deg[0])
     away = (angle_deg - middle + 180.0) % 360.0 - 180.0
     return angle_deg if abs(away) <= half else middle + float(np.clip(away, -half, half))
 
 
 def _interval(limits: tuple[float, float]) -> str:
+    """Text of an interval."""
     return f"{limits[0]:.0f} to {limits[1]:.0f}"

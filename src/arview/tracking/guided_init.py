@@ -1,8 +1,8 @@
-"""Guided initialisation: finds the part near a given pose, quickly enough to be tried on every frame of a video.
+"""Guided initialisation: finds the part near a given pose, fast enough for every frame of a video.
 
-The picture around the pose is made small, so that the part always spans the same few pixels. Turns, distances and
-shifts within reach are scored there by oriented edges, the best again at a higher resolution, and the best of those
-are refined by the tracker and judged by the same evidence as a tracked pose.
+The picture around the pose is reduced so that the part always spans the same few pixels. Rotations, distances and
+shifts within reach are scored there by oriented edges, the best ones again at a higher resolution. The best of these
+are refined and scored by the same evidence as a tracked pose.
 """
 
 from __future__ import annotations
@@ -29,17 +29,25 @@ from arview.refinement.view_model import PartView
 
 @dataclass(frozen=True)
 class GuidedInitOptions:
-    """Options of the snap.
+    """Options of the guided initialisation.
+
+    The limits are wider than the search (15°, 15 % and 15 %), because the best pose at its border may be just outside.
 
     Attributes:
-        turn_limit_deg, distance_limit, offset_limit: a pose found farther than this from the given one is not
-            taken for the part; the distance is a share, the offset in diameters of the part. They are wider than
-            the search (15°, 15 % and 15 %), because the best pose on its rim may lie just outside.
-        min_in_picture: less of the outline inside the picture is not judged.
-        min_coarse, min_fine: edge scores of the two rounds below which the part is not there.
-        min_score: of a pose less what its view is plain by; right and wrong poses part a little below.
-        rival_score_share: a nearer pose around the found one with this share of its score makes
-            the found one doubtful.
+        turn_limit_deg: largest rotation between the given pose and an accepted one.
+        distance_limit: largest relative difference of their distances.
+        offset_limit: largest shift between them across the line of sight, in diameters of the part.
+        min_in_picture: share of the outline inside the picture needed to accept a pose.
+        min_coarse: edge score of the first round below which the part is not there.
+        min_fine: edge score of the second round below which the part is not there.
+        min_score: score of a pose, reduced for a plain view, needed to accept it.
+        plain_penalty: reduction of the score for a view without distinct lines.
+        rival_score_share: share of the score with which a nearer pose of the same outline makes a pose ambiguous.
+        rival_distance: ratio of the distances around which a nearer pose is searched for.
+        max_rival_distance: a nearer pose at a larger ratio is the same pose.
+        crop_reach: half size of the crop, in half diameters, because the part may be nearer than the given pose.
+        max_scored: best poses of a grid that are compared with each other.
+        contour_points, design_points: points of outline and of design edges that are scored.
     """
 
     turn_limit_deg: float = 20.0
@@ -50,11 +58,24 @@ class GuidedInitOptions:
     min_coarse: float = 0.34
     min_fine: float = 0.4
     min_score: float = 0.6
+    plain_penalty: float = 0.3
+    rival_distance: float = 0.55
+    max_rival_distance: float = 0.85
+    crop_reach: float = 1.35
+    max_scored: int = 400
+    contour_points: int = 64
+    design_points: int = 32
 
 
 @dataclass(frozen=True)
 class GuidedPose:
-    """A pose found near a given one: ``cam_from_model`` (4,4), its evidence and its quality."""
+    """A pose found near a given one.
+
+    Attributes:
+        cam_from_model: (4,4) mm.
+        evidence: evidence of the picture for it.
+        quality: 0–1, 0 where too little of the outline is inside the picture.
+    """
 
     cam_from_model: Array
     evidence: PoseEvidence
@@ -63,13 +84,17 @@ class GuidedPose:
 
 @dataclass(frozen=True)
 class SearchLevel:
-    """One round of the search.
+    """One round of the search: a grid of poses around every start.
 
     Attributes:
-        radius_px: half the part's diameter in the small picture.
-        turns: (R,3,3); stretches: (D,) factors of the distance: tried around every start.
-        shift_px, shift_step_px: in the small picture.
-        kept_each, kept: of the best, around one start and in all, apart from each other by ``apart_deg``.
+        radius_px: half diameter of the part in the reduced picture.
+        turns: (R,3,3) rotations of the grid.
+        stretches: (D,) factors of the distance of the grid.
+        shift_px: largest shift of the grid, px of the reduced picture.
+        shift_step_px: distance of the shifts.
+        kept_each: best poses kept around one start.
+        kept: best poses kept in all.
+        separation_deg: smallest difference between poses that are kept; 1° corresponds to 1 % of the diameter.
     """
 
     radius_px: float
@@ -79,23 +104,44 @@ class SearchLevel:
     shift_step_px: int
     kept_each: int
     kept: int
-    apart_deg: float
+    separation_deg: float
 
 
-COARSE = SearchLevel(26.0, turn_ball(16.0, 9.0), np.geomspace(0.85, 1.15, 7), 8, 2, 8, 8, 4.0)
-"""15° all around, 15 % of the distance, 15 % of the diameter aside."""
-FINE = SearchLevel(80.0, turn_ball(3.6, 2.4), np.linspace(0.97, 1.03, 5), 4, 2, 1, 4, 1.5)
-"""Between the poses of the coarse grid."""
-RIVAL = SearchLevel(26.0, turn_ball(22.0, 10.0), np.geomspace(0.69, 1.38, 8), 12, 3, 3, 3, 4.0)
-"""Around the found pose at RIVAL_DISTANCE: 0.38 to 0.76 of its distance."""
-RIVAL_DISTANCE = 0.55
-NEARER = 0.85
-"""A rival at a larger share of the distance is the same pose."""
+COARSE = SearchLevel(
+    radius_px=26.0,
+    turns=turn_ball(16.0, 9.0),
+    stretches=np.geomspace(0.85, 1.15, 7),
+    shift_px=8,
+    shift_step_px=2,
+    kept_each=8,
+    kept=8,
+    separation_deg=4.0,
+)
+"""First round: rotations up to 15°, 15 % of the distance, shifts of 15 % of the diameter."""
+FINE = SearchLevel(
+    radius_px=80.0,
+    turns=turn_ball(3.6, 2.4),
+    stretches=np.linspace(0.97, 1.03, 5),
+    shift_px=4,
+    shift_step_px=2,
+    kept_each=1,
+    kept=4,
+    separation_deg=1.5,
+)
+"""Second round: between the poses of the first grid."""
+RIVAL = SearchLevel(
+    radius_px=26.0,
+    turns=turn_ball(22.0, 10.0),
+    stretches=np.geomspace(0.69, 1.38, 8),
+    shift_px=12,
+    shift_step_px=3,
+    kept_each=3,
+    kept=3,
+    separation_deg=4.0,
+)
+"""Search for a nearer pose: 0.38 to 0.76 of the distance of the found one."""
 SPREAD_PX = 2
-PLAIN_SCORE = 0.3
-"""What a view without any line of its own takes from a pose's worth."""
-CROP_REACH = 1.35
-"""Radii around the part's middle that are looked at: it may be nearer than the given pose says."""
+"""Tolerance of the edge positions in the response maps."""
 
 
 class GuidedInit:
@@ -104,7 +150,7 @@ class GuidedInit:
     Args:
         views: guide views of the part.
         camera: intrinsics of the frames.
-        options: see GuidedInitOptions.
+        options: see `GuidedInitOptions`.
     """
 
     def __init__(self, views: GuideViewSet, camera: Camera, options: GuidedInitOptions | None = None) -> None:
@@ -115,13 +161,11 @@ class GuidedInit:
         self._refiner = PoseRefiner(PartView(views), camera)
 
     def find(self, image: NDArray[np.uint8], cam_from_model: Array) -> GuidedPose | None:
-        """The best pose within 15°, 15 % of the distance and 15 % of the diameter aside.
-
-        Its quality says whether it is right; it is returned even when that is low.
+        """The best pose within 15°, 15 % of the distance and a shift of 15 % of the diameter, whatever its quality.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
-            cam_from_model: (4,4) where the part should be, mm.
+            cam_from_model: (4,4) mm, where the part should be.
 
         Returns:
             None where the part would be outside the picture or behind the camera.
@@ -133,12 +177,16 @@ class GuidedInit:
         return self._best(image, [start, *self._search(image, start, near, FINE)])
 
     def lock(self, image: NDArray[np.uint8], cam_from_model: Array, min_quality: float) -> GuidedPose | None:
-        """The part's pose when it is near the given one beyond doubt, else None.
+        """The pose of the part if it is certainly near the given one, else None.
 
-        A pose must be good, near enough (see `GuidedInitOptions`) and borne out the better the plainer the part looks
-        from there. A plain part must not be a figure inside itself either: print on a box may look like a smaller
-        box, and then a nearer pose around it fits as well. Most pictures without the part are done with after the
-        first round.
+        A pose must be good enough, near enough (see `GuidedInitOptions`), and its score must be the higher the plainer
+        the view is. Nor may a plain part be a figure on itself: print on a box can look like a smaller box, and then a
+        nearer pose around it fits as well. Most pictures without the part are rejected after the first round.
+
+        Args:
+            image: (H,W,3) uint8 RGB of the camera's size.
+            cam_from_model: (4,4) mm, where the part should be.
+            min_quality: quality needed.
         """
         start = cam_from_model @ self._refiner.part.model_from_body
         near = self._search(image, start, [start], COARSE, self.options.min_coarse)
@@ -147,12 +195,12 @@ class GuidedInit:
             return None
         lines = view_lines(self._views.nearest(found.cam_from_model), self._views.diameter_mm)
         plainness = max(1.0 - lines / (2.0 * PLAIN_LINES), 0.0)
-        if found.evidence.score - PLAIN_SCORE * plainness < self.options.min_score:
+        if found.evidence.score - self.options.plain_penalty * plainness < self.options.min_score:
             return None
         return None if lines < PLAIN_LINES and self._has_rival(image, found) else found
 
     def is_near(self, cam_from_model: Array, guide_cam_from_model: Array) -> bool:
-        """Whether a pose is within the limits of `GuidedInitOptions` around a given one."""
+        """Whether a pose (4,4) is within the limits of `GuidedInitOptions` around a given one (4,4)."""
         o = self.options
         center = apply(cam_from_model, self._center_in_model)
         wanted = apply(guide_cam_from_model, self._center_in_model)
@@ -166,27 +214,32 @@ class GuidedInit:
         )
 
     def _has_rival(self, image: NDArray[np.uint8], found: GuidedPose) -> bool:
-        """Whether a much nearer pose around the found one fits about as well."""
+        """Whether a much nearer pose of the same outline fits about as well."""
         pose = found.cam_from_model @ self._refiner.part.model_from_body
         nearer = pose.copy()
-        nearer[:3, 3] *= RIVAL_DISTANCE
+        nearer[:3, 3] *= self.options.rival_distance
         starts = self._search(image, nearer, self._search(image, nearer, [nearer], RIVAL), FINE)
         rival = self._best(image, starts)
         if rival is None or rival.evidence.score < self.options.rival_score_share * found.evidence.score:
             return False
         center = apply(rival.cam_from_model, self._center_in_model)
-        return bool(np.linalg.norm(center) < NEARER * np.linalg.norm(pose[:3, 3]))
+        return bool(np.linalg.norm(center) < self.options.max_rival_distance * np.linalg.norm(pose[:3, 3]))
 
     def _search(
-        self, image: NDArray[np.uint8], around: Array, starts: list[Array], level: SearchLevel, least: float = 0.0
+        self, image: NDArray[np.uint8], around: Array, starts: list[Array], level: SearchLevel, min_score: float = 0.0
     ) -> list[Array]:
-        """The best poses (``cam_from_body``) of a level's grid around starts, best first.
+        """The best poses ``cam_from_body`` of a level's grid around some starts, best first.
 
-        ``around`` says where in the picture and at what scale to look; poses that score less than ``least`` are
-        left out.
+        Args:
+            image: (H,W,3) uint8 RGB.
+            around: (4,4) pose that gives place and scale of the crop.
+            starts: poses (4,4) around which the grid is laid.
+            level: the grid.
+            min_score: poses of a lower edge score are left out.
         """
         if not starts or around[2, 3] <= 0:
             return []
+        o = self.options
         maps = self._maps(image, around, level)
         if maps is None:
             return []
@@ -194,33 +247,33 @@ class GuidedInit:
         def search(start: Array) -> list[tuple[float, Array]]:
             scores, poses = score_around(
                 maps[0], self._refiner.part.arrays, start, maps[1], 0.01 * self._refiner.diameter_mm,
-                level.turns, level.stretches, level.shift_px, level.shift_step_px, 64, 32,
+                level.turns, level.stretches, level.shift_px, level.shift_step_px, o.contour_points, o.design_points,
             )  # fmt: skip
             best: list[tuple[float, Array]] = []
-            for index in np.argsort(-scores)[:400]:
-                if not any(self._same(poses[index], other, level.apart_deg) for _, other in best):
+            for index in np.argsort(-scores)[: o.max_scored]:
+                if not any(self._is_same(poses[index], other, level.separation_deg) for _, other in best):
                     best.append((float(scores[index]), poses[index]))
                     if len(best) >= level.kept_each:
                         break
             return best
 
         found = sorted((item for best in pool().map(search, starts) for item in best), key=lambda item: -item[0])
-        apart: list[Array] = []
+        chosen: list[Array] = []
         for score, pose in found:
-            if score < least:
+            if score < min_score:
                 break
-            if not any(self._same(pose, other, level.apart_deg) for other in apart):
-                apart.append(pose)
-        return apart[: level.kept]
+            if not any(self._is_same(pose, other, level.separation_deg) for other in chosen):
+                chosen.append(pose)
+        return chosen[: level.kept]
 
     def _maps(
         self, image: NDArray[np.uint8], cam_from_body: Array, level: SearchLevel
     ) -> tuple[NDArray[np.uint8], Array] | None:
-        """Response maps of the picture around a pose, made small, and their intrinsics; None outside the picture."""
+        """Response maps of a reduced crop around a pose (4,4), and its intrinsics; None outside the picture."""
         camera = self.camera
         radius_px = self._refiner.radius_px(cam_from_body)
         scale = min(1.0, level.radius_px / radius_px)
-        reach_px = CROP_REACH * radius_px + level.shift_px / scale
+        reach_px = self.options.crop_reach * radius_px + level.shift_px / scale
         center = camera.project(cam_from_body[:3, 3])
         size = np.array([camera.width, camera.height])
         first = np.clip(np.floor(center - reach_px), 0, size).astype(int)
@@ -236,20 +289,21 @@ class GuidedInit:
         return response_maps(part, SPREAD_PX, pad), intrinsics
 
     def _best(self, image: NDArray[np.uint8], starts: list[Array]) -> GuidedPose | None:
-        """The start that is worth most after refinement."""
+        """The start (4,4) with the best score after refinement."""
         if not starts:
             return None
         gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
         def refine(start: Array) -> GuidedPose:
             pose = self._refiner.refine_fresh(image, gray, start, SEARCH_STAGES)
-            look = self._refiner.appearance_at(image, pose)
-            evidence = self._refiner.evidence(image, gray, pose, look)
+            appearance = self._refiner.appearance_at(image, pose)
+            evidence = self._refiner.evidence(image, gray, pose, appearance)
             is_inside = evidence.points_in_picture >= self.options.min_in_picture
             quality = evidence.quality if is_inside else 0.0
             return GuidedPose(pose @ self._refiner.part.body_from_model, evidence, quality)
 
         return max(pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.score))
 
-    def _same(self, a: Array, b: Array, angle_deg: float) -> bool:
+    def _is_same(self, a: Array, b: Array, angle_deg: float) -> bool:
+        """Whether two poses (4,4) differ by less than an angle, and by as many per cent of the diameter."""
         return are_near(a, b, 0.01 * angle_deg * self._refiner.diameter_mm, angle_deg)

@@ -1,12 +1,13 @@
-"""How far a pose is from the one that the motion so far predicts."""
+"""Distance of a pose from the pose predicted from the motion so far."""
 
 from __future__ import annotations
 
 from arview.geometry import Array, rotation_angle_rad
 
 ROTATION_UNIT_RAD = 0.785
+"""Rotation that has a distance of 1."""
 LATERAL_UNIT, AXIAL_UNIT = 0.35, 0.7
-"""Rotation, and translation in diameters across and along the line of sight, that count as a distance of 1."""
+"""Shifts across and along the line of sight, in diameters of the part, that have a distance of 1."""
 
 
 def squared_motion_distance(cam_from_body: Array, predicted: Array, diameter_mm: float) -> float:

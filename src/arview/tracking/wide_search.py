@@ -1,9 +1,9 @@
-"""Non-local search: finds the part again around its last poses when it moved farther than the tracker's stages reach.
+"""Wide search around a predicted pose, for a part that moved farther than the schedules of the tracker reach.
 
-After the idea of Tian et al., "Large-displacement 3D Object Tracking with Hybrid Non-local Optimization" (ECCV 2022):
-rotations are sampled widely, the rest is found for each, and the best are refined locally. Own here: turns, distances
-and shifts are scored by oriented edges of the picture and of the learned colours in a small crop (`matching`), and
-the best are climbed (`search_poses`) there and once more at twice the resolution.
+After Tian et al., "Large-displacement 3D Object Tracking with Hybrid Non-local Optimization" (ECCV 2022): rotations are
+sampled widely, the other parameters are found for each, and the best poses are refined locally. Here rotations,
+distances and shifts are scored by oriented edges of the picture and of the learned colours in a small crop. The best
+are refined by a pattern search there, and again at twice the resolution.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.core import parallel as threads
 from arview.core.kernel import kernel
+from arview.core.parallel import pool
 from arview.detection.features.response_maps import response_maps, score_around
 from arview.detection.search.pattern_search import search_poses
 from arview.detection.search.template_bank import select_distinct
 from arview.geometry import Array, turn_ball
 from arview.refinement.modalities.region import BINS, ColorModel
+from arview.refinement.view_model import ViewArrays
 
 
 @dataclass(frozen=True)
@@ -29,12 +30,20 @@ class WideSearchOptions:
     """Options of the search.
 
     Attributes:
-        radii_px: half the part's diameter in the pictures of the two rounds.
-        turn_reach_deg, turn_step_deg: turns tried, a ball of them; stretches: factors of the distance.
-        shift: of the picture, in radii; shift_step_px: in the first round's pixels.
-        points: of the outline and, as many, of design edges that are looked at.
-        climbed: how many of the first round's best are climbed, and of those again in the second round.
-        kept: poses left.
+        radii_px: half diameter of the part in the pictures of the two rounds.
+        turn_reach_deg: largest rotation tried.
+        turn_step_deg: distance of the rotations tried.
+        stretches: factors of the distance tried.
+        shift: largest shift tried, in half diameters.
+        shift_step_px: distance of the shifts tried, px of the first round's picture.
+        points: points of the outline, and as many of design edges, that are scored.
+        refined: poses refined by the pattern search in the two rounds.
+        kept: poses returned.
+        search_steps_deg: first rotations of the pattern search in the two rounds.
+        search_stretches: first relative changes of the distance in the two rounds.
+        separation_deg: smallest difference between the poses that go into the two pattern searches and are returned;
+            1° corresponds to 1 % of the diameter.
+        crop_margin: half size of the crops of the two rounds, in half diameters, without shifts.
     """
 
     radii_px: tuple[float, float] = (26.0, 52.0)
@@ -44,22 +53,28 @@ class WideSearchOptions:
     shift: float = 0.7
     shift_step_px: int = 3
     points: int = 48
-    climbed: tuple[int, int] = (12, 6)
+    refined: tuple[int, int] = (12, 6)
     kept: int = 4
+    search_steps_deg: tuple[float, float] = (7.0, 3.0)
+    search_stretches: tuple[float, float] = (0.04, 0.02)
+    separation_deg: tuple[float, float, float] = (10.0, 5.0, 2.5)
+    crop_margin: tuple[float, float] = (1.1, 1.25)
 
 
 class WideSearch:
     """Search for one part with one camera.
 
     Args:
-        part: arrays of all guide views, see `PartView.arrays`.
-        camera: of the frames; ``intrinsics`` (10,) as the kernels take them.
-        diameter_mm: of the part.
+        part: guide views of the part.
+        camera: camera of the frames.
+        intrinsics: (10,) of the camera, as of `intrinsics_of`.
+        diameter_mm: diameter of the part.
+        options: see `WideSearchOptions`.
     """
 
     def __init__(
         self,
-        part: tuple[NDArray[np.generic], ...],
+        part: ViewArrays,
         camera: Camera,
         intrinsics: Array,
         diameter_mm: float,
@@ -74,7 +89,7 @@ class WideSearch:
         self._stretches = np.array(self.options.stretches)
 
     def find(self, image: NDArray[np.uint8], colors: ColorModel, start: Array) -> list[Array]:
-        """The likeliest poses (``cam_from_body``) around a start, best first; none outside the picture.
+        """The best poses (4,4) ``cam_from_body`` around a start, best first; none where it is outside the picture.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
@@ -86,7 +101,7 @@ class WideSearch:
         if start[2, 3] <= 0 or not np.all(np.isfinite(center)):
             return []
         radius_px = 0.5 * self._diameter_mm * self._camera.fx / start[2, 3]
-        made = self._maps(image, colors, center, (1.1 + o.shift) * radius_px, o.radii_px[0] / radius_px)
+        made = self._maps(image, colors, center, (o.crop_margin[0] + o.shift) * radius_px, o.radii_px[0] / radius_px)
         if made is None:
             return []
         maps, intrinsics = made
@@ -99,26 +114,26 @@ class WideSearch:
                 o.shift_step_px, o.points, o.points,
             )  # fmt: skip
 
-        found = list(threads.pool().map(score, np.array_split(self._turns, 2)))
+        found = list(pool().map(score, np.array_split(self._turns, 2)))
         scores, poses = np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
-        poses = self._apart(scores, poses, 10.0, o.climbed[0])[1]
-        scores, poses = self._climb(maps, poses, intrinsics, 7.0, 0.04)
-        scores, poses = self._apart(scores, poses, 5.0, o.climbed[1])
+        poses = self._select(scores, poses, o.separation_deg[0], o.refined[0])[1]
+        scores, poses = self._refine(maps, poses, intrinsics, o.search_steps_deg[0], o.search_stretches[0])
+        scores, poses = self._select(scores, poses, o.separation_deg[1], o.refined[1])
         best = poses[0]
         radius_px = 0.5 * self._diameter_mm * self._camera.fx / best[2, 3]
         center = self._camera.project(best[:3, 3])
-        made = self._maps(image, colors, center, 1.25 * radius_px, o.radii_px[1] / radius_px)
+        made = self._maps(image, colors, center, o.crop_margin[1] * radius_px, o.radii_px[1] / radius_px)
         if made is None:
             return []
         maps, intrinsics = made
-        scores, poses = self._climb(maps, poses, intrinsics, 3.0, 0.02)
-        scores, poses = self._apart(scores, poses, 2.5, o.kept)
+        scores, poses = self._refine(maps, poses, intrinsics, o.search_steps_deg[1], o.search_stretches[1])
+        scores, poses = self._select(scores, poses, o.separation_deg[2], o.kept)
         return list(poses)
 
-    def _climb(
+    def _refine(
         self, maps: NDArray[np.uint8], poses: Array, intrinsics: Array, turn_deg: float, stretch: float
     ) -> tuple[Array, Array]:
-        """Scores and poses (N,4,4) after a pattern search from each of some poses."""
+        """Scores and poses (N,4,4) after a pattern search from each of some poses (N,4,4)."""
         points = self.options.points
 
         def search(starts: Array) -> tuple[Array, Array]:
@@ -127,20 +142,18 @@ class WideSearch:
                 2, 1, 2, 1, points, points,
             )  # fmt: skip
 
-        # Every other one: the first are not much alike in what they cost.
-        results = list(
-            threads.pool().map(search, [np.ascontiguousarray(poses[k::2]) for k in range(2) if len(poses[k::2])])
-        )
+        # Alternate poses go to the two threads, because the best ones take longer.
+        results = list(pool().map(search, [np.ascontiguousarray(poses[k::2]) for k in range(2) if len(poses[k::2])]))
         return np.concatenate([r[0] for r in results]), np.concatenate([r[1] for r in results])
 
-    def _apart(self, scores: Array, poses: Array, apart_deg: float, most: int) -> tuple[Array, Array]:
-        """The best poses, best first, none nearer to a better one than an angle (and as many % of the part)."""
+    def _select(self, scores: Array, poses: Array, separation_deg: float, max_count: int) -> tuple[Array, Array]:
+        """The best poses, best first, none closer to a better one than a separation."""
         order = np.argsort(-scores, kind="stable")[:400]
         scores, poses = scores[order], poses[order]
-        reach = np.full(len(poses), 0.01 * apart_deg * self._diameter_mm) / poses[:, 2, 3]
+        reach = np.full(len(poses), 0.01 * separation_deg * self._diameter_mm) / poses[:, 2, 3]
         chosen = select_distinct(
             np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), reach,
-            np.cos(np.deg2rad(apart_deg)), 1.0 + 0.01 * apart_deg, most,
+            np.cos(np.deg2rad(separation_deg)), 1.0 + 0.01 * separation_deg, max_count,
         )  # fmt: skip
         return scores[chosen], np.ascontiguousarray(poses[chosen])
 
@@ -152,28 +165,33 @@ class WideSearch:
         reach_px: float,
         scale: float,
     ) -> tuple[NDArray[np.uint8], Array] | None:
-        """Response maps of the picture around a place, made small, and their intrinsics; None outside the picture."""
+        """Response maps of a reduced crop around a pixel (2,), and its intrinsics; None outside the picture.
+
+        The crop reaches ``reach_px`` of the picture to every side and is reduced by ``scale``.
+        """
         size = np.array([self._camera.width, self._camera.height])
         first = np.clip(np.floor(center - reach_px), 0, size).astype(int)
         last = np.clip(np.ceil(center + reach_px) + 1, 0, size).astype(int)
-        # Edges are found at twice the resolution as long as the picture has it.
-        pool = 2 if scale <= 0.5 else 1
+        # Edges are detected at twice the resolution where the picture has it.
+        pooling = 2 if scale <= 0.5 else 1
         small = np.round((last - first) * scale).astype(int)
         if small.min() < 16:
             return None
         crop = _with_odds(image[first[1] : last[1], first[0] : last[0]], colors.bin_of, colors.odds)
-        way = cv2.INTER_AREA if scale * pool < 0.6 else cv2.INTER_LINEAR
-        crop = np.asarray(cv2.resize(crop, (pool * int(small[0]), pool * int(small[1])), interpolation=way))
+        interpolation = cv2.INTER_AREA if scale * pooling < 0.6 else cv2.INTER_LINEAR
+        crop = np.asarray(
+            cv2.resize(crop, (pooling * int(small[0]), pooling * int(small[1])), interpolation=interpolation)
+        )
         stretch = small / (last - first)
         intrinsics = self._intrinsics.copy()
         intrinsics[:2] *= stretch
         intrinsics[2:4] = (intrinsics[2:4] - first + 0.5) * stretch - 0.5
-        return response_maps(crop, 1, 0, pool), intrinsics
+        return response_maps(crop, 1, 0, pooling), intrinsics
 
 
 @kernel
 def _with_odds(image, bin_of, odds):  # type: ignore[no-untyped-def]
-    """(H,W,4): a picture with the probability that a pixel is of the part, 0–255, as its fourth channel."""
+    """Picture (H,W,4) with the probability that a pixel shows the part, 0–255, as its fourth channel."""
     height, width = image.shape[0], image.shape[1]
     out = np.empty((height, width, 4), dtype=np.uint8)
     table = np.empty(odds.shape[0], dtype=np.uint8)
