@@ -56,7 +56,7 @@ def test_no_name_is_a_submodule() -> None:
 
 def test_type_checkers_see_the_names() -> None:
     source = (ROOT / "src" / "arview" / "__init__.py").read_text(encoding="utf-8")
-    block = source[source.index("if TYPE_CHECKING:") : source.index("__version__ =")]
+    block = source[source.index("if TYPE_CHECKING:") : source.index("__all__ =")]
     for name, module in arview._MODULE_OF.items():
         lines = [line for line in block.splitlines() if line.strip().startswith(f"from {module} import ")]
         assert len(lines) == 1 and name in lines[0].replace(",", "").split(), name
