@@ -2,8 +2,8 @@
 
 For every component the kernels measure the share of its visible edge points that lie on image edges, at the best of
 the small shifts that tolerance and pose error allow; the same share at the best of many larger shifts; how the colours
-change across its outline; and whether the edges around it are found, which tells an occluded component from a missing
-one.
+change across its outline; and whether the edges around it are found, which separates occluded components from missing
+ones.
 
 Source: scores of a shifted edge template by Borgefors (PAMI 1988).
 """
@@ -43,8 +43,8 @@ class PointLimits(NamedTuple):
         min_slope: weakest image edge, grey levels per px of the strongest channel.
         max_points: points measured per component.
         min_points: points that a component must show to be measured at all.
-        well_supported: share of supported points from which on no displaced placement is tried, to save time.
-        typical_alternative: share that then stands for the best displaced placement.
+        well_supported: share of supported points from which on displaced placements are not tried, to save time.
+        typical_displaced: share that is then assumed at the best displaced placement.
         color_reach_px: distance from an edge at which colours are compared.
         max_surroundings: points of other components gathered around one.
         min_surroundings: with fewer of them the surroundings are unknown and count as found.
@@ -54,7 +54,7 @@ class PointLimits(NamedTuple):
     max_points: int = 48
     min_points: int = 14
     well_supported: float = 0.8
-    typical_alternative: float = 0.45
+    typical_displaced: float = 0.45
     color_reach_px: float = 3.0
     max_surroundings: int = 16
     min_surroundings: int = 8
@@ -65,17 +65,17 @@ class EdgeSupportOptions:
     """Shifts at which a component's edges are tried.
 
     Attributes:
-        displaced_mm: a component may deviate this far from nominal,
-        displaced_share: but no further than this share of the part's diameter.
-        pose_px: error of the pose, added to both.
-        shift_cost: share of points that a shift to the border of what is allowed must gain.
-        searched_mm: larger shifts are tried up to this distance,
-        searched_share: this share of the part's diameter,
-        searched_px: and this distance in the picture, whichever is least.
-        search_gap_px: distance between the allowed and the nearest larger shift.
-        min_search_px: width of the ring of larger shifts where the bounds above leave less.
+        displaced_mm: largest deviation from the nominal placement that is allowed.
+        displaced_share: the same in diameters of the part; the smaller one holds.
+        pose_px: error of the pose, which is added to it.
+        shift_cost: share of points by which the support must grow at the largest allowed shift.
+        searched_mm: largest shift that is tried.
+        searched_share: the same in diameters of the part.
+        searched_px: the same in the picture; the smallest of the three holds.
+        search_gap_px: gap between allowed and larger shifts.
+        min_search_px: range of larger shifts beyond the allowed ones where the bounds above leave less.
         search_step_px: grid of the larger shifts.
-        points: see `PointLimits`.
+        points: limits of the measurement at each point.
     """
 
     displaced_mm: float = 2.5
@@ -92,7 +92,7 @@ class EdgeSupportOptions:
 
 
 class EdgeSupport(NamedTuple):
-    """What the edges of one picture say of each component; all (C,), -1 where a component shows too little.
+    """Edge measurements of each component in one picture; all (C,), -1 where too little of a component is visible.
 
     Attributes:
         supported: share of its points on image edges at the nominal placement.
@@ -399,7 +399,7 @@ def measure_edge_support(picture, edges, projection, shifts, limits):  # type: i
         points.sizes[c] = kept
         here = _best_shift(picture, c, places, along, kept, scores, shifts.near, shifts.near_costs, points.hit[c])
         support.supported[c] = here
-        support.displaced[c] = limits.typical_alternative
+        support.displaced[c] = limits.typical_displaced
         if here < limits.well_supported:
             support.displaced[c] = _best_shift(picture, c, places, along, kept, scores, shifts.far, no_costs, ignored)
         support.contrast[c] = _contrast(picture.image, edges, projected, c, limits.color_reach_px)

@@ -1,7 +1,8 @@
-"""How edges and the presence network are combined into log odds that a component is not at its nominal placement.
+"""Log odds that a component is not at its nominal placement, by its edges and by the presence network.
 
-Both are logistic models, whose weights were fitted to pictures of right and wrong assemblies and are stored in
-``weights/component_log_odds.json``. All ratios are natural logarithms of the likelihood of "not there" over "there".
+Two logistic models, of the edges alone and of edges and network together. Their weights were fitted to pictures of
+right and wrong assemblies and are stored in ``weights/component_log_odds.json``. Log odds are natural logarithms of the
+likelihood ratio of "not there" to "there".
 """
 
 from __future__ import annotations

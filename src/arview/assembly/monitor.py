@@ -1,7 +1,7 @@
-"""Is every component where the CAD has it? A similar part may hold the pose with one component missing or misplaced.
+"""Is every component where the CAD has it? A similar part is tracked as well, though one component is wrong.
 
-The base and all other components hold the pose, so a component that is missing, misplaced or replaced leaves its own
-edges unsupported. Observations of single pictures (`observation`) give log odds that each component is not at its
+The base and all other components determine the pose, so a component that is missing, misplaced or replaced leaves its
+own edges unsupported. Observations of single pictures (`observation`) give log odds that each component is not at its
 nominal placement; here they add up over pictures from different directions until a threshold is passed, as in Wald's
 sequential test (1945). One set of fitted weights serves all parts.
 """
@@ -26,25 +26,25 @@ class MonitorOptions:
     """When components are called mismatched or verified, and how often frames are observed.
 
     Attributes:
-        mismatch_log_odds: a component with more is called mismatched,
-        cleared_log_odds: and no longer with less than this; with more than this it is uncertain.
-        verified_log_odds: a component with less is verified: it is missing in one of 50 cases.
-        open_log_odds: a component with more is open: it is observed sooner, and searched for elsewhere.
-        single_log_odds: a component with more in a single picture is called mismatched by it.
+        mismatch_log_odds: a component with more becomes mismatched.
+        cleared_log_odds: a mismatched component with less is cleared; other components with more are uncertain.
+        verified_log_odds: a component with less is verified: the odds that it is not there are below 1 to 50.
+        open_log_odds: a component with more is open: it is observed sooner, and at alternative placements too.
+        single_log_odds: a component with more in a single picture is a mismatch of that picture.
         max_added: cap on the log odds that one observation adds against a component, because one entering the view is
             at first only partly visible.
-        max_log_odds: bound on the summed log odds.
-        forgetting: share of the summed log odds that every observation takes away.
-        first_observations: frames after a lock that are all observed; no component is called mismatched before the
+        max_log_odds: bound on the summed log odds, in both directions.
+        forgetting: share of the summed log odds that is lost with each observation.
+        first_observations: frames after a lock that are all observed. No component is called mismatched before the
             last of them, because noise differs between frames.
-        suspect_frames: frames between observations while a component is suspect or about to be visible for the first
-            time,
-        open_frames: while one is open,
-        rest_frames: and while all are as expected. From a direction that is not new the next longer one holds.
-        fresh_observations: a direction counts as new for this many observations while a component is suspect, because
-            the first may have been blurred.
-        observation: how one picture is observed.
-        directions: how observations from one direction are combined.
+        suspect_frames: frames between observations while a component is suspect, or while an open one becomes visible.
+        open_frames: frames between observations while a component is open.
+        rest_frames: frames between observations while all components are as expected. All three are for new
+            directions; from a known direction the next longer interval is used.
+        fresh_observations: observations from a direction before it counts as known while a component is suspect,
+            because the first ones may have been blurred.
+        observation: options of a single observation.
+        directions: options of combining observations from one direction.
     """
 
     mismatch_log_odds: float = 2.4
@@ -66,12 +66,12 @@ class MonitorOptions:
 
 @dataclass
 class MonitorState:
-    """What is known of the components of the part in view.
+    """State of the components of the part in view.
 
     Attributes:
         log_odds: (C,) summed log odds that each is not at its nominal placement.
-        directions: what observations from each direction have added.
-        is_mismatched: (C,) called mismatched.
+        directions: evidence added from each direction.
+        is_mismatched: (C,) mismatched.
         is_verified: (C,) confirmed at its nominal placement.
         was_visible: (C,) visible in the last observation.
         has_suspects: the last observation had suspects.
@@ -115,7 +115,7 @@ class AssemblyMonitor:
 
     @property
     def uncertain(self) -> tuple[str, ...]:
-        """Names of components that must be observed again before the part can be called right."""
+        """Names of components that must be observed again before the part is called right."""
         state = self._state
         return self._names((state.log_odds > self.options.cleared_log_odds) & ~state.is_mismatched)
 
@@ -136,7 +136,7 @@ class AssemblyMonitor:
         )
 
     def update(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
-        """Take in a frame with a good pose; it is observed only if it may tell something new.
+        """Process a frame with a good pose; it is observed only if it may add evidence.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
@@ -181,7 +181,7 @@ class AssemblyMonitor:
         return np.asarray(np.arange(len(is_open)) == open_indices[state.observations % len(open_indices)])
 
     def _is_due(self, cam_from_model: Array) -> bool:
-        """Whether a frame may tell something new; the more is open, the sooner the next observation."""
+        """Whether a frame may add evidence: the sooner, the more components are open."""
         o, state = self.options, self._state
         if state.observations < o.first_observations:
             return True
@@ -202,7 +202,7 @@ class AssemblyMonitor:
     def _shows_new(self, cam_from_model: Array) -> bool:
         """Whether this direction shows an open component that the last observation could not show."""
         state = self._state
-        is_visible = self._observer.is_visible(cam_from_model)
+        is_visible = self._observer.visible_from(cam_from_model)
         return bool(np.any((state.log_odds > self.options.open_log_odds) & ~state.was_visible & is_visible))
 
     def _names(self, is_meant: NDArray[np.bool_]) -> tuple[str, ...]:

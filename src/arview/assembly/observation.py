@@ -34,17 +34,17 @@ class ObservationOptions:
     Attributes:
         max_part_px: larger pictures of the part are shrunk to about this size.
         margin_px: border around the part that is cut out with it, after shrinking.
-        occluded_share: share of found edges around a component at which it counts as occluded,
-        unoccluded_share: and share from which on it counts as unoccluded; in between in proportion.
-        confirmed_log_odds: components whose edges give less are confirmed; the network, which is less sure of real
-            pictures, does not predict for them.
-        nominal_edges: weight, against an alternative placement, of what the edges say for the nominal one. The
-            alternative rests on the network alone.
-        suspect_log_odds: components with more are suspects, whether occluded or not.
-        expected_suspects: every suspect beyond these halves the log odds against all components, because one wrong
-            component is more likely than many.
-        max_log_odds: bound on the log odds that one observation gives.
-        visible_edges, edge_support, log_odds, placements, placement_search: see there.
+        occluded_share: share of supported edge points around a component up to which it counts as occluded.
+        unoccluded_share: share from which on it counts as unoccluded; in between it counts in proportion.
+        confirmed_log_odds: components with less by their edges are confirmed, and the network does not predict for
+            them, because it is less certain on real pictures.
+        nominal_edges: weight of edge evidence for the nominal placement in the log odds of an alternative one, which
+            otherwise depend on the network alone.
+        suspect_log_odds: components with more are suspects; occlusion is not considered here.
+        expected_suspects: each suspect beyond this number halves the log odds against all components, because one
+            wrong component is more likely than many.
+        max_log_odds: bound on the log odds of one observation, in both directions.
+        visible_edges, edge_support, log_odds, placements, placement_search: options of these steps.
     """
 
     max_part_px: float = 400.0
@@ -64,12 +64,12 @@ class ObservationOptions:
 
 
 class Observation(NamedTuple):
-    """What one picture says of the components; all (C,).
+    """Evidence of one picture about each component; all (C,).
 
     Attributes:
-        log_odds: of "not at its nominal placement" to "there"; 0 where nothing is said.
-        is_suspect: its edges are not found, though it may be occluded; or it is found at an alternative placement.
-        is_visible: enough of it is visible to say something.
+        log_odds: of "not at its nominal placement" to "there"; 0 without evidence.
+        is_suspect: it may be missing or occluded, or is found at an alternative placement.
+        is_visible: enough of it is visible to measure its edges.
         support: the measurements of its edges, -1 where it is not visible.
     """
 
@@ -91,7 +91,7 @@ class PartCrop(NamedTuple):
 
 
 class ComponentObserver:
-    """Observes the components of one part with one camera; keeps nothing between pictures but caches.
+    """Observes the components of one part with one camera. It has no state between pictures but caches.
 
     Args:
         views: guide views; their directions and camera are used.
@@ -147,14 +147,14 @@ class ComponentObserver:
         log_odds = np.where(log_odds > 0.0, log_odds * 0.5**excess, log_odds)
         return Observation(np.clip(log_odds, -o.max_log_odds, o.max_log_odds), is_suspect, is_visible, support)
 
-    def is_visible(self, cam_from_model: Array) -> NDArray[np.bool_]:
+    def visible_from(self, cam_from_model: Array) -> NDArray[np.bool_]:
         """(C,) components that show enough edge points of their own from about the direction of a pose."""
         edges = self._visible_edges.nearest(cam_from_model)
         points = np.bincount(edges.component[edges.is_own], minlength=len(edges.starts) - 1)
         return np.asarray(points >= self._options.edge_support.points.min_points)
 
     def _unoccluded(self, support: EdgeSupport) -> Array:
-        """(C,) 0 where the edges around a component, or of all others, are not found, 1 where they are."""
+        """(C,) 1 where the edges around a component, and those of all others, are found; 0 where they are not."""
         o = self._options
         found = np.minimum(support.surroundings, support.others)
         share = np.clip((found - o.occluded_share) / (o.unoccluded_share - o.occluded_share), 0.0, 1.0)

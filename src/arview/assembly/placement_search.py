@@ -28,15 +28,15 @@ _NEIGHBOURS = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.
 
 @dataclass(frozen=True)
 class PlacementSearchOptions:
-    """Budget of the search, and how its log odds count.
+    """Budget of the search, and weights of its log odds.
 
     Attributes:
         kept_per_component: placements of a component that the first refinement starts from.
         refinement_steps: grid steps of the refinements around the best placements.
-        max_nominal: cap on the log odds against the nominal placement, which count on their own anyway.
-        unseen_nominal: stands for them where the nominal placement is not visible.
-        min_nominal: components with less against their nominal placement are not searched for.
-        swap_margin: swaps whose log odds without mirrored crops fall short by more are not scored again with them.
+        max_nominal: cap on the log odds against the nominal placement, which are evidence by themselves already.
+        hidden_nominal: log odds that are assumed where the nominal placement is not visible.
+        min_nominal: components with lower log odds against their nominal placement are not searched for.
+        swap_margin: swaps are dropped if their log odds, without mirrored crops, are below the choice cost by more.
         max_scored: placements of a component that the network scores, those with the best edge responses.
         max_placements: placements tried in one picture, over all components.
         max_components: components searched for in one picture, those with most against their nominal placement.
@@ -48,7 +48,7 @@ class PlacementSearchOptions:
     kept_per_component: int = 2
     refinement_steps: tuple[float, ...] = (0.5, 0.25)
     max_nominal: float = 1.5
-    unseen_nominal: float = -0.5
+    hidden_nominal: float = -0.5
     min_nominal: float = -2.5
     swap_margin: float = 1.0
     max_scored: int = 10
@@ -109,7 +109,7 @@ class PlacementSearch:
             (C,), -inf where nothing was searched for or visible.
         """
         o = self._options
-        nominal = np.where(np.isnan(nominal), o.unseen_nominal, np.minimum(nominal, o.max_nominal))
+        nominal = np.where(np.isnan(nominal), o.hidden_nominal, np.minimum(nominal, o.max_nominal))
         searched = self._affordable(np.flatnonzero(is_searched & (nominal > o.min_nominal)), nominal)
         placements = [_Placement(index, shift) for index in searched for shift in self._placements.shifts[index]]
         found = self._best(placements, picture, o.kept_per_component)

@@ -19,21 +19,21 @@ from arview.geometry import Array
 
 @dataclass(frozen=True)
 class PlacementOptions:
-    """What counts as mounted, and which placements are tried.
+    """When a component is mounted on another, and which placements are tried.
 
     Attributes:
         max_samples: samples of a component's surface.
         spacing_share: their distance, in diameters of the part.
-        touch_share: surfaces nearer than this share of the diameter touch.
+        touch_share: distance, in diameters of the part, below which surfaces touch.
         min_touching: share of a component's samples that must touch what it is mounted on.
         min_flatness: length of the mean normal of the touched surface; 1 is flat. Also the cosine between the normals
             of two components' bases that can be swapped.
-        reach_mm: placements are tried up to this distance,
-        reach_share: and this share of the diameter, whichever is less.
-        steps: grid steps to that distance.
-        min_steps: nearer placements cannot be told from the nominal one.
-        overhang_steps: a component may stick out this many steps beyond its base.
-        clear_share: it may overlap others by this share of the diameter.
+        reach_mm: largest distance of an alternative placement.
+        reach_share: the same in diameters of the part; the smaller one holds.
+        steps: grid steps up to that distance.
+        min_steps: nearer placements, in steps, cannot be distinguished from the nominal one.
+        overhang_steps: grid steps by which a component may extend beyond its base.
+        clear_share: distance, in diameters of the part, by which it may overlap others.
     """
 
     max_samples: int = 4000

@@ -1,7 +1,7 @@
 """A small convolutional network that predicts whether a component is at a placement.
 
-Edges cannot tell similar components apart, such as two nuts. The network gets the picture around a component, the
-normals and depth that the CAD has there, and the edge-response maps; its input is built as that of the pose verifier,
+Edges cannot distinguish similar components, such as two nuts. The network takes the picture around a component, the
+normals and depth that the CAD has there, and the edge-response maps; its input is made like that of the pose verifier,
 for one component instead of the part. It was fitted to random assemblies with right, missing, displaced and swapped
 components: see ``tools/training`` and the entry ``presence_net.onnx`` of the manifest of weights.
 """
