@@ -180,7 +180,12 @@ def lens(
         click.get_current_context().exit(ExitCode.CANNOT_MEASURE)
 
 
-@calibrate.command(short_help="List the stored calibrations.")
+@calibrate.command(
+    short_help="List the stored calibrations.",
+    epilog="""\b
+Examples:
+  arview calibrate profiles""",
+)
 def profiles() -> None:
     """List the profiles stored by `--profile`, and where they are."""
     from arview.camera.profiles import list_profiles, profile_folder

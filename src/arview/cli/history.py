@@ -265,6 +265,10 @@ def export(
 
 @history.command(
     short_help="Check that nothing was changed.",
+    epilog="""\b
+Examples:
+  arview history check
+  arview history check --store /data/plate.sqlite""",
     exit_codes={ExitCode.DONE: "every result is as it was added", ExitCode.FAIL: "a result is damaged"},
 )
 @STORE

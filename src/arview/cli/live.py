@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import gc
 import importlib.util
 import logging
@@ -135,6 +134,8 @@ def live(
     unit: str | None,
 ) -> None:
     """Serve the overlay of PART to phones and screens in the local network."""
+    import asyncio
+
     require_extra()
     from arview.cad.part_file import find_part_file
     from arview.live.options import LiveOptions
@@ -198,6 +199,8 @@ def require_extra() -> None:
 async def _serve(
     server: LiveServer, options: LiveOptions, part_path: str, views_path: str | None, renderer: str, unit: str | None
 ) -> None:
+    import asyncio
+
     from arview.guideviews import GuideViewOptions
     from arview.live.server.loading import load_subject, warm_up
 

@@ -37,7 +37,13 @@ def study() -> None:
     """Simulate registrations of posts: bias, spread, and what they depend on."""
 
 
-@study.command(short_help="Displacements of 1 to 9 mm: true against estimated.")
+@study.command(
+    short_help="Displacements of 1 to 9 mm: true against estimated.",
+    epilog="""\b
+Examples:
+  arview study displacement --quick
+  arview study displacement -o studies/ --seed 1""",
+)
 @OUTPUT
 @QUICK
 @SEED
@@ -48,7 +54,13 @@ def displacement(output: str, quick: bool, seed: int) -> None:
     _write(lambda: displacement_study(quick, seed), output)
 
 
-@study.command(short_help="Noise of 0 to 0.5 mm: registration and cylinder fit.")
+@study.command(
+    short_help="Noise of 0 to 0.5 mm: registration and cylinder fit.",
+    epilog="""\b
+Examples:
+  arview study noise --quick
+  arview study noise -o studies/ --seed 1""",
+)
 @OUTPUT
 @QUICK
 @SEED
@@ -59,7 +71,13 @@ def noise(output: str, quick: bool, seed: int) -> None:
     _write(lambda: noise_study(quick, seed), output)
 
 
-@study.command(short_help="Bias of displacements near zero.")
+@study.command(
+    short_help="Bias of displacements near zero.",
+    epilog="""\b
+Examples:
+  arview study rice --quick
+  arview study rice -o studies/ --seed 1""",
+)
 @OUTPUT
 @QUICK
 @SEED
@@ -73,7 +91,14 @@ def rice(output: str, quick: bool, seed: int) -> None:
     _write(lambda: rice_study(quick, seed), output)
 
 
-@study.command(short_help="Dense and sparse clouds without noise.")
+@study.command(
+    short_help="Dense and sparse clouds without noise.",
+    epilog="""\b
+Examples:
+  arview study density --quick
+  arview study density --rows bd --runs 50 --cloud-runs 5
+  arview study density -o studies/ --seed 1""",
+)
 @OUTPUT
 @QUICK
 @SEED
@@ -81,8 +106,8 @@ def rice(output: str, quick: bool, seed: int) -> None:
 @click.option(
     "--cloud-runs", type=click.IntRange(min=1), metavar="N", help="Runs of ICP between clouds.  [default: 500]"
 )
-@click.option("--rows", default="abcd", show_default=True, help="a 240,965/240,965, b 24,099/24,099, c 240,965/24,099, "
-              "d 240,965/2,411 points of reference and measured.")  # fmt: skip
+@click.option("--rows", default="abcd", show_default=True, help="Rows of the study, points of reference/measured: "
+              "a 240,965/240,965, b 24,099/24,099, c 240,965/24,099, d 240,965/2,411.")  # fmt: skip
 def density(output: str, quick: bool, seed: int, runs: int | None, cloud_runs: int | None, rows: str) -> None:
     """Bias and CPU time at a displacement of 1 mm, by number of points: exact surface and ICP between clouds.
 
@@ -95,7 +120,13 @@ def density(output: str, quick: bool, seed: int, runs: int | None, cloud_runs: i
     _write(lambda: density_study(quick, seed, runs, cloud_runs, rows), output)
 
 
-@study.command(short_help="Convergence thresholds of 0.1 to 1e-5 mm.")
+@study.command(
+    short_help="Convergence thresholds of 0.1 to 1e-5 mm.",
+    epilog="""\b
+Examples:
+  arview study threshold --quick
+  arview study threshold -o studies/ --seed 1""",
+)
 @OUTPUT
 @QUICK
 @SEED
