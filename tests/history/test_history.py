@@ -439,7 +439,7 @@ def test_refusals_and_doubts() -> None:
     assert ability.names == ("Pp", "Ppk")
     rough = capability(np.random.default_rng(2).normal(0, 0.05, 60), -1.0, 1.0, [0.04] * 60)
     assert rough.measurement_share == pytest.approx(0.64, abs=0.25)
-    assert any("of the measurement" in warning for warning in rough.warnings)
+    assert any("due to the measurement" in warning for warning in rough.warnings)
 
 
 # ---- series, picture, commands
