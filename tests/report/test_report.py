@@ -33,9 +33,9 @@ from arview.reconstruction.types import DenseCloud, PosedPhoto, SparseModel
 from arview.rendering.rasterizer import rasterise
 from arview.report import gather, make_report
 from arview.report import make as make_module
+from arview.report.formatting import finding_text, number, zone_text
 from arview.report.pictures import CropOptions, make_gallery, overview
 from arview.report.scene import SceneOptions, make_scene, scene_json
-from arview.report.words import finding_text, number, zone_text
 from helpers.inspections import bench_inspection, deviation, inspection
 from helpers.photo_scene import CAMERA, bench, photograph, ring, write_photos
 
@@ -158,7 +158,7 @@ def test_the_ghost_lies_on_the_block_in_the_photo(
     """Against the silhouette of the nominal block as the camera of the photo projects it."""
     sparse = in_datum_frame(reconstruction)
     plain = replace(found, components=(replace(found.components[0]),), foreign_objects=())
-    options = CropOptions(width_px=640, height_px=480, share=0.01, least_px=640)  # the whole photo
+    options = CropOptions(width_px=640, height_px=480, share=0.01, min_px=640)  # the whole photo
     crop = make_gallery(plain, model, sparse, options).components["block_1"][0]
     photo = next(one for one in sparse.photos if one.name == crop.photo)
     from arview.reconstruction.intake.reading import read_photo
@@ -205,7 +205,7 @@ def test_the_page_holds_all_and_needs_no_network(
     page = tmp_path / "report.html"
     evidence = make_report(source, page, part=part, folder=tmp_path)
     assert evidence.absent == {
-        "distances": "There is no distance map in this inspection: there was no cloud, or nothing of it was near."
+        "distances": "This inspection has no distance map: there was no cloud, or no part of it was near the CAD model."
     }
     text = page.read_text(encoding="utf-8")
     body = re.sub(r"<script.*?</script>|<style.*?</style>", "", text, flags=re.DOTALL)
@@ -216,8 +216,8 @@ def test_the_page_holds_all_and_needs_no_network(
     plain = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", body))
     for expected in (
         "bench", "SN-7", "Fail", "1 missing, 1 out of tolerance", "the photos are few", "+2.400", "−1.800",
-        "6.000 (1.000)", "undetermined", "The component is not there.", "Foreign object on plate, 90 mm²",
-        "ISO 14253-1", "fewer than 100 points", "8 photos, 300 points seen 2,400 times", "datum A",
+        "6.000 (1.000)", "undetermined", "The component is missing.", "Foreign object on plate, 90 mm²",
+        "ISO 14253-1", "fewer than 100 points", "8 photos, 300 points observed 2,400 times", "datum A",
     ):  # fmt: skip
         assert expected in plain, expected
     # Two crops of each finding and of the chip, one thumbnail, the overview.
@@ -274,7 +274,7 @@ def test_the_scene_is_the_cad_and_the_cloud(
     cloud = reconstruction.cloud
     assert cloud is not None
     moved = replace(cloud, points=apply(invert(ROUGH_FROM_DATUM), cloud.points))
-    scene = make_scene(found, model, moved, None, SceneOptions(most_points=5000))
+    scene = make_scene(found, model, moved, None, SceneOptions(max_points=5000))
     assert scene is not None
     again = json.loads(scene_json(scene))
     vertices = _decoded(again["mesh"])
@@ -295,7 +295,7 @@ def test_the_scene_is_the_cad_and_the_cloud(
     assert by_name["block_3"]["displacement"] == [0.1, 0.05, None]
     assert by_name["bench"]["verdict"] is None
     assert make_scene(found, None, None, None) is None
-    assert "mesh" not in (make_scene(found, model, moved, None, SceneOptions(most_faces=10)) or {})
+    assert "mesh" not in (make_scene(found, model, moved, None, SceneOptions(max_faces=10)) or {})
 
 
 def _decoded(pack: dict[str, Any]) -> Array:
@@ -314,7 +314,7 @@ def test_the_view_works_from_a_file(source: Path, part: Part, patched: None, tmp
         f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri(),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    if 'class="live"' not in done.stdout and "gives no WebGL" in done.stdout:
+    if 'class="live"' not in done.stdout and "does not support WebGL" in done.stdout:
         pytest.skip("this chromium has no WebGL")
     assert 'data-state="ready"' in done.stdout
     assert re.search(r'class="name fail"[^>]*>block_2<', done.stdout)
@@ -387,7 +387,7 @@ def test_the_command(source: Path, tmp_path: Path) -> None:
     done = CliRunner().invoke(main, ["report", str(source)])
     assert done.exit_code == 0, done.output
     assert (tmp_path / "report.html").is_file()
-    assert "left out: The CAD was not given" in done.output
+    assert "The CAD model was not given" in done.output
     for arguments, message in (
         ([str(tmp_path / "none.json")], "no such file"),
         ([str(source), "-o", str(source)], "would overwrite an input"),

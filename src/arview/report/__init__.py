@@ -1,7 +1,7 @@
-"""Report: an inspection as one HTML file and as PDF, with pictures, charts and a 3D view."""
+"""Reports: an inspection as one HTML file and as PDF, with pictures, charts and a 3D view."""
 
-from arview.report.evidence import Evidence, gather
+from arview.report.evidence import ReportEvidence, gather
 from arview.report.make import make_report
 from arview.report.page import ReportOptions
 
-__all__ = ["Evidence", "ReportOptions", "gather", "make_report"]
+__all__ = ["ReportEvidence", "ReportOptions", "gather", "make_report"]

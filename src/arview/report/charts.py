@@ -1,4 +1,4 @@
-"""Charts of reports as SVG, drawn by matplotlib: they scale, print sharp, and their text can be searched."""
+"""Charts of reports as SVG, drawn by matplotlib, so that they scale and their text can be searched."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ VERDICT_HEX = {
     Verdict.UNDECIDED: "#a96a00",
     Verdict.NOT_MEASURED: "#5b6675",
 }
-"""Dark enough on white for text (contrast above 4.5 : 1)."""
+"""Colours of the verdicts, dark enough for text on white (contrast above 4.5 : 1)."""
 _MARKER = {Verdict.PASS: "o", Verdict.FAIL: "X", Verdict.UNDECIDED: "D", Verdict.NOT_MEASURED: "_"}
 _SERIES = ("#2b5c8a", "#e0912f", "#7aa6c2", "#7a5195", "#5a8f5a", "#b0413e", "#9c8a5a", "#8796a5", "#3d8b8b", "#c58fb4")
 
 
 def svg(made: Any, label: str) -> str:
-    """The figure as an SVG element to put into a page, with a label for those who do not see it."""
+    """The figure as an SVG element for a page, with a label for assistive technology."""
     out = io.StringIO()
     made.savefig(out, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     text = out.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    # Clip paths and markers are referred to by id: ids must not repeat among the charts of a page.
+    # Clip paths and markers are referenced by id, which must be unique among the charts of a page.
     salt = f"c{zlib.crc32(label.encode()):08x}"
     text = re.sub(r'\bid="([^"]+)"', rf'id="{salt}-\1"', text)
     text = re.sub(r'(url\(#|href="#)', rf"\1{salt}-", text)
@@ -42,7 +42,7 @@ def svg(made: Any, label: str) -> str:
 
 
 def tolerance_chart(components: Sequence[ComponentDeviation]) -> str:
-    """How much of its tolerance each component uses, with the interval that U leaves."""
+    """Distance of each component as a share of its tolerance, with its 95 % interval."""
     rows = [c for c in components if c.distance_mm is not None and c.tolerance_mm is not None]
     if not rows:
         return ""
@@ -72,13 +72,13 @@ def tolerance_chart(components: Sequence[ComponentDeviation]) -> str:
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.set_xlim(0.0, limit)
         axes.xaxis.set_major_formatter(lambda value, _: f"{100.0 * value:.3g} %")
-        axes.set_xlabel("distance from the design place, share of the tolerance, with its 95 % interval")
+        axes.set_xlabel("distance from the design position as a share of the tolerance, with its 95 % interval")
         axes.grid(axis="y", visible=False)
         return svg(made, "Share of the tolerance that each component uses")
 
 
 def histogram_chart(distances: DistanceMap) -> str:
-    """Signed distances of the cloud to the CAD."""
+    """Histogram of the signed distances of the cloud to the CAD model."""
     values = distances.distances
     whole = distances.statistics[0]
     span = min(distances.reach_mm, max(10.0 * whole.fwhm_mm, 0.1))
@@ -91,7 +91,7 @@ def histogram_chart(distances: DistanceMap) -> str:
         axes.yaxis.set_major_formatter(lambda value, _: f"{100.0 * value:.3g} %")
         axes.set_xlim(edges[0], edges[-1])
         axes.set_xlabel(
-            f"signed distance to the CAD, mm, outside positive; {100.0 * outside:.0f} % lie beyond the picture"
+            f"signed distance to the CAD, mm, outside positive; {100.0 * outside:.0f} % are outside this range"
         )
         axes.set_ylabel("share of the points")
         axes.grid(axis="x", visible=False)
@@ -99,7 +99,7 @@ def histogram_chart(distances: DistanceMap) -> str:
 
 
 def budget_chart(components: Sequence[ComponentDeviation]) -> str:
-    """What the uncertainty of each component is made of: shares of its variance."""
+    """Uncertainty budget of each component: shares of its variance."""
     rows = [c for c in components if c.details is not None and c.details.budget]
     if not rows:
         return ""
@@ -137,11 +137,11 @@ def budget_chart(components: Sequence[ComponentDeviation]) -> str:
 
 
 def coverage_chart(directions: Array, sizes: NDArray[np.int64] | None = None) -> str:
-    """From where the photos look at the part: azimuth round the circle, elevation towards its middle.
+    """Viewing directions of the photos: azimuth around the circle, elevation towards its centre.
 
     Args:
         directions: (M,3) from the part to the cameras, model frame.
-        sizes: (M,) components seen in each.
+        sizes: (M,) number of components visible in each photo.
     """
     unit = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
     azimuth = np.arctan2(unit[:, 1], unit[:, 0])
@@ -158,11 +158,11 @@ def coverage_chart(directions: Array, sizes: NDArray[np.int64] | None = None) ->
         axes.set_rgrids(rings, [f"{90.0 - ring:.0f}°" for ring in rings], angle=22.5, fontsize=7.5, color=MUTED)
         axes.set_thetagrids(range(0, 360, 45), ["+x", "", "+y", "", "−x", "", "−y", ""])
         axes.spines["polar"].set_color("#9aa5b1")
-        return svg(made, "Directions from which the photos look at the part")
+        return svg(made, "Viewing directions of the photos")
 
 
 def reprojection_chart(lengths_px: Array, photos: NDArray[np.int32], names: Sequence[str]) -> str:
-    """Distances between points as seen and as computed: of all, and the middle half and 95 % of each photo."""
+    """Reprojection errors: histogram of all, and median and 95 % quantile of each photo."""
     with figure(3.0, ncols=2, gridspec_kw={"width_ratios": [1, 1.25]}) as (made, (left, right)):
         limit = float(np.percentile(lengths_px, 99.0)) if len(lengths_px) else 1.0
         edges = np.linspace(0.0, limit, 41)
@@ -191,11 +191,11 @@ def reprojection_chart(lengths_px: Array, photos: NDArray[np.int32], names: Sequ
 
 
 def datum_chart(datums: Sequence[DatumReport]) -> str:
-    """Scatter of each datum about itself, and what it contradicts the datums before it."""
+    """Residuals of each datum about its own best fit and in the datum frame."""
     with figure(0.95 + 0.42 * len(datums)) as (made, axes):
         places = np.arange(len(datums))
         axes.barh(places - 0.18, [d.residual_mm for d in datums], height=0.34, color=_SERIES[0],
-                  label="scatter about its own best place")  # fmt: skip
+                  label="scatter about its own best fit")  # fmt: skip
         axes.barh(places + 0.18, [d.rest_mm for d in datums], height=0.34, color="#c9d8e6",
                   label="rms in the datum frame")  # fmt: skip
         axes.set_yticks(places, [f"{d.label}  {d.feature}" for d in datums])
@@ -208,7 +208,7 @@ def datum_chart(datums: Sequence[DatumReport]) -> str:
 
 
 def _interval(row: ComponentDeviation) -> tuple[float, float]:
-    """The stated 95 % interval of the distance, else ± U."""
+    """The stated 95 % interval of the distance, or the distance ± U."""
     if row.details is not None and row.details.interval_mm is not None:
         return row.details.interval_mm
     distance, uncertainty = row.distance_mm or 0.0, row.uncertainty_mm or 0.0

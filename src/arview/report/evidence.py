@@ -1,4 +1,4 @@
-"""What a report is made of: the inspection, and whatever of the measurement is still there; what is not, and why."""
+"""The data of a report: the inspection and what is available of the measurement, with reasons for what is absent."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from arview.reconstruction.types import DenseCloud, SparseModel
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """All in the datum frame, which is the frame ``model`` of the inspection, mm.
+class ReportEvidence:
+    """The data of a report, in the datum frame, mm.
 
     Attributes:
-        inspection: what was measured.
+        inspection: the inspection.
         source: its file.
-        sha256: of that file, hexadecimal.
-        part: the CAD; None when it was not given.
+        sha256: hash of that file, hexadecimal.
+        part: the part with its CAD model; None when not given.
         sparse: photos with their poses, and points; None without the folder of the reconstruction.
         cloud: dense cloud in the colours of the photos, or None.
-        distances: of the cloud to the CAD, or None.
-        absent: why something is None, in a sentence, by the name of the field.
+        distances: distances of the cloud to the CAD model, or None.
+        absent: sentences that explain why fields are None, by the name of the field.
     """
 
     inspection: Inspection
@@ -47,17 +47,17 @@ class Evidence:
 
 def gather(
     source: str | Path, part: Part | None = None, folder: str | Path | None = None, photos: str | Path | None = None
-) -> Evidence:
-    """Everything that belongs to the inspection in a file, as far as it is there.
+) -> ReportEvidence:
+    """Collect the available data of an inspection.
 
     Args:
         source: ``inspection.json``.
-        part: what was measured against; without it there is no CAD in the report.
-        folder: of `arview reconstruct`; default: the folder of the inspection, if it is one.
-        photos: where the photos are, when not where they were.
+        part: the part that was inspected; without it the report has no CAD model.
+        folder: folder of a reconstruction; default: the folder of the inspection, if it contains one.
+        photos: folder of the photos if they were moved.
 
     Raises:
-        InputError: the inspection cannot be read, or ``folder`` was given and is no reconstruction.
+        InputError: the inspection cannot be read, or ``folder`` was given and is not a reconstruction.
         MismatchError: the part is not the one that was inspected.
     """
     source = Path(source)
@@ -65,34 +65,34 @@ def gather(
     sha256 = hashlib.sha256(source.read_bytes()).hexdigest()
     absent: dict[str, str] = {}
     if part is None:
-        absent["part"] = "The CAD was not given (--part), so that nothing is drawn of it."
+        absent["part"] = "The CAD model was not given (--part), so it is not drawn."
     sparse, cloud = _reconstruction(inspection, source, part, folder, photos, absent)
     distances = _distances(inspection, source, part, cloud, absent)
     if cloud is None and distances is None:
-        absent.setdefault("cloud", "There is no cloud with this inspection.")
-    return Evidence(inspection, source, sha256, part, sparse, cloud, distances, absent)
+        absent.setdefault("cloud", "This inspection has no cloud.")
+    return ReportEvidence(inspection, source, sha256, part, sparse, cloud, distances, absent)
 
 
 def _reconstruction(
     inspection: Inspection, source: Path, part: Part | None, folder: str | Path | None, photos: str | Path | None,
     absent: dict[str, str],
 ) -> tuple[SparseModel | None, DenseCloud | None]:  # fmt: skip
-    """Photos and cloud of the reconstruction, moved to the datum frame."""
+    """Photos and cloud of the reconstruction, transformed to the datum frame."""
     from arview.measurement.folder import in_model_frame, read_folder
 
     if folder is None and not (source.parent / "reconstruction.json").is_file():
-        absent["sparse"] = "The folder of the reconstruction is not at hand (--folder), so that there are no photos."
+        absent["sparse"] = "The folder of the reconstruction is not available (--folder), so there are no photos."
         return None, None
     if inspection.datum_system is None:
-        absent["sparse"] = "The inspection does not say where its frame is in the photos (file of version 1.0)."
+        absent["sparse"] = "The inspection does not contain the pose of its frame in the photos (file of version 1.0)."
         return None, None
-    place = source.parent if folder is None else Path(folder)
+    location = source.parent if folder is None else Path(folder)
     try:
-        found = read_folder(place, photos)
+        found = read_folder(location, photos)
         if part is not None:
             found = in_model_frame(found, part)
         elif found.scale.model_from_scan is None:
-            raise InputError("the part was found by the shape of its cloud, which needs the CAD (--part)")
+            raise InputError("the part was located by the shape of its cloud, which needs the CAD model (--part)")
     except ArviewError as error:
         if folder is not None:
             raise
@@ -111,11 +111,11 @@ def _reconstruction(
 def _distances(
     inspection: Inspection, source: Path, part: Part | None, cloud: DenseCloud | None, absent: dict[str, str]
 ) -> DistanceMap | None:
-    """Those that were written beside the inspection, else those of the cloud to the CAD."""
+    """The distances that were written beside the inspection, or those computed from cloud and CAD model."""
     report = inspection.distance_map
     if report is None:
         absent["distances"] = (
-            "There is no distance map in this inspection: there was no cloud, or nothing of it was near."
+            "This inspection has no distance map: there was no cloud, or no part of it was near the CAD model."
         )
         return None
     written = next((source.parent / name for name in report.files if name.endswith(".ply")), None)
@@ -124,7 +124,7 @@ def _distances(
     if cloud is not None and part is not None:
         return distance_map(cloud, part.model, reach_mm=report.reach_mm)
     absent["distances"] = (
-        "The distances themselves are not at hand (`arview measure` writes them beside the inspection, unless"
-        " --no-maps was given): only their statistics are shown."
+        "The distances are not available (`arview measure` writes them beside the inspection unless --no-maps is"
+        " given): only their statistics are shown."
     )
     return None

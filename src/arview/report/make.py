@@ -1,4 +1,4 @@
-"""From an inspection to its report: one call."""
+"""The report of an inspection, written by one call."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from arview.core.atomic import replacing
 from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
 from arview.errors import InputError, MissingDependencyError, OutputError
-from arview.report.evidence import Evidence, gather
+from arview.report.evidence import ReportEvidence, gather
 from arview.report.page import ReportOptions, build_context, render
 
 PANGO_INSTALL_COMMAND = (
@@ -23,23 +23,23 @@ def make_report(
     inspection: str | Path, html: str | Path | None = None, pdf: str | Path | None = None, part: Part | None = None,
     *, folder: str | Path | None = None, photos: str | Path | None = None, options: ReportOptions | None = None,
     progress: Progress | None = None,
-) -> Evidence:  # fmt: skip
-    """Write the report of an inspection as one HTML file without links to elsewhere, as PDF, or both.
+) -> ReportEvidence:  # fmt: skip
+    """Write the report of an inspection as one self-contained HTML file, as PDF, or both.
 
     Args:
-        inspection: ``inspection.json``; the files that `arview measure` wrote lie beside it.
+        inspection: ``inspection.json``, beside the files that `arview measure` wrote.
         html, pdf: files to write.
-        part: the CAD that was measured against; without it the report has no pictures and no CAD.
-        folder: of `arview reconstruct`; default: the folder of the inspection, if it is one.
-        photos: where the photos are, when not where they were.
-        options: how much the report holds.
-        progress: called with (what, done, total).
+        part: the part that was inspected; without it the report has no pictures and no CAD model.
+        folder: folder of a reconstruction; default: the folder of the inspection, if it contains one.
+        photos: folder of the photos if they were moved.
+        options: extent of the report.
+        progress: called with (step, done, total).
 
     Returns:
-        what the report was made of; ``absent`` says what was not there.
+        the data of the report; its ``absent`` explains what is missing.
 
     Raises:
-        InputError: the inspection cannot be read, or ``folder`` is no reconstruction; neither file is asked for.
+        InputError: the inspection cannot be read, ``folder`` is not a reconstruction, or no file is given.
         MismatchError: the part is not the one that was inspected.
         MissingDependencyError: the PDF needs libraries that are not installed.
         OutputError: a file cannot be written.
@@ -47,24 +47,24 @@ def make_report(
     check_type(inspection, PATH, "make_report: inspection")
     check_type(part, (Part, NoneType), "make_report: part")
     if html is None and pdf is None:
-        raise InputError("report: name a file to write, HTML or PDF")
-    tell = progress or (lambda what, done, total: None)
+        raise InputError("report: give a file to write, HTML or PDF")
+    report_progress = progress or (lambda what, done, total: None)
     if pdf is not None:
         _weasyprint()
-    tell("reading", 0, 1)
+    report_progress("reading", 0, 1)
     evidence = gather(inspection, part, folder, photos)
-    context = build_context(evidence, options or ReportOptions(), tell)
+    context = build_context(evidence, options or ReportOptions(), report_progress)
     if html is not None:
         _write(Path(html), render(context, for_print=False).encode("utf-8"))
     if pdf is not None:
-        tell("PDF", 0, 1)
+        report_progress("PDF", 0, 1)
         _write(Path(pdf), pdf_of(render(context, for_print=True), evidence))
-    tell("done", 1, 1)
+    report_progress("done", 1, 1)
     return evidence
 
 
-def pdf_of(page: str, evidence: Evidence) -> bytes:
-    """The page on A4, with the inspection attached."""
+def pdf_of(page: str, evidence: ReportEvidence) -> bytes:
+    """The page as PDF/A-3 with the inspection attached."""
     weasyprint = _weasyprint()
     attachment = weasyprint.Attachment(
         string=evidence.source.read_bytes(), name=evidence.source.name, description="the inspection (arview)",

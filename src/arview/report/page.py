@@ -1,4 +1,4 @@
-"""The report's page: everything that the template shows, made of the evidence."""
+"""The page of a report: the context of its template, and rendering."""
 
 from __future__ import annotations
 
@@ -18,11 +18,9 @@ from arview.inspection import ComponentDeviation, Details, Inspection, Verdict
 from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.measurement.cloud.distance_map import COLOR_STOPS, map_picture
 from arview.overlay.labels import by_urgency
-from arview.report import charts, how
-from arview.report.evidence import Evidence
-from arview.report.pictures import Crop, CropOptions, Gallery, Picture, make_gallery, overview
-from arview.report.scene import SceneOptions, make_scene, scene_json
-from arview.report.words import (
+from arview.report import charts, explanations
+from arview.report.evidence import ReportEvidence
+from arview.report.formatting import (
     NONE,
     VERDICT_WORD,
     determined,
@@ -33,6 +31,8 @@ from arview.report.words import (
     verdict_word,
     zone_text,
 )
+from arview.report.pictures import Crop, CropOptions, Gallery, RgbImage, make_gallery, overview
+from arview.report.scene import SceneOptions, make_scene, scene_json
 from arview.version import __version__
 
 _FONTS = (("Inter", "400", "inter-400"), ("Inter", "600", "inter-600"), ('"Inter Greek"', "400", "inter-greek-400"))
@@ -41,16 +41,16 @@ _EXAGGERATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """How much a report holds."""
+    """Extent and quality of a report."""
 
     crops: CropOptions = field(default_factory=CropOptions)
     scene: SceneOptions = field(default_factory=SceneOptions)
-    jpeg_quality: int = 84  # of the pictures: no artefacts are seen at the size of the page
-    map_limit_mm: float = 1.0  # of the colours of the distance map
+    jpeg_quality: int = 84  # quality of the pictures, without visible artefacts at the size of the page
+    map_limit_mm: float = 1.0  # end of the colour scale of the distance map
 
 
-def build_context(evidence: Evidence, options: ReportOptions, progress: Progress) -> dict[str, Any]:
-    """What the template needs, for screen and paper alike."""
+def build_context(evidence: ReportEvidence, options: ReportOptions, progress: Progress) -> dict[str, Any]:
+    """The context of the template, for screen and print."""
     inspection, part, sparse = evidence.inspection, evidence.part, evidence.sparse
     model = None if part is None else part.model
     gallery = Gallery({}, (), ())
@@ -72,14 +72,14 @@ def build_context(evidence: Evidence, options: ReportOptions, progress: Progress
         "source_name": evidence.source.name,
         "inspection_base64": base64.b64encode(evidence.source.read_bytes()).decode("ascii"),
         "verdict": {"verdict": whole.value, "word": VERDICT_WORD[whole], "sentence": verdict_sentence(inspection)},
-        "facts": how.facts(inspection),
+        "facts": explanations.facts(inspection),
         "note": inspection.provenance.note,
         "warnings": inspection.warnings,
         "absences": evidence.absent,
         "unread": gallery.unread,
-        "how": how.paragraphs(inspection),
-        "provenance": how.provenance(inspection, evidence.part),
-        "uncertainty_lead": how.uncertainty(inspection),
+        "how": explanations.paragraphs(inspection),
+        "provenance": explanations.provenance(inspection, evidence.part),
+        "uncertainty_lead": explanations.uncertainty(inspection),
     }
     context |= _components(evidence) | _findings(evidence, gallery, options)
     context |= _distance_map(evidence, options) | _budget(inspection) | _datums(inspection)
@@ -88,9 +88,9 @@ def build_context(evidence: Evidence, options: ReportOptions, progress: Progress
     if model is not None:
         context["overview"] = _embedded(overview(inspection, model, sparse), options.jpeg_quality)
         context["overview_caption"] = (
-            "The design place of each component, drawn over a photo; arrows point to where it is, longer than they are."
+            "Components at their design positions, drawn over a photo; exaggerated arrows point to the measured positions."
             if sparse is not None
-            else "The nominal part; arrows point to where components are, longer than they are."
+            else "The nominal part; exaggerated arrows point to the measured positions."
         )
     progress("3D view", 0, 1)
     context |= _viewer(evidence, options)
@@ -99,7 +99,7 @@ def build_context(evidence: Evidence, options: ReportOptions, progress: Progress
 
 
 def render(context: dict[str, Any], for_print: bool) -> str:
-    """The page as HTML: with viewer for a screen, without it for print."""
+    """The page as HTML, with the viewer for screens and without it for print."""
     import jinja2
 
     from arview.web import font, three_js
@@ -122,7 +122,7 @@ def render(context: dict[str, Any], for_print: bool) -> str:
     )
 
 
-def _components(evidence: Evidence) -> dict[str, Any]:
+def _components(evidence: ReportEvidence) -> dict[str, Any]:
     rows = []
     for index, one in enumerate(evidence.inspection.components):
         center = _center(one, evidence)
@@ -157,11 +157,11 @@ def _components(evidence: Evidence) -> dict[str, Any]:
             }
         )
     lead = verdict_sentence(evidence.inspection)
-    return {"rows": rows, "components_lead": f"{lead[:1].upper()}{lead[1:]}.", "legend": how.LEGEND}
+    return {"rows": rows, "components_lead": f"{lead[:1].upper()}{lead[1:]}.", "legend": explanations.LEGEND}
 
 
-def _center(one: ComponentDeviation, evidence: Evidence) -> Array | None:
-    """Nominal place of the point that the displacement is of."""
+def _center(one: ComponentDeviation, evidence: ReportEvidence) -> Array | None:
+    """Nominal position of the point that the displacement refers to, or None."""
     if one.details is not None:
         return np.array(one.details.center_mm)
     if evidence.part is not None:
@@ -169,7 +169,7 @@ def _center(one: ComponentDeviation, evidence: Evidence) -> Array | None:
     return None
 
 
-def _findings(evidence: Evidence, gallery: Gallery, options: ReportOptions) -> dict[str, Any]:
+def _findings(evidence: ReportEvidence, gallery: Gallery, options: ReportOptions) -> dict[str, Any]:
     inspection = evidence.inspection
     order = {one.name: index for index, one in enumerate(inspection.components)}
     has_photos = evidence.part is not None and evidence.sparse is not None
@@ -189,7 +189,7 @@ def _findings(evidence: Evidence, gallery: Gallery, options: ReportOptions) -> d
                 "text": finding_text(one),
                 "crops": crops,
                 "no_crop": "No photo shows it." if has_photos else "",
-                "methods": [] if details is None else [how.method_row(method) for method in details.methods],
+                "methods": [] if details is None else [explanations.method_row(method) for method in details.methods],
                 "notes": [] if details is None else _own_notes(details),
             }
         )
@@ -207,18 +207,18 @@ def _findings(evidence: Evidence, gallery: Gallery, options: ReportOptions) -> d
 
 
 def _own_notes(details: Details) -> list[str]:
-    """Notes that are not those of a method already."""
+    """Notes that are not also those of a method."""
     of_methods = {note for method in details.methods for note in (*method.notes, method.reason)}
     return [note for note in details.notes if note not in of_methods]
 
 
-def _crop(crop: Crop, options: ReportOptions, what: str = "ghost: design place") -> dict[str, Any]:
+def _crop(crop: Crop, options: ReportOptions, what: str = "overlay: design position") -> dict[str, Any]:
     arrow = "" if crop.arrow_scale is None else f"; arrow × {crop.arrow_scale:g}"
     caption = f"{crop.photo}; {what}{arrow}"
     return {"photo": crop.photo, "caption": caption, **_embedded(crop.image, options.jpeg_quality)}
 
 
-def _distance_map(evidence: Evidence, options: ReportOptions) -> dict[str, Any]:
+def _distance_map(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
     report = evidence.inspection.distance_map
     context: dict[str, Any] = {
         "gradient": Markup(", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in COLOR_STOPS)),
@@ -244,8 +244,8 @@ def _distance_map(evidence: Evidence, options: ReportOptions) -> dict[str, Any]:
     return context
 
 
-def _trimmed(image: Picture, margin: int = 12) -> Picture:
-    """Without white borders."""
+def _trimmed(image: RgbImage, margin: int = 12) -> RgbImage:
+    """The picture without white borders."""
     rows, columns = (np.flatnonzero((image < 250).any(axis=(1 - axis, 2))) for axis in (0, 1))
     if len(rows) == 0:
         return image
@@ -284,7 +284,7 @@ def _datums(inspection: Inspection) -> dict[str, Any]:
             "label": d.label,
             "feature": "best fit" if d.feature == "fit" else d.feature,
             "component": d.component,
-            "locked": how.in_words(d.locked),
+            "locked": explanations.constraint_text(d.locked),
             "count": f"{d.used:,} of {d.of:,}" if d.of else NONE,
             "residual": number(d.residual_mm),
             "rest": number(d.rest_mm),
@@ -297,8 +297,8 @@ def _datums(inspection: Inspection) -> dict[str, Any]:
     return {"datums": rows, "datums_lead": notes.strip()}
 
 
-def _photos(evidence: Evidence) -> dict[str, Any]:
-    """Reprojection errors, coverage, and the photos one by one."""
+def _photos(evidence: ReportEvidence) -> dict[str, Any]:
+    """Reprojection errors, coverage and the list of photos."""
     from arview.reconstruction.covariance import reprojection_residuals
     from arview.reconstruction.coverage import coverage
 
@@ -325,11 +325,13 @@ def _photos(evidence: Evidence) -> dict[str, Any]:
         )
     rms = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else 0.0
     lead = (
-        f"{len(sparse.photos)} photos, {len(sparse.points_in_scan):,} points seen {len(lengths):,} times; reprojection"
-        f" error {rms:.2f} px rms, {float(np.median(lengths)) if len(lengths) else 0.0:.2f} px in the median."
+        f"{len(sparse.photos)} photos, {len(sparse.points_in_scan):,} points observed {len(lengths):,} times;"
+        f" reprojection error {rms:.2f} px rms, {float(np.median(lengths)) if len(lengths) else 0.0:.2f} px in the median."
     )
     if sparse.unplaced:
-        lead += f" {len(sparse.unplaced)} could not be placed: " + ", ".join(name for name, _ in sparse.unplaced) + "."
+        lead += (
+            f" {len(sparse.unplaced)} could not be registered: " + ", ".join(name for name, _ in sparse.unplaced) + "."
+        )
     context: dict[str, Any] = {"photos": rows, "photos_lead": lead}
     if part is not None:
         seen = coverage(part.model, [(photo.camera, photo.cam_from_scan) for photo in sparse.photos])
@@ -352,7 +354,7 @@ def _photos(evidence: Evidence) -> dict[str, Any]:
     return context
 
 
-def _charts(evidence: Evidence) -> dict[str, Markup]:
+def _charts(evidence: ReportEvidence) -> dict[str, Markup]:
     inspection, system = evidence.inspection, evidence.inspection.datum_system
     made = {
         "tolerance": charts.tolerance_chart(inspection.components),
@@ -365,21 +367,23 @@ def _charts(evidence: Evidence) -> dict[str, Markup]:
     return {name: Markup(text) for name, text in made.items()}
 
 
-def _viewer(evidence: Evidence, options: ReportOptions) -> dict[str, Any]:
+def _viewer(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
     model = None if evidence.part is None else evidence.part.model
     scene = make_scene(evidence.inspection, model, evidence.cloud, evidence.distances, options.scene)
     if scene is None:
         return {"scene": ""}
     cloud = scene.get("cloud", {})
-    lead = ["The CAD at its design place (transparent) and each component where it was measured (solid)."]
+    lead = ["Components at their design positions (transparent) and measured positions (solid)."]
     if "mesh" not in scene:
-        lead = ["The CAD is not shown: " + ("it was not given." if model is None else "it has too many triangles.")]
+        lead = [
+            "The CAD model is not shown: " + ("it was not given." if model is None else "it has too many triangles.")
+        ]
     if cloud:
         shown = len(cloud["points"]) // 8
         lead.append(f"{shown:,} of the {cloud['of']:,} points of the cloud.")
     else:
         lead.append(evidence.absent.get("cloud", "There is no cloud."))
-    modes = [(name, text) for name, text in (("photo", "photos"), ("distance", "distance to the CAD"))
+    modes = [(name, text) for name, text in (("photo", "photos"), ("distance", "distance to the CAD model"))
              if ("colors" if name == "photo" else "distances") in cloud]  # fmt: skip
     return {
         "scene": Markup(scene_json(scene)),
@@ -395,7 +399,7 @@ def _moment(inspection: Inspection) -> str:
     return inspection.created.strftime("%Y-%m-%d %H:%M UTC")
 
 
-def _embedded(image: Picture, quality: int) -> dict[str, Any]:
+def _embedded(image: RgbImage, quality: int) -> dict[str, Any]:
     """A picture as a data URL, JPEG."""
     from PIL import Image
 

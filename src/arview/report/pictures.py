@@ -1,4 +1,4 @@
-"""Pictures of a report: photos cropped to what was found, with the ghost of the design and an arrow; the whole part."""
+"""Pictures of a report: crops of photos with the overlay of a component and its displacement, and an overview."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from arview.reconstruction.intake.reading import read_photo
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from arview.rendering.renderers import ZBufferRenderer
 
-Picture = NDArray[np.uint8]
+RgbImage = NDArray[np.uint8]
+"""(H,W,3) RGB picture."""
 _ROUND_SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _FOREIGN_RGB = (255, 214, 10)
 _BACKGROUND = (52, 58, 68)
@@ -30,35 +31,41 @@ _BACKGROUND = (52, 58, 68)
 
 @dataclass(frozen=True)
 class CropOptions:
-    """What the crops show."""
+    """Size and selection of the crops."""
 
-    width_px: int = 720  # of a crop: sharp on a page that shows two beside each other
+    width_px: int = 720  # size of a crop, sharp on a page with two of them side by side
     height_px: int = 540
-    share: float = 0.55  # of the crop's side that the component takes: its neighbours tell where it is
-    least_px: int = 160  # of the photo that a crop shows at least; fewer would only be blur
-    arrow_share: float = 0.3  # of the crop's width that the arrow is at most long
-    apart_deg: float = 40.0  # between the lines of sight of two crops, so that the second one tells more
-    longest_px: int = 400  # of the renderings that say what can be seen; a component of 1 % still has 16 px
+    share: float = 0.55  # share of the crop that the component fills; the rest shows its surroundings
+    min_px: int = 160  # smallest width of the region of the photo; smaller ones would be blurred
+    arrow_share: float = 0.3  # largest length of the arrow as a share of the width of the crop
+    apart_deg: float = 40.0  # smallest angle between the lines of sight of two crops
+    max_px: int = 400  # longer side of the renderings that determine the visibility
 
 
 @dataclass(frozen=True)
 class Crop:
-    """Part of a photo with what is drawn on it.
+    """A region of a photo with the overlay.
 
     Attributes:
         image: (H,W,3) uint8 RGB.
         photo: name of the photo.
-        arrow_scale: how much longer than the displacement the arrow is; None without an arrow.
+        arrow_scale: exaggeration of the displacement arrow; None without an arrow.
     """
 
-    image: Picture
+    image: RgbImage
     photo: str
     arrow_scale: float | None
 
 
 @dataclass(frozen=True)
 class Gallery:
-    """Crops by component, by number of the foreign object, and why photos could not be read."""
+    """The crops of a report.
+
+    Attributes:
+        components: crops by the name of the component.
+        foreign: crops of each foreign object.
+        unread: reasons why photos could not be read.
+    """
 
     components: dict[str, tuple[Crop, ...]]
     foreign: tuple[tuple[Crop, ...], ...]
@@ -69,22 +76,22 @@ def make_gallery(
     inspection: Inspection, model: Model, sparse: SparseModel, options: CropOptions | None = None,
     progress: StepProgress | None = None,
 ) -> Gallery:  # fmt: skip
-    """Two crops of what did not pass and of foreign objects, one of the rest, from the photos that show it best.
+    """Crops from the photos that show each object best: one for components that passed, else two.
 
     Args:
-        inspection: what was measured, in the frame of ``sparse``.
-        model: nominal.
-        sparse: photos and poses, mm.
-        options: see there.
-        progress: called with (done, in all).
+        inspection: the inspection, in the frame of ``sparse``.
+        model: the CAD model.
+        sparse: photos and their poses, mm.
+        options: see `CropOptions`.
+        progress: called with (photos done, number of photos).
     """
     options = options or CropOptions()
-    tell = progress or (lambda done, total: None)
-    seen = _Seen(model, sparse.photos, options)
+    report_progress = progress or (lambda done, total: None)
+    ranking = _PhotoRanking(model, sparse.photos, options)
     wanted: list[tuple[str | int, list[int]]] = [
-        (one.name, seen.best_of(one, 1 if one.verdict is Verdict.PASS else 2)) for one in inspection.components
+        (one.name, ranking.best_of(one, 1 if one.verdict is Verdict.PASS else 2)) for one in inspection.components
     ]
-    wanted += [(index, seen.best_of_box(one)) for index, one in enumerate(inspection.foreign_objects)]
+    wanted += [(index, ranking.best_of_box(one)) for index, one in enumerate(inspection.foreign_objects)]
     by_photo: dict[int, list[str | int]] = {}
     for key, photos in wanted:
         for index in photos:
@@ -92,7 +99,7 @@ def make_gallery(
     crops: dict[tuple[str | int, int], Crop] = {}
     unread: list[str] = []
     for done, (index, keys) in enumerate(by_photo.items()):
-        tell(done, len(by_photo))
+        report_progress(done, len(by_photo))
         photo = sparse.photos[index]
         try:
             image = read_photo(photo.path)
@@ -100,7 +107,7 @@ def make_gallery(
             unread.append(str(error))
             continue
         if image.shape[:2] != (photo.camera.height, photo.camera.width):
-            unread.append(f"{photo.path}: is {image.shape[1]}×{image.shape[0]}, not the photo that was measured in")
+            unread.append(f"{photo.path}: is {image.shape[1]}×{image.shape[0]}, not the size of the measured photo")
             continue
         for key in keys:
             if isinstance(key, str):
@@ -109,7 +116,7 @@ def make_gallery(
                 crops[key, index] = _component_crop(deviation, inspection, model, photo, image, options)
             else:
                 crops[key, index] = _foreign_crop(inspection.foreign_objects[key], photo, image, options)
-    tell(len(by_photo), len(by_photo))
+    report_progress(len(by_photo), len(by_photo))
     found = {key: tuple(crops[key, photo] for photo in photos if (key, photo) in crops) for key, photos in wanted}
     return Gallery(
         {key: value for key, value in found.items() if isinstance(key, str)},
@@ -118,11 +125,11 @@ def make_gallery(
     )
 
 
-def overview(inspection: Inspection, model: Model, sparse: SparseModel | None = None, width: int = 1440) -> Picture:
-    """The whole part with ghosts in the colours of the verdicts, arrows and labels, (H,W,3) uint8 RGB.
+def overview(inspection: Inspection, model: Model, sparse: SparseModel | None = None, width: int = 1440) -> RgbImage:
+    """The whole part with the overlay in the colours of the verdicts, arrows and labels, (H,W,3) uint8 RGB.
 
-    Over the photo that shows it best, if there is one that can be read; else the nominal part alone, from the right
-    and above.
+    The overlay is drawn over the photo that shows the part best, or, without a readable photo, on a plain background
+    from the upper right.
     """
     options = OverlayOptions(show_status=False, max_labels=10)
     for photo in _whole_views(model, sparse.photos if sparse is not None else ()):
@@ -145,7 +152,7 @@ def overview(inspection: Inspection, model: Model, sparse: SparseModel | None = 
 
 
 def _whole_views(model: Model, photos: Sequence[PosedPhoto]) -> list[PosedPhoto]:
-    """Photos that hold the whole part, those from the middle of the heights first, in which it is large."""
+    """Photos that contain the whole part, those in which it is largest first."""
     corners = _corners(model.bounds_in_model)
     views = []
     for photo in photos:
@@ -153,12 +160,12 @@ def _whole_views(model: Model, photos: Sequence[PosedPhoto]) -> list[PosedPhoto]
         size = np.array([photo.camera.width, photo.camera.height])
         if np.isfinite(pixels).all() and (pixels >= 0).all() and (pixels < size).all():
             share = float(np.max(np.ptp(pixels, axis=0) / size))
-            views.append((min(share, 0.8), photo))  # beyond that there is no room for labels
+            views.append((min(share, 0.8), photo))  # larger parts leave no room for labels
     return [photo for _, photo in sorted(views, key=lambda view: -view[0])]
 
 
 def _whole_pose(model: Model, camera: Camera) -> Array:
-    """A view in which the model's box fills the picture but for the labels' margins."""
+    """A pose in which the bounding box of the model fills the picture except for margins for labels."""
     direction = np.array([0.45, -0.75, 0.75]) / np.linalg.norm([0.45, -0.75, 0.75])
     corners, distance = _corners(model.bounds_in_model), 3.0 * model.diameter_mm
     for _ in range(4):
@@ -168,7 +175,7 @@ def _whole_pose(model: Model, camera: Camera) -> Array:
     return pose
 
 
-class _Seen:
+class _PhotoRanking:
     """How many pixels of what each photo shows."""
 
     def __init__(self, model: Model, photos: Sequence[PosedPhoto], options: CropOptions) -> None:
@@ -177,7 +184,7 @@ class _Seen:
         self.pixels = np.zeros((len(photos), len(model.components)))
         self._depths: list[tuple[Camera, NDArray[np.float32]]] = []
         for row, photo in enumerate(photos):
-            scale = min(1.0, options.longest_px / max(photo.camera.width, photo.camera.height))
+            scale = min(1.0, options.max_px / max(photo.camera.width, photo.camera.height))
             small = photo.camera.scaled(round(photo.camera.width * scale), round(photo.camera.height * scale))
             drawn = ZBufferRenderer(model, small).render(photo.cam_from_scan)
             ids = drawn.component_ids
@@ -185,7 +192,7 @@ class _Seen:
             self._depths.append((small.without_distortion(), drawn.depth_mm))
 
     def best_of(self, deviation: ComponentDeviation, count: int) -> list[int]:
-        """Photos that show a component large and its displacement from the side, in different directions."""
+        """Photos, from different directions, that show a component large and its displacement from the side."""
         bounds = self.model.component(deviation.name).bounds_in_model
         score = self.pixels[:, self.model.index(deviation.name)] * self._inside(_corners(bounds))
         rays = self._rays(bounds.mean(axis=0))
@@ -193,10 +200,10 @@ class _Seen:
         if displacement is not None:
             along = rays @ (np.array(displacement) / np.linalg.norm(displacement))
             score = score * np.sqrt(np.maximum(1.0 - along**2, 0.0))
-        return self._apart(score, rays, count)
+        return self._select_apart(score, rays, count)
 
     def best_of_box(self, one: ForeignReport) -> list[int]:
-        """Photos in which the middle of a foreign object is not behind the CAD, nearest first."""
+        """Photos in which the centre of a foreign object is not occluded by the CAD model, the nearest first."""
         center, size = np.array(one.center_mm), np.array(one.size_mm)
         rays = self._rays(center)
         score = self._inside(center + 0.5 * size * _UNIT_CORNERS) / np.linalg.norm(self.centres - center, axis=1)
@@ -207,14 +214,14 @@ class _Seen:
                 surface = depth[int(v), int(u)]
                 if surface > 0 and surface < in_cam[2] - max(0.6 * float(np.linalg.norm(size)), 1.0):
                     score[index] = 0.0
-        return self._apart(score, rays, 2)
+        return self._select_apart(score, rays, 2)
 
     def _rays(self, point: Array) -> Array:
         rays = self.centres - point
         return np.asarray(rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9))
 
     def _inside(self, corners: Array) -> Array:
-        """1 for photos that hold all corners (8,3), 0.05 for those that do not."""
+        """(M,) weights: 1 for photos that contain all corners (8,3), 0.05 for others."""
         result = np.zeros(len(self.photos))
         for index, photo in enumerate(self.photos):
             pixels = photo.camera.project(apply(photo.cam_from_scan, corners))
@@ -223,7 +230,7 @@ class _Seen:
             result[index] = 1.0 if holds else 0.05
         return result
 
-    def _apart(self, score: Array, rays: Array, count: int) -> list[int]:
+    def _select_apart(self, score: Array, rays: Array, count: int) -> list[int]:
         chosen: list[int] = []
         score = score.copy()
         while len(chosen) < count and score.max(initial=0.0) > 0.0:
@@ -237,15 +244,15 @@ _BOX_EDGES = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1"
 
 
 def _corners(bounds: Array) -> Array:
-    """The eight corners of a box (2,3)."""
+    """The eight corners, (8,3), of a box given by its bounds, (2,3)."""
     return np.asarray(bounds.mean(axis=0) + 0.5 * (bounds[1] - bounds[0]) * _UNIT_CORNERS)
 
 
 def _component_crop(
-    deviation: ComponentDeviation, inspection: Inspection, model: Model, photo: PosedPhoto, image: Picture,
+    deviation: ComponentDeviation, inspection: Inspection, model: Model, photo: PosedPhoto, image: RgbImage,
     options: CropOptions,
 ) -> Crop:  # fmt: skip
-    """The design place of a component as a ghost, and an arrow to where it is."""
+    """A crop with the overlay of a component at its design position and an arrow to its measured position."""
     bounds = model.component(deviation.name).bounds_in_model
     crop, camera = _cut(image, photo, _corners(bounds), options)
     scale: float | None = None
@@ -262,8 +269,8 @@ def _component_crop(
     return Crop(picture, photo.name, scale)
 
 
-def _foreign_crop(one: ForeignReport, photo: PosedPhoto, image: Picture, options: CropOptions) -> Crop:
-    """The box round something that does not belong there."""
+def _foreign_crop(one: ForeignReport, photo: PosedPhoto, image: RgbImage, options: CropOptions) -> Crop:
+    """A crop with the bounding box of a foreign object."""
     corners = np.array(one.center_mm) + 0.5 * np.array(one.size_mm) * _UNIT_CORNERS
     crop, camera = _cut(image, photo, corners, options)
     pixels = camera.project(apply(photo.cam_from_scan, corners))
@@ -273,15 +280,15 @@ def _foreign_crop(one: ForeignReport, photo: PosedPhoto, image: Picture, options
     return Crop(crop, photo.name, None)
 
 
-def _cut(image: Picture, photo: PosedPhoto, corners: Array, options: CropOptions) -> tuple[Picture, Camera]:
-    """The part of a photo round some points (N,3), at the size of a crop, and its camera."""
+def _cut(image: RgbImage, photo: PosedPhoto, corners: Array, options: CropOptions) -> tuple[RgbImage, Camera]:
+    """The region of a photo around points (N,3), scaled to the size of a crop, and its camera."""
     pixels = photo.camera.project(apply(photo.cam_from_scan, corners))
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     camera = photo.camera
     middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
     aspect = options.width_px / options.height_px
     extent = np.ptp(pixels, axis=0) / options.share
-    width = float(np.clip(max(extent[0], extent[1] * aspect, options.least_px), 1, camera.width))
+    width = float(np.clip(max(extent[0], extent[1] * aspect, options.min_px), 1, camera.width))
     width = min(width, camera.height * aspect)
     size = np.array([round(width), round(width / aspect)])
     low = np.clip(np.round(middle - 0.5 * size), 0, np.array([camera.width, camera.height]) - size).astype(int)

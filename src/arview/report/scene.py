@@ -1,4 +1,4 @@
-"""What the viewer in the page shows: CAD, cloud and arrows, packed into one JSON text."""
+"""The scene of the viewer in the page: CAD model, cloud and arrows as JSON."""
 
 from __future__ import annotations
 
@@ -20,36 +20,38 @@ from arview.overlay.options import OverlayOptions
 from arview.reconstruction.types import DenseCloud
 
 _STEPS = 65535
-"""Coordinates are stored in 16 bits over the box of what they belong to: a metre in steps of 15 µm."""
+"""Steps of the coordinates, which are stored in 16 bits over their bounding box: a metre in steps of 15 µm."""
 
 _REACH_MM = 3.0
-"""Points farther from the CAD have no distance."""
+"""Points farther from the CAD model have no distance."""
 
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """How much the viewer is given."""
+    """Size of the scene."""
 
-    most_points: int = 90_000  # about 1.3 MB in the page, dense enough for a part of the size of the screen
-    most_faces: int = 400_000  # beyond that the page gets slow and large; the CAD is then left out
-    around: float = 0.15  # of the part's diameter that the cloud may stand out: the bench is not wanted
+    max_points: int = (
+        90_000  # points of the cloud; about 1.3 MB in the page, dense enough for a part that fills the screen
+    )
+    max_faces: int = 400_000  # triangles above which the CAD model is omitted, because the page would become slow
+    margin: float = 0.15  # margin around the part, share of its diameter, outside of which the cloud is cut off
 
 
 def make_scene(
     inspection: Inspection, model: Model | None, cloud: DenseCloud | None, distances: DistanceMap | None,
     options: SceneOptions | None = None,
 ) -> dict[str, Any] | None:  # fmt: skip
-    """The scene as an object for JSON; None when there is neither CAD nor cloud.
+    """The scene as a JSON object; None when there is neither CAD model nor cloud. All data are in one frame.
 
     Args:
-        inspection: deviations, in the frame of all others.
-        model: nominal.
-        cloud: in the colours of the photos.
-        distances: of a cloud to the CAD; used when there is no cloud with colours.
-        options: how much.
+        inspection: the deviations.
+        model: the CAD model, or None.
+        cloud: cloud in the colours of the photos, or None.
+        distances: distances of a cloud to the CAD model, used if there is no cloud with colours.
+        options: see `SceneOptions`.
     """
     options = options or SceneOptions()
-    if model is not None and len(model.mesh[1]) > options.most_faces:
+    if model is not None and len(model.mesh[1]) > options.max_faces:
         model = None
     scene: dict[str, Any] = {"stops": COLOR_STOPS.tolist(), "components": []}
     if model is not None:
@@ -85,7 +87,7 @@ def make_scene(
 
 
 def scene_json(scene: dict[str, Any]) -> str:
-    """As text that can stand in a script element: no ``<`` in it."""
+    """The scene as JSON text without ``<``, so that it can be embedded in a script element."""
     return json.dumps(_rounded(scene), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
@@ -101,16 +103,16 @@ def _mesh(model: Model) -> dict[str, Any]:
 def _points(
     cloud: DenseCloud | None, model: Model | None, distances: DistanceMap | None, options: SceneOptions
 ) -> dict[str, Any] | None:
-    """A random choice of the points near the part, with photo colours and distances as far as they are known."""
-    chance = np.random.default_rng(0)
+    """A random sample of the points near the part, with colours and distances as far as they are known."""
+    rng = np.random.default_rng(0)
     if cloud is not None:
         points = np.asarray(cloud.points, dtype=np.float64)
         keep = np.isfinite(points).all(axis=1)
         if model is not None:
-            reach = options.around * model.diameter_mm
+            reach = options.margin * model.diameter_mm
             low, high = model.bounds_in_model
             keep &= ((points > low - reach) & (points < high + reach)).all(axis=1)
-        chosen = _choice(np.flatnonzero(keep), options.most_points, chance)
+        chosen = _choice(np.flatnonzero(keep), options.max_points, rng)
         if len(chosen) == 0:
             return None
         near: dict[str, Any] = {"colors": _text(np.asarray(cloud.colors[chosen], dtype="u1"))}
@@ -118,25 +120,25 @@ def _points(
             near["distances"] = _text(_distances_um(points[chosen], model))
         return {**_packed(points[chosen]), **near, "of": len(points)}
     if distances is not None:
-        chosen = _choice(np.arange(len(distances.distances)), options.most_points, chance)
+        chosen = _choice(np.arange(len(distances.distances)), options.max_points, rng)
         um = np.round(1000.0 * distances.distances[chosen]).clip(-32767, 32767).astype("<i2")
         return {**_packed(distances.points_in_model[chosen]), "distances": _text(um), "of": len(distances.distances)}
     return None
 
 
 def _distances_um(points: Array, model: Model) -> NDArray[np.int16]:
-    """Signed distances of the points in micrometres, −32768 for those that are far from the CAD."""
+    """Signed distances of the points in µm; −32768 for points far from the CAD model."""
     closest = MeshSurface(*model.mesh).closest(points, _REACH_MM)
     um = np.where(closest.faces >= 0, np.round(1000.0 * closest.distances).clip(-32767, 32767), -32768)
     return np.asarray(um.astype("<i2"))
 
 
-def _choice(indices: NDArray[np.int64], most: int, chance: np.random.Generator) -> NDArray[np.int64]:
-    return indices if len(indices) <= most else np.sort(chance.choice(indices, most, replace=False))
+def _choice(indices: NDArray[np.int64], limit: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    return indices if len(indices) <= limit else np.sort(rng.choice(indices, limit, replace=False))
 
 
 def _packed(points: Array) -> dict[str, Any]:
-    """Points (N,3) in 16 bits each over their box."""
+    """Points (N,3) with coordinates of 16 bits over their bounding box."""
     low, high = points.min(axis=0), points.max(axis=0)
     step = np.maximum(high - low, 1e-6) / _STEPS
     whole = np.round((points - low) / step).astype("<u2")
@@ -148,7 +150,7 @@ def _text(values: NDArray[Any]) -> str:
 
 
 def _rounded(value: Any) -> Any:
-    """Floats to seven digits: the page need not carry seventeen."""
+    """Round floats to seven digits to reduce the size of the page."""
     if isinstance(value, float):
         return float(f"{value:.7g}")
     if isinstance(value, dict):

@@ -1,12 +1,12 @@
-// The viewer of the report: CAD as designed and as measured, cloud, arrows. Needs the global THREE and, in the page,
-// #scene (JSON, see scene.py) and #viewer. Draws only when something changes.
+// The viewer of the report: components at their design and measured positions, cloud, arrows. Needs the global THREE and
+// the elements #scene (JSON, see scene.py) and #viewer. It draws only when something changes.
 "use strict";
 (() => {
   const host = document.getElementById("viewer");
   const source = document.getElementById("scene");
   if (!host || !source) return;
   const COLORS = { pass: 0x2fbf86, fail: 0xf0564f, undecided: 0xf0b13c, not_measured: 0x8ea3bd, none: 0xb9c2cc };
-  const WORDS = { pass: "pass", fail: "fail", undecided: "undecided", not_measured: "not measured" };
+  const VERDICT_TEXTS = { pass: "pass", fail: "fail", undecided: "undecided", not_measured: "not measured" };
 
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const points = (pack) => {
@@ -27,13 +27,13 @@
     } catch (error) {
       host.classList.add("flat");
       host.querySelector(".viewer-note").textContent =
-        "This browser gives no WebGL, which the 3D view needs; the pictures of this page do without it.";
+        "This browser does not support WebGL, which the 3D view needs; the pictures do not need it.";
       return;
     }
     host.classList.add("live");
     renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     stage.appendChild(renderer.domElement);
-    renderer.domElement.setAttribute("aria-label", "3D view of the part; drag to turn, scroll or pinch to zoom");
+    renderer.domElement.setAttribute("aria-label", "3D view of the part; drag to rotate, scroll or pinch to zoom");
     const world = new THREE.Scene();
     world.background = new THREE.Color(0x1f252e);
     world.add(new THREE.HemisphereLight(0xffffff, 0x5a6470, 2.2));
@@ -55,7 +55,7 @@
       const faces = new Uint32Array(bytes(scene.mesh.faces).buffer);
       scene.components.forEach((component, index) => {
         const [first, last] = scene.mesh.ranges[index];
-        // Each component by itself, with faces of its own: flat shading and sharp edges.
+        // Faces share no vertices, for flat shading and sharp edges.
         const mine = faces.subarray(3 * first, 3 * last);
         const flat = new Float32Array(3 * mine.length);
         for (let i = 0; i < mine.length; i++)
@@ -97,7 +97,7 @@
       groups.arrows.add(new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color: 0xffd60a })));
     }
 
-    // ---- the cloud, in the colours of the photos or by distance
+    // ---- the cloud, coloured by the photos or by distance
     let cloud = null, distances = null, photo = null;
     if (scene.cloud) {
       const geometry = new THREE.BufferGeometry();
@@ -130,7 +130,7 @@
       color.needsUpdate = true;
     }
 
-    // ---- arrows from the design place, longer than they are
+    // ---- exaggerated arrows from the design position
     const diameter = box.getSize(new THREE.Vector3()).length();
     const middle = box.getCenter(new THREE.Vector3());
     function drawArrows(scale) {
@@ -156,7 +156,7 @@
       }
     }
 
-    // ---- names over the picture
+    // ---- names over the view
     const names = host.querySelector(".names");
     const labels = scene.components.filter((c) => c.center && c.verdict && c.verdict !== "pass").map((component) => {
       const label = document.createElement("span");
@@ -167,7 +167,7 @@
     });
 
     const panel = host.querySelector(".about");
-    function tell(component) {
+    function showDetails(component) {
       panel.textContent = "";
       const title = document.createElement("strong");
       title.textContent = component.name;
@@ -176,7 +176,7 @@
       if (component.verdict === null) line("not inspected");
       else if (component.missing) line("fail: missing");
       else {
-        line(WORDS[component.verdict]);
+        line(VERDICT_TEXTS[component.verdict]);
         if (component.distance != null) line(`distance ${number(component.distance)} ± ${number(component.uncertainty)} mm`);
         component.displacement.forEach((value, k) => line(`d${"xyz"[k]} ${number(value)}${value === null ? "" : " mm"}`));
       }
@@ -184,10 +184,10 @@
     }
 
     // ---- drawing, only when needed
-    let asked = false;
-    const ask = () => { if (!asked) { asked = true; requestAnimationFrame(draw); } };
+    let isRequested = false;
+    const requestDraw = () => { if (!isRequested) { isRequested = true; requestAnimationFrame(draw); } };
     function draw() {
-      asked = false;
+      isRequested = false;
       sun.position.copy(camera.position);
       renderer.render(world, camera);
       const { width, height } = stage.getBoundingClientRect();
@@ -209,11 +209,11 @@
       camera.aspect = width / height;
       camera.updateProjectionMatrix();
       if (cloud) cloud.material.size = diameter / 320;
-      if (!isMoved) look(...view);
-      ask();
+      if (!isMoved) setView(...view);
+      requestDraw();
     }
-    function look(x, y, z) {
-      // As near as shows the whole box.
+    function setView(x, y, z) {
+      // The nearest position from which the whole bounding box is visible.
       const towards = new THREE.Vector3(x, y, z).normalize();
       let distance = 2 * diameter;
       for (let i = 0; i < 5; i++) {
@@ -233,9 +233,9 @@
       }
       controls.target.copy(middle);
       controls.update();
-      ask();
+      requestDraw();
     }
-    controls.addEventListener("change", ask);
+    controls.addEventListener("change", requestDraw);
 
     const settings = host.querySelector(".controls");
     const value = (name) => settings.querySelector(`[name="${name}"]`);
@@ -253,7 +253,7 @@
         legend.querySelector(".high").textContent = `+${limit.value} mm`;
       }
       if (scene.mesh) drawArrows(Number(value("exaggeration").value));
-      ask();
+      requestDraw();
     }
     settings.addEventListener("input", apply);
     settings.addEventListener("click", (event) => {
@@ -261,7 +261,7 @@
       if (!chosen) return;
       view = chosen;
       isMoved = false;
-      look(...view);
+      setView(...view);
     });
     let pressed = null;
     renderer.domElement.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; });
@@ -272,10 +272,10 @@
                                    1 - ((event.clientY - area.top) / area.height) * 2);
       const ray = new THREE.Raycaster();
       ray.setFromCamera(at, camera);
-      // Inspected components before what they stand on.
+      // Inspected components take precedence over the others.
       const hits = ray.intersectObjects(pickable, false);
       const hit = hits.find((one) => one.object.userData.component.verdict !== null) || hits[0];
-      if (hit) tell(hit.object.userData.component); else panel.hidden = true;
+      if (hit) showDetails(hit.object.userData.component); else panel.hidden = true;
     });
     new ResizeObserver(resize).observe(stage);
     resize();
@@ -283,7 +283,7 @@
     host.dataset.state = "ready";
   }
 
-  // When it comes near the window, or when the page has been there for a while.
+  // Start when the viewer comes near the viewport, or some time after the page has loaded.
   let isStarted = false;
   const once = () => { if (!isStarted) { isStarted = true; start(); } };
   if ("IntersectionObserver" in window)

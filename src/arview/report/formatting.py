@@ -1,4 +1,4 @@
-"""Numbers and verdicts as a report writes them: an undetermined value is a word, never a number."""
+"""Formatting of numbers and verdicts. An undetermined value is written as a word, never as a number."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ VERDICT_WORD = {
 
 
 def number(value: float | None, digits: int = 3, signed: bool = False) -> str:
-    """With a true minus; a dash for None."""
+    """A number with a typographic minus; a dash for None."""
     if value is None:
         return NONE
     text = f"{value:{'+' if signed else ''}.{digits}f}"
@@ -27,59 +27,60 @@ def number(value: float | None, digits: int = 3, signed: bool = False) -> str:
 
 
 def determined(value: float | None, digits: int = 3, signed: bool = False) -> str | Markup:
-    """Like ``number``, but ``undetermined`` for None."""
+    """As `number`, but ``undetermined`` for None."""
     return UNDETERMINED if value is None else number(value, digits, signed)
 
 
 def verdict_word(deviation: ComponentDeviation) -> str:
-    """The verdict, or what was found."""
+    """The verdict, or ``Missing``."""
     return "Missing" if deviation.finding is Finding.MISSING else VERDICT_WORD[deviation.verdict]
 
 
 def zone_text(deviation: ComponentDeviation) -> str | Markup:
-    """Diameter of the position zone that holds the component, and of the one allowed (ISO 1101)."""
+    """Diameter of the position tolerance zone that contains the component, and the allowed diameter (ISO 1101)."""
     if deviation.distance_mm is None:
         return UNDETERMINED if deviation.verdict is Verdict.UNDECIDED else NONE
     details = deviation.details
     zone = details.zone_diameter_mm if details is not None else None
     text = number(2.0 * deviation.distance_mm if zone is None else zone)
     if None in deviation.displacement_mm:
-        text = f"≥ {text}"  # an undetermined axis can only make it larger
+        text = f"≥ {text}"  # a displacement along the undetermined axis can only enlarge it
     return text if deviation.tolerance_mm is None else f"{text} ({number(2.0 * deviation.tolerance_mm)})"
 
 
 def finding_text(deviation: ComponentDeviation) -> str:
-    """What was found of a component that did not pass, in a sentence or two."""
+    """Description of a component that did not pass."""
     if deviation.finding is Finding.MISSING:
-        return "The component is not there."
+        return "The component is missing."
     if deviation.distance_mm is None:
         state = "was not measured" if deviation.verdict is Verdict.NOT_MEASURED else "could not be determined"
-        return f"Where it stands {state}."
-    text = f"{number(deviation.distance_mm)} mm from its design place, U = {number(deviation.uncertainty_mm)} mm"
+        return f"Its position {state}."
+    text = f"{number(deviation.distance_mm)} mm from its design position, U = {number(deviation.uncertainty_mm)} mm"
     if deviation.tolerance_mm is not None:
-        text += f"; {number(deviation.tolerance_mm)} mm are allowed"
+        text += f"; {number(deviation.tolerance_mm)} mm is allowed"
     axes = ", ".join(
         f"d{axis}\u00a0{'undetermined' if value is None else number(value, signed=True)}"
         for axis, value in zip("xyz", deviation.displacement_mm, strict=True)
     )
     details = deviation.details
-    turned = ""
+    rotation = ""
     if details is not None and details.angle_tolerance_deg is not None and details.angle_deg is not None:
-        turned = (
-            f" Turned by {number(details.angle_deg, 2)}° ± {number(details.angle_uncertainty_deg, 2)}°,"
-            f" {number(details.angle_tolerance_deg, 2)}° are allowed."
+        rotation = (
+            f" Rotated by {number(details.angle_deg, 2)}° ± {number(details.angle_uncertainty_deg, 2)}°,"
+            f" {number(details.angle_tolerance_deg, 2)}° is allowed."
         )
-    return f"{text}: {axes}.{turned}"
+    return f"{text}: {axes}.{rotation}"
 
 
 def short_text(deviation: ComponentDeviation) -> str:
-    """Distance, U and tolerance for a caption."""
+    """Distance, U and tolerance as a caption."""
     text = f"{number(deviation.distance_mm)} ± {number(deviation.uncertainty_mm)} mm"
     return text if deviation.tolerance_mm is None else f"{text} of {number(deviation.tolerance_mm)}"
 
 
 def foreign_text(one: ForeignReport) -> str:
-    """What and where, in a sentence."""
+    """Description of a foreign object."""
     x, y, z = (number(value, 1) for value in one.center_mm)
     a, b, c = (number(value, 1) for value in one.size_mm)
-    return f"{one.text[:1].upper()}{one.text[1:]}. Its box of {a} × {b} × {c} mm is about ({x}, {y}, {z}) mm."
+    box = f"Its bounding box of {a} × {b} × {c} mm has its centre at ({x}, {y}, {z}) mm."
+    return f"{one.text[:1].upper()}{one.text[1:]}. {box}"

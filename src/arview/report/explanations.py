@@ -1,4 +1,4 @@
-"""How it was measured, in words and tables."""
+"""Texts and tables that explain how the part was measured."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any
 
 from arview.cad.part import Part
 from arview.inspection import Inspection, MethodResult
-from arview.report.words import NONE, determined, number
+from arview.report.formatting import NONE, determined, number
 from arview.version import __version__
 
 LEGEND = (
-    "Nominal and measured are the place of the middle of the component's bounding box in the datum frame, deviation is"
-    " measured minus nominal (dx, dy, dz). Distance is the length of the deviation and is compared with the tolerance,"
-    " which is a radius; position Ø is the diameter of the smallest position tolerance zone that holds the component"
-    " (ISO 1101), twice the distance, with the allowed diameter in brackets. U is the expanded uncertainty of the"
-    " distance. Tilt is the angle between measured and design axis, twist the turn about that axis. Undetermined: the"
-    " measurement does not say; the value is unknown, not zero."
+    "Nominal and measured are the position of the centre of the component's bounding box in the datum frame; deviation"
+    " is measured minus nominal (dx, dy, dz). Distance is the length of the deviation and is compared with the tolerance"
+    ", which is a radius. Position Ø is the diameter of the smallest position tolerance zone that contains the component"
+    " (ISO 1101), twice the distance, with the allowed diameter in parentheses. U is the expanded uncertainty of the"
+    " distance. Tilt is the angle between measured and design axis, twist the rotation about that axis. Undetermined"
+    " means that the measurement cannot determine the value: it is unknown, not zero."
 )
 _DOF = {
     "rx": "rotation about x",
@@ -27,20 +27,20 @@ _DOF = {
     "tz": "position along z",
 }
 _METHODS = {
-    "sweep": "sweep: patches of the component's surface are moved along their normals until the photos agree on them",
-    "edges": "edges: the edges of the CAD are fitted to those in the photos",
-    "cloud": "cloud: the dense cloud is registered to the CAD (for comparison, unless it is the only one)",
+    "sweep": "sweep: patches of the component's surface are moved along their normals until the photos match",
+    "edges": "edges: the edges of the CAD model are fitted to those in the photos",
+    "cloud": "cloud: the dense cloud is registered to the CAD model (for comparison, unless it is the only method)",
 }
 
 
-def in_words(locked: str) -> str:
-    """Degrees of freedom like ``rx ry tz`` in words; other texts as they are."""
+def constraint_text(locked: str) -> str:
+    """Degrees of freedom like ``rx ry tz`` as text; other texts are returned unchanged."""
     parts = locked.split()
     return ", ".join(_DOF[part] for part in parts) if parts and all(part in _DOF for part in parts) else locked
 
 
 def facts(inspection: Inspection) -> list[tuple[str, str]]:
-    """The box at the head of the report."""
+    """Names and values of the summary at the head of the report."""
     source = inspection.provenance
     tolerances = {c.tolerance_mm for c in inspection.components if c.tolerance_mm is not None}
     largest = max((c.uncertainty_mm for c in inspection.components if c.uncertainty_mm is not None), default=None)
@@ -58,20 +58,20 @@ def facts(inspection: Inspection) -> list[tuple[str, str]]:
 
 
 def paragraphs(inspection: Inspection) -> list[str]:
-    """The measurement in sentences."""
+    """Description of the measurement."""
     source, system = inspection.provenance, inspection.datum_system
     options = dict(source.options)
     text = []
     used = [_METHODS[name] for name in options.get("methods", "").split(",") if name in _METHODS]
     if source.photos:
         text.append(
-            f"{source.photos} photos were placed relative to each other by their image features (structure from"
-            " motion), brought to millimetres and into the frame of the CAD, and each component was measured in them."
+            f"The poses of {source.photos} photos were determined from image features (structure from motion) and"
+            " transformed to millimetres in the frame of the CAD model. Each component was measured in these photos."
         )
     else:
         text.append(f"Method: {source.method}.")
     if used:
-        text.append("Ways of measuring: " + "; ".join(used) + ". Sweep and edges are combined by their covariance.")
+        text.append("Measurement methods: " + "; ".join(used) + ". Sweep and edges are combined by their covariances.")
     if system is not None and system.scale_from:
         scale = f"The scale comes from {system.scale_from}"
         if system.scale_std is not None:
@@ -80,28 +80,28 @@ def paragraphs(inspection: Inspection) -> list[str]:
     if system is not None and system.datums:
         labels = ", ".join(datum.label for datum in system.datums)
         text.append(
-            f"All deviations are stated in the frame of the datums {labels}, in this order; what they leave free is"
-            " decided by the best fit of the base."
+            f"All deviations are stated in the frame of the datums {labels}, in this order; remaining degrees of"
+            " freedom are determined by the best fit of the base."
         )
     if "guard" in options:
         guard = options["guard"]
         text.append(
-            f"Decision rule (ISO 14253-1, guard factor {guard}): a component passes when distance + {guard} · U is"
-            f" within its tolerance, fails when distance − {guard} · U is not, and is undecided between. The part"
-            " passes when every component does and nothing foreign is there."
+            f"Decision rule (ISO 14253-1, guard factor {guard}): a component passes if distance + {guard} · U is within"
+            f" its tolerance, fails if distance − {guard} · U exceeds it, and is undecided otherwise. The part passes"
+            " if all components pass and there are no foreign objects."
         )
     return text
 
 
 def uncertainty(inspection: Inspection) -> str:
-    """What U means."""
+    """Definition of U."""
     options = dict(inspection.provenance.options)
-    text = f"U is the expanded uncertainty (k = {options.get('k', '2')}) of the distance from the design place"
+    text = f"U is the expanded uncertainty (k = {options.get('k', '2')}) of the distance from the design position"
     if "probability" in options:
         share = 100.0 * float(options["probability"])
         text += (
-            f"; near zero it is as large as makes its interval hold the true distance {share:g} times of 100, as a"
-            " distance cannot be negative"
+            f"; near zero it is chosen such that its interval contains the true distance with a probability of"
+            f" {share:g} %, because a distance cannot be negative"
         )
     draws = options.get("monte_carlo", "0")
     if draws.isdigit() and int(draws):
@@ -112,7 +112,7 @@ def uncertainty(inspection: Inspection) -> str:
 
 
 def provenance(inspection: Inspection, part: Part | None) -> list[tuple[str, str]]:
-    """Everything that identifies the measurement."""
+    """Names and values that identify the measurement."""
     source = inspection.provenance
     rows = [
         ("measured by", f"{source.tool} {source.version}"),
@@ -129,7 +129,7 @@ def provenance(inspection: Inspection, part: Part | None) -> list[tuple[str, str
 
 
 def method_row(method: MethodResult) -> dict[str, Any]:
-    """A row of a finding's table of methods."""
+    """A row of the table of methods of a finding."""
     if method.displacement_mm is None:
         remark = f"not measured: {method.reason}" if method.reason else "not measured"
         return {
