@@ -88,7 +88,7 @@ def build_context(evidence: ReportEvidence, options: ReportOptions, progress: Pr
     if model is not None:
         context["overview"] = _embedded(overview(inspection, model, sparse), options.jpeg_quality)
         context["overview_caption"] = (
-            "Components at their design positions, drawn over a photo; exaggerated arrows point to the measured positions."
+            "Components at their design positions over a photo; exaggerated arrows point to the measured positions."
             if sparse is not None
             else "The nominal part; exaggerated arrows point to the measured positions."
         )
@@ -326,7 +326,7 @@ def _photos(evidence: ReportEvidence) -> dict[str, Any]:
     rms = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else 0.0
     lead = (
         f"{len(sparse.photos)} photos, {len(sparse.points_in_scan):,} points observed {len(lengths):,} times;"
-        f" reprojection error {rms:.2f} px rms, {float(np.median(lengths)) if len(lengths) else 0.0:.2f} px in the median."
+        f" reprojection error {rms:.2f} px rms, {float(np.median(lengths)) if len(lengths) else 0.0:.2f} px median."
     )
     if sparse.unplaced:
         lead += (
