@@ -14,9 +14,9 @@ LEGEND = (
     "Nominal and measured are the position of the centre of the component's bounding box in the datum frame; deviation"
     " is measured minus nominal (dx, dy, dz). Distance is the length of the deviation and is compared with the"
     " tolerance, which is a radius. Position Ø is the diameter of the smallest position tolerance zone that contains"
-    " the component (ISO 1101), twice the distance, with the allowed diameter in parentheses. U is the expanded uncertainty of the"
-    " distance. Tilt is the angle between measured and design axis, twist the rotation about that axis. Undetermined"
-    " means that the measurement cannot determine the value: it is unknown, not zero."
+    " the component (ISO 1101), twice the distance, with the allowed diameter in parentheses. U is the expanded"
+    " uncertainty of the distance. Tilt is the angle between measured and design axis, twist the rotation about that"
+    " axis. Undetermined means that the measurement cannot determine the value: it is unknown, not zero."
 )
 _DOF = {
     "rx": "rotation about x",

@@ -1,4 +1,4 @@
-"""What arview's pages share, read from the package: three.js in one file and a font (see ``tools/vendor-web``)."""
+"""Assets that the pages of arview share: three.js in one file and a font (see ``tools/vendor-web``)."""
 
 from __future__ import annotations
 
