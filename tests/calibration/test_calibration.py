@@ -280,7 +280,7 @@ def test_views_of_a_video_are_chosen_by_what_they_tell() -> None:
     blurred = [replace(view, blur_px=6.0) for view in views_of(rng, 12)]
     still = [replace(dull[0], pixels=dull[0].pixels + rng.normal(0, 0.08, dull[0].pixels.shape)) for _ in range(10)]
     views = [replace(v, name=f"frame {k}") for k, v in enumerate([*dull, *telling, *blurred, *still])]
-    chosen, rejected = choose_views(views, 640, 480, ChoiceOptions(most=25))
+    chosen, rejected = choose_views(views, 640, 480, ChoiceOptions(max_views=25))
     names = {view.name for view in chosen}
     assert len(names) == 25
     assert len(names | set(rejected)) == len(views)
@@ -328,8 +328,8 @@ def test_too_few_views_are_refused() -> None:
 @pytest.mark.parametrize(
     ("spec", "expected"),
     [
-        ("charuco:9x8:21:16:DICT_5X5_100", "a board of 11 columns, not of 9"),
-        ("charuco:11x8:21:16:DICT_4X4_50", "no marker of DICT_4X4_50 is seen, but such of DICT_5X5"),
+        ("charuco:9x8:21:16:DICT_5X5_100", "a board with 11 columns instead of 9"),
+        ("charuco:11x8:21:16:DICT_4X4_50", "no marker of DICT_4X4_50 was found, but some of DICT_5X5"),
         ("grid:11x8:16:5:DICT_5X5_100", "needs a ChArUco board"),
     ],
 )
@@ -372,7 +372,7 @@ def test_photos_of_several_cameras_and_none_with_a_board(pictures: list[np.ndarr
     with pytest.raises(InputError, match="holds no photos"):
         calibrate([empty], BOARD)
     write_photo(empty / "wall.jpg", np.full((480, 640), 130, np.uint8))
-    with pytest.raises(InputError, match="no marker of the board in any of 1 picture;"):
+    with pytest.raises(InputError, match="no marker of the board was found in any of 1 picture;"):
         calibrate([empty], BOARD)
     for k in range(3):
         write_photo(empty / f"{k}.jpg", pictures[k])
@@ -384,7 +384,7 @@ def test_a_video_and_a_corrupt_one(pictures: list[np.ndarray], tmp_path: Path) -
     images = [cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB) for gray in pictures]
     clip = write_clip(tmp_path / "clip.mp4", images, [0.5 * k for k in range(len(images))], faststart=True)
     result = calibrate([clip], BOARD)
-    assert result.sightings.looked_at >= 20
+    assert result.sightings.searched >= 20
     assert_near_truth(result.solution, focal=0.002, centre_px=1.0, pixel_px=0.12, corner_px=0.8)
     torn = tmp_path / "torn.mp4"
     torn.write_bytes(clip.read_bytes()[: clip.stat().st_size // 9])

@@ -242,7 +242,7 @@ def test_calibrated_camera_is_scaled_turned_or_refused(tmp_path: Path) -> None:
     (upright,), warnings = lenses_of([PhotoExif(3000, 4000)], file)
     assert isinstance(upright, Lens) and not upright.is_calibrated
     assert upright.camera.fy == 3210.0
-    assert "first guess" in warnings[0]
+    assert "initial guess" in warnings[0]
     (refused,), _ = lenses_of([PhotoExif(4000, 2250)], file)
     assert isinstance(refused, MismatchError) and "aspect ratio" in str(refused)
     # One zoom fits the calibration, the other does not.
@@ -331,7 +331,7 @@ def test_bad_photos_are_named_and_good_ones_kept(tmp_path: Path) -> None:
     intake = intake_photos(folder)
     rejected = names(intake.rejected)
     assert set(rejected) == {"blurred.jpg", "black.jpg", "wall.jpg", "small.jpg", "panorama.jpg"}
-    assert "blurred beyond use" in rejected["blurred.jpg"] and "black" in rejected["black.jpg"]
+    assert "too blurred to be used" in rejected["blurred.jpg"] and "black" in rejected["black.jpg"]
     assert "no texture" in rejected["wall.jpg"] and "panorama" in rejected["panorama.jpg"]
     told = "\n".join(intake.warnings)
     assert "1 of 11 photos is blurred (slightly_blurred.jpg)" in told

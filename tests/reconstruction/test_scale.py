@@ -210,7 +210,7 @@ def test_scale_file(tmp_path: Path) -> None:
     rig.write_text(json.dumps({"cam_from_rig_mm": {"a.jpg": rigid(np.eye(3), [1, 2, 3]).tolist()}}))
     np.testing.assert_allclose(load_rig(rig).centres_mm["a.jpg"], [-1, -2, -3])
     rig.write_text('{"centres_mm": {"a": [1, 2]}}')
-    with pytest.raises(InputError, match="not what it should be"):
+    with pytest.raises(InputError, match="a value is invalid"):
         load_rig(rig)
 
 

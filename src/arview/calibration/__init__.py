@@ -1,1 +1,1 @@
-"""Lens calibration from pictures of a ChArUco board: the board to print, finding it, the camera and how sure it is."""
+"""Lens calibration from pictures of a ChArUco board: finding the board, the camera, its uncertainty and a verdict."""

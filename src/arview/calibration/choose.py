@@ -1,8 +1,9 @@
-"""Which views of a video to calibrate from: sharp, still, and together telling most about the camera.
+"""Choice of the views of a video for calibration: sharp, still, and together with the most information on the camera.
 
-Each view brings information on the intrinsics, its own pose taken as unknown; views are taken one after the other so
-that the determinant of what is known grows most (D-optimal design, Fedorov 1972). Tilted views, views near the
-picture's corners and views from other distances come out first by themselves.
+Each view carries information on the intrinsics, with its own pose unknown; views are chosen one after the other such
+that the determinant of the information grows most (D-optimal design, Fedorov 1972). This prefers tilted views, views
+near
+the picture's corners and views at different distances.
 """
 
 from __future__ import annotations
@@ -22,47 +23,56 @@ from arview.geometry import Array, rigid
 
 @dataclass(frozen=True)
 class ChoiceOptions:
-    """How many views, and which are not worth looking at."""
+    """Number of views, and which views are excluded from the choice."""
 
-    most: int = 40  # more make the noise smaller, but not what the model of the lens leaves out
-    worse: float = 2.0  # times the median expected error of a corner (blur, motion): left out
-    apart: float = 0.02  # of the diagonal: views nearer to each other show the same, the better one stays
-    candidates: int = 160  # views the choice is made from
-    first: int = 25  # views of the first camera, by which the information of the others is told
+    max_views: int = 40  # more reduce the noise, but not the errors of the lens model
+    max_error_ratio: float = (
+        2.0  # views with a larger expected error, relative to the median (blur, motion), are excluded
+    )
+    min_separation: float = 0.02  # of the diagonal; of views nearer to each other the better one is kept
+    candidates: int = 160  # views from which the choice is made
+    initial_views: int = 25  # for the first camera, with which the information of all views is computed
 
     def __post_init__(self) -> None:
-        if self.most < SolveOptions.min_views or self.candidates < self.most or not self.worse > 1:
-            raise InputError(f"choice of views: expected at least {SolveOptions.min_views} views and worse above 1")
+        if self.max_views < SolveOptions.min_views or self.candidates < self.max_views or not self.max_error_ratio > 1:
+            raise InputError(
+                f"choice of views: expected at least {SolveOptions.min_views} views and an error ratio above 1"
+            )
 
 
 def choose_views(
     views: Sequence[BoardView], width: int, height: int, options: ChoiceOptions | None = None
 ) -> tuple[list[BoardView], dict[str, str]]:
-    """The views to calibrate from, in their order, and in words why others are left out.
+    """The views to calibrate from, in their order, and why others are left out, by name.
+
+    Args:
+        views: all views of the board.
+        width, height: of the sensor's picture, px.
+        options: see `ChoiceOptions`.
 
     Raises:
         InputError: no camera explains the views at all.
     """
     options = options or ChoiceOptions()
-    if len(views) <= options.most:
+    if len(views) <= options.max_views:
         return list(views), {}
     rejected: dict[str, str] = {}
     expected = np.array([view.sigma_px for view in views])
-    limit = options.worse * float(np.median(expected))
+    limit = options.max_error_ratio * float(np.median(expected))
     outlines = [_outline(view) for view in views]
     kept: list[int] = []
     diagonal = float(np.hypot(width, height))
     for i in np.argsort(expected):
         name = views[i].name
         if expected[i] > limit:
-            rejected[name] = "is blurred, or the board moves in it"
-        elif any(np.max(np.abs(outlines[i] - outlines[k])) < options.apart * diagonal for k in kept):
+            rejected[name] = "is blurred, or the board moves"
+        elif any(np.max(np.abs(outlines[i] - outlines[k])) < options.min_separation * diagonal for k in kept):
             rejected[name] = "shows the board where a better view has it"
         elif len(kept) < options.candidates:
             kept.append(int(i))
         else:
             rejected[name] = "there are better views"
-    if len(kept) > options.most:
+    if len(kept) > options.max_views:
         chosen = _max_information([views[i] for i in kept], [outlines[i] for i in kept], width, height, options)
         rejected |= {views[i].name: "adds little to the others" for k, i in enumerate(kept) if k not in chosen}
         kept = [kept[k] for k in chosen]
@@ -72,13 +82,14 @@ def choose_views(
 def _max_information(
     views: list[BoardView], outlines: list[Array], width: int, height: int, options: ChoiceOptions
 ) -> list[int]:
-    camera = solve([views[k] for k in _spread(outlines, options.first)], width, height).camera
+    """Indices of the views that together have the most information, chosen greedily."""
+    camera = solve([views[k] for k in _spread(outlines, options.initial_views)], width, height).camera
     shares = np.array([_information(view, camera) for view in views])
-    # What is known before any view: the order of magnitude of a lens.
+    # Prior information: the order of magnitude of the intrinsics.
     side = float(max(width, height))
     known = np.diag(1.0 / np.array([side, side, 0.2 * side, 0.2 * side, 1.0, 1.0, 0.05, 0.05, 1.0]) ** 2)
     chosen: list[int] = []
-    for _ in range(options.most):
+    for _ in range(options.max_views):
         gain = np.linalg.slogdet(known + shares)[1]
         gain[chosen] = -np.inf
         best = int(np.argmax(gain))
@@ -88,13 +99,14 @@ def _max_information(
 
 
 def _information(view: BoardView, camera: Camera) -> Array:
+    """(9,9) information on the intrinsics of one view, with its pose unknown."""
     _, turn, shift = cv2.solvePnP(view.points_in_board, view.pixels, camera.matrix, camera.dist)
     pose = rigid(cv2.Rodrigues(turn)[0], np.asarray(shift).ravel())
     return information(view, camera, pose)[0] / view.sigma_px**2
 
 
 def _outline(view: BoardView) -> Array:
-    """(4,2) px where the corners of a 200 mm square of the board are, by a homography: where and how it is held."""
+    """(4,2) px of the corners of a 200 mm square of the board, by a homography: a summary of the board's pose."""
     found, _ = cv2.findHomography(view.points_in_board[:, :2], view.pixels)
     square = np.array([[[0.0, 0.0], [200.0, 0.0], [200.0, 200.0], [0.0, 200.0]]])
     if found is None:
@@ -103,7 +115,7 @@ def _outline(view: BoardView) -> Array:
 
 
 def _spread(outlines: list[Array], count: int) -> list[int]:
-    """Views far apart from each other: each the farthest from those before."""
+    """Indices of views far apart from each other: each is the one farthest from those before."""
     flat = np.array([outline.ravel() for outline in outlines])
     chosen = [0]
     distance = np.linalg.norm(flat - flat[0], axis=1)

@@ -1,4 +1,4 @@
-"""Why no picture shows the board: another dictionary, another layout, or nothing there at all."""
+"""Why no picture shows the board: another dictionary, another layout, or no markers at all."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ _DICTIONARIES = (
     "DICT_4X4_250", "DICT_5X5_250", "DICT_6X6_250", "DICT_7X7_250", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
     "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9",
 )  # fmt: skip
-"""Of each family one that the others are parts of, but for boards of more than 250 markers."""
+"""Of each family one dictionary that includes the smaller ones, except for boards of more than 250 markers."""
 _MIN_MARKERS = 4
+"""Markers of one picture that a conclusion needs."""
 _FIT = 0.1
-"""Share of a marker's side that corners may lie off a homography: lens distortion bends boards by less."""
+"""Distance from a homography, in sides of a marker, that corners may have because of lens distortion."""
 
 
 MarkerDetections = tuple[Array, NDArray[np.int64]]
@@ -41,27 +42,27 @@ def diagnose_missing_board(
         columns = _columns_that_fit(board, detections)
         if columns is not None and columns != board.columns:
             return (
-                f"markers of {board.dictionary} are seen, but they lie as on a board of {columns} columns, not of"
-                f" {board.columns}; correct --board"
+                f"markers of {board.dictionary} were found, but arranged as on a board with {columns} columns instead"
+                f" of {board.columns}; correct --board"
             )
         if columns is None:
             return (
-                f"markers of {board.dictionary} are seen, but they do not lie as on a board of {board.columns}×"
+                f"markers of {board.dictionary} were found, but not arranged as on a board of {board.columns}×"
                 f"{board.rows} squares of {board.cell_mm:g} mm with markers of {board.marker_mm:g} mm; check --board"
             )
         return (
-            "the markers of the board are seen, but hardly any place where squares meet: it is too small, blurred or"
-            " covered; bring it nearer and in focus, with light"
+            "the markers of the board were found, but hardly any corner of its squares: it is too small, blurred or"
+            " covered; bring it nearer and into focus, with more light"
         )
     other = _other_dictionary(pictures)
     if other is not None:
-        return f"no marker of {board.dictionary} is seen, but such of {other}; give the board that is in the pictures"
+        return f"no marker of {board.dictionary} was found, but some of {other}; give the board in the pictures"
     count = f"{picture_count} picture{'s' if picture_count > 1 else ''}"
-    return f"no marker of the board in any of {count}; it must be whole, in focus and fill about half of the picture"
+    return f"no marker of the board was found in any of {count}; it must be whole, in focus and fill half of it"
 
 
 def _columns_that_fit(board: Board, detections: Sequence[MarkerDetections]) -> int | None:
-    """The number of columns with which the ids of the markers make a plane board in most pictures."""
+    """Number of columns with which the ids of the markers form a plane board in most pictures; None if there is none."""
     pictures = sorted((one for one in detections if len(one[1]) >= _MIN_MARKERS), key=lambda one: -len(one[1]))[:3]
     votes: Counter[int] = Counter()
     for quads, ids in pictures:
@@ -72,6 +73,7 @@ def _columns_that_fit(board: Board, detections: Sequence[MarkerDetections]) -> i
 
 
 def _fits(board: Board, columns: int, quads: Array, ids: NDArray[np.int64]) -> bool:
+    """Whether markers lie as on a board with this number of columns, up to a homography."""
     import cv2
 
     rows = 2 * (int(ids.max()) + 1) // columns + 2
@@ -101,7 +103,7 @@ def _fits(board: Board, columns: int, quads: Array, ids: NDArray[np.int64]) -> b
 
 
 def _other_dictionary(pictures: Iterable[NDArray[np.uint8]]) -> str | None:
-    """The family of markers of which most are seen."""
+    """The dictionary family of most markers in some pictures; None without enough."""
     import cv2
 
     counts: Counter[str] = Counter()

@@ -1,4 +1,4 @@
-"""A picture of a calibration: where the board was seen, and how sure a ray is at each place of the picture."""
+"""A picture of a calibration: where the board was seen, and the uncertainty of rays over the picture."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from arview.core.figures import INK, figure
 from arview.errors import InputError
 
 FORMATS = ("png", "svg", "pdf")
+"""Formats that `draw` writes."""
 _ARROW = 0.08
-"""Longest residual arrow, of the picture's longer side."""
+"""Length of the longest residual arrow, as a share of the picture's longer side."""
 
 
 def draw(calibration: Calibration, kind: str = "png") -> bytes:
-    """Corners with their residuals, and U of a ray's place, as a picture of a kind of FORMATS. Raises InputError."""
+    """Corners with their residuals, and U of rays over the picture, in one of FORMATS. Raises InputError."""
     if kind not in FORMATS:
         raise InputError(f"plot: {kind!r}: expected one of {', '.join(FORMATS)}")
     solution, verdict = calibration.solution, calibration.verdict
@@ -25,12 +26,12 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
     pixels = np.concatenate([view.pixels for view in solution.views])
     residuals = np.concatenate(solution.residuals)
     length = np.linalg.norm(residuals, axis=1)
-    most = float(np.percentile(length, 99)) or 1.0
-    scale = _ARROW * max(camera.width, camera.height) / most
+    longest = float(np.percentile(length, 99)) or 1.0
+    scale = _ARROW * max(camera.width, camera.height) / longest
     height = 4.6 * min(1.6, max(0.5, camera.height / camera.width)) + 0.7
     with figure(height, 10.0, has_grid=False, ncols=2) as (made, (left, right)):
         arrows = left.quiver(*pixels.T, *(residuals * scale).T, length, angles="xy", scale_units="xy", scale=1,
-                             cmap="viridis", width=0.0022, clim=(0, most))  # fmt: skip
+                             cmap="viridis", width=0.0022, clim=(0, longest))  # fmt: skip
         made.colorbar(arrows, ax=left, orientation="horizontal", aspect=40, label="residual, px")
         covered = f"{len(pixels)} corners, {len(solution.views)} views, {100 * verdict.coverage:.0f} % of the picture"
         left.set_title(f"{covered}; residuals {solution.rms_px:.2f} px", loc="left", fontsize=9.5, color=INK)

@@ -1,4 +1,4 @@
-"""Photos or a video of a board → camera, with its uncertainty and a verdict in words."""
+"""From photos or a video of a board to a camera with its uncertainty and a verdict."""
 
 from __future__ import annotations
 
@@ -24,7 +24,15 @@ from arview.version import __version__
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration with all that is known of it: what was seen, the camera, and the verdict."""
+    """A calibration.
+
+    Attributes:
+        board: the board in the pictures.
+        sightings: what the pictures show.
+        solution: the camera.
+        verdict: its grade.
+        rejected: why pictures are not used, by name.
+    """
 
     board: Board
     sightings: BoardSightings
@@ -34,12 +42,12 @@ class Calibration:
 
     @property
     def camera(self) -> Camera:
-        """Of the sensor's picture, before it is turned upright."""
+        """The camera of the sensor's picture, before it is rotated upright."""
         return self.solution.camera
 
     @property
     def lens(self) -> dict[str, Any]:
-        """What tells the lens and its mode, for profiles."""
+        """Record that identifies the lens and its mode, for profiles."""
         return lens_record(self.sightings.exif, self.camera.width, self.camera.height)
 
 
@@ -55,22 +63,22 @@ def calibrate(
 
     Args:
         sources: photo files, folders, globs; or one video.
-        board: the board that is in them.
-        choice: of views, where there are many.
-        solving: what is left out.
-        limits: of the verdict.
-        progress: called with pictures looked at and in all.
+        board: the board in them.
+        choice: how views are chosen if there are many.
+        solving: how outliers are rejected.
+        limits: of the grades.
+        progress: called with pictures done and in all.
 
     Raises:
-        InputError: nothing readable, no board, too few views, or views that no camera explains.
+        InputError: nothing can be read, there is no board, there are too few views, or no camera explains them.
     """
     sightings = find_views(sources, board, progress)
-    least = (solving or SolveOptions()).min_views
-    if len(sightings.views) < least:
+    min_views = (solving or SolveOptions()).min_views
+    if len(sightings.views) < min_views:
         why = "; ".join(f"{name} {reason}" for name, reason in list(sightings.rejected.items())[:3])
         raise InputError(
-            f"{sightings.label}: the board is seen in {len(sightings.views)} of {sightings.looked_at} pictures, at"
-            f" least {least} are needed, 20 are good" + (f" ({why})" if why else "")
+            f"{sightings.label}: the board is seen in {len(sightings.views)} of {sightings.searched} pictures, at"
+            f" least {min_views} are needed, 20 are good" + (f" ({why})" if why else "")
         )
     try:
         views, left_out = choose_views(sightings.views, sightings.width, sightings.height, choice)
@@ -82,7 +90,7 @@ def calibrate(
 
 
 def record_of(calibration: Calibration) -> dict[str, Any]:
-    """What goes into the camera file beside the numbers: ``calibration`` and ``lens``. Infinite values are null."""
+    """Contents of the camera file besides the intrinsics: ``calibration`` and ``lens``. Infinite values are null."""
     solution, verdict, seen = calibration.solution, calibration.verdict, calibration.sightings
 
     def plain(value: float) -> float | None:
@@ -97,7 +105,7 @@ def record_of(calibration: Calibration) -> dict[str, Any]:
             "verdict": verdict.grade.value,
             "reasons": list(verdict.reasons),
             "advice": list(verdict.advice),
-            "pictures": seen.looked_at,
+            "pictures": seen.searched,
             "views_found": len(seen.views),
             "views_used": len(solution.views),
             "corners_used": sum(len(view.ids) for view in solution.views),

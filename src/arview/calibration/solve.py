@@ -1,9 +1,9 @@
-"""The camera from views of a board, without those that do not fit, and how sure each of its numbers is.
+"""The camera from views of a board, without outliers, and its covariance.
 
 OpenCV adjusts intrinsics and poses together (Zhang 2000, A flexible new technique for camera calibration); views and
-corners whose residuals stand out are left out, round by round. The covariance is that of the adjustment with the poses
-eliminated, not smaller than what the scatter from view to view says (the sandwich of Huber 1967, clustered by view):
-corners of one picture err together by blur, motion and a board that is not quite flat.
+corners with outlying residuals are removed, round by round. The covariance is that of the adjustment with the poses
+eliminated, but not smaller than the scatter from view to view (the sandwich estimate of Huber 1967, clustered by view):
+errors of the corners of one picture are correlated by blur, motion and a board that is not quite flat.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from arview.errors import InputError
 from arview.geometry import Array, rigid
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+"""Names of the intrinsics, in the order of the covariance."""
 K = 2.0
-"""Coverage factor of all U here: 95 % of a normal distribution."""
+"""Coverage factor of every U in this room: 95 % of a normal distribution."""
 
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """What is left out."""
+    """Rejection of outliers."""
 
-    min_views: int = 5  # poses and nine intrinsics from less are hardly checked by anything
-    view_outlier: float = 2.5  # times the median view's rms: a blurred or bent view
-    view_floor_px: float = 0.15  # views that fit this well are kept, however well the others do
-    corner_outlier: float = 4.5  # robust standard deviations: 1 corner of 25,000 of normal errors
-    rounds: int = 12  # of solving and leaving out; wrong corners go a few at a time
+    min_views: int = 5  # with fewer, poses and nine intrinsics are hardly checked
+    view_outlier: float = 2.5  # times the median view's rms; a view above is blurred or bent
+    view_floor_px: float = 0.15  # views that fit this well are kept, however well the others fit
+    corner_outlier: float = 4.5  # robust standard deviations; 1 in 25,000 normal errors is larger
+    rounds: int = 12  # of solving and rejecting; wrong corners are removed a few at a time
 
     def __post_init__(self) -> None:
         if self.min_views < 3 or not (self.view_outlier > 1 and self.corner_outlier > 2 and self.rounds > 0):
@@ -44,13 +45,13 @@ class Solution:
 
     Attributes:
         camera: of the sensor's picture.
-        covariance: (9,9) of PARAMETERS; infinite where the views do not tell.
-        views: those that were used, without the corners that were left out.
+        covariance: (9,9) of PARAMETERS; infinite where the views do not determine them.
+        views: those that were used, without rejected corners.
         cams_from_board: (V,4,4) their poses, mm.
-        residuals: of each view (N,2) px, found minus projected.
+        residuals: (N,2) px of each view, found minus projected.
         rms_px: of all residuals, per coordinate.
-        rejected: by name, why a view was left out.
-        corners_left_out: number of them, in views that were kept.
+        rejected: why a view was rejected, by its name.
+        corners_left_out: number of rejected corners in views that were kept.
     """
 
     camera: Camera
@@ -69,10 +70,15 @@ class Solution:
 
 
 def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOptions | None = None) -> Solution:
-    """The camera that took the views, of width × height px.
+    """Calibrate the camera that took the views.
+
+    Args:
+        views: of the board.
+        width, height: of the sensor's picture, px.
+        options: see `SolveOptions`.
 
     Raises:
-        InputError: too few views, or the adjustment breaks down; in words that say what to take.
+        InputError: too few views fit together, or the adjustment fails; the message says what to do.
     """
     options = options or SolveOptions()
     kept, rejected = list(views), dict[str, str]()
@@ -81,12 +87,12 @@ def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOpt
     for _ in range(options.rounds):
         if len(kept) < options.min_views:
             raise InputError(
-                f"only {len(kept)} of {len(views)} views of the board fit together; {options.min_views} are the"
-                " least, 20 are good: hold the board flat and still, in focus, and take it from many sides"
+                f"only {len(kept)} of {len(views)} views of the board fit together; at least {options.min_views} are"
+                " needed, 20 are good: hold the board flat and still, in focus, and take it from many sides"
             )
         solution = _adjust(kept, width, height, None if solution is None else solution.camera)
-        trimmed = [_without_outliers(view, r, options) for view, r in zip(kept, solution.residuals, strict=True)]
-        # A wrong corner spoils its view's pose: whether the view fits is seen when it is gone.
+        trimmed = [_trimmed(view, r, options) for view, r in zip(kept, solution.residuals, strict=True)]
+        # A wrong corner distorts its view's pose, so views are only rejected once no corner is.
         unchanged = {view.name for view, less in zip(kept, trimmed, strict=True) if len(view.ids) == len(less.ids)}
         bad = _bad_views(solution, unchanged, options)
         rejected |= bad
@@ -102,20 +108,20 @@ def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOpt
 
 
 def information(view: BoardView, camera: Camera, cam_from_board: Array) -> tuple[Array, Array]:
-    """(9,9) information on PARAMETERS of a view's corners at 1 px, its pose unknown; and (N·2,9) their Jacobian."""
+    """Information (9,9) on PARAMETERS of a view's corners at 1 px with its pose unknown, and their Jacobian (N·2,9)."""
     _, intrinsics, pose = _project(view.points_in_board, camera, cam_from_board)
-    # What a change of the pose explains as well says nothing of the camera.
+    # Changes that a change of the pose explains as well carry no information on the camera.
     basis, _ = np.linalg.qr(pose)
     left = intrinsics - basis @ (basis.T @ intrinsics)
     return left.T @ left, left
 
 
 def pixel_uncertainty(solution: Solution, pixels: Array) -> Array:
-    """(N,) expanded uncertainty (px, k = 2, of the worst direction) of where a ray is seen, at pixels (N,2).
+    """(N,) expanded uncertainty, px with k = 2 in the worst direction, of where a ray is seen, at pixels (N,2).
 
-    What a rotation of the camera explains as well is taken out over these pixels: no use of a camera notices it.
+    The part that a rotation of the camera explains over these pixels is removed, because no application notices it.
     """
-    with np.errstate(all="ignore"):  # a wild lens has no ray for pixels far from all corners
+    with np.errstate(all="ignore"):  # strong distortion may give no ray for pixels far from all corners
         rays = solution.camera.unproject(pixels)
         _, intrinsics, pose = _project(rays, solution.camera, np.eye(4))
     if not all(np.isfinite(one).all() for one in (solution.covariance, intrinsics, pose)):
@@ -128,7 +134,7 @@ def pixel_uncertainty(solution: Solution, pixels: Array) -> Array:
 
 
 def pixel_difference(camera: Camera, other: Camera, pixels: Array) -> Array:
-    """(N,2) px: where ``other`` sees the rays that ``camera`` sees at pixels (N,2), less the best rotation."""
+    """(N,2) px by which ``other`` sees rays elsewhere than ``camera`` does, at pixels (N,2), less the best rotation."""
     rays = camera.unproject(pixels)
     _, _, pose = _project(rays, camera, np.eye(4))
     basis, _ = np.linalg.qr(pose[:, :3])
@@ -146,6 +152,7 @@ def picture_grid(width: int, height: int, columns: int = 9, rows: int = 7) -> Ar
 
 
 def _adjust(views: Sequence[BoardView], width: int, height: int, start: Camera | None) -> Solution:
+    """One adjustment of intrinsics and poses by OpenCV. Raises InputError when it fails."""
     import cv2
 
     objects = [view.points_in_board.astype(np.float32)[:, None] for view in views]
@@ -161,8 +168,8 @@ def _adjust(views: Sequence[BoardView], width: int, height: int, start: Camera |
         found = Camera(width, height, fx, fy, cx, cy, np.ravel(d)[:5])
     except (cv2.error, InputError, ValueError) as error:
         raise InputError(
-            "no camera explains the views of the board; tilt it by 20° to 45° to all sides, bring it near and far, and"
-            " check that --board is the one in the pictures"
+            "no camera explains the views of the board; tilt it by 20° to 45° to all sides, take it from near and"
+            " far, and check that --board is the one in the pictures"
         ) from error
     poses = np.array([
         rigid(cv2.Rodrigues(np.asarray(turn))[0], np.asarray(shift).ravel())
@@ -177,7 +184,7 @@ def _adjust(views: Sequence[BoardView], width: int, height: int, start: Camera |
 
 
 def _covariance(views: Sequence[BoardView], camera: Camera, poses: Array, residuals: Sequence[Array]) -> Array:
-    """(9,9), of the adjustment's own and of the scatter between views the larger, parameter by parameter."""
+    """(9,9) covariance: for each parameter the larger of the adjustment's and of the scatter between views."""
     total, scatter, squares = np.zeros((9, 9)), np.zeros((9, 9)), 0.0
     for view, pose, residual in zip(views, poses, residuals, strict=True):
         one, jacobian = information(view, camera, pose)
@@ -193,14 +200,14 @@ def _covariance(views: Sequence[BoardView], camera: Camera, poses: Array, residu
         return np.full((9, 9), np.inf)
     inverse = (vectors / values) @ vectors.T / np.outer(size, size)
     own = inverse * squares / freedom
-    # As many views as there are numbers leave no scatter: degrees of freedom as in HC1 of MacKinnon and White (1985).
+    # Correction for the degrees of freedom, as in HC1 of MacKinnon and White (1985).
     between = inverse @ scatter @ inverse * len(views) / max(1.0, len(views) - 9.0 / 2.0)
     grow = np.sqrt(np.maximum(1.0, np.diag(between) / np.diag(own)))
     return np.asarray(own * np.outer(grow, grow))
 
 
 def _project(points: Array, camera: Camera, cam_from_points: Array) -> tuple[Array, Array, Array]:
-    """Pixels (N,2), and their derivatives (2N,9) by PARAMETERS and (2N,6) by rotation vector and shift."""
+    """Pixels (N,2) and their derivatives (2N,9) by PARAMETERS and (2N,6) by rotation vector and translation."""
     import cv2
 
     turn = cv2.Rodrigues(cam_from_points[:3, :3])[0]
@@ -213,7 +220,7 @@ def _project(points: Array, camera: Camera, cam_from_points: Array) -> tuple[Arr
 def _bad_views(solution: Solution, unchanged: set[str], options: SolveOptions) -> dict[str, str]:
     """Views that fit much worse than the others, at most a third of them at once, the worst first."""
     rms = np.array([np.sqrt(np.mean(residual**2)) for residual in solution.residuals])
-    # Of each view the robust size: a single wrong corner is left out by itself.
+    # A robust size, because single wrong corners are rejected by themselves.
     size = np.array([np.median(np.abs(residual)) / 0.6745 for residual in solution.residuals])
     usual = float(np.median(size))
     limit = max(options.view_outlier * usual, options.view_floor_px)
@@ -224,7 +231,8 @@ def _bad_views(solution: Solution, unchanged: set[str], options: SolveOptions) -
     }
 
 
-def _without_outliers(view: BoardView, residual: Array, options: SolveOptions) -> BoardView:
+def _trimmed(view: BoardView, residual: Array, options: SolveOptions) -> BoardView:
+    """The view without corners whose residuals are outliers."""
     length = np.linalg.norm(residual, axis=1)
     # The median length of a two-dimensional normal error is 1.1774 σ.
     keep = length < options.corner_outlier * max(float(np.median(length)) / 1.1774, 0.02)

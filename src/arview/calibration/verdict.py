@@ -1,4 +1,4 @@
-"""Whether a calibration is good enough, in words: what the views cover, how sure the numbers are, what to do."""
+"""Verdict on a calibration, in words: coverage of the views, uncertainty, and what to do."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from arview.geometry import Array
 
 
 class Grade(StrEnum):
-    """What a calibration is worth."""
+    """Grade of a calibration."""
 
     GOOD = "good"
     USABLE = "usable"
@@ -23,31 +23,31 @@ class Grade(StrEnum):
 class VerdictOptions:
     """Limits of the grades; lengths in px as shares of the picture's diagonal."""
 
-    good_focal: float = 0.002  # U of the focal length: 0.2 % of the distance, 1 mm at arm's length
-    usable_focal: float = 0.01  # beyond, a guess from EXIF data is as good
+    good_focal: float = 0.002  # relative U of the focal length: 0.2 % of the distance, 1 mm at arm's length
+    usable_focal: float = 0.01  # a guess from EXIF data is as good as more than this
     good_pixel: float = 5e-4  # U of where a ray is seen, at the worst of 63 places: 1 px at 1080p
-    usable_pixel: float = 3e-3
-    usable_rms: float = 1e-3  # residuals: above, the board is not flat, or it is not this board
+    usable_pixel: float = 3e-3  # limit of usable for the same
+    usable_rms: float = 1e-3  # residuals; above, the board is not flat, or is another one
     good_coverage: float = 0.7  # share of the picture's cells with a corner of the board
-    usable_coverage: float = 0.4
-    tilted_deg: float = 20.0  # a view tilted by more tells the focal length
-    min_tilted: int = 4  # such views, to at least two sides
-    good_range: float = 1.3  # farthest over nearest board
+    usable_coverage: float = 0.4  # limit of usable for the same
+    tilted_deg: float = 20.0  # views tilted by more than this determine the focal length
+    min_tilted: int = 4  # number of such views, to at least two sides
+    good_range: float = 1.3  # distance of the farthest over the nearest board
 
 
 @dataclass(frozen=True)
 class CalibrationVerdict:
-    """A calibration verdict.
+    """Verdict on a calibration.
 
     Attributes:
-        grade: the whole.
-        focal_u: U of the focal length, relative.
+        grade: of the whole.
+        focal_u: relative U of the focal length.
         centre_u_px: U of the principal point.
-        pixel_u_px: U of where a ray is seen: median and worst over the picture.
-        coverage: share of the picture's 8×6 cells that hold a corner.
-        cells: (6,8) corners in each cell.
-        tilts_deg: smallest, median, largest angle between the board and the picture's plane.
-        distance_ratio: farthest over nearest board.
+        pixel_u_px: U of where a ray is seen: median and maximum over the picture.
+        coverage: share of the picture's 8×6 cells that contain a corner.
+        cells: (6,8) number of corners in each cell.
+        tilts_deg: smallest, median and largest angle between the board and the picture plane.
+        distance_ratio: distance of the farthest over the nearest board.
         reasons: why it is not better.
         advice: what to do about it.
     """
@@ -65,7 +65,7 @@ class CalibrationVerdict:
 
 
 def assess(solution: Solution, options: VerdictOptions | None = None) -> CalibrationVerdict:
-    """The calibration against the limits, with what to do when it is not good."""
+    """Compare a calibration with the limits, and say what to do if it is not good."""
     options = options or VerdictOptions()
     camera = solution.camera
     diagonal = float(np.hypot(camera.width, camera.height))
@@ -87,11 +87,11 @@ def assess(solution: Solution, options: VerdictOptions | None = None) -> Calibra
     ]
     reasons = [
         f"the focal length is known to ± {100 * focal_u:.2f} % only" if np.isfinite(focal_u)
-        else "the views do not tell the focal length",
+        else "the views do not determine the focal length",
         f"a ray at the worst place of the picture is known to ± {worst:.2f} px only" if np.isfinite(worst)
-        else "the views do not tell where rays are seen",
+        else "the views do not determine where rays are seen",
         f"the corners scatter by {solution.rms_px:.2f} px",
-        f"corners of the board were seen in {100 * coverage:.0f} % of the picture only",
+        f"corners of the board were seen in only {100 * coverage:.0f} % of the picture",
     ]  # fmt: skip
     why = [reason for reason, grade in zip(reasons, grades, strict=True) if grade is not Grade.GOOD]
     order = list(Grade)
@@ -123,12 +123,14 @@ def assess(solution: Solution, options: VerdictOptions | None = None) -> Calibra
 
 
 def _grade(value: float, good: float, usable: float) -> Grade:
+    """Grade of a value against two limits; smaller is better."""
     if value <= good:
         return Grade.GOOD
     return Grade.USABLE if value <= usable else Grade.NOT_ENOUGH
 
 
 def _cells(solution: Solution) -> Array:
+    """Number of corners in each of 8×6 cells of the picture."""
     pixels = np.concatenate([view.pixels for view in solution.views])
     camera = solution.camera
     sides = (-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5)
@@ -138,19 +140,20 @@ def _cells(solution: Solution) -> Array:
 
 
 def _attitudes(solution: Solution, tilted_deg: float) -> tuple[Array, int, Array]:
-    """Tilt of each view in degrees; to how many of four sides tilted ones lean; distances of their middles in mm."""
+    """Tilt of each view in degrees, number of sides (of four) to which tilted views lean, and distances in mm."""
     middles = np.array([
         pose[:3, :3] @ view.points_in_board.mean(axis=0) + pose[:3, 3]
         for view, pose in zip(solution.views, solution.cams_from_board, strict=True)
     ])  # fmt: skip
     normals = solution.cams_from_board[:, :3, 2]
-    # Against the picture's plane: a board parallel to it tells no focal length, wherever it is seen.
+    # A board parallel to the picture plane does not determine the focal length, wherever it is seen.
     tilts = np.degrees(np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0)))
     sides = np.floor(np.arctan2(normals[:, 1], normals[:, 0]) / (np.pi / 2))
     return tilts, len(set(sides[tilts >= tilted_deg])), np.linalg.norm(middles, axis=1)
 
 
 def _empty_corners(cells: Array) -> list[str]:
+    """Names of the picture's corners without a corner of the board."""
     names = {
         "upper left": (0, 0), "upper right": (0, -1), "lower left": (-1, 0), "lower right": (-1, -1),
     }  # fmt: skip

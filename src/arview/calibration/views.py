@@ -1,8 +1,8 @@
-"""Pictures of a ChArUco board: from photos and videos to corners, with what each picture is worth.
+"""Pictures of a ChArUco board: from photos or a video to corners, with the accuracy to expect of each picture.
 
-Corners are those of OpenCV's ChArUco detector (Garrido-Jurado et al. 2014), refined where the squares meet. Pictures
-are taken as the sensor saw them, before the turn that makes them upright: portrait and landscape photos of one phone
-calibrate one camera, and that is how ``load_camera`` expects it.
+Corners are found by OpenCV's ChArUco detector (Garrido-Jurado et al. 2014) and refined where the squares meet. Pictures
+are used as the sensor recorded them, before the rotation that makes them upright: portrait and landscape photos of one
+phone calibrate one camera, which is what `load_camera` expects.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from arview.fiducials.board import Board, cv_board
 from arview.geometry import Array
 
 MIN_CORNERS = 8
-"""A picture with fewer says little and is easily wrong."""
-_LOOKS_PER_S = 5.0
-"""Frames of a video that are looked at; a hand-held camera hardly moves in between."""
-_MAX_LOOKS = 400
+"""Pictures with fewer corners contain little information and are easily wrong."""
+_FRAMES_PER_S = 5.0
+"""Frames of a video that are searched per second; a hand-held camera hardly moves in between."""
+_MAX_FRAMES = 400
+"""Frames of a video that are searched at most."""
 _SHUTTER_S = 0.02
-"""How long a phone takes to read a picture out: it bends what moves."""
+"""Readout time of a phone's sensor (rolling shutter), which distorts moving objects."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,8 @@ class BoardView:
         ids: (N,) numbers of the corners.
         points_in_board: (N,3) mm, z = 0.
         pixels: (N,2) in the sensor's picture, integers at pixel centres.
-        blur_px: spread of edges on the board (Gaussian sigma), NaN when not known.
-        speed_px_s: how fast the board moved in the picture; 0 of photos.
+        blur_px: spread of edges on the board (Gaussian sigma), NaN when unknown.
+        speed_px_s: speed of the board in the picture; 0 for photos.
     """
 
     name: str
@@ -54,7 +55,7 @@ class BoardView:
 
     @property
     def sigma_px(self) -> float:
-        """How well its corners are likely to be placed: noise, blur beyond the usual, and motion while it was read."""
+        """Expected standard deviation of its corners: noise, blur beyond the usual, and motion during readout."""
         blur = max(0.0, (1.0 if np.isnan(self.blur_px) else self.blur_px) - 1.0)
         return float(np.linalg.norm([0.1, 0.1 * blur, 0.05 * _SHUTTER_S * self.speed_px_s]))
 
@@ -64,14 +65,14 @@ class BoardSightings:
     """What the pictures show.
 
     Attributes:
-        label: the source, for messages.
+        label: name of the source, for messages.
         width, height: of the sensor's picture, px.
         views: pictures with the board.
-        rejected: by name, why a picture is not used.
-        looked_at: number of pictures.
-        exif: what the first used photo (or the video) says of its camera.
+        rejected: why a picture is not used, by its name.
+        searched: number of pictures.
+        exif: EXIF data of the first used photo, or of the video.
         quarter_turns_clockwise: from the sensor's picture to the upright one, of most pictures.
-        warnings: in words.
+        warnings: messages.
     """
 
     label: str
@@ -79,7 +80,7 @@ class BoardSightings:
     height: int
     views: tuple[BoardView, ...]
     rejected: dict[str, str]
-    looked_at: int
+    searched: int
     exif: PhotoExif
     quarter_turns_clockwise: int = 0
     warnings: tuple[str, ...] = ()
@@ -87,11 +88,11 @@ class BoardSightings:
 
 @dataclass
 class BoardFinder:
-    """Finds the corners of one board in gray pictures; boards of OpenCV before 4.6 are recognised by themselves."""
+    """Finds the corners of one board in grey pictures; boards of OpenCV before 4.6 (legacy pattern) are recognised."""
 
     board: Board
     markers_seen: list[tuple[Array, NDArray[np.int64]]] = field(default_factory=list)
-    """Quads (N,4,2) and ids of the markers in pictures whose corners could not be told: for the diagnosis."""
+    """Corners (N,4,2) and ids (N,) of the markers in pictures with too few board corners, for the diagnosis."""
 
     def __post_init__(self) -> None:
         import cv2
@@ -106,7 +107,7 @@ class BoardFinder:
             self._detectors.append(self._detector(True))
 
     def find(self, name: str, gray: NDArray[np.uint8]) -> BoardView | str:
-        """The view of a picture (H,W) uint8, or in words why there is none."""
+        """The view of a picture (H,W) uint8, or the reason why there is none."""
         for detector in list(self._detectors):
             corners, ids, quads, marker_ids = detector.detectBoard(gray)
             if ids is not None and len(ids) >= MIN_CORNERS:
@@ -115,7 +116,7 @@ class BoardFinder:
                 number = np.asarray(ids).ravel().astype(np.int64)
                 pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
                 if detector.getBoard().checkCharucoCornersCollinear(np.asarray(ids)):
-                    return "shows one line of the board's corners only"
+                    return "shows only one line of the board's corners"
                 return BoardView(name, number, points[number], pixels, _blur_px(gray, pixels))
         found = 0 if marker_ids is None else len(marker_ids)
         if found == 0:
@@ -133,31 +134,34 @@ class BoardFinder:
         if is_legacy:
             drawn.setLegacyPattern(True)
         details = cv2.aruco.CharucoParameters()
-        details.minMarkers = 1  # of the two beside a corner: nearer to the picture's edge, where the lens bends most
+        details.minMarkers = (
+            1  # one of the two beside a corner suffices, to reach the border, where distortion is largest
+        )
         return cv2.aruco.CharucoDetector(drawn, details, self._parameters)
 
 
 def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgress | None = None) -> BoardSightings:
-    """Look for the board in photos, or in one video.
+    """Search for the board in photos, or in one video.
 
     Args:
-        sources: photo files, folders or globs of them; or one video file.
-        board: which board it is.
+        sources: photo files, folders or globs of these; or one video file.
+        board: the board to find.
         progress: called with pictures done and in all.
 
     Raises:
-        InputError: nothing there or readable, pictures of several cameras in equal parts, or no board in any
-            picture; the message says what was seen instead.
+        InputError: no source can be read, no camera took more than half of the pictures, or none of them shows the
+            board;
+            the message says what was found instead.
     """
     finder = BoardFinder(board)
     if not sources:
-        raise InputError("give photos of the board, or a video of it")
+        raise InputError("expected photos of the board, or a video of it")
     if len(sources) == 1 and _is_video(Path(sources[0])):
-        sightings = _look_at_video(Path(sources[0]), finder, progress)
+        sightings = _views_of_video(Path(sources[0]), finder, progress)
     else:
-        sightings = _look_at_photos(sources, finder, progress)
+        sightings = _views_of_photos(sources, finder, progress)
     if not sightings.views:
-        reason = diagnose_missing_board(board, finder.markers_seen, sightings.looked_at, _some_pictures(sources))
+        reason = diagnose_missing_board(board, finder.markers_seen, sightings.searched, _some_pictures(sources))
         raise InputError(f"{sightings.label}: {reason}")
     return sightings
 
@@ -165,9 +169,10 @@ def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgre
 # --- photos ------------------------------------------------------------------------------------------------
 
 
-def _look_at_photos(
+def _views_of_photos(
     sources: Sequence[str | Path], finder: BoardFinder, progress: StepProgress | None
 ) -> BoardSightings:
+    """Search for the board in photos; those of another lens than most are left out."""
     from arview.reconstruction.intake.reading import photo_paths
 
     paths: list[Path] = []
@@ -184,7 +189,7 @@ def _look_at_photos(
     views = []
     for done, (path, name) in enumerate(zip(paths, names, strict=True), 1):
         if name in chosen:
-            found = _look_at(path, name, chosen[name].quarter_turns_clockwise, finder)
+            found = _view_of_photo(path, name, chosen[name].quarter_turns_clockwise, finder)
             if isinstance(found, BoardView):
                 views.append(found)
             else:
@@ -198,12 +203,13 @@ def _look_at_photos(
     if others:
         warnings.append(
             f"{len(others)} of {len(paths)} photos are of another camera, zoom or size and are left out: "
-            f"{', '.join(list(others)[:4])}; calibrate each by itself"
+            f"{', '.join(list(others)[:4])}; calibrate these separately"
         )
     return BoardSightings(label, width, height, tuple(views), rejected, len(paths), first, turns, tuple(warnings))
 
 
 def _exif_of_all(paths: Sequence[Path], names: Sequence[str]) -> tuple[dict[str, PhotoExif], dict[str, str]]:
+    """EXIF data of the photos, and why others cannot be read, both by name."""
     from arview.camera.exif import read_exif
 
     exifs, rejected = {}, {}
@@ -229,8 +235,8 @@ def _one_lens(label: str, exifs: dict[str, PhotoExif]) -> tuple[dict[str, PhotoE
     if len(counts) > 1 and 2 * counts[0][1] <= len(keys):
         listed = "; ".join(f"{count} of {key}" for key, count in counts[:4])
         raise InputError(
-            f"{label}: photos of {len(counts)} cameras, zooms or sizes ({listed}); give those of one, each has its own"
-            " calibration"
+            f"{label}: photos of {len(counts)} cameras, zooms or sizes ({listed}); give those of one, because each has"
+            " its own calibration"
         )
     main = counts[0][0]
     chosen = {name: exif for (name, exif), key in zip(exifs.items(), keys, strict=True) if key == main}
@@ -239,11 +245,13 @@ def _one_lens(label: str, exifs: dict[str, PhotoExif]) -> tuple[dict[str, PhotoE
 
 
 def _sensor_size(exif: PhotoExif) -> tuple[int, int]:
+    """Width and height of the sensor's picture, before it is rotated upright."""
     width, height = exif.upright_size
     return (height, width) if exif.quarter_turns_clockwise % 2 else (width, height)
 
 
-def _look_at(path: Path, name: str, turns: int, finder: BoardFinder) -> BoardView | str:
+def _view_of_photo(path: Path, name: str, turns: int, finder: BoardFinder) -> BoardView | str:
+    """The view of one photo, or the reason why there is none."""
     import cv2
 
     from arview.reconstruction.intake.reading import read_photo
@@ -260,10 +268,12 @@ def _look_at(path: Path, name: str, turns: int, finder: BoardFinder) -> BoardVie
 
 
 def _is_video(path: Path) -> bool:
+    """Whether a file is taken for a video: it exists and is not a photo by its suffix."""
     return path.is_file() and path.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES
 
 
-def _look_at_video(path: Path, finder: BoardFinder, progress: StepProgress | None) -> BoardSightings:
+def _views_of_video(path: Path, finder: BoardFinder, progress: StepProgress | None) -> BoardSightings:
+    """Search for the board in the frames of a video."""
     import cv2
 
     from arview.camera.profiles import exif_of_video
@@ -271,16 +281,16 @@ def _look_at_video(path: Path, finder: BoardFinder, progress: StepProgress | Non
 
     with open_source(path) as source:
         fps, count = source.fps or 30.0, source.frame_count
-    stride = max(1, round(fps / _LOOKS_PER_S), -(-(count or 0) // _MAX_LOOKS))
+    stride = max(1, round(fps / _FRAMES_PER_S), -(-(count or 0) // _MAX_FRAMES))
     views: list[BoardView] = []
     rejected: dict[str, str] = {}
-    looked_at = 0
+    searched = 0
     with open_source(path, stride=stride) as source:
         turns = source.quarter_turns_clockwise
         before: BoardView | None = None
         before_s = 0.0
         for frame in source:
-            looked_at += 1
+            searched += 1
             gray = np.rot90(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), turns)
             found = finder.find(f"frame {frame.index}", np.ascontiguousarray(gray))
             if isinstance(found, BoardView):
@@ -291,17 +301,18 @@ def _look_at_video(path: Path, finder: BoardFinder, progress: StepProgress | Non
                 before = None
                 rejected[f"frame {frame.index}"] = found
             if progress and source.frame_count:
-                progress(min(looked_at, source.frame_count), source.frame_count)
+                progress(min(searched, source.frame_count), source.frame_count)
         ended = source.ended_reason
         size = (source.height, source.width) if turns % 2 else (source.width, source.height)
-    if looked_at == 0:
+    if searched == 0:
         raise InputError(f"{path}: no frame could be read; record or copy the video again")
     warnings = (ended,) if ended else ()
     exif = exif_of_video(path, *size)
-    return BoardSightings(str(path), *size, tuple(views), rejected, looked_at, exif, turns, warnings)
+    return BoardSightings(str(path), *size, tuple(views), rejected, searched, exif, turns, warnings)
 
 
 def _speed_px_s(before: BoardView | None, now: BoardView, seconds: float) -> float:
+    """Median speed of the corners that two successive views share; 0 if unknown."""
     if before is None or seconds <= 0.0:
         return 0.0
     _, here, there = np.intersect1d(now.ids, before.ids, return_indices=True)
@@ -314,7 +325,7 @@ def _speed_px_s(before: BoardView | None, now: BoardView, seconds: float) -> flo
 
 
 def _blur_px(gray: NDArray[np.uint8], pixels: Array) -> float:
-    """Spread of the edges in the part of the picture that holds the corners."""
+    """Edge spread of the part of the picture that contains the corners; NaN if it is small."""
     from arview.reconstruction.intake.checks import blur_and_texture
 
     height, width = gray.shape
@@ -325,8 +336,8 @@ def _blur_px(gray: NDArray[np.uint8], pixels: Array) -> float:
     return blur_and_texture(np.ascontiguousarray(gray[low[1] : high[1], low[0] : high[0]]))[0]
 
 
-def _some_pictures(sources: Sequence[str | Path], most: int = 3) -> Iterator[NDArray[np.uint8]]:
-    """A few gray pictures of the sources, for the diagnosis."""
+def _some_pictures(sources: Sequence[str | Path], count: int = 3) -> Iterator[NDArray[np.uint8]]:
+    """About ``count`` grey pictures of the sources, for the diagnosis."""
     import cv2
 
     from arview.reconstruction.intake.reading import photo_paths, read_photo
@@ -334,13 +345,13 @@ def _some_pictures(sources: Sequence[str | Path], most: int = 3) -> Iterator[NDA
 
     if len(sources) == 1 and _is_video(Path(sources[0])):
         with open_source(sources[0]) as source:
-            stride = max(1, (source.frame_count or 60) // most)
+            stride = max(1, (source.frame_count or 60) // count)
         with open_source(sources[0], stride=stride) as source:
             for frame in source:
                 yield cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         return
     paths = [path for item in sources for path in photo_paths(item)[0]]
-    for path in paths[:: max(1, len(paths) // most)]:
+    for path in paths[:: max(1, len(paths) // count)]:
         try:
             yield cv2.cvtColor(read_photo(path), cv2.COLOR_RGB2GRAY)
         except InputError:

@@ -148,7 +148,7 @@ def lens(
         profile_path(profile)
     one = parse_board(board_spec)
     with progress_bar("looking for the board") as progress:
-        choice = ChoiceOptions(most=max_views, candidates=max(max_views, ChoiceOptions.candidates))
+        choice = ChoiceOptions(max_views=max_views, candidates=max(max_views, ChoiceOptions.candidates))
         result = run(sources, one, choice, progress=progress)
     _print(result)
     if picture is not None:
@@ -230,7 +230,7 @@ def _print(result: Calibration) -> None:
         say(f"left out {sum(len(names) for names in list(reasons.values())[12:])} more, each for its reason")
     corners = sum(len(view.ids) for view in solution.views)
     click.echo(
-        f"board found in {len(seen.views)} of {seen.looked_at} pictures of {seen.width}×{seen.height} px;"
+        f"board found in {len(seen.views)} of {seen.searched} pictures of {seen.width}×{seen.height} px;"
         f" {len(solution.views)} views with {corners} corners used, residuals {solution.rms_px:.3f} px rms"
     )
     for line in _camera_lines(result):

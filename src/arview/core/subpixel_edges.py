@@ -1,7 +1,8 @@
-"""Sub-pixel brightness steps across predicted CAD edges.
+"""Sub-pixel steps of brightness across predicted edges.
 
-One-dimensional search along the normal (Harris, RAPID 1990) with several hypotheses per point (Vacchetti, Lepetit &
-Fua, ISMAR 2004). Profiles are averaged over short parallel lines, in linear light, where blur does not shift a step.
+One-dimensional search along the normal (Harris, RAPID 1990; several hypotheses per point: Vacchetti, Lepetit & Fua,
+ISMAR
+2004). Profiles are means over short parallel lines, in linear light, where blur does not displace a step.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from arview.core.kernel import kernel
 from arview.geometry import Array
 
 HYPOTHESES = 4
-"""Number of strongest steps kept per point."""
+"""Number of steps kept per point, the strongest."""
 STEP_PX = 0.5
-"""Distance between samples of a profile."""
+"""Distance between the samples of a profile."""
 
 
 def linear_light(gray: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(H,W) grey levels 0–255 in linear light (inverse sRGB curve), slightly smoothed against noise."""
+    """(H,W) grey levels 0–255 in linear light by the sRGB curve, smoothed slightly against noise."""
     levels = np.arange(256) / 255.0
     linear = 255.0 * np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
     return np.ascontiguousarray(cv2.GaussianBlur(linear.astype(np.float32)[gray], (0, 0), 0.7))
@@ -28,18 +29,19 @@ def linear_light(gray: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 @kernel
 def find_steps(gray, pixels, normals, reach_px, half_width_px, threshold):  # type: ignore[no-untyped-def]
-    """Extrema of the slope along the normal of each point.
+    """Find the extrema of the slope along the normal of each point.
 
     Args:
-        gray: (H,W) float32.
+        gray: (H,W) float32 in linear light.
         pixels, normals: (N,2) predicted edge points and unit normals in the picture.
-        reach_px: search length to either side of the point.
-        half_width_px: half the width, along the edge, of the five parallel profiles that are averaged.
+        reach_px: search range to either side.
+        half_width_px: five parallel lines within this distance to either side along the edge are averaged.
         threshold: weakest slope, grey levels per px.
 
     Returns:
-        offsets (N,K) px along the normal; slopes (N,K), signed grey levels per px, 0 where there is no step; seen (N,),
-        False where the profile would leave the picture.
+        offsets (N,K) px along the normal; slopes (N,K) signed grey levels per px, 0 = none; seen (N,) whether the
+        profile
+        lies inside the picture.
     """
     height, width = gray.shape
     count = pixels.shape[0]
@@ -91,7 +93,16 @@ def find_steps(gray, pixels, normals, reach_px, half_width_px, threshold):  # ty
 
 
 def choose_steps(offsets: Array, slopes: Array, spread_px: float, half_slope: float) -> tuple[Array, Array]:
-    """Offset (N,) px and signed slope (N,) of the best hypothesis by strength and nearness; slope 0 means none."""
+    """Choose for each point the hypothesis with the best product of strength and nearness.
+
+    Args:
+        offsets, slopes: (N,K) of `find_steps`.
+        spread_px: standard deviation of the Gaussian that weights nearness.
+        half_slope: slope at which strength has half its full weight.
+
+    Returns:
+        offset (N,) px and signed slope (N,); slope 0 = none.
+    """
     strength = np.abs(slopes)
     score = strength / (strength + half_slope) * np.exp(-0.5 * (offsets / spread_px) ** 2)
     best = np.argmax(score, axis=1)

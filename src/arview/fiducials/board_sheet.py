@@ -1,7 +1,8 @@
 """A ChArUco board as a page to print: PDF in true scale, with two rulers that show whether the printer kept it.
 
 The page is drawn in millimetres: its content stream sets 72/25.4 pt as the unit once, so that every number after it is
-a length on paper. Viewers are asked to print it unscaled (PDF 1.7, 12.2 ViewerPreferences).
+a
+length on paper. Viewers are asked to print without scaling (PDF 1.7, 12.2 ViewerPreferences).
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ PAPERS_MM = {
     "A4": (297.0, 210.0), "A3": (420.0, 297.0), "A2": (594.0, 420.0), "A1": (841.0, 594.0), "A0": (1189.0, 841.0),
     "letter": (279.4, 215.9), "tabloid": (431.8, 279.4),
 }  # fmt: skip
-"""Sheets, landscape: width and height."""
+"""Width and height of sheets in landscape format."""
 DICTIONARY = "DICT_5X5_100"
+"""Default marker dictionary of printed boards."""
 COLUMNS, ROWS = 11, 8
-"""Squares when nothing was asked: many corners, markers still legible when the board fills half a picture."""
-_MARGIN_MM, _STRIP_MM = 10.0, 15.0
-"""What printers leave white; and the room for rulers and text below the board (left of it for the upright one)."""
+"""Default number of squares: many corners, with markers that are legible when the board fills half of a picture."""
+_MARGIN_MM, _RULER_ROOM_MM = 10.0, 15.0
+"""Margin that printers leave white, and room for rulers and text below and left of the board."""
 _PT_PER_MM = 72.0 / 25.4
 _TEXT_MM, _TICK_MM = 2.8, 3.0
 
@@ -36,9 +38,9 @@ class Sheet:
     """A board on its page.
 
     Attributes:
-        board: what is printed.
+        board: the board.
         width_mm, height_mm: of the page.
-        left_mm, top_mm: corner of the board from the page's upper left corner.
+        left_mm, top_mm: upper left corner of the board, from that of the page.
         ruler_mm: length of the two rulers.
     """
 
@@ -51,7 +53,7 @@ class Sheet:
 
 
 def parse_paper(text: str) -> tuple[float, float]:
-    """Width and height in mm of ``A4`` (landscape), …, or ``WIDTHxHEIGHT`` in mm. Raises InputError."""
+    """Width and height in mm of a paper in PAPERS_MM (landscape), or of ``WIDTHxHEIGHT``. Raises InputError."""
     known = {name.lower(): size for name, size in PAPERS_MM.items()}
     if text.strip().lower() in known:
         return known[text.strip().lower()]
@@ -68,10 +70,15 @@ def parse_paper(text: str) -> tuple[float, float]:
 def fit_board(
     paper_mm: tuple[float, float], columns: int | None = None, rows: int | None = None, dictionary: str = DICTIONARY
 ) -> Board:
-    """The largest board of so many squares on a sheet: squares in whole millimetres, markers ¾ of them.
+    """The largest board with the given number of squares on a sheet; squares are whole mm, markers ¾ of that.
+
+    Args:
+        paper_mm: width and height of the sheet.
+        columns, rows: number of squares; default COLUMNS and ROWS, exchanged on an upright sheet.
+        dictionary: OpenCV's name of the marker dictionary.
 
     Raises:
-        InputError: the squares would be smaller than 3 mm, or the dictionary has too few markers.
+        InputError: the squares would be smaller than 3 mm.
     """
     if columns is None or rows is None:
         upright = paper_mm[1] > paper_mm[0]
@@ -87,10 +94,10 @@ def fit_board(
 
 
 def place_board(board: Board, paper_mm: tuple[float, float]) -> Sheet:
-    """The board in the middle of the page's room, with rulers as long as fit.
+    """The board in the middle of the printable area, with rulers as long as fit.
 
     Raises:
-        InputError: it is no ChArUco board, does not fit, or its dictionary has too few markers.
+        InputError: it is not a ChArUco board, does not fit, or its dictionary has too few markers.
     """
     if not board.is_charuco:
         raise InputError(f"{board}: only ChArUco boards are printed; corners of single markers are less exact")
@@ -104,14 +111,15 @@ def place_board(board: Board, paper_mm: tuple[float, float]) -> Sheet:
             f"{board}: is {across:g}×{down:g} mm; on {paper_mm[0]:g}×{paper_mm[1]:g} mm there is room for"
             f" {width:g}×{height:g} mm; take a larger sheet or smaller squares"
         )
-    left = _MARGIN_MM + _STRIP_MM + 0.5 * (width - across)
+    left = _MARGIN_MM + _RULER_ROOM_MM + 0.5 * (width - across)
     top = _MARGIN_MM + 0.5 * (height - down)
     ruler = next(mm for mm in (500.0, 200.0, 100.0, 50.0, 20.0) if mm <= min(across, down) or mm == 20.0)
     return Sheet(board, *paper_mm, left, top, ruler)
 
 
 def rectangles_mm(board: Board) -> tuple[Array, Array]:
-    """Black (N,4) and, on top of them, white (M,4) rectangles left, top, width, height, mm from the upper left corner.
+    """Black (N,4) and, on top of them, white (M,4) rectangles (left, top, width, height) in mm from the upper left
+    corner.
 
     Squares without a marker are black; a marker is a black square with white bits.
     """
@@ -129,7 +137,7 @@ def rectangles_mm(board: Board) -> tuple[Array, Array]:
     ]  # fmt: skip
     white = []
     for index, corner in markers:
-        # float32 corners of OpenCV: the marker's place follows from its square.
+        # OpenCV's corners are float32, so the exact position is computed from the square.
         left, top = np.floor(corner / cell) * cell + 0.5 * (cell - side)
         black.append((float(left), float(top), side, side))
         picture = np.pad(cv2.aruco.generateImageMarker(drawn.getDictionary(), index, bits) > 127, ((0, 0), (0, 1)))
@@ -144,16 +152,18 @@ def rectangles_mm(board: Board) -> tuple[Array, Array]:
 
 
 def board_pdf(sheet: Sheet) -> bytes:
-    """One page of PDF with the board, two rulers, and how to give it to ``arview calibrate``."""
+    """One page of PDF with the board, two rulers, and the command line for ``arview calibrate``."""
     import pydyf
 
     stream = pydyf.Stream(compress=False)
     stream.set_matrix(_PT_PER_MM, 0, 0, _PT_PER_MM, 0, 0)
     stream.push_state()
-    stream.set_matrix(1, 0, 0, -1, sheet.left_mm, sheet.height_mm - sheet.top_mm)  # from the board's corner, y down
+    stream.set_matrix(
+        1, 0, 0, -1, sheet.left_mm, sheet.height_mm - sheet.top_mm
+    )  # origin at the board's corner, y down
     for gray, rectangles in zip((0, 1), rectangles_mm(sheet.board), strict=True):
         stream.set_color_rgb(gray, gray, gray)
-        for rectangle in rectangles:  # one path, so that no hairlines show between neighbours
+        for rectangle in rectangles:  # one path, so that no hairlines appear between neighbours
             stream.rectangle(*(_short(value) for value in rectangle))
         stream.fill()
     stream.pop_state()
@@ -178,7 +188,7 @@ def board_pdf(sheet: Sheet) -> bytes:
 
 
 def _draw_rulers(stream: Any, sheet: Sheet) -> None:
-    """A ruler along the board and one up it, with a line of text each."""
+    """A ruler below the board and one left of it, with text."""
     board, length = sheet.board, sheet.ruler_mm
     bottom = sheet.height_mm - sheet.top_mm - board.rows * board.cell_mm
     stream.set_color_rgb(0, 0, 0)
@@ -208,6 +218,7 @@ def _draw_rulers(stream: Any, sheet: Sheet) -> None:
 
 
 def _write(stream: Any, text: str, x: float, y: float) -> None:
+    """Write text at (x, y) mm."""
     escaped = re.sub(r"([\\()])", r"\\\1", text).encode("cp1252", "replace")
     stream.begin_text()
     stream.set_font_size("F1", _TEXT_MM)
@@ -217,10 +228,12 @@ def _write(stream: Any, text: str, x: float, y: float) -> None:
 
 
 def _room(paper_mm: tuple[float, float]) -> tuple[float, float]:
-    return paper_mm[0] - 2.0 * _MARGIN_MM - _STRIP_MM, paper_mm[1] - 2.0 * _MARGIN_MM - _STRIP_MM
+    """Width and height of the printable area for the board, mm."""
+    return paper_mm[0] - 2.0 * _MARGIN_MM - _RULER_ROOM_MM, paper_mm[1] - 2.0 * _MARGIN_MM - _RULER_ROOM_MM
 
 
 def _markers_in(dictionary: str) -> int:
+    """Number of markers in a dictionary."""
     import cv2
 
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
@@ -228,5 +241,5 @@ def _markers_in(dictionary: str) -> int:
 
 
 def _short(value: float) -> float:
-    """Rounded to a nanometre: what PDF readers keep."""
+    """The value rounded to a nanometre, which PDF readers can represent."""
     return round(float(value), 6)

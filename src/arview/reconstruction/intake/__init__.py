@@ -1,4 +1,4 @@
-"""Intake: photos or a video become upright photos with a first camera each, and what is wrong with them in words."""
+"""Intake: photos or a video become upright photos, each with a first camera, and with messages about what is wrong."""
 
 from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck
 from arview.reconstruction.intake.lenses import Lens

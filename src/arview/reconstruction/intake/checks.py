@@ -1,4 +1,4 @@
-"""What can be told of a photo before any matching: blur, texture, exposure, and whether it is there twice."""
+"""Checks of a photo before any matching: blur, texture, exposure, and duplicates."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.reconstruction.intake.reading import Pixels
 
-_FINE, _COARSE = 1.0, 2.0  # px, the two scales whose gradients are compared
-_DIRECTIONS = 6  # bins of edge direction: motion blurs the edges across it only
-_MIN_EDGES = 60  # edge points that a direction needs to have a say
-_MIN_GRADIENT, _MAX_GRADIENT = 4.0, 12.0  # grey levels per px that an edge needs, without noise and at most
-_TILES = (12, 16)  # rows and columns in which texture is looked for
-_TILE_EDGES = 0.002  # share of a tile's pixels: an edge across a quarter of it
-_THUMB = (24, 18)  # px, for finding candidates of equal pictures
-_COMPARED_PX = 400  # longest side of the pictures that duplicates are confirmed on
-_COMPARED_TILES = (6, 8)
+_FINE, _COARSE = 1.0, 2.0  # px, smoothing at the two scales whose gradients are compared
+_DIRECTIONS = 6  # bins of edge direction, because motion blurs only the edges across it
+_MIN_EDGES = 60  # edge points that a direction needs for an estimate of its blur
+_MIN_GRADIENT, _MAX_GRADIENT = 4.0, 12.0  # range of the gradient, grey levels per px, that an edge needs
+_TILES = (12, 16)  # rows and columns of the tiles in which texture is measured
+_TILE_EDGES = 0.002  # share of edge pixels in a textured tile: an edge across a quarter of it
+_THUMB = (24, 18)  # px, size of the pictures on which candidates for duplicates are found
+_COMPARED_PX = 400  # longest side of the pictures on which duplicates are confirmed
+_COMPARED_TILES = (6, 8)  # rows and columns of the tiles in which these are compared
 
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """When a photo is called bad. Pixels are those of a picture whose longest side is 1000 to 2000 px."""
+    """Thresholds for bad photos. Pixels are those of a picture whose longest side is 1000 to 2000 px."""
 
-    blurred_px: float = 2.0  # edge spread (Gaussian sigma); sharp photos have 0.3 to 1.2
-    blurred_ratio: float = 1.8  # of the median photo's spread, so that one shaken photo among sharp ones is named
-    blurred_min_px: float = 1.3  # below, a photo that is worse than the others is still sharp enough
-    useless_px: float = 3.5  # features cannot be placed any more
-    useless_ratio: float = 3.0  # and the others are so much better that it is not missed
-    min_textured: float = 0.02  # share of the picture's tiles with edges; an outline of a plain part gives 0.1
-    clipped: float = 0.4  # share of white pixels: a white background gives 0.3
-    clipped_more: float = 0.2  # above the median photo's share: overexposed against the others
-    dark_level: float = 50.0  # grey level that 95 % of the pixels stay below
-    min_side_px: int = 320  # shorter side; below are thumbnails and icons
-    max_aspect: float = 2.6  # above are panoramas, which no pinhole camera made
+    blurred_px: float = 2.0  # edge spread (Gaussian sigma) of a blurred photo; sharp ones have 0.3 to 1.2
+    blurred_ratio: float = 1.8  # the same relative to the median photo, to find one shaken photo among sharp ones
+    blurred_min_px: float = 1.3  # a photo below this is sharp enough, even if it is worse than the others
+    useless_px: float = 3.5  # edge spread at which features can no longer be placed …
+    useless_ratio: float = 3.0  # … and, relative to the median photo, at which the photo is not missed
+    min_textured: float = 0.02  # share of tiles with edges; the outline of a plain part gives 0.1
+    clipped: float = 0.4  # share of white pixels of an overexposed photo; a white background gives 0.3
+    clipped_more: float = 0.2  # the same above the median photo's share
+    dark_level: float = 50.0  # grey level that 95 % of a dark photo's pixels do not exceed
+    min_side_px: int = 320  # shorter side; smaller pictures are thumbnails and icons
+    max_aspect: float = 2.6  # longer over shorter side; more is a panorama, which no pinhole camera took
     same_thumbs: float = 0.95  # correlation above which two pictures are compared in detail
-    same_shift: float = 0.00125  # of the longer side: pictures that differ by less than such a shift are the same view
+    same_shift: float = 0.00125  # of the longer side; pictures that differ by less than this shift show the same view
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class PhotoCheck:
     Attributes:
         name: of the photo.
         blur_px: spread of its edges (Gaussian sigma in px of a picture of 1000 to 2000 px); NaN without edges.
-        textured: share of its tiles that hold edges, 0–1.
-        clipped: share of pixels that are white, 0–1.
-        level_95: grey level that 95 % of the pixels stay below, 0–255.
+        textured: share of its tiles that contain edges, 0–1.
+        clipped: share of white pixels, 0–1.
+        level_95: grey level that 95 % of the pixels do not exceed, 0–255.
     """
 
     name: str
@@ -68,16 +68,18 @@ def check_photo(name: str, gray: Pixels) -> PhotoCheck:
 
 
 def blur_and_texture(gray: Pixels) -> tuple[float, float]:
-    """Edge spread in px (NaN without edges) and the share of tiles with edges, of a (H,W) uint8 picture.
+    """Edge spread in px (NaN without edges) and share of tiles with edges of a (H,W) uint8 picture.
 
-    An edge of spread s has a gradient of 1 / sqrt(s² + t²) after smoothing with t: the ratio of the gradients at two
-    scales tells s and does not depend on contrast, so that a sharp photo of little texture counts as sharp (Zhuo and
-    Sim 2011, Defocus map estimation from a single image). Of the strongest quarter of the edge points the median
-    counts, in the direction where it is worst.
+    An edge of spread s has a gradient of 1 / sqrt(s² + t²) after smoothing with t. The ratio of the gradients at two
+    scales
+    gives s independently of contrast, so that a sharp photo with little texture counts as sharp (Zhuo and Sim 2011,
+    Defocus
+    map estimation from a single image). The result is the median over the strongest quarter of the edge points, in the
+    direction where it is largest.
     """
     fine = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), _FINE)
     coarse = cv2.GaussianBlur(fine, (0, 0), float(np.sqrt(_COARSE**2 - _FINE**2)))
-    # White noise of sigma n leaves gradients of 0.2 n at the fine scale; its sigma shows in what that scale took away.
+    # White noise of sigma n leaves gradients of 0.2 n at the fine scale; n follows from what the smoothing removed.
     noise = float(np.percentile(np.abs(gray[::4, ::4] - fine[::4, ::4]), 20)) / 0.22
     floor = min(max(_MIN_GRADIENT, 1.2 * noise), _MAX_GRADIENT)
     rows, columns, direction, strength, spread = _edge_points(fine, coarse, floor)
@@ -98,7 +100,7 @@ def blur_and_texture(gray: Pixels) -> tuple[float, float]:
 def _edge_points(
     fine: NDArray[np.float32], coarse: NDArray[np.float32], floor: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
-    """Row, column, bin of direction, gradient and spread (px) of the points where the gradient is at its ridge."""
+    """Row, column, direction bin, squared gradient and spread (px) of the points at which the gradient has a ridge."""
     height, width = fine.shape
     squared = np.zeros((height, width), np.float32)
     for y in range(1, height - 1):
@@ -137,7 +139,7 @@ def _edge_points(
 
 
 def thumbnail(gray: Pixels) -> Pixels:
-    """The picture at a longest side of 400 px, on which duplicates are looked for."""
+    """The picture reduced to a longest side of 400 px, for the search for duplicates."""
     scale = _COMPARED_PX / max(gray.shape)
     size = max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale))
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
@@ -146,8 +148,9 @@ def thumbnail(gray: Pixels) -> Pixels:
 def same_views(thumbnails: list[Pixels], options: CheckOptions) -> list[tuple[int, int]]:
     """Pairs (i < j) of pictures taken from the same place in the same direction, whatever their size and exposure.
 
-    Candidates are found by the correlation of tiny pictures; in each tile of a candidate pair the difference, after
-    fitting brightness and contrast, must be smaller than that of the picture to itself moved by ``same_shift``.
+    Candidates are found by correlation of tiny pictures. In every tile of a candidate pair the difference, after
+    fitting
+    brightness and contrast, must be smaller than that of the picture to itself displaced by ``same_shift``.
     """
     if len(thumbnails) < 2:
         return []
@@ -159,7 +162,8 @@ def same_views(thumbnails: list[Pixels], options: CheckOptions) -> list[tuple[in
 
 
 def _is_same_view(first: Pixels, second: Pixels, options: CheckOptions) -> bool:
-    if np.abs(np.subtract(first.shape, second.shape)).max() > 2:  # a turned or cropped picture; 2 px are rounding
+    """Whether two pictures show the same view."""
+    if np.abs(np.subtract(first.shape, second.shape)).max() > 2:  # a rotated or cropped picture; 2 px are rounding
         return False
     size = first.shape[1], first.shape[0]
     a = cv2.GaussianBlur(first.astype(np.float32), (0, 0), 1.0)
@@ -171,5 +175,5 @@ def _is_same_view(first: Pixels, second: Pixels, options: CheckOptions) -> bool:
     def tile_rms(values: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.sqrt(cv2.resize(values.astype(np.float32) ** 2, _COMPARED_TILES[::-1], interpolation=cv2.INTER_AREA))
 
-    noise = 2.0  # grey levels: JPEG, and what a single gain does not explain
+    noise = 2.0  # grey levels: JPEG, and differences that a single gain does not explain
     return bool(np.all(tile_rms(a - gain * b - offset) <= tile_rms(moved) + noise))

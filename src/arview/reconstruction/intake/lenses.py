@@ -1,4 +1,4 @@
-"""A first camera for every photo, and which photos share it."""
+"""The first camera of every photo, and which photos share it."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from arview.camera.profiles import profile_of_photo
 from arview.camera.read import guess_camera, load_camera
 from arview.errors import MismatchError
 
-_FOCAL_ROUNDING_MM = 0.055  # programs write the focal length in tenths of a millimetre, or more finely
+_FOCAL_ROUNDING_MM = 0.055  # focal lengths are written in tenths of a millimetre, or finer
 _EQUIVALENT_ROUNDING_MM = 0.5  # the 35 mm equivalent is written in whole millimetres
-_ZOOM_TOLERANCE = 0.01
-_FOCAL_DISAGREES = 0.15  # an EXIF focal length is right within a few per cent; more is another zoom
+_ZOOM_TOLERANCE = 0.01  # relative difference of digital zooms that count as equal
+_FOCAL_DISAGREES = 0.15  # log ratio: EXIF focal lengths are right within a few per cent; more is another zoom
 
 
 @dataclass(frozen=True)
 class Lens:
     """One lens at one zoom and picture size, whose photos share their intrinsics.
 
-    Portrait and landscape photos of one phone are two lenses here: their upright pictures have different cameras.
+    Portrait and landscape photos of one phone are two lenses here, because their upright pictures have different
+    cameras.
 
     Attributes:
-        key: unique, readable ("iPhone 12 4.2 mm 4032×3024").
-        camera: first guess of the intrinsics, upright.
-        is_calibrated: True when the camera is a calibration, which self-calibration must not change.
-        focal_from: in words, where the focal length came from.
+        key: unique and readable ("iPhone 12 4.2 mm 4032×3024").
+        camera: initial intrinsics, upright.
+        is_calibrated: the camera is a calibration, which self-calibration must not change.
+        focal_from: where the focal length came from, for messages.
     """
 
     key: str
@@ -42,13 +43,15 @@ def lenses_of(exifs: Sequence[PhotoExif], camera: str | Path | None) -> tuple[li
     """The lens of each photo, or why the given camera does not fit it; and warnings.
 
     Photos share a lens when make, model, focal lengths (within the rounding of EXIF), digital zoom, upright size and,
-    where known, the serial number agree; without EXIF data by size. A calibrated lens is told apart by its turn too,
-    since turning mirrors the principal point. The focal length comes from ``camera``, else the
-    35 mm equivalent, else the focal length and the sensor's width, else 1.2 × the longer side.
+    where
+    known, the serial number agree; without EXIF data, when their sizes agree. Calibrated lenses are also distinguished
+    by
+    orientation, because rotation moves the principal point. The focal length comes from ``camera``, else the 35 mm
+    equivalent, else the focal length and the sensor's width, else it is 1.2 × the longer side.
 
     Args:
         exifs: of the photos.
-        camera: camera file, ``profile`` or ``fov:DEG`` as for ``load_camera``; None or ``exif`` for what photos say.
+        camera: camera file, ``profile`` or ``fov:DEG`` as for `load_camera`; None or ``exif`` to use EXIF data.
 
     Raises:
         InputError: the camera file cannot be used at all.
@@ -69,8 +72,8 @@ def lenses_of(exifs: Sequence[PhotoExif], camera: str | Path | None) -> tuple[li
         index_of_photo.append(index)
     if is_file:
         warnings += [
-            f"photos of {lens.key} are upright without saying how the camera was turned; the calibration, turned by "
-            "90°, is only their first guess"
+            f"photos of {lens.key} are upright without an EXIF orientation; the calibration, rotated by 90°, is only "
+            "their initial guess"
             for lens in lenses
             if isinstance(lens, Lens) and not lens.is_calibrated
         ]
@@ -79,6 +82,8 @@ def lenses_of(exifs: Sequence[PhotoExif], camera: str | Path | None) -> tuple[li
 
 
 def _same_lens(a: PhotoExif, b: PhotoExif, turns_matter: bool) -> bool:
+    """Whether two photos share a lens; ``turns_matter`` distinguishes orientations."""
+
     def close(x: float | None, y: float | None, tolerance: float) -> bool:
         return x is y if x is None or y is None else abs(x - y) <= tolerance + 1e-9
 
@@ -94,6 +99,7 @@ def _same_lens(a: PhotoExif, b: PhotoExif, turns_matter: bool) -> bool:
 
 
 def _new_lens(exif: PhotoExif, camera: str | Path | None, is_file: bool, taken: Sequence[str]) -> Lens:
+    """The lens of a photo that shares no earlier one. Raises MismatchError when the camera does not fit it."""
     width, height = exif.upright_size
     focal = f"{exif.focal_length_mm:.1f} mm" if exif.focal_length_mm else ""
     equivalent = f"({exif.focal_length_35mm_mm:g} mm equivalent)" if exif.focal_length_35mm_mm else ""
@@ -111,13 +117,14 @@ def _new_lens(exif: PhotoExif, camera: str | Path | None, is_file: bool, taken: 
     except MismatchError:
         if turns % 2:
             raise
-        # Upright pixels without an orientation: which way the camera was turned is not known, so the principal point
-        # may be mirrored, and the calibration is a first guess only.
+        # The pixels are upright without an EXIF orientation, so the direction of the camera's rotation is unknown: the
+        # principal point may be mirrored, and the calibration is only an initial guess.
         turned = load_camera(camera, width, height, quarter_turns_clockwise=1)
-        return Lens(key, turned, False, f"{camera}, turned by 90°")
+        return Lens(key, turned, False, f"{camera}, rotated by 90°")
 
 
 def _lens_from_exif(key: str, exif: PhotoExif) -> Lens:
+    """A lens with the focal length of the EXIF data, or a guess."""
     width, height = exif.upright_size
     guess = guess_camera(width, height)
     focal_px = focal_length_px(exif, width, height)
@@ -128,7 +135,9 @@ def _lens_from_exif(key: str, exif: PhotoExif) -> Lens:
 
 
 def _drop_calibration_of_other_zooms(lenses: list[Lens | MismatchError], firsts: Sequence[PhotoExif]) -> list[str]:
-    """Replace the calibration of lenses whose EXIF says another zoom, if it says so of some lenses only; warnings."""
+    """Replace the calibration of lenses with another focal length in EXIF, if that of other lenses fits; return
+    warnings.
+    """
     off = {}
     for index, (lens, exif) in enumerate(zip(lenses, firsts, strict=True)):
         focal_px = focal_length_px(exif, *exif.upright_size)
@@ -141,12 +150,12 @@ def _drop_calibration_of_other_zooms(lenses: list[Lens | MismatchError], firsts:
             own = _lens_from_exif(lens.key, firsts[index])
             lenses[index] = own
             warnings.append(
-                f"photos of {lens.key}: their EXIF data tell a focal length of {own.camera.fx:.0f} px, the camera file "
-                f"{lens.camera.fx:.0f} px: another zoom; they are calibrated anew"
+                f"photos of {lens.key}: the focal length is {own.camera.fx:.0f} px in their EXIF data, but "
+                f"{lens.camera.fx:.0f} px in the camera file, so the zoom differs; they are calibrated anew"
             )
         elif isinstance(lens, Lens) and disagreement > _FOCAL_DISAGREES:
             warnings.append(
-                f"the camera file gives a focal length of {lens.camera.fx:.0f} px, the EXIF data of {lens.key} tell "
-                "another; check that the camera file belongs to these photos"
+                f"the camera file gives a focal length of {lens.camera.fx:.0f} px, the EXIF data of {lens.key} a "
+                "different one; check that the camera file belongs to these photos"
             )
     return warnings

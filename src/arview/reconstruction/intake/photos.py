@@ -1,4 +1,4 @@
-"""intake_photos: photo files become Photos with a first camera each, and what is wrong with them is said in words."""
+"""Intake of photo files: they become `Photo`s with a first camera each, and bad ones are rejected with a reason."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.intake.reading import RAW_SUFFIXES, Pixels, glance, photo_paths
 from arview.reconstruction.types import Photo
 
-MIN_PHOTOS = 3  # a third photo is the first that can contradict the other two
+MIN_PHOTOS = 3  # the third photo is the first that can contradict the others
 GOOD_NUMBER = "20 to 40 photos from all around the part, each sharing more than half of what it shows with the next"
-_FEW_PHOTOS = 8
-_NAMES_SHOWN = 5
+_FEW_PHOTOS = 8  # with fewer, a warning is given
+_NAMES_SHOWN = 5  # names listed in a message
 
 
 @dataclass(frozen=True)
 class Intake:
-    """What intake made of the photos.
+    """Result of the intake.
 
     Attributes:
         photos: usable ones, in natural order of their names.
         rejected: (name, reason) of the others.
-        warnings: sentences on what is usable and yet not good.
+        warnings: messages about photos that are usable but poor.
         checks: measures of every photo that could be read.
         lenses: of the usable photos, the one with most photos first.
     """
@@ -44,8 +44,16 @@ class Intake:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """One photo that was read: what the file says of itself, its measures and its thumbnail."""
+class ReadPhoto:
+    """A photo that was read.
+
+    Attributes:
+        name: of the photo.
+        path: of its file.
+        exif: its EXIF data.
+        check: its measures.
+        thumbnail: reduced grey picture.
+    """
 
     name: str
     path: Path
@@ -60,28 +68,31 @@ def intake_photos(
     options: CheckOptions | None = None,
     progress: StepProgress | None = None,
 ) -> Intake:
-    """Read, judge and sort the photos of a folder.
+    """Read and check the photos of a folder.
 
-    Left out, with a reason, are files that cannot be read, thumbnails, panoramas, photos without any texture,
-    duplicates, photos blurred beyond use and those that the camera file does not fit. What is merely poor is kept and
-    said in a warning. Photos that show something else are found later, when photos are matched.
+    Rejected, with a reason, are files that cannot be read, thumbnails, panoramas, photos without texture, duplicates,
+    photos
+    too blurred for use, and those that the camera file does not fit. Photos that are merely poor are kept with a
+    warning.
+    Photos of something else are only found later, when photos are matched.
 
     Args:
-        source: folder, glob, or list of photo files; other files in a folder are passed over.
-        camera: camera file, ``fov:DEG`` or, as None, ``exif``; see ``lenses_of``.
+        source: folder, glob, or list of photo files; other files in a folder are ignored.
+        camera: camera file, ``fov:DEG`` or, as None, ``exif``; see `lenses_of`.
         options: thresholds of the checks.
         progress: called with the number of photos done and in all.
 
     Raises:
-        InputError: nothing there, fewer than three usable photos, hardly any texture, or an unusable camera file.
+        InputError: there are no photos, fewer than three are usable, most have no texture, or the camera file is
+            unusable.
         MismatchError: the camera file fits none of the photos.
     """
     paths, names = photo_paths(source)
     with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
-        seen: list[Seen] = []
+        seen: list[ReadPhoto] = []
         rejected: dict[str, str] = {}
-        for done, (name, result) in enumerate(zip(names, pool.map(look_at, paths, names), strict=True), 1):
-            if isinstance(result, Seen):
+        for done, (name, result) in enumerate(zip(names, pool.map(read_and_check, paths, names), strict=True), 1):
+            if isinstance(result, ReadPhoto):
                 seen.append(result)
             else:
                 rejected[name] = result
@@ -92,9 +103,9 @@ def intake_photos(
 
 
 def assess(
-    label: str, seen: Sequence[Seen], rejected: dict[str, str], camera: str | Path | None, options: CheckOptions
+    label: str, seen: Sequence[ReadPhoto], rejected: dict[str, str], camera: str | Path | None, options: CheckOptions
 ) -> Intake:
-    """Intake of photos that have been looked at; ``rejected`` holds the reasons found so far. Raises as its caller."""
+    """Intake of photos that have been read; ``rejected`` holds reasons found so far. Raises as `intake_photos` does."""
     rejected = dict(rejected)
     total = len(seen) + len(rejected)
     for photo in seen:
@@ -105,9 +116,9 @@ def assess(
     usable = [photo for photo in seen if photo.name not in rejected]
     rejected |= _duplicates(usable, options)
     usable = [photo for photo in usable if photo.name not in rejected]
-    rejected |= _blurred_beyond_use(usable, options)
+    rejected |= _too_blurred(usable, options)
     usable = [photo for photo in usable if photo.name not in rejected]
-    warnings = _judge_exposure(usable, options) + _judge_blur(usable, options)
+    warnings = _exposure_warnings(usable, options) + _blur_warnings(usable, options)
 
     lenses, lens_warnings = lenses_of([photo.exif for photo in usable], camera)
     warnings += lens_warnings
@@ -125,7 +136,7 @@ def assess(
     used = {photo.lens for photo in photos}
     by_key = {lens.key: lens for lens in lenses if isinstance(lens, Lens) and lens.key in used}
     counts = {key: sum(photo.lens == key for photo in photos) for key in by_key}
-    warnings += _judge_numbers(photos, counts)
+    warnings += _number_warnings(photos, counts)
     return Intake(
         photos=tuple(photos),
         rejected=tuple(rejected.items()),
@@ -135,8 +146,8 @@ def assess(
     )
 
 
-def look_at(path: Path, name: str) -> Seen | str:
-    """The photo as far as needed to judge it, or why it cannot be read."""
+def read_and_check(path: Path, name: str) -> ReadPhoto | str:
+    """The photo as far as the checks need it, or why it cannot be read."""
     if path.suffix.lower() in RAW_SUFFIXES:
         return "is a raw photo; develop it to JPEG, with the same settings for all"
     try:
@@ -145,37 +156,38 @@ def look_at(path: Path, name: str) -> Seen | str:
         return f"cannot be read: {error.strerror or error}"
     except ArviewError as error:
         return str(error)
-    return Seen(name, path, seen.exif, check_photo(name, seen.gray), thumbnail(seen.gray))
+    return ReadPhoto(name, path, seen.exif, check_photo(name, seen.gray), thumbnail(seen.gray))
 
 
-def _unusable(photo: Seen, options: CheckOptions) -> str:
-    """Why this photo is of no use whatever the others are like, else empty."""
+def _unusable(photo: ReadPhoto, options: CheckOptions) -> str:
+    """Why a photo is unusable whatever the others are like; empty if it is usable."""
     width, height = photo.exif.upright_size
     check = photo.check
     if min(width, height) < options.min_side_px:
         return f"has only {width}×{height} px; give the photo itself, not a thumbnail"
     if max(width, height) > options.max_aspect * min(width, height):
-        return f"is a panorama ({width}×{height} px), which no single camera position shows; give plain photos"
+        return f"is a panorama ({width}×{height} px), which a single camera position cannot show; give plain photos"
     if check.textured >= options.min_textured:
         return ""
     if check.level_95 < options.dark_level:
-        return "is black or nearly so; take it again with more light"
+        return "is black or nearly black; take it again with more light"
     if check.clipped > options.clipped:
         return "is overexposed to white; take it again with less light"
     return "shows no texture: a plain surface, or wholly out of focus"
 
 
-def _check_texture(label: str, seen: Sequence[Seen], options: CheckOptions) -> None:
+def _check_texture(label: str, seen: Sequence[ReadPhoto], options: CheckOptions) -> None:
+    """Raise InputError when more than half of the photos have no texture."""
     plain = [photo.name for photo in seen if photo.check.textured < options.min_textured]
     if plain and 2 * len(plain) > len(seen):
         raise InputError(
-            f"{label}: {len(plain)} of {len(seen)} photos show no texture at all ({_listed(plain)}), so that there is "
+            f"{label}: {len(plain)} of {len(seen)} photos show no texture at all ({_listed(plain)}), so there is "
             "nothing to match; bring the part itself into view, in focus, on a patterned surface such as newspaper"
         )
 
 
-def _duplicates(photos: Sequence[Seen], options: CheckOptions) -> dict[str, str]:
-    """Of photos of the same view, all but the largest and sharpest, with the reason."""
+def _duplicates(photos: Sequence[ReadPhoto], options: CheckOptions) -> dict[str, str]:
+    """Of photos of the same view, all but the largest and sharpest, each with the reason."""
 
     def rank(index: int) -> tuple[int, float, int]:
         check = photos[index].check
@@ -186,37 +198,40 @@ def _duplicates(photos: Sequence[Seen], options: CheckOptions) -> dict[str, str]
     for pair in same_views([photo.thumbnail for photo in photos], options):
         best, other = (photos[index].name for index in sorted(pair, key=rank))
         if best not in dropped and other not in dropped:
-            dropped[other] = f"shows the same as {best} from the same place; it adds nothing"
+            dropped[other] = f"shows the same view as {best}; it adds nothing"
     return dropped
 
 
-def _blurred_beyond_use(photos: Sequence[Seen], options: CheckOptions) -> dict[str, str]:
-    least = max(options.useless_px, options.useless_ratio * _usual_blur(photos))
-    reason = "is blurred beyond use (shaken or out of focus); take it again"
-    return {photo.name: reason for photo in photos if photo.check.blur_px > least}
+def _too_blurred(photos: Sequence[ReadPhoto], options: CheckOptions) -> dict[str, str]:
+    """Photos that are too blurred to be used, with the reason."""
+    limit = max(options.useless_px, options.useless_ratio * _usual_blur(photos))
+    reason = "is too blurred to be used (shaken or out of focus); take it again"
+    return {photo.name: reason for photo in photos if photo.check.blur_px > limit}
 
 
-def _judge_blur(photos: Sequence[Seen], options: CheckOptions) -> list[str]:
+def _blur_warnings(photos: Sequence[ReadPhoto], options: CheckOptions) -> list[str]:
+    """Warning about blurred photos."""
     worse = max(options.blurred_ratio * _usual_blur(photos), options.blurred_min_px)
-    least = min(worse, options.blurred_px)
-    # Where a photo is white, its edges end in white and look soft.
-    blurred = [p.name for p in photos if p.check.blur_px > least and p.check.clipped <= options.clipped]
+    limit = min(worse, options.blurred_px)
+    # Edges of white areas look soft, so overexposed photos are not checked.
+    blurred = [p.name for p in photos if p.check.blur_px > limit and p.check.clipped <= options.clipped]
     if not blurred:
         return []
     advice = "focus on the part, hold the camera still and give it more light"
     return [f"{_counted(blurred, len(photos), 'blurred')}, out of focus or shaken: {advice}"]
 
 
-def _usual_blur(photos: Sequence[Seen]) -> float:
-    """Median blur in px; 0 when no photo has edges."""
+def _usual_blur(photos: Sequence[ReadPhoto]) -> float:
+    """Median blur in px; 0 if no photo has edges."""
     blurs = [photo.check.blur_px for photo in photos if np.isfinite(photo.check.blur_px)]
     return float(np.median(blurs)) if blurs else 0.0
 
 
-def _judge_exposure(photos: Sequence[Seen], options: CheckOptions) -> list[str]:
+def _exposure_warnings(photos: Sequence[ReadPhoto], options: CheckOptions) -> list[str]:
+    """Warnings about overexposed and dark photos."""
     usual = float(np.median([photo.check.clipped for photo in photos])) if photos else 0.0
-    most = min(options.clipped, usual + options.clipped_more)
-    bright = [photo.name for photo in photos if photo.check.clipped > most]
+    limit = min(options.clipped, usual + options.clipped_more)
+    bright = [photo.name for photo in photos if photo.check.clipped > limit]
     dark = [photo.name for photo in photos if photo.check.level_95 < options.dark_level]
     warnings = []
     if bright:
@@ -227,6 +242,7 @@ def _judge_exposure(photos: Sequence[Seen], options: CheckOptions) -> list[str]:
 
 
 def _check_number(label: str, photos: Sequence[Photo], rejected: dict[str, str], total: int) -> None:
+    """Raise InputError, with the reasons for rejections, when fewer than MIN_PHOTOS are usable."""
     if len(photos) >= MIN_PHOTOS:
         return
     usable = f"only {len(photos)}" if photos else "none"
@@ -238,7 +254,8 @@ def _check_number(label: str, photos: Sequence[Photo], rejected: dict[str, str],
     )
 
 
-def _judge_numbers(photos: Sequence[Photo], counts: dict[str, int]) -> list[str]:
+def _number_warnings(photos: Sequence[Photo], counts: dict[str, int]) -> list[str]:
+    """Warnings about too few photos, in all or of one lens."""
     warnings = []
     if len(photos) < _FEW_PHOTOS:
         warnings.append(f"only {len(photos)} photos: the result will have gaps; take {GOOD_NUMBER}")
@@ -246,7 +263,7 @@ def _judge_numbers(photos: Sequence[Photo], counts: dict[str, int]) -> list[str]
         if count < MIN_PHOTOS and count < len(photos):
             names = _listed([photo.name for photo in photos if photo.lens == key])
             warnings.append(
-                f"{names} differs from the other photos in camera, zoom or size ({key}): with so few photos of it its "
+                f"{names} differs from the other photos in camera, zoom or size ({key}); with so few photos of it, its "
                 "focal length is uncertain; use one camera without zoom, and photos that are not cropped"
             )
     return warnings

@@ -1,4 +1,4 @@
-"""Finding and reading photo files: JPEG, PNG, TIFF, BMP and HEIC, upright, eight bits."""
+"""Finding and reading photo files: JPEG, PNG, TIFF, BMP and HEIC, upright, with eight bits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Pixels = NDArray[np.uint8]
 
 SUFFIXES = PHOTO_SUFFIXES | HEIF_SUFFIXES
 RAW_SUFFIXES = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
-GLANCE_PX = 2000  # longest side at which photos are judged: about the size that features are looked for in
+GLANCE_PX = 2000  # longest side at which photos are checked: about the size at which features are found
 
 _UPRIGHT: dict[int, Callable[[Pixels], Pixels]] = {
     1: lambda a: a,
@@ -44,10 +44,10 @@ _UPRIGHT: dict[int, Callable[[Pixels], Pixels]] = {
 
 
 def read_photo(path: str | Path) -> Pixels:
-    """(H,W,3) uint8 RGB of a photo, upright by its EXIF orientation; alpha dropped, 16 bits scaled to 8.
+    """(H,W,3) uint8 RGB of a photo, upright by its EXIF orientation; alpha is dropped, 16 bits are scaled to 8.
 
     Raises:
-        InputError: the file is missing, empty, cut short or no picture.
+        InputError: the file is missing, empty, truncated or not a picture.
     """
     data = read_bytes(Path(path))
     try:
@@ -59,7 +59,7 @@ def read_photo(path: str | Path) -> Pixels:
 
 @dataclass(frozen=True)
 class Glance:
-    """A photo as far as it must be read to judge it: EXIF data and an upright grey picture, longest side ≤ 2000 px."""
+    """EXIF data of a photo, and its upright grey picture with a longest side of at most 2000 px."""
 
     exif: PhotoExif
     gray: Pixels
@@ -68,8 +68,12 @@ class Glance:
 def glance(data: bytes) -> Glance:
     """Decode all of a photo's bytes, at half, quarter or eighth size where that is enough.
 
-    Pillow finds files that end too early. Of JPEGs whose data are damaged within, it makes a picture without a word;
-    FFmpeg's decoder notices, so those are run through it too. InputError says what is wrong, without the file's name.
+    Pillow detects truncated files, but decodes JPEGs with damaged data without an error. FFmpeg's decoder reports
+    these, so
+    JPEGs are decoded by it too.
+
+    Raises:
+        InputError: what is wrong, without the file's name.
     """
     with open_picture(data) as picture:
         width, height = picture.size
@@ -79,7 +83,9 @@ def glance(data: bytes) -> Glance:
         size = (max(1, width // factor), max(1, height // factor))
         picture.draft("L", size)
         gray = _pixels(picture, "L")
-        exif = replace(exif_of(picture), width=width, height=height)  # after decoding: of a PNG it decodes everything
+        exif = replace(
+            exif_of(picture), width=width, height=height
+        )  # after decoding, because reading a PNG's EXIF decodes all
         is_jpeg = picture.format in ("JPEG", "MPO")
     if is_jpeg and _is_damaged_jpeg(data):
         raise InputError("its data are damaged and part of the picture is lost; copy it again from the camera")
@@ -89,7 +95,7 @@ def glance(data: bytes) -> Glance:
 
 
 def read_bytes(path: Path) -> bytes:
-    """All bytes of a file; InputError names it when it cannot be read."""
+    """All bytes of a file. Raises InputError, which names the file, when it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -97,13 +103,16 @@ def read_bytes(path: Path) -> bytes:
 
 
 def photo_paths(source: str | Path | Sequence[str | Path]) -> tuple[list[Path], list[str]]:
-    """Photo files of a folder, glob, file or list of them in natural order, and a unique name for each.
+    """Photo files of a folder, glob, file or list of these in natural order, with a unique name for each.
 
-    Of a folder its own photos count, and only when it has none those of the folders below it, so that results which
-    were written beneath the photos are not taken for photos. Hidden files, and raw files beside a JPEG of the same
-    name, are left out. Names are paths below the folder.
+    Of a folder its own photos are taken, or if it has none those of its subfolders, so that results written below the
+    photos
+    are not taken for photos. Hidden files, and raw files beside a JPEG of the same name, are skipped. Names are paths
+    below
+    the folder.
 
-    Raises InputError when there is no such folder or no photo in it.
+    Raises:
+        InputError: the folder does not exist, or there is no photo in it.
     """
     if not isinstance(source, str | Path):
         return _named(list(dict.fromkeys(Path(item) for item in source)))
@@ -125,6 +134,7 @@ def photo_paths(source: str | Path | Sequence[str | Path]) -> tuple[list[Path], 
 
 
 def _photos_among(paths: Iterable[Path], below: Path | None = None) -> list[Path]:
+    """Photo files among some paths, in natural order."""
     photos = []
     for path in paths:
         parts = path.relative_to(below).parts if below else (path.name,)
@@ -137,13 +147,13 @@ def _photos_among(paths: Iterable[Path], below: Path | None = None) -> list[Path
 
 
 def _named(paths: list[Path]) -> tuple[list[Path], list[str]]:
-    """The paths with their shortest unique names: file names, or the paths themselves when two are alike."""
+    """The paths with unique names: file names, or the paths themselves if two file names are equal."""
     names = [path.name for path in paths]
     return paths, names if len(set(names)) == len(names) else [path.as_posix() for path in paths]
 
 
 def _pixels(picture: Image, mode: str) -> Pixels:
-    """Decoded pixels, (H,W,3) for mode RGB and (H,W) for L; InputError when the data do not suffice."""
+    """Decoded pixels, (H,W,3) for mode RGB and (H,W) for L. Raises InputError when the data are damaged."""
     try:
         picture.load()
         if picture.mode == "F":
@@ -154,15 +164,17 @@ def _pixels(picture: Image, mode: str) -> Pixels:
         return gray if mode == "L" else np.repeat(gray[..., None], 3, axis=2)
     except InputError:
         raise
-    except Exception as error:  # the decoders raise whatever damaged data run them into
-        raise InputError("is cut short or damaged; copy it again from the camera") from error
+    except Exception as error:  # with damaged data, decoders may raise anything
+        raise InputError("is truncated or damaged; copy it again from the camera") from error
 
 
 def _upright(pixels: Pixels, orientation: int) -> Pixels:
+    """The pixels rotated by an EXIF orientation."""
     return np.ascontiguousarray(_UPRIGHT[orientation](pixels))
 
 
 def _is_damaged_jpeg(data: bytes) -> bool:
+    """Whether FFmpeg's decoder finds the data of a JPEG damaged."""
     import av
 
     decoder = av.CodecContext.create("mjpeg", "r")
@@ -174,5 +186,5 @@ def _is_damaged_jpeg(data: bytes) -> bool:
     except av.error.InvalidDataError:
         return True
     except av.error.FFmpegError:
-        return False  # a kind of JPEG that FFmpeg does not know, but Pillow does
+        return False  # a kind of JPEG that only Pillow supports
     return False

@@ -1,4 +1,4 @@
-"""intake_video: sharp, well-spread frames of a video become photos."""
+"""Intake of a video: sharp, well-spread frames become photos."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from arview.core.atomic import replacing
 from arview.core.progress import StepProgress
 from arview.errors import InputError, OutputError
 from arview.reconstruction.intake.checks import CheckOptions, check_photo, thumbnail
-from arview.reconstruction.intake.photos import MIN_PHOTOS, Intake, Seen, assess, look_at
+from arview.reconstruction.intake.photos import MIN_PHOTOS, Intake, ReadPhoto, assess, read_and_check
 from arview.reconstruction.intake.reading import GLANCE_PX, Pixels
 from arview.video import Frame, FrameSource, open_source
 
-_QUANTUM = 0.01  # of the diagonal: a move smaller than this may be the hand's tremble, and is not added up
-_MIN_TRACKED = 20  # points, and share of those found, below which the track has broken
-_MIN_TRACKED_SHARE = 0.3
+_QUANTUM = 0.01  # of the diagonal; smaller motions may be tremble of the hand, and are not added up
+_MIN_TRACKED = 20  # tracked corners below which the track has broken
+_MIN_TRACKED_SHARE = 0.3  # the same as a share of the corners found
 
 
 @dataclass(frozen=True)
 class VideoIntakeOptions:
-    """How frames are picked; raises InputError for values that pick none."""
+    """How frames are chosen. Raises InputError for values that choose none."""
 
-    max_frames: int = 60  # as many as sparse reconstruction places in about a minute
+    max_frames: int = 60  # number that sparse reconstruction places in about a minute
     min_step: float = 0.025  # of the diagonal between frames: about 6° around a part that fills a third of the picture
-    looks_per_s: float = 10.0  # frames looked at; a hand-held camera hardly moves in a tenth of a second
-    tracked_px: int = 480  # longest side of the pictures that motion is tracked in
-    middle: float = 0.7  # share of each step that its frame is chosen from, so that two frames do not meet at its end
+    looks_per_s: float = 10.0  # frames examined per second; a hand-held camera hardly moves in a tenth of a second
+    tracked_px: int = 480  # longest side of the pictures in which motion is tracked
+    middle: float = 0.7  # share of each step from which its frame is chosen, so that two frames are not adjacent
     checks: CheckOptions = field(default_factory=CheckOptions)
 
     def __post_init__(self) -> None:
@@ -49,20 +49,21 @@ def intake_video(
     camera: str | Path | None = None,
     progress: StepProgress | None = None,
 ) -> Intake:
-    """Pick frames of a video and write them into ``folder`` as ``frame_000123.png``, numbered as in the video.
+    """Choose frames of a video and write them into ``folder`` as ``frame_000123.png``, numbered as in the video.
 
-    The video is looked through once for the path of the picture's motion (median motion of tracked corners) and the
-    sharpness of each frame. The path is cut into equal steps, and the sharpest frame of each step's middle is taken.
+    A first pass measures the motion of the picture (median motion of tracked corners) and the sharpness of each frame.
+    The
+    path of the motion is cut into equal steps, and the sharpest frame in the middle of each step is chosen.
 
     Args:
         path: video file, or folder or glob of its frames.
-        folder: where the frames are written; made when missing. Each file appears complete or not at all.
-        options: how frames are picked.
-        camera: camera file or ``fov:DEG``, as for ``intake_photos``.
-        progress: called with frames done and in all, over both passes; not when the number is unknown.
+        folder: where the frames are written; created if missing. Each file appears complete or not at all.
+        options: how frames are chosen.
+        camera: camera file or ``fov:DEG``, as for `intake_photos`.
+        progress: called with frames done and in all, over both passes; not if the number is unknown.
 
     Raises:
-        InputError: no readable video, the camera does not move, or no texture.
+        InputError: the video cannot be read, the camera does not move, or there is no texture.
         MismatchError: the camera file does not fit the video.
         OutputError: the frames cannot be written.
     """
@@ -73,7 +74,7 @@ def intake_video(
         stride = max(1, round((source.fps or 30.0) / options.looks_per_s))
     with open_source(path, stride=stride) as source:
         total = 2 * (source.frame_count or 0)
-        indices, travel, sharpness = _look_through(source, options, progress, total)
+        indices, travel, sharpness = _measure_motion(source, options, progress, total)
         chosen = {indices[k] for k in choose_frames(travel, sharpness, options)}
         if len(chosen) < MIN_PHOTOS:
             raise InputError(
@@ -100,9 +101,9 @@ def intake_frames(
     camera: str | Path | None = None,
     progress: StepProgress | None = None,
 ) -> Intake:
-    """The intake of frames that ``intake_video`` has written into ``folder`` before.
+    """Intake of frames that `intake_video` wrote into ``folder`` before.
 
-    The video is opened only to learn how it was turned, which a calibrated camera needs. Raises as ``intake_video``.
+    The video is opened only for its orientation, which a calibrated camera needs. Raises as `intake_video` does.
     """
     options = options or VideoIntakeOptions()
     frames = sorted(Path(folder).glob("frame_*.png"))
@@ -110,8 +111,8 @@ def intake_frames(
         turns = source.quarter_turns_clockwise
     seen, rejected = [], {}
     for done, frame in enumerate(frames, 1):
-        result = look_at(frame, frame.name)
-        if isinstance(result, Seen):
+        result = read_and_check(frame, frame.name)
+        if isinstance(result, ReadPhoto):
             seen.append(replace(result, exif=replace(result.exif, quarter_turns_clockwise=turns)))
         else:
             rejected[frame.name] = result
@@ -123,7 +124,7 @@ def intake_frames(
 def choose_frames(
     travel: NDArray[np.float64], sharpness: NDArray[np.float64], options: VideoIntakeOptions
 ) -> list[int]:
-    """Indices of the sharpest frame in the middle of each of equal steps of ``travel`` (N,), which never falls."""
+    """Indices of the sharpest frame in the middle of each of equal steps of ``travel`` (N,), which never decreases."""
     count = min(options.max_frames, int(travel[-1] / options.min_step) + 1)
     place = travel / max(travel[-1], 1e-12) * count
     step = np.minimum(place.astype(int), count - 1)
@@ -138,10 +139,10 @@ def choose_frames(
     return chosen
 
 
-def _look_through(
+def _measure_motion(
     source: FrameSource, options: VideoIntakeOptions, progress: StepProgress | None, total: int
 ) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
-    """Index of each frame, how far the picture has travelled (in diagonals, never falling), and its sharpness."""
+    """Index of each frame, accumulated motion of the picture (diagonals, non-decreasing), and its sharpness."""
     indices: list[int] = []
     travel: list[float] = []
     sharpness: list[float] = []
@@ -149,7 +150,7 @@ def _look_through(
     for done, frame in enumerate(source, 1):
         gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         travel.append(motion.add(_shrunk(gray, options.tracked_px)))
-        # Neighbouring frames show the same, so that plain contrast of fine detail tells which is the sharpest.
+        # Neighbouring frames show the same, so the contrast of fine detail is a measure of sharpness.
         sharpness.append(float(cv2.Laplacian(_shrunk(gray, 2 * options.tracked_px), cv2.CV_32F).var()))
         indices.append(frame.index)
         if progress and total:
@@ -160,10 +161,10 @@ def _look_through(
 
 
 class _Motion:
-    """Sums the picture's motion: corners are tracked from a reference, which is renewed after each real move."""
+    """Accumulates the picture's motion: corners are tracked from a reference that is renewed after each real move."""
 
     def __init__(self, options: VideoIntakeOptions) -> None:
-        self._lost_step = options.min_step  # what a broken track counts for: the view has changed
+        self._lost_step = options.min_step  # added when the track breaks, because the view has changed
         self._travelled = 0.0
         self._previous: Pixels | None = None
         self._reference: NDArray[np.float32] | None = None  # (N,1,2) px, in the reference picture
@@ -171,7 +172,7 @@ class _Motion:
         self._found = 0
 
     def add(self, gray: Pixels) -> float:
-        """Travel in picture diagonals up to this picture."""
+        """Accumulated motion up to this picture, in diagonals."""
         previous, self._previous = self._previous, gray
         if previous is None or self._now is None or self._reference is None:
             self._restart(gray)
@@ -200,6 +201,7 @@ class _Motion:
 
 
 def _shrunk(gray: Pixels, max_side_px: int) -> Pixels:
+    """The picture reduced to a longest side."""
     scale = max_side_px / max(gray.shape)
     if scale >= 1:
         return gray
@@ -207,8 +209,8 @@ def _shrunk(gray: Pixels, max_side_px: int) -> Pixels:
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
 
 
-def _written(frame: Frame, folder: Path, turns: int) -> Seen:
-    """Write the frame as PNG and look at it."""
+def _written(frame: Frame, folder: Path, turns: int) -> ReadPhoto:
+    """Write the frame as PNG and check it."""
     name = f"frame_{frame.index:06d}.png"
     bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
     _, png = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
@@ -221,4 +223,4 @@ def _written(frame: Frame, folder: Path, turns: int) -> Seen:
     gray = _shrunk(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), GLANCE_PX)
     height, width = frame.image.shape[:2]
     exif = PhotoExif(width, height, quarter_turns_clockwise=turns)
-    return Seen(name, folder / name, exif, check_photo(name, gray), thumbnail(gray))
+    return ReadPhoto(name, folder / name, exif, check_photo(name, gray), thumbnail(gray))

@@ -1,4 +1,4 @@
-"""Scale and frame from the CAD: the part is detected in a few photos, the detections vote, all photos refine."""
+"""Scale and frame from the CAD: the part is detected in a few photos, the detections vote, and all photos refine."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Pixels = NDArray[np.uint8]
 
 
 FOUND_QUALITY = 0.5
-"""A detection of this quality is believed alone."""
+"""Quality from which a detection is reliable by itself."""
 
 
 @dataclass(frozen=True)
@@ -37,19 +37,20 @@ class CadOptions:
     """Options of finding the CAD in the photos.
 
     Attributes:
-        detect_width_px: longer side of the pictures that the part is searched in.
-        max_detections: photos searched at most; while no two agree, at most ``first_detections``.
-        agreeing: so many photos end the search.
-        min_quality: detections that would not be believed alone vote too: with others they may agree.
-        sightings: detections taken of a photo.
-        subdivisions: of the guide views' directions: 3 is about 8° apart, enough to start from.
-        spans: smallest and largest part of the longer side that the part is expected to span.
-        max_side_px: photos are refined at this size at most: memory.
-        max_views: photos refined at most, spread: time.
-        rival_views: photos in which rivals of the best vote are judged.
-        min_support: a similarity borne out by less is no find, see `Support`.
-        clear_lead: a rival with so little less support makes the frame ambiguous.
-        refine: of the joint refinement.
+        detect_width_px: longer side of the pictures in which the part is searched for.
+        max_detections: maximum number of photos searched.
+        first_detections: maximum number of photos searched while no two agree.
+        agreeing: number of agreeing photos that ends the search.
+        min_quality: detections of at least this quality vote, even if they would not be reliable by themselves.
+        sightings: maximum number of detections per photo.
+        subdivisions: of the guide views' directions; 3 is about 8° apart, enough for a start.
+        spans: smallest and largest share of the photo's longer side that the part is expected to span.
+        max_side_px: photos are refined at no larger size, to limit memory.
+        max_views: maximum number of photos refined, spread over all directions, to limit time.
+        rival_views: number of photos in which alternatives to the best vote are scored.
+        min_support: minimum support of a similarity that is accepted, see `Support`.
+        clear_lead: an alternative whose support is less than this below the best one's makes the frame ambiguous.
+        refine: options of the joint refinement.
     """
 
     detect_width_px: int = 800
@@ -70,7 +71,15 @@ class CadOptions:
 
 @dataclass(frozen=True)
 class CadFind:
-    """The CAD found in the photos: the fit, its support, what it was fitted to, and words for the evidence."""
+    """The CAD as found in the photos.
+
+    Attributes:
+        fit: the refined similarity.
+        support: its support.
+        refiner: with the views to which it was fitted.
+        detail: description for the evidence.
+        warnings: messages about doubts.
+    """
 
     fit: Fit
     support: Support
@@ -81,14 +90,19 @@ class CadFind:
 
 @dataclass(frozen=True)
 class NotFound:
-    """Why the CAD was not found; ``is_contradiction`` when it was seen, but not where the reconstruction says."""
+    """Why the CAD was not found.
+
+    Attributes:
+        reason: as a message.
+        is_contradiction: the part was seen, but not where the reconstruction has it.
+    """
 
     reason: str
     is_contradiction: bool = False
 
 
 def base_names(part: Part) -> tuple[str, ...]:
-    """The components that define the frame: those of role ``base``, else the largest."""
+    """The components that define the frame: those with the role ``base``, else the largest."""
     present = {component.name for component in part.model.components}
     base = tuple(s.name for s in part.settings if s.role == "base" and s.name in present)
     if base:
@@ -98,7 +112,7 @@ def base_names(part: Part) -> tuple[str, ...]:
 
 
 def spread_order(photos: Sequence[PosedPhoto]) -> list[int]:
-    """Indices of the photos such that those at the front look from as different places as possible."""
+    """Indices of the photos, ordered such that the first ones look from places as different as possible."""
     centres = np.array([photo.centre_in_scan for photo in photos])
     axes = np.array([photo.cam_from_scan[2, :3] for photo in photos])
     size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean() or 1.0
@@ -113,13 +127,13 @@ def spread_order(photos: Sequence[PosedPhoto]) -> list[int]:
 
 
 def make_view(photo: PosedPhoto, image: Pixels, max_side_px: int) -> ScaleView:
-    """A photo in linear light, no larger than ``max_side_px``."""
+    """A photo in linear light, with no side longer than ``max_side_px``."""
     camera, gray = shrunk(photo.camera, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), max_side_px)
     return ScaleView(photo.name, camera, linear_light(gray), photo.cam_from_scan)
 
 
 def shrunk(camera: Camera, image: Pixels, max_side_px: int) -> tuple[Camera, Pixels]:
-    """Camera and picture no larger than ``max_side_px``."""
+    """Camera and picture, reduced to ``max_side_px`` if they are larger."""
     scale = max_side_px / max(camera.width, camera.height)
     if scale >= 1.0:
         return camera, image
@@ -128,14 +142,16 @@ def shrunk(camera: Camera, image: Pixels, max_side_px: int) -> tuple[Camera, Pix
 
 
 def search_ranges(part: Part, cameras: Sequence[Camera], spans: tuple[float, float]) -> list[ViewRange]:
-    """From where the part may be seen, likelier first: above, then below, as far as its file declares either.
+    """View ranges to search, the more likely one first: from above, then from below, as far as the part file declares
+    them.
 
-    Photos are taken from all around, whatever sides are declared for tracking. Distances follow from the lenses, in
-    steps of the root of two so that guide views can be kept.
+    Photos are taken from all around, whatever azimuth is declared for tracking. Distances follow from the lenses, in
+    steps
+    of √2 so that cached guide views can be reused.
     """
     longer = np.array([camera.fx / max(camera.width, camera.height) for camera in cameras])
     diameter = part.model.diameter_mm
-    # Nearer than 0.75 diameters guide views cannot be made.
+    # Guide views cannot be made from nearer than 0.75 diameters.
     low = max(0.75, 2.0 ** (np.floor(2.0 * np.log2(longer.min() / spans[1])) / 2.0)) * diameter
     high = max(1.5 * low, 2.0 ** (np.ceil(2.0 * np.log2(longer.max() / spans[0])) / 2.0) * diameter)
     distances = (float(low), float(high))
@@ -153,14 +169,17 @@ def find_cad(
     options: CadOptions,
     progress: Progress | None = None,
 ) -> CadFind | NotFound:
-    """The similarity that puts the CAD into the photos, or why it was not found.
+    """Find the similarity that fits the CAD to the photos.
 
     Args:
         photos: placed photos.
-        read: the (H,W,3) uint8 RGB picture of one, upright, of its camera's size.
-        part: that is looked for.
-        options: see CadOptions.
-        progress: see Progress.
+        read: returns the upright (H,W,3) uint8 RGB picture of a photo, of the size of its camera.
+        part: the part to find.
+        options: see `CadOptions`.
+        progress: called with (what, done, total).
+
+    Returns:
+        The CAD as found, or why it was not found.
     """
     if len(photos) < 2:
         return NotFound("fewer than two photos were placed")
@@ -188,7 +207,9 @@ def _search(
     options: CadOptions,
     progress: Progress | None,
 ) -> tuple[list[Vote], Array, NotFound]:
-    """Votes of the detections, turns (N,3,3) that make the part look much the same, and why not when no vote."""
+    """Votes of the detections, rotations (N,3,3) under which the part looks similar, and the reason if there is no
+    vote.
+    """
     from arview.detection.detector import options_for
     from arview.tracking.diagnosis import diagnose_search
 
@@ -221,9 +242,9 @@ def _search(
         if votes and len(votes[0].sightings) >= enough:
             return votes, next(iter(detectors.values())).symmetries.near, NotFound("")
     if sure >= enough:
-        apart = f"the part was found in {sure} photos, but they do not agree about where it is"
+        apart = f"the part was found in {sure} photos, but at places that contradict each other"
         return [], np.zeros((0, 3, 3)), NotFound(apart, is_contradiction=True)
-    reason = max(reasons, key=reasons.count) if reasons else "it looks much the same from several sides"
+    reason = max(reasons, key=reasons.count) if reasons else "it looks similar from several sides"
     few = f"the part was found in only {sure} of the photos; in others: {reason}"
     return [], np.zeros((0, 3, 3)), NotFound(few if sure else reason)
 
@@ -238,7 +259,7 @@ def _refined(
     options: CadOptions,
     progress: Progress | None,
 ) -> CadFind | NotFound:
-    """The vote, or a twin of it, that the edges of several photos bear out best, refined in all; or why none is."""
+    """Refine the vote, or its rotated alternative, that the edges of several photos support best; or say why none."""
     chosen = list(order[: options.max_views])
     views: list[ScaleView] = []
     for view in pool().map(lambda i: make_view(photos[i], read(photos[i]), options.max_side_px), chosen):
@@ -257,7 +278,7 @@ def _refined(
     warnings = []
     rivals = [score for score, other in scored[1:] if _is_other(scored[0][1], other)]
     if rivals and scored[0][0] - max(rivals) < options.clear_lead:
-        warnings.append("the part looks much the same after a turn: the frame may be that of its twin")
+        warnings.append("the part looks similar after a rotation, so the frame may be wrong by that rotation")
     if progress:
         progress("fitting the CAD", 0, 1)
     refiner = JointRefiner(model, base, views, options.refine)
@@ -265,26 +286,26 @@ def _refined(
     support = refiner.support(fit.similarity, fit.samples)
     if max(support.score, support.base_score) < options.min_support:
         reason = (
-            f"the part was found in {len(votes[0].sightings)} photos, but with the photos' poses only "
+            f"the part was found in {len(votes[0].sightings)} photos, but with the poses of these only "
             f"{100 * support.share:.0f} % of its edges are where they should be "
-            f"({100 * support.chance:.0f} % by chance)"
+            f"({100 * support.chance:.0f} % would be by chance)"
         )
         return NotFound(reason, is_contradiction=True)
     detail = (
-        f"CAD edges in {len(views)} photos, {', '.join(base)} taken to be as drawn: "
+        f"CAD edges in {len(views)} photos, with {', '.join(base)} at nominal: "
         f"{100 * support.share:.0f} % found, {fit.sigma_px:.2f} px"
     )
     return CadFind(fit, support, refiner, detail, tuple(warnings))
 
 
 def _turned(similarity: Similarity, turn: Array, model: Model) -> Similarity:
-    """The similarity with the part turned (3,3) about its middle."""
+    """The similarity with the part rotated (3,3) about its centre."""
     to_center = rigid(np.eye(3), model.center_in_model)
     back = to_center @ rigid(turn.T, np.zeros(3)) @ invert(to_center)
     return Similarity(similarity.scale, back @ similarity.model_from_scan)
 
 
 def _is_other(a: Similarity, b: Similarity) -> bool:
-    """Whether two refined similarities are apart: a rival that slid into the best is none."""
+    """Whether two refined similarities differ; an alternative that converged to the best one is none."""
     cosine = 0.5 * (float(np.sum(a.model_from_scan[:3, :3] * b.model_from_scan[:3, :3])) - 1.0)
     return bool(cosine < np.cos(np.deg2rad(2.0)) or abs(np.log(a.scale / b.scale)) > 0.02)

@@ -1,4 +1,4 @@
-"""Does the reconstruction have the shape of the CAD? Registered photos and small residuals prove nothing."""
+"""Check that the reconstruction has the shape of the CAD, which placed photos and small residuals do not prove."""
 
 from __future__ import annotations
 
@@ -14,29 +14,32 @@ from arview.reconstruction.types import SparseModel
 from arview.rendering.renderers import ZBufferRenderer
 
 DRAWN_PX = 600
-"""Longer side at which the CAD is drawn for the points."""
+"""Longer side at which the CAD is rendered for the check of the points."""
 NEAR_SHARE = 0.006
-"""Points this near to the CAD's surface lie on it, in diameters of the part: rough surfaces, displaced components."""
+"""Distance in diameters of the part below which points lie on the CAD's surface: rough surfaces, displaced components.
+"""
 RIM_PX = 3
-"""Points this near to an outline, in px drawn, may belong to what is behind it."""
+"""Points this near to an outline, in rendered px, may belong to what is behind it."""
 MIN_PHOTOS = 3
-"""Points seen by fewer photos are often wrong matches."""
+"""Points observed in fewer photos are often wrong matches."""
 MIN_POINTS = 60
+"""Points on the part that the check of the points needs."""
 MIN_NEAR, MAX_BEHIND = 0.6, 0.15
+"""Smallest share of points near the surface, and largest share behind it, of a consistent reconstruction."""
 MIN_EDGES, MIN_OF_OTHERS = 0.25, 0.45
-"""Share of edges found beyond chance in all; in a photo, of what the others show."""
+"""Smallest share of edges found beyond chance, in all photos; and in one photo, relative to the median photo."""
 MAX_MISFITS = 0.1
-"""Share of photos that may not fit."""
+"""Largest share of photos that may not fit."""
 
 
 def check_consistency(sparse: SparseModel, model: Model, found: CadFind, similarity: Similarity) -> Consistency:
-    """Edges of the CAD in every photo, and sparse points against the CAD's surface.
+    """Check the edges of the CAD in every photo, and the sparse points against the CAD's surface.
 
     Args:
-        sparse: the reconstruction, unit arbitrary.
+        sparse: the reconstruction, in an arbitrary unit.
         model: the CAD.
-        found: the CAD in the photos.
-        similarity: the one that is kept.
+        found: the CAD as it was found in the photos.
+        similarity: the similarity to check.
     """
     support = found.refiner.support(similarity)
     usual = float(np.nanmedian(support.by_view))
@@ -72,10 +75,11 @@ def check_consistency(sparse: SparseModel, model: Model, found: CadFind, similar
 
 
 def points_before_surface(sparse: SparseModel, model: Model, similarity: Similarity) -> Array:
-    """How far (N,) mm the sparse points on the part lie before the CAD's surface, seen by their photos.
+    """Signed distances (N,) in mm by which sparse points on the part lie in front of the CAD's surface.
 
-    Negative is behind: nothing can be seen there if the CAD is right. Each point's median over the photos that see it
-    on the part, where at least half of those that see it do.
+    Negative values are behind the surface, where nothing is visible if the CAD is right. Each value is the median over
+    the
+    photos that see the point on the part; points are left out if more than half of their photos see them off the part.
     """
     points = similarity.points_in_model(sparse.points_in_scan)
 
@@ -96,7 +100,7 @@ def points_before_surface(sparse: SparseModel, model: Model, similarity: Similar
         u, v = np.round(pixels[ok]).astype(np.intp).T
         around = [depth[v + dv, u + du] for dv in (-RIM_PX, 0, RIM_PX) for du in (-RIM_PX, 0, RIM_PX)]
         lowest, highest = np.min(around, axis=0), np.max(around, axis=0)
-        # Between the nearest and the farthest surface around a point it is on it, on steps and slopes too.
+        # A point between the nearest and the farthest surface around its pixel counts as on it: steps and slopes.
         z = in_cam[ok, 2]
         gap = np.where(z < lowest, lowest - z, np.where(z > highest, highest - z, 0.0))
         before[ok] = np.where(lowest > 0, gap, np.nan)

@@ -1,4 +1,4 @@
-"""Scale and rough frame of a reconstruction from everything that is known about them."""
+"""Scale and approximate frame of a reconstruction from all evidence."""
 
 from __future__ import annotations
 
@@ -19,14 +19,21 @@ from arview.reconstruction.scale.targets import scale_from_rig, scale_from_targe
 from arview.reconstruction.scale.types import TRUST, Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import PosedPhoto, SparseModel
 
-DISAGREE = 4.0
-"""Sources that differ by more standard deviations disagree."""
+MAX_SIGMAS = 4.0
+"""Sources that differ by more standard deviations than this contradict each other."""
 NO_CHECK = Consistency(True, "not checked against the CAD")
 
 
 @dataclass(frozen=True)
 class CombinedScale:
-    """The scale that the evidence agrees on, its relative standard deviation, the evidence, and disagreements."""
+    """The scale on which the evidence agrees.
+
+    Attributes:
+        scale: mm per unit.
+        std: relative standard deviation.
+        evidence: all of it, in order of trust, marked as used or rejected.
+        warnings: messages about rejected evidence.
+    """
 
     scale: float
     std: float
@@ -42,14 +49,15 @@ def find_scale(
     read: Callable[[PosedPhoto], Pixels] | None = None,
     progress: Progress | None = None,
 ) -> ScaleResult:
-    """Scale (mm per unit) and rough CAD frame of a sparse model.
+    """Find the scale (mm per unit) and the approximate CAD frame of a sparse model.
 
     Args:
         sparse: poses in an arbitrary frame and unit.
-        part: to be found in the photos; None: only ``sources`` are used, and there is no frame.
-        sources: boards, tags, scale bars and rig that are known.
+        part: to be found in the photos; None uses ``sources`` only and gives no frame.
+        sources: known boards, tags, scale bars and rig.
         options: of finding the CAD.
-        read: the (H,W,3) uint8 RGB picture of a photo, upright, of its camera's size; by default its file is read.
+        read: returns the upright (H,W,3) uint8 RGB picture of a photo, of the size of its camera; default: from its
+            file.
         progress: called with (what, done, total).
 
     Raises:
@@ -79,7 +87,7 @@ def find_scale(
             combined.scale if combined else None, combined.std if combined else None, None, None,
             combined.evidence if combined else (), tuple(warnings), no_fit.reason, consistency,
         )  # fmt: skip
-    # What the other sources add to the scale moves the frame as far as the two depend on each other.
+    # The change of scale by the other sources moves the frame by as much as the two are correlated.
     fit = found.fit
     change = float(np.log(combined.scale / fit.similarity.scale))
     by_scale = fit.covariance[:, 6] / fit.covariance[6, 6]
@@ -90,7 +98,7 @@ def find_scale(
     consistency = check_consistency(sparse, part.model, found, similarity)
     against = [e for e in combined.evidence if e.kind == "cad" and not e.is_used]
     if against:
-        reason = f"the CAD has another size than {combined.evidence[0].detail}"
+        reason = f"the size of the CAD contradicts {combined.evidence[0].detail}"
         consistency = replace(consistency, is_consistent=False, reason=f"{reason}; {consistency.reason}")
     warnings += found.warnings
     if not consistency.is_consistent:
@@ -102,10 +110,11 @@ def find_scale(
 
 
 def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:
-    """The mean of the evidence by inverse variance, in order of trust; None without any.
+    """Weighted mean of the evidence by inverse variance; None without any.
 
-    What disagrees with the more trusted (by more than DISAGREE standard deviations) is set aside, with a warning that
-    names both. What scatters more than it should has a standard deviation as much larger.
+    Evidence that differs from more trusted evidence by more than MAX_SIGMAS standard deviations is rejected, with a
+    warning
+    that names both. If the rest scatters by more than its standard deviations allow, that of the mean is increased.
     """
     ordered = sorted(evidence, key=lambda e: TRUST.index(e.kind))
     checked: list[ScaleEvidence] = []
@@ -113,14 +122,14 @@ def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:
     for e in ordered:
         trusted = [other for other in checked if other.is_used]
         apart = [abs(np.log(e.mm_per_unit / t.mm_per_unit)) / np.hypot(e.std, t.std) for t in trusted]
-        is_used = not apart or bool(max(apart) <= DISAGREE)
+        is_used = not apart or bool(max(apart) <= MAX_SIGMAS)
         checked.append(replace(e, is_used=is_used))
         if not is_used:
             rival = trusted[int(np.argmax(apart))]
             percent = 100.0 * (e.mm_per_unit / rival.mm_per_unit - 1.0)
             warnings.append(
                 f"the scale of [{e.detail}] differs by {percent:+.3f} % ({max(apart):.0f} σ) from that of "
-                f"[{rival.detail}], which is trusted more and was used"
+                f"[{rival.detail}], which is more trusted and was used"
             )
     used = [e for e in checked if e.is_used]
     if not used:
@@ -140,6 +149,7 @@ def _positive(covariance: Array) -> Array:
 
 
 def _read_file(photo: PosedPhoto) -> NDArray[np.uint8]:
+    """The picture of a photo, from its file."""
     from arview.reconstruction.intake.reading import read_photo
 
     return read_photo(photo.path)

@@ -1,9 +1,9 @@
-"""Joint refinement: one similarity ``model_from_scan`` from the CAD's edges in all photos at once.
+"""Joint refinement of one similarity ``model_from_scan`` from the CAD's edges in all photos.
 
-The relative poses of the photos are those of the reconstruction; seven unknowns are left (rotation, translation,
-scale), found by Gauss-Newton on the distances between projected CAD edges and steps of brightness. A component that
-is not where the CAD says would pull them along, so each but the base has a displacement of its own, held near zero
-by a heavy-tailed prior (Lange, Little & Taylor 1989) whose width the components themselves say.
+The relative poses of the photos are those of the reconstruction. The seven unknowns (rotation, translation, scale) are
+found by Gauss-Newton on the distances between projected CAD edges and steps of brightness. A component that is not at
+its nominal position would bias them, so every component except the base has a displacement of its own, with a
+heavy-tailed prior at zero (Lange, Little & Taylor 1989) whose width is estimated from the displacements themselves.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from arview.rendering.renderers import ZBufferRenderer
 
 @dataclass(frozen=True)
 class ScaleView:
-    """A photo as the refinement sees it.
+    """A photo as the refinement uses it.
 
     Attributes:
         name: of the photo.
         camera: of ``gray``, with distortion.
-        gray: (H,W) float32, linear light, a little smoothed.
-        cam_from_scan: (4,4), unit of the reconstruction.
+        gray: (H,W) float32, in linear light, slightly smoothed.
+        cam_from_scan: (4,4), in the unit of the reconstruction.
     """
 
     name: str
@@ -46,19 +46,21 @@ class RefineOptions:
     """Options of the joint refinement.
 
     Attributes:
-        rough_reaches_px, reaches_px: how far edges are looked for, round by round, in px of the views; first in a few.
+        rough_reaches_px: search range across the edges in each round from a distant start, in px of the views.
+        reaches_px: search range in each round from a near start.
         spacing_px: between samples along an edge, in px of the views.
-        drawn_width_px: longer side at which hidden edges are found out; finer shows little more.
-        half_width_px: profiles are averaged so far along the edge.
-        threshold: weakest step, grey levels of 255 per px in linear light.
-        half_slope: a step of this slope counts half.
-        contact_px: an edge this near to a surface of another component, in px drawn, is a joint (and often a weld).
-        min_sigma_px: residuals are never taken to be better than this: lens, tessellation, pixel response.
-        near_px, beside_px: a step so near bears an edge out; chance is counted so far beside it.
-        dark_shift_px: how far all edges may be shifted towards the dark side (1 σ): tone curve, glare.
-        min_displacement_mm: width of the prior on displacements of components, at least.
-        base_sigma_mm: how far the edges of the base may mislead (shadows below, a bench of the same colour).
-        systematic_px: what all edges may be off together (chamfers, tone curve), for the uncertainty.
+        drawn_width_px: longer side at which hidden edges are determined.
+        half_width_px: profiles are averaged over this distance to either side along the edge.
+        threshold: weakest step, in grey levels (of 255) per px in linear light.
+        half_slope: slope at which a step has half its full weight.
+        contact_px: edges this near to a surface of another component, in rendered px, are joints (and often welds).
+        min_sigma_px: lower bound of the residuals' standard deviation: lens, tessellation, pixel response.
+        near_px: distance up to which a step supports an edge.
+        beside_px: distance beside the edges at which chance is measured.
+        dark_shift_px: standard deviation of a common shift of all edges to the dark side: tone curve, glare.
+        min_displacement_mm: lower bound of the width of the prior on displacements.
+        base_sigma_mm: standard deviation of an error of the base's edges: shadows, a bench of the same colour.
+        systematic_px: standard deviation of a common error of all edges, for the uncertainty: chamfers, tone curve.
     """
 
     rough_reaches_px: tuple[float, ...] = (12.0, 10.0, 7.0, 5.0)
@@ -80,15 +82,15 @@ class RefineOptions:
 
 @dataclass(frozen=True)
 class Fit:
-    """The joint refinement's result.
+    """Result of the joint refinement.
 
     Attributes:
         similarity: at the optimum.
-        covariance: (7,7) of the step that `Similarity.moved` takes, from residuals that are alike along an edge, in a
-            photo and in a component.
+        covariance: (7,7) of the step of `Similarity.moved`, for residuals that are correlated along an edge, in a photo
+            and in a component.
         sigma_px: robust standard deviation of the edges' offsets.
         displacements_mm: (C,3) of the components, in the model; zero for the base.
-        samples: of each view, for looking again.
+        samples: edge points of each view, for further measurements.
     """
 
     similarity: Similarity
@@ -100,12 +102,13 @@ class Fit:
 
 @dataclass(frozen=True)
 class Support:
-    """How well a similarity is borne out.
+    """How well the photos support a similarity.
 
     Attributes:
-        by_view, by_component: share of edge points with a step of brightness where predicted, less what chance gives:
-            0 = as much as beside the edges, 1 = all; NaN where nothing was looked at.
-        share, chance: of all points: with a step at the edge, and beside it.
+        by_view, by_component: share of edge points with a step of brightness where predicted, beyond chance: 0 = no
+            more
+            than beside the edges, 1 = all; NaN where nothing was searched.
+        share, chance: shares over all points, at the edges and beside them.
         is_base: (C,) which components define the frame.
     """
 
@@ -117,18 +120,24 @@ class Support:
 
     @property
     def score(self) -> float:
-        """Mean of the components' shares: for comparing similarities of the same photos."""
+        """Mean of the components' shares, for comparing similarities in the same photos."""
         return _mean(self.by_component)
 
     @property
     def base_score(self) -> float:
-        """The same of the base: the others may be displaced."""
+        """Mean share of the base, because other components may be displaced."""
         return _mean(self.by_component[self.is_base])
 
 
 @dataclass(frozen=True)
 class EdgeSamples:
-    """Visible CAD edge points of one view: (N,3) points and unit tangents in the model, component, feature (N,)."""
+    """Visible CAD edge points of one view.
+
+    Attributes:
+        points, tangents: (N,3) points (mm) and unit tangents in the model.
+        component: (N,) index.
+        feature: (N,) number of the straight line to which the point belongs.
+    """
 
     points: Array
     tangents: Array
@@ -138,25 +147,25 @@ class EdgeSamples:
 
 @dataclass(frozen=True)
 class EdgeResiduals:
-    """What one view says.
+    """Steps found at the edge points of one view.
 
     Attributes:
-        rows: (M,8) of the Jacobian: twist, d log(scale), and the step's sign: the shift of all edges to the dark side.
-        offsets: (M,) px from the predicted edge to the step.
-        component, feature: (M,) of which each is.
-        looked, found: (C,) points inside the picture, and those with a step near them.
+        rows: (M,8) derivatives by the twist and d log(scale), and the sign of the step for a shift to the dark side.
+        offsets: (M,) from the predicted edge to the step, px.
+        component, feature: (M,) to which each belongs.
+        looked, found: (C,) number of points inside the picture, and of those with a step near them.
     """
 
     rows: Array
     offsets: Array
     component: NDArray[np.int32]
     feature: NDArray[np.int64]
-    looked: NDArray[np.int64]
+    searched: NDArray[np.int64]
     found: NDArray[np.int64]
 
 
 class JointRefiner:
-    """Refines similarities of one model and some views; what it needs of the model is made once."""
+    """Refines similarities of one model in some views."""
 
     def __init__(self, model: Model, base: Sequence[str], views: Sequence[ScaleView], options: RefineOptions) -> None:
         self.model = model
@@ -167,7 +176,7 @@ class JointRefiner:
         self._is_base = np.array([component.name in base for component in model.components])
 
     def samples(self, view: ScaleView, cam_from_model: Array) -> EdgeSamples:
-        """Edge points that the view shows, without joints of components and folds of curved surfaces."""
+        """Edge points that the view shows, without joints between components and folds of curved surfaces."""
         o = self.options
         shrink = min(1.0, o.drawn_width_px / max(view.camera.width, view.camera.height))
         drawn = view.camera.without_distortion().scaled(
@@ -191,7 +200,9 @@ class JointRefiner:
         return EdgeSamples(points, tangents, component, self._features(points, tangents, component))
 
     def rough(self, start: Similarity) -> tuple[Similarity, Support]:
-        """A similarity refined from far, by all components or by the base alone, whichever finds the base better."""
+        """Refine from a distant start, with all components and with the base alone; keep the result with better base
+        support.
+        """
         tried = []
         for components in (np.ones_like(self._is_base), self._is_base):
             fit = self.refine(start, self.options.rough_reaches_px, components)
@@ -206,7 +217,9 @@ class JointRefiner:
         reaches_px: Sequence[float] | None = None,
         components: NDArray[np.bool_] | None = None,
     ) -> Fit:
-        """The similarity that the edges of all views agree on, from a near one; of some ``components`` (C,) only."""
+        """Refine from a near start to the similarity on which the edges of all views agree; ``components`` (C,) selects
+        some.
+        """
         o = self.options
         reaches = reaches_px or o.reaches_px
         similarity, samples = start, self.sample_all(start, components)
@@ -222,7 +235,7 @@ class JointRefiner:
         return Fit(similarity, covariance, system.sigma_px, displacements, samples)
 
     def _systematic(self, similarity: Similarity, samples: Sequence[EdgeSamples]) -> Array:
-        """(7,7) covariance of what residuals do not show: that all edges lie a little off, outwards or to one side."""
+        """(7,7) covariance of errors that residuals do not show: all edges a little too far out, or to one side."""
         points = np.concatenate([s.points for s in samples]) - self.center
         if not len(points):
             return np.zeros((7, 7))
@@ -235,32 +248,32 @@ class JointRefiner:
         return np.diag(np.repeat([sigma_mm / radius_mm, shift_mm, sigma_mm / radius_mm], [3, 3, 1]) ** 2)
 
     def support(self, similarity: Similarity, samples: Sequence[EdgeSamples] | None = None) -> Support:
-        """How many predicted edges the views show, against how many they show beside them."""
+        """Share of predicted edges that the views show, compared with the share found beside them."""
         o = self.options
         samples = samples or self.sample_all(similarity)
         counts = []
         for shift_px in (0.0, -o.beside_px, o.beside_px):
             measured = self.measure_all(similarity, samples, 2.0 * o.near_px, shift_px)
-            counts.append([np.stack([m.looked for m in measured]), np.stack([m.found for m in measured])])
-        (looked, found), (left, by_left), (right, by_right) = counts
+            counts.append([np.stack([m.searched for m in measured]), np.stack([m.found for m in measured])])
+        (searched, found), (left, by_left), (right, by_right) = counts
 
         def contrast(axis: int) -> Array:
             with np.errstate(invalid="ignore", divide="ignore"):
-                share = found.sum(axis) / np.where(looked.sum(axis) >= 10, looked.sum(axis), np.nan)
+                share = found.sum(axis) / np.where(searched.sum(axis) >= 10, searched.sum(axis), np.nan)
                 chance = (by_left + by_right).sum(axis) / (left + right).sum(axis)
                 return np.asarray((share - chance) / (1.0 - np.minimum(chance, 0.95)))
 
         chance = (by_left + by_right).sum() / max(1, (left + right).sum())
         return Support(
-            contrast(1), contrast(0), float(found.sum() / max(1, looked.sum())), float(chance), self._is_base
+            contrast(1), contrast(0), float(found.sum() / max(1, searched.sum())), float(chance), self._is_base
         )
 
     def measure(
         self, view: ScaleView, samples: EdgeSamples, cam_from_model: Array, reach_px: float, shift_px: float = 0.0
     ) -> EdgeResiduals:
-        """Steps of brightness near the predicted edges, and how these move with a step of the similarity.
+        """Find steps of brightness near the predicted edges, and their derivatives by a step of the similarity.
 
-        With ``shift_px`` it is looked beside the edges: what is found there is chance.
+        With ``shift_px`` the search is beside the edges, where steps are found by chance.
         """
         o = self.options
         in_cam = apply(cam_from_model, samples.points)
@@ -271,7 +284,7 @@ class JointRefiner:
         )
         offsets, slopes = choose_steps(all_offsets, all_slopes, 0.4 * reach_px, o.half_slope)
         is_found = seen & (slopes != 0.0)
-        # Through the lens by differences: of one micrometre per mm of depth.
+        # Numerical derivative through the lens, with steps of one micrometre per mm of depth.
         delta = 1e-6 * in_cam[:, 2:]
         by_cam = np.stack([
             np.sum((view.camera.project(in_cam + delta * axis) - pixels) * normals, axis=1) / delta[:, 0]
@@ -292,7 +305,7 @@ class JointRefiner:
     def measure_all(
         self, start: Similarity, samples: Sequence[EdgeSamples], reach_px: float, shift_px: float = 0.0
     ) -> list[EdgeResiduals]:
-        """`measure` of every view."""
+        """`measure` for every view."""
 
         def one(pair: tuple[ScaleView, EdgeSamples]) -> EdgeResiduals:
             return self.measure(pair[0], pair[1], start.cam_from_model(pair[0].cam_from_scan), reach_px, shift_px)
@@ -300,7 +313,7 @@ class JointRefiner:
         return list(pool().map(one, zip(self.views, samples, strict=True)))
 
     def sample_all(self, start: Similarity, components: NDArray[np.bool_] | None = None) -> list[EdgeSamples]:
-        """`samples` of every view, of some ``components`` (C,) only."""
+        """`samples` of every view, optionally of some ``components`` (C,) only."""
 
         def one(view: ScaleView) -> EdgeSamples:
             found = self.samples(view, start.cam_from_model(view.cam_from_scan))
@@ -322,7 +335,7 @@ class JointRefiner:
         return np.asarray(np.stack([-along[:, 1], along[:, 0]], axis=1))
 
     def _features(self, points: Array, tangents: Array, component: NDArray[np.int32]) -> NDArray[np.int64]:
-        """One number for all points of a component on the same straight line: errors along it are alike."""
+        """(N,) one number for all points of a component on the same straight line, whose errors are correlated."""
         sign = np.sign(np.take_along_axis(tangents, np.argmax(np.abs(tangents), axis=1)[:, None], axis=1))
         direction = np.round(4.0 * tangents * sign).astype(np.int64)
         foot = points - self.center - np.sum((points - self.center) * tangents, axis=1, keepdims=True) * tangents
@@ -332,12 +345,12 @@ class JointRefiner:
 
 
 def _mean(values: Array) -> float:
-    """Of those that are numbers; 0 without any."""
+    """Mean of the finite values; 0 if there are none."""
     return float(np.nanmean(values)) if np.isfinite(values).any() else 0.0
 
 
 class _JointSystem:
-    """The equations of one round: 8 common unknowns, 3 more for each component that may be displaced."""
+    """Equations of one round: 8 common unknowns, and 3 for each component that may be displaced."""
 
     def __init__(
         self, measured: Sequence[EdgeResiduals], displacements: Array, is_base: NDArray[np.bool_], o: RefineOptions
@@ -348,7 +361,7 @@ class _JointSystem:
         self.feature = np.concatenate([m.feature for m in measured])
         self.view = np.repeat(np.arange(len(measured)), [len(m.offsets) for m in measured])
         self.is_base = is_base
-        # What is left over when each component is where it was last seen to be.
+        # Residuals with each component at the place that the previous round found.
         left = self.offsets - np.sum(self.rows[:, 3:6] * displacements[self.component], axis=1)
         self.sigma_px = max(o.min_sigma_px, 1.4826 * float(np.median(np.abs(left))) if len(left) else np.inf)
         self.weights = np.clip(1.0 - (left / (4.685 * self.sigma_px)) ** 2, 0.0, None) ** 2 / self.sigma_px**2
@@ -385,9 +398,9 @@ class _JointSystem:
         return solution[:7], displacements
 
     def covariance(self) -> Array:
-        """(7,7) of the solution, with errors alike in a photo, along an edge and in a component.
+        """(7,7) of the solution, with errors correlated within a photo, along an edge and within a component.
 
-        The cluster-robust estimate (Liang & Zeger 1986), summed over the three ways to group the residuals.
+        The cluster-robust estimate (Liang & Zeger 1986), summed over these three groupings of the residuals.
         """
         total = np.zeros((8, 8))
         for labels, rows in (

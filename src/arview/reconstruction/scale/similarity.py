@@ -1,4 +1,4 @@
-"""Similarities: scaled rigid motions between the reconstruction and the CAD, or between two sets of points."""
+"""Similarity transforms between the reconstruction and the CAD, or between two sets of points."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from arview.geometry import Array, apply, exp_se3, invert, orthonormalise, rigid
 
 @dataclass(frozen=True)
 class Similarity:
-    """``x_model = model_from_scan @ (scale * x_scan)``: scale in mm per unit, ``model_from_scan`` rigid (4,4)."""
+    """``x_model = model_from_scan @ (scale * x_scan)``, with ``scale`` in mm per unit and ``model_from_scan`` (4,4)
+    rigid.
+    """
 
     scale: float
     model_from_scan: Array
 
     def cam_from_model(self, cam_from_scan: Array) -> Array:
-        """(4,4) in mm of a photo whose pose in the reconstruction is known."""
+        """(4,4) pose in mm of a photo whose pose in the reconstruction is known."""
         scaled = rigid(cam_from_scan[:3, :3], self.scale * cam_from_scan[:3, 3])
         return np.asarray(scaled @ invert(self.model_from_scan))
 
     def points_in_model(self, points_in_scan: Array) -> Array:
-        """(N,3) mm of points in the reconstruction."""
+        """(N,3) in mm, of points (N,3) of the reconstruction."""
         return apply(self.model_from_scan, self.scale * points_in_scan)
 
     def moved(self, step: Array, center_in_model: Array) -> Similarity:
-        """After a step (7,): twist about the model's centre on the right of ``cam_from_model``, and d log(scale).
+        """The similarity after a step (7,): twist about the model's centre on the right of ``cam_from_model``, and d
+        log(scale).
 
-        The scale leaves the centre where it is in the reconstruction.
+        The change of scale leaves the centre where it is in the reconstruction.
         """
         to_center = rigid(np.eye(3), center_in_model)
         scan_from_model = invert(to_center @ exp_se3(-step[:6]) @ invert(to_center) @ self.model_from_scan)
@@ -40,7 +43,13 @@ class Similarity:
 
 @dataclass(frozen=True)
 class PointFit:
-    """A similarity between points, its relative standard deviation of the scale, and the rms residual in mm."""
+    """A similarity fitted to points.
+
+    Attributes:
+        similarity: the fit.
+        scale_std: relative standard deviation of its scale.
+        rms_mm: root mean square residual.
+    """
 
     similarity: Similarity
     scale_std: float
@@ -48,17 +57,18 @@ class PointFit:
 
 
 def fit_points(points_in_scan: Array, points_in_mm: Array, scale: float | None = None) -> PointFit:
-    """The least-squares similarity that takes points (N,3) of the reconstruction to the same points in mm.
+    """Least-squares similarity from points (N,3) of the reconstruction to the same points in mm.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (PAMI 1991); the
-    uncertainty of the scale comes from the residuals. With ``scale`` given only the rigid motion is fitted.
+    uncertainty
+    of the scale follows from the residuals. With ``scale`` given, only the rigid motion is fitted.
 
     Raises:
-        InputError: fewer than three points, or all at one place.
+        InputError: there are fewer than three points, or all coincide.
     """
     source, target = np.asarray(points_in_scan, np.float64), np.asarray(points_in_mm, np.float64)
     if len(source) < 3 or source.shape != target.shape:
-        raise InputError(f"similarity: {len(source)} and {len(target)} points; at least three pairs are needed")
+        raise InputError(f"similarity: {len(source)} and {len(target)} points; expected at least three pairs")
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     spread = float(np.sum(a * a))
     if not spread > 0 or not np.sum(b * b) > 0:

@@ -1,4 +1,4 @@
-"""Descriptions of what gives the scale: boards, tags, scale bars and camera rigs, from the command line or a file."""
+"""Known scale bars, camera rigs and other sources of scale, from the command line or a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,14 @@ BAR_FORM = "ID1:ID2:LENGTH_MM or DICTIONARY:ID1:ID2:LENGTH_MM, e.g. 3:7:500.02"
 
 @dataclass(frozen=True)
 class ScaleBar:
-    """The known distance between the centres of two tags, mm, and its standard deviation."""
+    """The known distance between the centres of two tags.
+
+    Attributes:
+        dictionary: OpenCV's name of the marker dictionary.
+        first, second: ids of the tags.
+        length_mm: the distance.
+        std_mm: its standard deviation.
+    """
 
     dictionary: str
     first: int
@@ -31,7 +38,12 @@ class ScaleBar:
 
 @dataclass(frozen=True)
 class Rig:
-    """What is known about the cameras: centres (3,) mm by photo, or distances (photo, photo, mm)."""
+    """What is known about the cameras.
+
+    Attributes:
+        centres_mm: (3,) camera centre of a photo, by its name.
+        distances_mm: (photo, photo, mm) distances between camera centres.
+    """
 
     centres_mm: dict[str, Array] = field(default_factory=dict)
     distances_mm: tuple[tuple[str, str, float], ...] = ()
@@ -39,7 +51,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class ScaleSources:
-    """All that is known to be in view, or about the cameras."""
+    """Everything of known size that may be in view, and what is known about the cameras."""
 
     boards: tuple[Board, ...] = ()
     tags: tuple[Tags, ...] = ()
@@ -48,7 +60,7 @@ class ScaleSources:
 
 
 def parse_scale_bar(text: str, default_dictionary: str = DEFAULT_DICTIONARY) -> ScaleBar:
-    """Scale bar of a command line, see BAR_FORM. Raises InputError."""
+    """The scale bar described on the command line, see BAR_FORM. Raises InputError."""
     match = re.fullmatch(r"(?:([A-Za-z][\w-]*|\d+x[\w-]+):)?(\d+):(\d+):([\d.]+)", text.strip())
     if not match:
         raise InputError(f"scale bar {text!r}: expected {BAR_FORM}")
@@ -58,13 +70,13 @@ def parse_scale_bar(text: str, default_dictionary: str = DEFAULT_DICTIONARY) -> 
 
 
 def load_rig(path: str | Path) -> Rig:
-    """Rig of a JSON file.
+    """Read a rig from a JSON file.
 
-    Any of ``{"centres_mm": {photo: [x, y, z]}}``, ``{"cam_from_rig_mm": {photo: 4×4}}`` and
+    It holds any of ``{"centres_mm": {photo: [x, y, z]}}``, ``{"cam_from_rig_mm": {photo: 4×4}}`` and
     ``{"distances_mm": [[photo, photo, mm], …]}``.
 
     Raises:
-        InputError: unreadable, no JSON, none of these, or a value that cannot be.
+        InputError: the file cannot be read, is not JSON, holds none of these, or a value is invalid.
     """
     path = Path(path)
     try:
@@ -77,13 +89,14 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def load_scale_file(path: str | Path) -> ScaleSources:
-    """Sources of a TOML file with ``[[board]]``, ``[[tag]]``, ``[[scale_bar]]`` and ``[rig]``.
+    """Read scale sources from a TOML file with ``[[board]]``, ``[[tag]]``, ``[[scale_bar]]`` and ``[rig]``.
 
-    A board has ``spec`` as on the command line, a tag ``dictionary``, ``side_mm`` and perhaps ``ids``, a bar ``ids``
-    (two), ``length_mm`` and perhaps ``dictionary`` and ``std_mm``, the rig what `load_rig` reads.
+    A board has ``spec`` as on the command line; a tag ``dictionary``, ``side_mm`` and optionally ``ids``; a bar ``ids``
+    (two),
+    ``length_mm`` and optionally ``dictionary`` and ``std_mm``; the rig what `load_rig` reads.
 
     Raises:
-        InputError: unreadable, no TOML, an unknown key or a value that cannot be.
+        InputError: the file cannot be read, is not TOML, or a key or value is invalid.
     """
     path = Path(path)
     try:
@@ -101,7 +114,7 @@ def load_scale_file(path: str | Path) -> ScaleSources:
         tags.append(Tags(dictionary_name(str(entry["dictionary"])), parse_length_mm(f"{path}", entry["side_mm"]), ids))
     for entry in _entries(content, "scale_bar", ("ids", "length_mm"), ("dictionary", "std_mm"), path):
         if not isinstance(entry["ids"], list) or len(entry["ids"]) != 2:
-            raise InputError(f"{path}: [[scale_bar]] ids = {entry['ids']!r}: expected two numbers of tags")
+            raise InputError(f"{path}: [[scale_bar]] ids = {entry['ids']!r}: expected the ids of two tags")
         name = dictionary_name(str(entry.get("dictionary", DEFAULT_DICTIONARY)))
         first, second = (int(i) for i in entry["ids"])
         std_mm = parse_length_mm(f"{path}", entry.get("std_mm", ScaleBar.std_mm))
@@ -111,12 +124,14 @@ def load_scale_file(path: str | Path) -> ScaleSources:
 
 
 def _bar(text: str, dictionary: str, first: int, second: int, length_mm: float, std_mm: float = 0.02) -> ScaleBar:
+    """A checked scale bar. Raises InputError when both ends are the same tag."""
     if first == second:
         raise InputError(f"scale bar {text!r}: both ends are tag {first}")
     return ScaleBar(dictionary, first, second, length_mm, std_mm)
 
 
 def _rig(content: Any, where: str) -> Rig:
+    """A rig from the content of a file. Raises InputError."""
     if not isinstance(content, dict):
         raise InputError(f"{where}: expected an object")
     known = ("centres_mm", "cam_from_rig_mm", "distances_mm")
@@ -129,7 +144,7 @@ def _rig(content: Any, where: str) -> Rig:
             centres[str(name)] = -pose[:3, :3].T @ pose[:3, 3]
         distances = tuple((str(a), str(b), float(mm)) for a, b, mm in content.get(known[2], ()))
     except (TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{where}: a value is not what it should be ({error})") from error
+        raise InputError(f"{where}: a value is invalid ({error})") from error
     if not all(np.isfinite(c).all() for c in centres.values()) or not all(0 < d[2] < np.inf for d in distances):
         raise InputError(f"{where}: centres must be finite, distances positive")
     return Rig(centres, distances)
@@ -138,6 +153,7 @@ def _rig(content: Any, where: str) -> Rig:
 def _entries(
     content: dict[str, Any], key: str, needed: tuple[str, ...], optional: tuple[str, ...], path: Path
 ) -> list[dict[str, Any]]:
+    """The tables of an array of tables, with known keys only. Raises InputError."""
     entries = content.get(key, [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{path}: {key}: expected tables [[{key}]]")
@@ -150,6 +166,7 @@ def _entries(
 
 
 def _only(table: dict[str, Any], allowed: tuple[str, ...], where: str) -> None:
+    """Check that a table has no unknown keys. Raises InputError."""
     for key in table:
         if key not in allowed:
             raise InputError(f"{where} unknown key {key!r}; allowed: {', '.join(allowed)}")

@@ -1,4 +1,4 @@
-"""What finding the scale takes and gives."""
+"""Evidence for the scale of a reconstruction, and the result of combining it."""
 
 from __future__ import annotations
 
@@ -11,13 +11,22 @@ from arview.geometry import Array
 from arview.reconstruction.scale.similarity import Similarity
 
 Kind = Literal["board", "tag", "scale_bar", "rig", "cad"]
+"""Kinds of evidence."""
 TRUST: tuple[Kind, ...] = ("board", "tag", "scale_bar", "rig", "cad")
-"""Kinds of evidence in order of trust."""
+"""Kinds of evidence, the most trusted first."""
 
 
 @dataclass(frozen=True)
 class ScaleEvidence:
-    """One source of the scale: its kind, mm per unit, relative standard deviation, and in words what was used."""
+    """One source of the scale.
+
+    Attributes:
+        kind: of evidence.
+        mm_per_unit: the scale.
+        std: relative standard deviation.
+        detail: description of what was used.
+        is_used: False when it was rejected.
+    """
 
     kind: Kind
     mm_per_unit: float
@@ -26,7 +35,7 @@ class ScaleEvidence:
     is_used: bool = True
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The evidence for JSON."""
         return {
             "kind": self.kind,
             "mm_per_unit": self.mm_per_unit,
@@ -41,12 +50,13 @@ class Consistency:
     """Whether the reconstruction has the shape of the CAD.
 
     Attributes:
-        is_consistent: nothing speaks against it; also True when nothing could be checked, see ``reason``.
-        reason: in words, what speaks against it or what was checked.
-        edges_found, edges_by_chance: shares of predicted CAD edges with a step of brightness, at and beside them.
+        is_consistent: no evidence contradicts it; also True when nothing could be checked, see ``reason``.
+        reason: what contradicts it, or what was checked.
+        edges_found, edges_by_chance: shares of predicted CAD edges with a step of brightness at them, and beside them.
         residual_px: robust standard deviation of the edges' offsets.
-        points_near, points_behind: shares of the sparse points on the part near the CAD's surface, and behind it.
-        misfits: names of photos in which the edges are not where the others say.
+        points_near, points_behind: shares of the sparse points on the part that are near the CAD's surface, and behind
+            it.
+        misfits: names of photos in which the edges are not where the other photos have them.
     """
 
     is_consistent: bool
@@ -61,17 +71,17 @@ class Consistency:
 
 @dataclass(frozen=True)
 class ScaleResult:
-    """Scale and place of a reconstruction.
+    """Scale and pose of a reconstruction.
 
     Attributes:
-        scale: mm per unit; None when no source said it.
+        scale: mm per unit; None without evidence.
         scale_std: relative standard deviation; None without a scale.
-        model_from_scan: (4,4) rigid, to be used after scaling (`SparseModel.transformed`); None when the CAD was not
-            found, see ``why_no_frame``.
+        model_from_scan: (4,4) rigid, applied after scaling (`SparseModel.transformed`); None if the CAD was not found,
+            see ``why_no_frame``.
         covariance: (6,6) of ``model_from_scan``: twist (rad, mm) about the model's centre; None without it.
-        evidence: every source, in order of trust; those set aside have ``is_used`` False.
-        warnings: disagreements of the sources and doubts, in words.
-        why_no_frame: why the part was not found; empty when it was.
+        evidence: every source, in order of trust; rejected ones have ``is_used`` False.
+        warnings: messages about disagreement of the sources and other doubts.
+        why_no_frame: why the part was not found; empty if it was.
         consistency: of the reconstruction's shape with the CAD's.
     """
 
@@ -86,13 +96,13 @@ class ScaleResult:
 
     @property
     def similarity(self) -> Similarity | None:
-        """Scale and frame together; None when one is missing."""
+        """Scale and frame together; None if one is missing."""
         if self.scale is None or self.model_from_scan is None:
             return None
         return Similarity(self.scale, self.model_from_scan)
 
     def provenance(self) -> dict[str, Any]:
-        """What ``mm_per_unit`` comes from, for JSON."""
+        """The result for JSON."""
         c = self.consistency
         return {
             "mm_per_unit": self.scale,
@@ -116,7 +126,7 @@ class ScaleResult:
 
     @classmethod
     def from_provenance(cls, content: dict[str, Any]) -> ScaleResult:
-        """The inverse of ``provenance``."""
+        """The inverse of `provenance`."""
         c = dict(content["consistency"])
         matrices = [None if content[name] is None else np.array(content[name]) for name in _MATRICES]
         return cls(

@@ -1,8 +1,8 @@
-"""Which similarity do detections of the part in several photos agree on?
+"""Consensus of detections of the part in several photos on one similarity.
 
-Each detection says where the part is before its camera, the reconstruction says where the cameras are. Any two that
-agree make a similarity; it counts in how many photos a detection bears it out (consensus: Fischler & Bolles 1981).
-Wrong detections and symmetric twins agree with few others.
+Each detection gives the part's pose relative to its camera; the reconstruction gives the cameras' poses. Any two that
+agree define a similarity, whose score is the sum over the photos with a detection that supports it (consensus: Fischler
+& Bolles 1981). Wrong detections and symmetric alternatives agree with few others.
 """
 
 from __future__ import annotations
@@ -17,14 +17,23 @@ from arview.geometry import Array, apply, invert, orthonormalise, rigid, rotatio
 from arview.reconstruction.scale.similarity import Similarity
 
 AGREE_RAD = np.deg2rad(2.5)
+"""Largest difference in rotation of detections that agree."""
 ACROSS, ALONG = 0.02, 0.06
-"""Detections agree when they place the middle this near across the view and along it, in diameters of the part."""
+"""Largest differences of the centre, across and along the view, of detections that agree; in diameters of the part."""
 SAME_RAD, SAME_PLACE, SAME_SCALE = np.deg2rad(8.0), 0.1, 0.06
+"""Differences in rotation, position (diameters) and log scale below which two similarities count as one."""
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """A detection in one photo: index of the photo, its pose in the reconstruction, ``cam_from_model``, quality."""
+    """A detection in one photo.
+
+    Attributes:
+        photo: index of the photo.
+        cam_from_scan: (4,4) pose of the photo in the reconstruction.
+        cam_from_model: (4,4) detected pose, mm.
+        quality: of the detection, 0–1.
+    """
 
     photo: int
     cam_from_scan: Array
@@ -34,7 +43,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Vote:
-    """A similarity, the detections that bear it out (one a photo), and the sum of their qualities."""
+    """A similarity, the detections that support it (one per photo), and the sum of their qualities."""
 
     similarity: Similarity
     sightings: tuple[Sighting, ...]
@@ -42,11 +51,12 @@ class Vote:
 
 
 def vote(sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: float) -> list[Vote]:
-    """The similarities that at least two photos agree on, best first, each apart from those before it.
+    """Similarities on which at least two photos agree, best first, each different from those before it.
 
     Args:
-        sightings: detections, several of one photo allowed.
-        center_in_model, diameter_mm: of the part.
+        sightings: detections; a photo may have several.
+        center_in_model: (3,) centre of the part, mm.
+        diameter_mm: of the part.
     """
     votes = []
     for a, b in combinations(sightings, 2):
@@ -55,7 +65,7 @@ def vote(sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: flo
         chosen: Sequence[Sighting] = (a, b)
         for _ in range(2):
             similarity = _fit(chosen, center_in_model)
-            chosen = _bearing_out(similarity, sightings, center_in_model, diameter_mm) if similarity else ()
+            chosen = _supporting(similarity, sightings, center_in_model, diameter_mm) if similarity else ()
             if len(chosen) < 2:
                 break
         if similarity is not None and len(chosen) >= 2:
@@ -69,12 +79,14 @@ def vote(sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: flo
 
 
 def _rotation(sighting: Sighting) -> Array:
-    """``model_from_scan``'s rotation (3,3) according to one detection."""
+    """Rotation (3,3) of ``model_from_scan`` according to one detection."""
     return np.asarray(sighting.cam_from_model[:3, :3].T @ sighting.cam_from_scan[:3, :3])
 
 
 def _fit(sightings: Sequence[Sighting], center_in_model: Array) -> Similarity | None:
-    """Least squares: the mean rotation, and place and size such that all see the middle where they detect it."""
+    """Least-squares similarity: the mean rotation, then the position and scale at which all see the centre where
+    detected.
+    """
     rotation = orthonormalise(rigid(np.mean([_rotation(s) for s in sightings], axis=0), np.zeros(3)))[:3, :3]
     rows, right = [], []
     for s in sightings:
@@ -89,10 +101,10 @@ def _fit(sightings: Sequence[Sighting], center_in_model: Array) -> Similarity | 
     return Similarity(scale, rigid(rotation, center_in_model - scale * rotation @ solution[:3]))
 
 
-def _bearing_out(
+def _supporting(
     similarity: Similarity, sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: float
 ) -> list[Sighting]:
-    """The best sighting of each photo that agrees with a similarity."""
+    """The best detection of each photo that agrees with a similarity."""
     best: dict[int, Sighting] = {}
     for sighting in sightings:
         if _agrees(similarity, sighting, center_in_model, diameter_mm):
@@ -103,7 +115,7 @@ def _bearing_out(
 
 
 def _agrees(similarity: Similarity, sighting: Sighting, center_in_model: Array, diameter_mm: float) -> bool:
-    """Whether a detection is where the similarity says."""
+    """Whether a detection agrees with a similarity."""
     expected = similarity.cam_from_model(sighting.cam_from_scan)
     if rotation_angle_rad(expected, sighting.cam_from_model) > AGREE_RAD:
         return False
@@ -115,7 +127,7 @@ def _agrees(similarity: Similarity, sighting: Sighting, center_in_model: Array, 
 
 
 def _same(a: Similarity, b: Similarity, center_in_model: Array, diameter_mm: float) -> bool:
-    """Whether two similarities are one for all purposes."""
+    """Whether two similarities are equal for practical purposes."""
     if rotation_angle_rad(a.model_from_scan, b.model_from_scan) > SAME_RAD:
         return False
     middles = [apply(invert(s.model_from_scan), center_in_model) / s.scale for s in (a, b)]
