@@ -62,7 +62,7 @@ def diagnose_missing_board(
 
 
 def _columns_that_fit(board: Board, detections: Sequence[MarkerDetections]) -> int | None:
-    """Number of columns with which the ids of the markers form a plane board in most pictures; None if there is none."""
+    """Number of columns with which the ids of the markers form a plane board in most pictures, or None."""
     pictures = sorted((one for one in detections if len(one[1]) >= _MIN_MARKERS), key=lambda one: -len(one[1]))[:3]
     votes: Counter[int] = Counter()
     for quads, ids in pictures:

@@ -134,7 +134,7 @@ def pixel_uncertainty(solution: Solution, pixels: Array) -> Array:
 
 
 def pixel_difference(camera: Camera, other: Camera, pixels: Array) -> Array:
-    """(N,2) px by which ``other`` sees rays elsewhere than ``camera`` does, at pixels (N,2), less the best rotation."""
+    """(N,2) px from where ``camera`` sees rays to where ``other`` does, at pixels (N,2), less the best rotation."""
     rays = camera.unproject(pixels)
     _, _, pose = _project(rays, camera, np.eye(4))
     basis, _ = np.linalg.qr(pose[:, :3])
