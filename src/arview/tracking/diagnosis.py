@@ -283,10 +283,10 @@ def _low_contrast(
 ) -> str:
     """Whether the colours inside and outside the outline at a pose are about the same."""
     features = views.nearest(cam_from_model).features
-    ahead = apply(cam_from_model, features.contour_points)
+    in_camera = apply(cam_from_model, features.contour_points)
     normals = features.contour_normals @ cam_from_model[:3, :3].T
-    pixels = camera.project(ahead)
-    aside = camera.project(ahead + 0.01 * views.diameter_mm * normals) - pixels
+    pixels = camera.project(in_camera)
+    aside = camera.project(in_camera + 0.01 * views.diameter_mm * normals) - pixels
     with np.errstate(invalid="ignore"):
         aside *= 4.0 / np.linalg.norm(aside, axis=1, keepdims=True)
         inside, outside = np.round(pixels - aside), np.round(pixels + aside)

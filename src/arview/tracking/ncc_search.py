@@ -120,7 +120,7 @@ class AppearanceMatch(NamedTuple):
     view: int
 
 
-class Placement(NamedTuple):
+class ViewPlacement(NamedTuple):
     """A view placed in a picture.
 
     Attributes:
@@ -173,7 +173,7 @@ class NccSearch:
             for center, template in windows.find(picture):
                 view, step = chosen[template]
                 roll = 2.0 * np.pi * step / o.roll_steps
-                starts.append(Placement(0.0, np.array([*center, roll, FINE_PART_PX / PART_PX]), level, int(view)))
+                starts.append(ViewPlacement(0.0, np.array([*center, roll, FINE_PART_PX / PART_PX]), level, int(view)))
         return self._select(self._refine(starts, pictures, stored), pictures, stored)
 
     def _search_space(self, rotations: Array, near: Array | None) -> tuple[NDArray[np.intp], Array]:
@@ -211,8 +211,8 @@ class NccSearch:
         return pictures[::-1]
 
     def _refine(
-        self, starts: list[Placement], pictures: list[NDArray[np.float32]], stored: StoredViews
-    ) -> list[Placement]:
+        self, starts: list[ViewPlacement], pictures: list[NDArray[np.float32]], stored: StoredViews
+    ) -> list[ViewPlacement]:
         """The best placements after a pattern search, best first."""
         o = self.options
         if not starts:
@@ -224,14 +224,16 @@ class NccSearch:
             score, place = pattern_search(
                 pictures[start.level], stored.pictures[start.view], stored.masks[start.view], start.place, steps, 2
             )
-            found.append(Placement(float(score), place, start.level, start.view))
+            found.append(ViewPlacement(float(score), place, start.level, start.view))
         found.sort(key=lambda item: -item.score)
         count = o.neighbour_searches
         found[:count] = [self._try_neighbours(pictures[item.level], item, stored) for item in found[:count]]
         found.sort(key=lambda item: -item.score)
         return found
 
-    def _spread(self, starts: list[Placement], pictures: list[NDArray[np.float32]], stored: StoredViews) -> list[int]:
+    def _spread(
+        self, starts: list[ViewPlacement], pictures: list[NDArray[np.float32]], stored: StoredViews
+    ) -> list[int]:
         """Indices of the best placements as they are, few at each place of the picture."""
         o = self.options
         none = np.zeros(4)
@@ -254,7 +256,7 @@ class NccSearch:
                 chosen.append(int(k))
         return chosen
 
-    def _try_neighbours(self, picture: NDArray[np.float32], found: Placement, stored: StoredViews) -> Placement:
+    def _try_neighbours(self, picture: NDArray[np.float32], found: ViewPlacement, stored: StoredViews) -> ViewPlacement:
         """A placement, or that of a view from a direction nearby, if it correlates better at the same place."""
         o = self.options
         best = found
@@ -267,11 +269,11 @@ class NccSearch:
             start[2] = rolls_between(stored.rotations[k], rotation)
             score, place = pattern_search(picture, stored.pictures[k], stored.masks[k], start, NEIGHBOUR_STEPS, 1)
             if score > best.score:
-                best = Placement(float(score), place, found.level, int(k))
+                best = ViewPlacement(float(score), place, found.level, int(k))
         return best
 
     def _select(
-        self, found: list[Placement], pictures: list[NDArray[np.float32]], stored: StoredViews
+        self, found: list[ViewPlacement], pictures: list[NDArray[np.float32]], stored: StoredViews
     ) -> list[AppearanceMatch]:
         """The best placements as poses, each different from the others."""
         o = self.options

@@ -32,8 +32,8 @@ from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES
 from arview.refinement.view_model import PartView
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import squared_motion_distance
-from arview.tracking.tracked_frame import Proposal, RefinedPose, TrackedFrame, TrackerState
 from arview.tracking.tracker_options import TrackerOptions
+from arview.tracking.tracker_state import FrameContext, Proposal, RefinedPose, TrackerState
 from arview.tracking.wide_search import WideSearch
 
 
@@ -135,11 +135,11 @@ class Tracker:
 
     # --- Propose ------------------------------------------------------------------------------------------
 
-    def _predicted(self, frame: TrackedFrame) -> Iterator[Proposal]:
+    def _predicted(self, frame: FrameContext) -> Iterator[Proposal]:
         """The pose predicted from the motion so far and aligned with the texture found."""
         yield Proposal(frame.start, self.options.stages, frame.matches)
 
-    def _other_schedules(self, frame: TrackedFrame) -> Iterator[Proposal]:
+    def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
         """Other schedules, where the score is lower than usual."""
         o, usual = self.options, self.state.usual_score
         first = frame.found
@@ -154,7 +154,7 @@ class Tracker:
                 return
             yield Proposal(frame.start, stages, frame.matches, o.min_gain)
 
-    def _searched(self, frame: TrackedFrame) -> Iterator[Proposal]:
+    def _searched(self, frame: FrameContext) -> Iterator[Proposal]:
         """Poses of a wide search around the predicted one, where the best pose so far is suspicious."""
         if not self._is_suspicious(frame):
             return
@@ -165,7 +165,7 @@ class Tracker:
         # This score is usual from now on, because a search of the whole neighbourhood found nothing better.
         state.usual_score = frame.found.evidence.score
 
-    def _rechecked(self, frame: TrackedFrame) -> Iterator[Proposal]:
+    def _rechecked(self, frame: FrameContext) -> Iterator[Proposal]:
         """The pose of the recheck, where the best pose so far is far from the predicted one."""
         if self._recheck is None or self._motion(frame, frame.found) <= self.options.recheck_distance:
             return
@@ -175,7 +175,7 @@ class Tracker:
             # Refinement with the learned colours would lead it back, because they misled the best pose.
             yield Proposal(pose, LAST_STAGES[-1:], None, -math.inf, is_final=True)
 
-    def _shaded(self, frame: TrackedFrame) -> Iterator[Proposal]:
+    def _shaded(self, frame: FrameContext) -> Iterator[Proposal]:
         """The best pose so far, refined by the shading of a curved surface."""
         if self.options.use_shading and self.refiner.part.is_curved:
             best = frame.found
@@ -183,7 +183,7 @@ class Tracker:
 
     # --- Refine, score, select ----------------------------------------------------------------------------
 
-    def _refine(self, frame: TrackedFrame, proposal: Proposal) -> RefinedPose:
+    def _refine(self, frame: FrameContext, proposal: Proposal) -> RefinedPose:
         """Refine a proposal and collect its evidence."""
         refiner, appearance = self.refiner, self.state.appearance
         if proposal.stages:
@@ -198,7 +198,7 @@ class Tracker:
         evidence = refiner.evidence(frame.image, frame.smooth, pose, appearance)
         return RefinedPose(pose, information, evidence, proposal.matches)
 
-    def _is_better(self, frame: TrackedFrame, candidate: RefinedPose, proposal: Proposal) -> bool:
+    def _is_better(self, frame: FrameContext, candidate: RefinedPose, proposal: Proposal) -> bool:
         """Whether a refined proposal gains enough over the best pose so far."""
         if frame.best is None:
             return True
@@ -209,11 +209,11 @@ class Tracker:
             best -= penalty * self._motion(frame, frame.best)
         return score > best + proposal.min_gain
 
-    def _motion(self, frame: TrackedFrame, candidate: RefinedPose) -> float:
+    def _motion(self, frame: FrameContext, candidate: RefinedPose) -> float:
         """Squared motion distance of a pose from the predicted one."""
         return squared_motion_distance(candidate.cam_from_body, frame.predicted, self.diameter_mm)
 
-    def _is_suspicious(self, frame: TrackedFrame) -> bool:
+    def _is_suspicious(self, frame: FrameContext) -> bool:
         """Whether the best pose may be wrong: its score is low, or lower than usual, or it is off the prediction."""
         o, evidence = self.options, frame.found.evidence
         share = evidence.score / max(self.state.usual_score, 1e-6)
@@ -222,7 +222,7 @@ class Tracker:
         )
         return is_less or evidence.quality < o.min_learning_quality
 
-    def _quality(self, frame: TrackedFrame) -> float:
+    def _quality(self, frame: FrameContext) -> float:
         """Quality of the selected pose by edges, colours and texture."""
         evidence = frame.found.evidence
         if frame.found.matches is not None and evidence.points_in_picture > MIN_IN_PICTURE:
@@ -231,13 +231,13 @@ class Tracker:
 
     # --- State --------------------------------------------------------------------------------------------
 
-    def _prepare(self, image: NDArray[np.uint8]) -> TrackedFrame:
+    def _prepare(self, image: NDArray[np.uint8]) -> FrameContext:
         """A frame with its predicted pose and the texture found in it."""
         state, o = self.state, self.options
         self._follow_exposure(image[..., 1])
         predicted = apply_twist(state.cam_from_body, state.velocity)
         gray, smooth = self._gray_around(image, state.cam_from_body, predicted)
-        frame = TrackedFrame(image, gray, smooth, predicted, predicted)
+        frame = FrameContext(image, gray, smooth, predicted, predicted)
         if self._texture is not None:
             frame.pyramid = self._texture.pyramid(gray)
             matches = self._texture.measure(frame.pyramid, predicted)
@@ -246,7 +246,7 @@ class Tracker:
                 frame.matches, frame.start = matches, self._texture.align(matches, predicted)
         return frame
 
-    def _update(self, frame: TrackedFrame, quality: float) -> None:
+    def _update(self, frame: FrameContext, quality: float) -> None:
         """Update pose, velocity, usual score, colours and texture for the next frame."""
         state, o = self.state, self.options
         pose, evidence = frame.found.cam_from_body, frame.found.evidence
@@ -305,7 +305,7 @@ class Tracker:
         self._smooth[window] = smoothed(self._gray[window])
         return self._gray, self._smooth
 
-    def _remember_texture(self, frame: TrackedFrame) -> None:
+    def _remember_texture(self, frame: FrameContext) -> None:
         """Update the trust in the keyframes, and add one where it is missing and nothing hides the outline."""
         assert self._texture is not None and frame.pyramid is not None
         o, state, (pose, _, evidence, matches) = self.options, self.state, frame.found

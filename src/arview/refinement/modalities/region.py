@@ -141,8 +141,8 @@ def measure_region(image, colors, lines, runs_mm, focal, scale):  # type: ignore
     flat = 1.0 / 12.0
     half = 0.5 * 19 * scale
     # Long segments are sampled, because neighbouring pixels are similar.
-    hop = max(1, scale // 3)
-    soften = 0.55 * np.sqrt(scale) / (1 + (scale - 1) // hop)
+    sample_step = max(1, scale // 3)
+    soften = 0.55 * np.sqrt(scale) / (1 + (scale - 1) // sample_step)
     for i in range(count):
         z = depths[i]
         if z <= 0:
@@ -164,7 +164,7 @@ def measure_region(image, colors, lines, runs_mm, focal, scale):  # type: ignore
             posterior[d] = 1.0
         for s in range(19):
             total = 0.0
-            for k in range(0, scale, hop):
+            for k in range(0, scale, sample_step):
                 t = (s - 9.5) * scale + k + 0.5
                 # Beyond the run the line is on another surface.
                 if t < -run_in or t > run_out:

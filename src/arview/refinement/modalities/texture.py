@@ -55,6 +55,17 @@ class TextureMatches(NamedTuple):
     tried: int
 
 
+class MatchSettings(NamedTuple):
+    """Options of the matching in the form of the kernels, see `TextureOptions`."""
+
+    search_px: int
+    check_occlusion: bool
+    min_facing: float
+    min_trust: float
+    min_ncc: float
+    neighbour_px: float
+
+
 class PatchMatches(NamedTuple):
     """Result of `match_texture` for the N corners of a keyframe.
 
@@ -73,8 +84,6 @@ NEIGHBOURS = 7
 """Nearest neighbours with which the displacement of a patch is compared."""
 PATCH_SIDE = 9
 """Side of the patches, px."""
-MIN_TRUST = TextureOptions.min_trust
-"""Trust below which a corner is not searched for."""
 COARSE_NCC = 0.6
 """Smallest correlation of a patch on the coarse level from which a pose is estimated."""
 
@@ -189,7 +198,7 @@ def _count_near(points, cam_from_body, intrinsics, pixels, weights, limit_px):  
 
 
 @kernel
-def _find_visible(anchors, hierarchy, cam_from_body, min_facing, check_occlusion):  # type: ignore[no-untyped-def]
+def _find_visible(anchors, hierarchy, cam_from_body, settings):  # type: ignore[no-untyped-def]
     """Whether each trusted anchor (N,) faces the camera and is not hidden behind the part itself."""
     r = cam_from_body
     eye = np.empty(3)
@@ -197,7 +206,7 @@ def _find_visible(anchors, hierarchy, cam_from_body, min_facing, check_occlusion
         eye[a] = -(r[0, a] * r[0, 3] + r[1, a] * r[1, 3] + r[2, a] * r[2, 3])
     wanted = np.zeros(anchors.points.shape[0], dtype=np.bool_)
     for i in range(wanted.shape[0]):
-        if anchors.trust[i] < MIN_TRUST:
+        if anchors.trust[i] < settings.min_trust:
             continue
         p, t = anchors.points[i], anchors.tangents[i]
         dx, dy, dz = eye[0] - p[0], eye[1] - p[1], eye[2] - p[2]
@@ -206,10 +215,10 @@ def _find_visible(anchors, hierarchy, cam_from_body, min_facing, check_occlusion
             + (t[0, 0] * t[1, 2] - t[0, 2] * t[1, 0]) * dy
             + (t[0, 1] * t[1, 0] - t[0, 0] * t[1, 1]) * dz
         )
-        if facing < min_facing * np.sqrt(dx * dx + dy * dy + dz * dz):
+        if facing < settings.min_facing * np.sqrt(dx * dx + dy * dy + dz * dz):
             continue
         face = -1
-        if check_occlusion:
+        if settings.check_occlusion:
             # The ray starts 1 % along its way, so that it does not hit the surface itself.
             x, y, z = p[0] + 0.01 * dx, p[1] + 0.01 * dy, p[2] + 0.01 * dz
             _, face = cast_ray(hierarchy, x, y, z, dx, dy, dz, 0.99, True)
@@ -274,8 +283,7 @@ def _align_level(level, key_pyramid, pyramid, key_pixels, warps, wanted, min_ncc
 
 
 @kernel
-def match_texture(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intrinsics,  # type: ignore[no-untyped-def]
-                   damping, search_px, check_occlusion, min_facing, min_ncc, neighbour_px):  # fmt: skip
+def match_texture(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intrinsics, damping, settings):  # type: ignore[no-untyped-def]
     """Find the corners of a keyframe in a new frame, see `PatchMatches`.
 
     All patches are first shifted together on the coarsest level, then aligned one by one on level 2. If these agree on
@@ -288,23 +296,23 @@ def match_texture(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intri
         cam_from_body: (4,4) predicted pose.
         intrinsics: (10,) as of `intrinsics_of`.
         damping: (6,) of the pose on level 2, as in `solve_step`.
-        search_px, check_occlusion, min_facing, min_ncc, neighbour_px: see `TextureOptions`.
+        settings: `MatchSettings`.
     """
-    points = anchors.points
+    points, min_ncc = anchors.points, settings.min_ncc
     count = points.shape[0]
     height, width = pyramid[0].shape
     top = len(pyramid) - 1
     predicted = np.zeros((count, 2))
     warps = np.empty((count, 2, 2))
     scores = np.zeros(count)
-    expected = _find_visible(anchors, hierarchy, cam_from_body, min_facing, check_occlusion)
+    expected = _find_visible(anchors, hierarchy, cam_from_body, settings)
     _predict(anchors, cam_from_body, intrinsics, width, height, expected, predicted, warps)
     seen = np.flatnonzero(expected)
     pixels = predicted.copy()
-    if search_px > 0 and len(seen) > 0:
+    if settings.search_px > 0 and len(seen) > 0:
         chosen = seen[:: max(1, len(seen) // 24)]
         shift = common_shift(
-            key_pyramid[top], pyramid[top], 1 << top, anchors.pixels, predicted, warps, chosen, search_px
+            key_pyramid[top], pyramid[top], 1 << top, anchors.pixels, predicted, warps, chosen, settings.search_px
         )
         for a in range(2):
             pixels[:, a] += shift[a]
@@ -323,7 +331,7 @@ def match_texture(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intri
     for i in range(count):
         if scores[i] > 0.0:
             weights[i] = (scores[i] - min_ncc) / (1.0 - min_ncc)
-    _agree_with_neighbours(predicted, pixels, weights, neighbour_px)
+    _agree_with_neighbours(predicted, pixels, weights, settings.neighbour_px)
     return PatchMatches(pixels, weights, expected)
 
 
@@ -451,10 +459,17 @@ class TextureModality:
             return TextureMatches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
         self._clock += 1
         keyframe.last_used = self._clock
+        settings = MatchSettings(
+            search_px=o.search_px,
+            check_occlusion=o.check_occlusion,
+            min_facing=o.min_facing,
+            min_trust=o.min_trust,
+            min_ncc=o.min_ncc,
+            neighbour_px=o.neighbour_px,
+        )
         matches = match_texture(
-            keyframe.pyramid, pyramid, keyframe.anchors, self._caster.hierarchy, cam_from_body,
-            self._intrinsics, self._damping, o.search_px, o.check_occlusion, o.min_facing, o.min_ncc,
-            o.neighbour_px,
+            keyframe.pyramid, pyramid, keyframe.anchors, self._caster.hierarchy, cam_from_body, self._intrinsics,
+            self._damping, settings,
         )  # fmt: skip
         found = np.flatnonzero(matches.weights > 0.0)
         self._last = (keyframe, found, matches.pixels[found])

@@ -76,7 +76,7 @@ class Proposal(NamedTuple):
 
 
 @dataclass
-class TrackedFrame:
+class FrameContext:
     """One frame while it is tracked.
 
     Attributes:
