@@ -21,6 +21,7 @@ from typing import Protocol
 
 import numpy as np
 
+from arview.core.checks import check_type
 from arview.errors import OutputError
 from arview.pose import Pose
 from arview.video import Frame, FrameSource, Image
@@ -130,6 +131,7 @@ def annotate(
         OutputError: a file cannot be written, or no frame is in the range.
         ValueError: a sink without an overlay.
     """
+    check_type(source, FrameSource, "annotate: source")
     if sink is not None and overlay is None:
         raise ValueError("annotate: a sink needs an overlay")
     counts = _Counts()

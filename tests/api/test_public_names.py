@@ -102,6 +102,7 @@ def test_errors_name_what_was_passed() -> None:
         (lambda: arview.OverlayRenderer(camera, camera), r"^OverlayRenderer: model: expected Model, got Camera$"),
         (lambda: arview.make_guide_views("part.step", None), r"^make_guide_views: model: expected Model, got str"),
         (lambda: arview.measure(7, None), r"^measure: reconstruction: expected MetricReconstruction or str or Path"),
+        (lambda: arview.annotate("clip.mp4", None), r"^annotate: source: expected FrameSource, got str"),
         (lambda: arview.open_source(0), r"^open_source: spec: expected str or Path, got int \(0\)$"),
         (lambda: arview.inspect_part("out", "out"), r"^inspect_part: job: expected InspectJob, got str \('out'\)$"),
     ]
