@@ -80,3 +80,16 @@ def test_a_full_device_as_output_file_is_named(tmp_path: Path) -> None:
     done = subprocess.run([*board, "/dev/null"], capture_output=True, text=True, cwd=tmp_path, timeout=60)
     assert done.returncode == ExitCode.DONE, done.stderr
     assert not Path("/dev/null").is_file()
+
+
+def test_a_broken_pipe_of_something_else_is_a_bug(tmp_path: Path) -> None:
+    code = (
+        "import arview.cad\n"
+        "from arview.cli import main\n"
+        "def broken(path, unit): raise BrokenPipeError(32, 'Broken pipe')\n"
+        "arview.cad.load_part = broken\n"
+        "main(['check', 'part.toml'], prog_name='arview')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=60)
+    assert done.returncode == ExitCode.BUG
+    assert done.stderr.startswith("arview: internal error: BrokenPipeError") and done.stderr.count("\n") == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import select
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -118,9 +119,24 @@ def _closed_pipe_exits() -> Iterator[None]:
     try:
         yield
     except BrokenPipeError as error:
+        if not (_is_reader_gone(sys.stdout) or _is_reader_gone(sys.stderr)):
+            say_bug(error)  # of another pipe
+            raise click.exceptions.Exit(ExitCode.BUG) from error
         _discard(sys.stdout)
         _discard(sys.stderr)
         raise click.exceptions.Exit(ExitCode.CLOSED_PIPE) from error
+
+
+def _is_reader_gone(stream: TextIO | None) -> bool:
+    """True if nobody reads the pipe or socket behind a stream any more; also where that cannot be found out."""
+    try:
+        if stream is None:
+            return False
+        poll = select.poll()
+        poll.register(stream.fileno(), 0)
+        return bool(poll.poll(0))
+    except (AttributeError, OSError, ValueError):  # Windows, or not a stream of the operating system
+        return True
 
 
 def _code_of_os_error(error: OSError) -> ExitCode:
