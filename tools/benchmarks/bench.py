@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""How fast arview is on this machine: medians over the recorded sequences, as a table and JSON."""
+"""Measure the speed of arview on this machine: medians over the recorded sequences, as a table and as JSON."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from recordings import SAMPLE, sample_command, scenes, skip, table
 from suites.live_latency import live_latencies
 from suites.registration import MEASURED, REFERENCE, registrations
 
-Row = tuple[str, str, str]
+TableRow = tuple[str, str, str]
 MODALITIES = {"region+edge": SessionOptions(use_texture=False), "all three": SessionOptions()}
 DETECTED_FRAMES = 12
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="write the figures to this file too")
     parser.add_argument(
-        "--only", choices=["guideviews", "track", "detect", "annotate", "register", "live"], help="one section"
+        "--only", choices=["guideviews", "track", "detect", "annotate", "register", "live"], help="only this section"
     )
     chosen = parser.parse_args()
     found = scenes()
@@ -49,7 +49,7 @@ def main() -> None:
     }
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
     figures: dict[str, Any] = {"machine": machine}
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     for name, section in sections.items():
         if chosen.only in (None, name):
             figures[name], more = section()
@@ -62,8 +62,8 @@ def main() -> None:
         print(f"\nwrote {chosen.json}")
 
 
-def bench_guide_views(found: dict[str, Scene]) -> tuple[dict[str, Any], list[Row]]:
-    """Full sphere of the part with the most triangles, by each renderer: seconds, size, load time."""
+def bench_guide_views(found: dict[str, Scene]) -> tuple[dict[str, Any], list[TableRow]]:
+    """Guide views of the part with the most triangles, by each renderer: seconds, size, and time to load."""
     if not found:
         return {}, []
     part = max((scene.part for scene in found.values()), key=lambda part: len(part.model.mesh[1]))
@@ -97,8 +97,8 @@ def bench_guide_views(found: dict[str, Scene]) -> tuple[dict[str, Any], list[Row
     return figures, rows
 
 
-def bench_tracking(found: dict[str, Scene]) -> tuple[dict[str, Any], list[Row]]:
-    """Milliseconds a tracked frame."""
+def bench_tracking(found: dict[str, Scene]) -> tuple[dict[str, Any], list[TableRow]]:
+    """Milliseconds for each tracked frame."""
     figures: dict[str, Any] = {}
     rows = []
     for label, options in MODALITIES.items():
@@ -110,8 +110,8 @@ def bench_tracking(found: dict[str, Scene]) -> tuple[dict[str, Any], list[Row]]:
     return figures, rows
 
 
-def bench_detection(found: dict[str, Scene]) -> tuple[dict[str, Any], list[Row]]:
-    """Milliseconds to look for the part in a frame, without any earlier pose."""
+def bench_detection(found: dict[str, Scene]) -> tuple[dict[str, Any], list[TableRow]]:
+    """Milliseconds to detect the part in a frame, without a prior."""
     figures: dict[str, Any] = {}
     rows = []
     for name, scene in found.items():
@@ -130,8 +130,8 @@ def bench_detection(found: dict[str, Scene]) -> tuple[dict[str, Any], list[Row]]
     return figures, rows
 
 
-def bench_annotate() -> tuple[dict[str, Any], list[Row]]:
-    """Frames per second end to end on the sample clip, and the peak memory of half of it and all of it."""
+def bench_annotate() -> tuple[dict[str, Any], list[TableRow]]:
+    """Frames per second of the sample clip, end to end, and peak memory for half of it and for all of it."""
     if not (SAMPLE / "clip.mp4").is_file():
         skip("annotate", f"{SAMPLE / 'clip.mp4'} is not here")
         return {}, []
@@ -143,13 +143,13 @@ def bench_annotate() -> tuple[dict[str, Any], list[Row]]:
             text, peak_mb = run_measured(sample_command(Path(folder), *options))
             match = re.search(r"([0-9.]+) fps end to end", text)
             if match is None:
-                raise SystemExit(f"annotate said: {text}")
+                raise SystemExit(f"annotate printed no frame rate: {text}")
             figures[label] = {"fps": float(match[1]), "peak_mb": peak_mb}
             rows.append((f"annotate, {label}", SAMPLE.name, f"{match[1]} fps, peak memory {peak_mb:.0f} MB"))
     return figures, rows
 
 
-def bench_registration() -> tuple[dict[str, Any], list[Row]]:
+def bench_registration() -> tuple[dict[str, Any], list[TableRow]]:
     """CPU seconds and error of registering a post that was moved by 1 mm, without noise."""
     figures, rows = {}, []
     for name, cpu_s, error_um in registrations():
@@ -158,8 +158,8 @@ def bench_registration() -> tuple[dict[str, Any], list[Row]]:
     return figures, rows
 
 
-def bench_live() -> tuple[dict[str, Any], list[Row]]:
-    """What the live server adds, and camera to screen, in Chromium on this machine; the machine should be idle."""
+def bench_live() -> tuple[dict[str, Any], list[TableRow]]:
+    """Latency of the live server and from camera to screen, in Chromium on this machine, which should be idle."""
     figures, rows = {}, []
     for name, measured in live_latencies():
         figures[name] = measured
@@ -174,7 +174,7 @@ def bench_live() -> tuple[dict[str, Any], list[Row]]:
 
 
 def run_measured(command: list[str]) -> tuple[str, float]:
-    """What a command prints, and its peak memory in MB; ends this program when the command fails."""
+    """The output of a command, and its peak memory in MB; ends this program when the command fails."""
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     text = process.stdout.read()

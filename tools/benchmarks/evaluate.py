@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""How accurate arview is on recorded and semi-synthetic sequences and the sample clip, against what it must reach."""
+"""Evaluate arview on the recorded and semi-synthetic sequences, the sample clip and the photo sets, against targets."""
 
 from __future__ import annotations
 
@@ -33,32 +33,36 @@ from arview.pose import Pose, TrackingState
 from arview.tracking import Tracker, TrackingSession
 from options import positive
 from recordings import SAMPLE, photo_sets, sample_command, scenes, skip, table
-from rows import Line
-from suites.detection import Sections
-from suites.guided_init import snap_lines
-from suites.measurement import measure_lines
-from suites.reconstruction import reconstruct_lines
-from suites.relocalization import relearn_lines
+from rows import ResultRow
+from suites.detection import DetectionSuite
+from suites.guided_init import guided_init_rows
+from suites.measurement import measurement_rows
+from suites.reconstruction import reconstruction_rows
+from suites.relocalization import relocalization_rows
 
 TRUSTED = (TrackingState.TRACKED, TrackingState.CRITICAL)
 START_COUNT = 50
 SEED = 7
 SECTIONS = (
-    "track", "converge", "snap", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms", "lookalike",
-    "relearn", "sample", "reconstruct", "measure",
+    "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
+    "lookalike", "relocalize", "sample", "reconstruct", "measure",
 )  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path, default=Path("out"), help="for evaluation.json and .md")
-    parser.add_argument("--only", choices=SECTIONS, help="one section")
-    parser.add_argument("--shapes", type=names_of_shapes, default=SHAPES, help=f"of {','.join(SHAPES)}; default: all")
-    parser.add_argument("--frames", type=positive, help="look at no more frames of a scene than this, for a quick look")
     parser.add_argument(
-        "--sequences", type=Path, default=Path("out/sequences"), help="where semi-synthetic ones are kept"
+        "--folder", type=Path, default=Path("out"), help="for evaluation.json and evaluation.md; default: out"
     )
-    parser.add_argument("--backgrounds", type=Path, help="folder of photos; default: recordings and the machine's")
+    parser.add_argument("--only", choices=SECTIONS, help="only this section")
+    parser.add_argument("--shapes", type=names_of_shapes, default=SHAPES, help=f"of {','.join(SHAPES)}; default: all")
+    parser.add_argument("--frames", type=positive, help="largest number of frames of a scene, for a quick run")
+    parser.add_argument(
+        "--sequences", type=Path, default=Path("out/sequences"), help="where semi-synthetic sequences are kept"
+    )
+    parser.add_argument(
+        "--backgrounds", type=Path, help="folder of photos; default: recordings and those of this machine"
+    )
     parser.add_argument(
         "--photo-set", type=Path, action="append", default=[],
         help="another photo set: a folder made by samples/plate/generate.py --seed N -o FOLDER; may be given again",
@@ -67,35 +71,35 @@ def main() -> None:
     found = scenes()
     details: dict[str, Any] = {}
     sets, reconstructions = photo_sets(chosen.photo_set), chosen.folder / "photo_sets"
-    more = Sections(found, details, chosen.sequences, chosen.shapes, chosen.frames, chosen.backgrounds)
+    more = DetectionSuite(found, details, chosen.sequences, chosen.shapes, chosen.frames, chosen.backgrounds)
     makers = (
-        lambda: tracking_lines(found, details),
-        lambda: convergence_lines(found),
-        lambda: snap_lines(found, chosen.frames),
+        lambda: tracking_rows(found, details),
+        lambda: convergence_rows(found),
+        lambda: guided_init_rows(found, chosen.frames),
         more.detect,
         more.semisynthetic_track,
         more.semisynthetic_detect,
         more.false_alarms,
         more.look_alikes,
-        lambda: relearn_lines(found, details, chosen.frames),
-        lambda: sample_lines(details),
-        lambda: reconstruct_lines(sets, reconstructions, details),
-        lambda: measure_lines(sets, reconstructions, details),
+        lambda: relocalization_rows(found, details, chosen.frames),
+        lambda: sample_rows(details),
+        lambda: reconstruction_rows(sets, reconstructions, details),
+        lambda: measurement_rows(sets, reconstructions, details),
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
-    lines: list[Line] = []
+    rows: list[ResultRow] = []
     for name, make in sections.items():
         if chosen.only in (None, name):
             try:
-                lines += make()
+                rows += make()
             except InputError as error:  # no photos, no recordings
                 skip(name, str(error))
-    rows = [(x.measure, x.on, x.found, x.target, "yes" if x.is_reached else "NO") for x in lines]
-    text = table(("measure", "on", "found", "must reach", "reached"), rows)
+    cells = [(x.measure, x.on, x.found, x.target, "yes" if x.is_reached else "NO") for x in rows]
+    text = table(("measure", "on", "found", "must reach", "reached"), cells)
     print(text)
     chosen.folder.mkdir(parents=True, exist_ok=True)
     (chosen.folder / "evaluation.md").write_text(text + "\n")
-    content = {"lines": [asdict(line) for line in lines], "scenes": details}
+    content = {"rows": [asdict(row) for row in rows], "scenes": details}
     (chosen.folder / "evaluation.json").write_text(json.dumps(content, indent=1) + "\n")
     print(f"\nwrote {chosen.folder / 'evaluation.json'} and evaluation.md")
 
@@ -111,46 +115,46 @@ def names_of_shapes(text: str) -> tuple[str, ...]:
 # --- Tracking -------------------------------------------------------------------------------------------
 
 
-def tracking_lines(found: dict[str, Scene], details: dict[str, Any]) -> list[Line]:
-    """The sequences, from truth or from detection."""
-    lines = []
+def tracking_rows(found: dict[str, Scene], details: dict[str, Any]) -> list[ResultRow]:
+    """Rows of the recorded sequences, tracked from truth or from detection."""
+    rows = []
     for name, scene in found.items():
         result = evaluate_scene(scene, "detect" if name == "plate" else "truth")
         details[name] = result.to_dict()
-        lines += TRACKING[name](result)
+        rows += TRACKING[name](result)
     if "dragon" in found:
-        lines.append(wrong_start_line(found["dragon"]))
-    return lines
+        rows.append(wrong_start_row(found["dragon"]))
+    return rows
 
 
-def castle_lines(result: SceneResult) -> list[Line]:
+def castle_rows(result: SceneResult) -> list[ResultRow]:
     shift, turn, tracked = *figures(result.summary), tracked_frames(result)
     is_reached = shift.median <= 0.8 and turn.median <= 0.2 and shift.max <= 3 and turn.max <= 0.7
     text = f"median {shift.median:.2f} mm / {turn.median:.2f}°, max {shift.max:.2f} / {turn.max:.2f}"
     text += f", {tracked}/{len(result.frames)}"
     target = "median ≤ 0.8 mm / 0.2°, max ≤ 3 mm / 0.7°, 40/40"
-    return [Line("track from truth", "castle", text, target, is_reached and tracked == 40)]
+    return [ResultRow("track from truth", "castle", text, target, is_reached and tracked == 40)]
 
 
-def limit_lines(name: str, shift_mm: float, turn_deg: float) -> Any:
-    """Lines for a sequence whose every frame must be tracked and near the reference."""
+def rows_within(name: str, shift_mm: float, turn_deg: float) -> Any:
+    """A function that makes the rows of a sequence whose every frame must be tracked and near the reference."""
 
-    def lines(result: SceneResult) -> list[Line]:
+    def rows(result: SceneResult) -> list[ResultRow]:
         total, tracked = len(result.frames), tracked_frames(result)
         near = sum(f.error is not None and f.error.within(shift_mm, turn_deg) for f in result.frames)
         shift, turn = figures(result.summary)
         text = f"{tracked}/{total} tracked, {near} near; max {shift.max:.2f} mm / {turn.max:.2f}°"
         target = f"{total}/{total}, all within {shift_mm:g} mm / {turn_deg:g}° of the peer"
-        return [Line("track from truth", name, text, target, tracked == near == total)]
+        return [ResultRow("track from truth", name, text, target, tracked == near == total)]
 
-    return lines
+    return rows
 
 
-def dragon_lines(result: SceneResult) -> list[Line]:
+def dragon_rows(result: SceneResult) -> list[ResultRow]:
     near = [is_near_dragon(frame) for frame in result.frames]
     share = float(np.mean(near))
     target = "≥ 95 % within 4 mm across, 12 mm in depth, 4°"
-    return [Line("track from truth", "dragon", f"{100 * share:.1f} %", target, share >= 0.95)]
+    return [ResultRow("track from truth", "dragon", f"{100 * share:.1f} %", target, share >= 0.95)]
 
 
 def is_near_dragon(frame: FrameResult) -> bool:
@@ -158,7 +162,7 @@ def is_near_dragon(frame: FrameResult) -> bool:
     return error is not None and error.across_mm <= 4 and abs(error.depth_mm) <= 12 and error.rotation_deg <= 4
 
 
-def plate_lines(result: SceneResult) -> list[Line]:
+def plate_rows(result: SceneResult) -> list[ResultRow]:
     summary = result.summary
     share = summary.within_2cm_2deg or 0.0
     shift, turn = figures(summary)
@@ -166,22 +170,22 @@ def plate_lines(result: SceneResult) -> list[Line]:
     is_reached = share >= 0.95 and shift.median <= 2 and turn.median <= 0.2
     target = "≥ 95 % of frames with half in view, median ≤ 2 mm / 0.2°"
     return [
-        Line("track from detection", "plate", text, target, is_reached),
-        leaving_line("plate", list(result.frames)),
+        ResultRow("track from detection", "plate", text, target, is_reached),
+        loss_row("plate", list(result.frames)),
     ]
 
 
 TRACKING = {
-    "castle": castle_lines,
-    "cube": limit_lines("cube", 6.0, 3.0),
-    "teabox": limit_lines("teabox", 4.0, 1.0),
-    "dragon": dragon_lines,
-    "plate": plate_lines,
+    "castle": castle_rows,
+    "cube": rows_within("cube", 6.0, 3.0),
+    "teabox": rows_within("teabox", 4.0, 1.0),
+    "dragon": dragon_rows,
+    "plate": plate_rows,
 }
 
 
 def figures(summary: Summary) -> tuple[Spread, Spread]:
-    """Errors of place in mm and of rotation in deg; infinite when nothing was tracked."""
+    """Errors of position, mm, and of rotation, deg; infinite when nothing was tracked."""
     none = Spread(np.inf, np.inf, np.inf)
     return summary.errors.get("translation_mm", none), summary.errors.get("rotation_deg", none)
 
@@ -190,26 +194,26 @@ def tracked_frames(result: SceneResult) -> int:
     return sum(frame.pose.state is TrackingState.TRACKED for frame in result.frames)
 
 
-def leaving_line(name: str, frames: list[FrameResult]) -> Line:
-    """How soon the session notices that the part is gone, and how soon it has it again."""
+def loss_row(name: str, frames: list[FrameResult]) -> ResultRow:
+    """How soon the session notices that the part has left the view, and how soon it tracks it again."""
     late, back, false = [], [], 0
     for first, last in spans_out_of_view(frames):
         states = [frame.pose.state for frame in frames[first : last + 1]]
         gone = next((k for k, state in enumerate(states) if state not in TRUSTED), len(states))
         after = frames[last + 1 :]
-        seen = next((k for k, f in enumerate(after) if (f.visible or 0) >= 0.5), len(after))
+        in_view = next((k for k, f in enumerate(after) if (f.visible or 0) >= 0.5), len(after))
         again = next((k for k, f in enumerate(after) if f.pose.state is TrackingState.TRACKED), len(after))
         late.append(gone)
-        back.append(max(0, again - seen))
+        back.append(max(0, again - in_view))
         false += states.count(TrackingState.TRACKED)
     text = f"noticed after {late} frames, again after {back}, {false} false `tracked`"
     target = "lost within 5 frames, again within 10, no `tracked` while out"
     is_reached = bool(late) and max(late) <= 5 and max(back) <= 10 and false == 0
-    return Line("loss and return", name, text, target, is_reached)
+    return ResultRow("loss and return", name, text, target, is_reached)
 
 
 def spans_out_of_view(frames: list[FrameResult]) -> list[tuple[int, int]]:
-    """First and last place of each run of frames in which the part cannot be seen at all."""
+    """First and last index of each run of frames in which the part is out of view."""
     spans: list[tuple[int, int]] = []
     for k, frame in enumerate(frames):
         if frame.visible is not None and frame.visible <= 0.0:
@@ -224,15 +228,15 @@ def spans_out_of_view(frames: list[FrameResult]) -> list[tuple[int, int]]:
 
 
 def disturbed(truth: Array, center: Array, rng: np.random.Generator, turn_deg: float, depth: float) -> Array:
-    """The pose turned by an angle about a random axis through the centre, and moved in depth by a share."""
+    """A pose rotated by an angle about a random axis through the centre, and shifted in depth by a share."""
     axis = rng.normal(size=3)
     turn = exp_so3(np.deg2rad(turn_deg) * axis / np.linalg.norm(axis))
     start = truth @ rigid(turn, center - turn @ center)
     return rigid(np.eye(3), depth * apply(start, center)) @ start
 
 
-def wrong_start_line(scene: Scene) -> Line:
-    """A session started 10° off."""
+def wrong_start_row(scene: Scene) -> ResultRow:
+    """A session started from a pose with an error of 10°."""
     views, center = scene_guide_views(scene), scene.part.model.center_in_model
     rng = np.random.default_rng(SEED)
     truth = scene.frames[0].cam_from_model
@@ -248,12 +252,12 @@ def wrong_start_line(scene: Scene) -> Line:
             error = meter.measure(pose.cam_from_model, frame.cam_from_model)
             converged += error.across_mm <= 4 and abs(error.depth_mm) <= 12 and error.rotation_deg <= 4
     text = f"{converged} of 10 converged after 3 frames"
-    return Line("start 10° off", "dragon", text, "converged within 3 frames", converged == 10)
+    return ResultRow("start 10° off", "dragon", text, "converged within 3 frames", converged == 10)
 
 
-def convergence_lines(found: dict[str, Scene]) -> list[Line]:
-    """Random wrong starts, the tracker alone, four times the same picture."""
-    lines = []
+def convergence_rows(found: dict[str, Scene]) -> list[ResultRow]:
+    """The tracker alone, from random wrong poses, given the same picture four times."""
+    rows = []
     for name in ("dragon", "castle"):
         if name not in found:
             continue
@@ -275,15 +279,15 @@ def convergence_lines(found: dict[str, Scene]) -> list[Line]:
             converged += error.across_mm <= 3 and error.rotation_deg <= 3
         text = f"{100 * converged / START_COUNT:.0f} % of {START_COUNT} starts"
         target = "≥ 85 % within 3 mm across / 3° in 4 frames' work"
-        lines.append(Line("start 15° and 2 % off", name, text, target, converged >= 0.85 * START_COUNT))
-    return lines
+        rows.append(ResultRow("start 15° and 2 % off", name, text, target, converged >= 0.85 * START_COUNT))
+    return rows
 
 
 # --- The sample clip ------------------------------------------------------------------------------------
 
 
-def sample_lines(details: dict[str, Any]) -> list[Line]:
-    """The sample clip through the command line, from detection, against its truth."""
+def sample_rows(details: dict[str, Any]) -> list[ResultRow]:
+    """The sample clip, annotated by the command line from detection, against its truth."""
     clip = SAMPLE / "clip.mp4"
     if not clip.is_file():
         skip("sample", f"{clip} is not here")
@@ -310,8 +314,8 @@ def sample_lines(details: dict[str, Any]) -> list[Line]:
     found = f"{100 * share:.1f} % within 2 cm/2°, median {shift.median:.2f} mm / {turn.median:.2f}°"
     target = "≥ 95 % of frames with half in view"
     return [
-        Line("track from detection", SAMPLE.name, found, target, share >= 0.95),
-        leaving_line(SAMPLE.name, frames),
+        ResultRow("track from detection", SAMPLE.name, found, target, share >= 0.95),
+        loss_row(SAMPLE.name, frames),
     ]
 
 

@@ -1,4 +1,4 @@
-"""`arview live` as a program of its own, for measuring it from outside."""
+"""`arview live` in a process of its own, to be measured from outside."""
 
 from __future__ import annotations
 
@@ -13,7 +13,15 @@ from pathlib import Path
 
 @contextmanager
 def live_server(arguments: Sequence[object], folder: Path | None = None) -> Iterator[tuple[int, str]]:
-    """Process id, and the link to the page; the program works in a folder, and is ended afterwards."""
+    """Run `arview live` during a block.
+
+    Args:
+        arguments: of the command.
+        folder: working folder of the process.
+
+    Yields:
+        its process id and the link to its page.
+    """
     command = [sys.executable, "-m", "arview.cli", "live", *map(str, arguments)]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=folder)
     try:

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Render CAD along trajectories over real photos, with exact truth: test sequences in the manner of RBOT."""
+"""Render CAD models along trajectories over real photos, with exact truth: test sequences in the manner of RBOT."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from photos import background_photos
 from recordings import SEQUENCES
 
 DESCRIPTION = """\
-Render CAD along trajectories over real photos, with exact truth, as BOP scenes that `arview evaluate` reads.
+Render CAD models along trajectories over real photos, with exact truth, as BOP scenes that `arview evaluate` reads.
 
   make_sequences.py --shape all --variant all -o out/sequences     six shapes × four variants, 100 frames each
   make_sequences.py --shape flange --variant light --frames 300 --seed 2 -o out/sequences
@@ -36,17 +36,18 @@ Render CAD along trajectories over real photos, with exact truth, as BOP scenes 
   make_sequences.py --cad my.glb --trajectory ../shared/data/sequences/plate -o out/sequences
   make_sequences.py --shape assembly --lookalike -o out/look_alikes
 
-Pictures are 640×512 px with f = 650 px; a part turns about 7° and moves about 15 mm from frame to frame, at all
-sides of it, 450 to 1000 mm away. The same seed and backgrounds give the same pictures; what is there is kept."""
+Pictures are 640×512 px with f = 650 px; the part rotates by about 7° and moves by about 15 mm
+from frame to frame, seen from all sides, 450 to 1000 mm away. The same seed and backgrounds give the same pictures;
+existing sequences are kept."""
 
 EPILOG = """\
 variants:
   regular    fixed light
-  light      a light that circles, waxes and wanes
+  light      a light that circles and changes its brightness
   noise      the same, with noise of 12 grey levels and a slight blur
-  occlusion  the moving light, and another part circling in front; scene_gt_info.json says how much is seen
+  occlusion  the moving light, and another part circling in front; scene_gt_info.json has the visible share
 
-Each OUT/NAME_VARIANT holds models/assembly.glb (the CAD to be found), test/000001/ (rgb/, mask_visib/,
+Each OUT/NAME_VARIANT holds models/assembly.glb (the CAD to be detected), test/000001/ (rgb/, mask_visib/,
 scene_camera.json, scene_gt.json, scene_gt_info.json) and sequence.json (how it was made). Look-alikes hold the
 right CAD and pictures of a wrong assembly; sequence.json names what is wrong, different_fract how much of the
 part's picture it changes. For larger steps between frames read every 2nd, 3rd or 4th.
@@ -94,7 +95,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def jobs(chosen: argparse.Namespace) -> Iterator[Job]:
-    """What the command line asks for, one sequence after the other."""
+    """The sequences that the command line asks for."""
     follow = scene_to_follow(chosen.trajectory)
     variants = VARIANTS if chosen.variant == "all" else (chosen.variant,)
     recorded = recorded_name(chosen.cad)
@@ -126,14 +127,14 @@ def scene_to_follow(path: Path | None) -> Scene | None:
 
 
 def recorded_name(cad: Path | None) -> str:
-    """Name of the recording that a CAD file belongs to, or nothing."""
+    """Name of the recording that a CAD file belongs to, or an empty string."""
     found = [name for name in SEQUENCES if cad is not None and name in cad.resolve().parts]
     return found[0] if found else ""
 
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[StepProgress]:
-    """A bar on stderr, shown only on a terminal; yields a function of (done, in all)."""
+    """A progress bar on stderr, shown only on a terminal; yields a function of (frames done, frames in all)."""
     from tqdm import tqdm
 
     with tqdm(desc=label, disable=None, leave=False, unit="frame") as bar:

@@ -1,4 +1,4 @@
-"""Types of command-line options."""
+"""Types of command-line options for argparse."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from argparse import ArgumentTypeError
 
 
 def positive(text: str) -> int:
-    """A whole number from 1."""
+    """An integer of at least 1."""
     return _from(text, 1)
 
 
 def seed(text: str) -> int:
-    """A whole number from 0."""
+    """An integer of at least 0."""
     return _from(text, 0)
 
 
-def _from(text: str, lowest: int) -> int:
+def _from(text: str, minimum: int) -> int:
     value = int(text)
-    if value < lowest:
-        raise ArgumentTypeError(f"{value} is below {lowest}")
+    if value < minimum:
+        raise ArgumentTypeError(f"{value} is below {minimum}")
     return value
 
 

@@ -1,4 +1,4 @@
-"""The recorded sequences, photo sets and the sample clip that bench and evaluate run on."""
+"""The recorded sequences, the photo sets and the sample clip that the benchmarks run on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,15 @@ SEQUENCES = ("castle", "cube", "teabox", "dragon", "plate")
 
 @dataclass(frozen=True)
 class PhotoSet:
-    """Photos of a part with exact truth; ``as_built`` is the mesh that was photographed, where it is known."""
+    """Photos of a part with exact truth.
+
+    Attributes:
+        name: of the set.
+        folder: of the photos.
+        part: part file or CAD file.
+        truth: JSON file of the true cameras and displacements.
+        as_built: mesh of the part as photographed; the file need not exist.
+    """
 
     name: str
     folder: Path
@@ -29,7 +37,7 @@ class PhotoSet:
 
 
 def photo_sets(more: Sequence[Path] = ()) -> list[PhotoSet]:
-    """The sets that are here, and folders that samples/plate/generate.py wrote; what is missing is named on stderr."""
+    """The available photo sets, and folders written by samples/plate/generate.py; missing sets are named on stderr."""
     found = []
     for name, folder, file in (
         ("plate", SHARED / "plate", "plate.glb"),
@@ -48,7 +56,7 @@ def photo_sets(more: Sequence[Path] = ()) -> list[PhotoSet]:
 
 
 def scenes(names: tuple[str, ...] = SEQUENCES) -> dict[str, Scene]:
-    """The sequences that are here; the others are named on stderr."""
+    """The available sequences by name; missing ones are named on stderr."""
     found = {}
     for name in names:
         folder = DATA / name / "test" / "000001"
@@ -60,7 +68,7 @@ def scenes(names: tuple[str, ...] = SEQUENCES) -> dict[str, Scene]:
 
 
 def sample_command(output: Path, *options: str) -> list[str]:
-    """Command that annotates the sample clip into a folder."""
+    """The command that annotates the sample clip into a folder."""
     arguments = ["--part", "part.toml", "--camera", "camera.json", "--inspection", "inspection.json"]
     arguments = [str(SAMPLE / word) if "." in word else word for word in arguments]
     files = ["-o", str(output / "annotated.mp4"), "--poses", str(output / "poses.jsonl")]
@@ -69,7 +77,7 @@ def sample_command(output: Path, *options: str) -> list[str]:
 
 
 def skip(what: str, reason: str) -> None:
-    """Say on stderr that something is left out."""
+    """Print on stderr that something is left out."""
     print(f"skipped {what}: {reason}", file=sys.stderr)
 
 

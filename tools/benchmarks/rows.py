@@ -1,4 +1,4 @@
-"""Lines of the evaluation's table."""
+"""Rows of the table of an evaluation."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
-class Line:
-    """One line of the table: what was measured on what, what was found and must be reached."""
+class ResultRow:
+    """One row of the table: what was measured on what, the result, the target, and whether it is reached."""
 
     measure: str
     on: str
@@ -25,12 +25,12 @@ class Line:
 
 
 def watched(items: Iterable[Item], label: str) -> Iterator[Item]:
-    """The items, with a bar on stderr when that is a terminal."""
+    """The items, with a progress bar on stderr where that is a terminal."""
     return iter(tqdm(items, desc=label, disable=None, leave=False, file=sys.stderr))
 
 
 def timing(ms: Iterable[float]) -> str:
-    """Median and 95th percentile of times."""
+    """Median and 95th percentile of times, as text."""
     times = np.array(list(ms))
     if times.size == 0:
         return "no time measured"

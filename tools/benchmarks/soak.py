@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-"""Does the live server grow? A phone sends the sample clip at 30 fps for minutes; memory and frame age are watched.
-Then fifty phones come, send for a moment and are gone.
+"""Soak test of the live server: do its memory or the age of its frames grow?
 
-The server runs as a program of its own; the phone (WebRTC, annotated video back) and a screen that watches by motion
-JPEG run here, on the loopback interface. In the middle third the screen takes 5 pictures a second only.
+The server runs in a process of its own. A phone (WebRTC, annotated video back) sends the sample clip at 30 fps for some
+minutes, and a screen watches by motion JPEG, in the middle third at 5 pictures a second only; both run here, on the
+loopback interface. Then fifty phones connect, send for a moment and vanish.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "samples" / "bracket_plate"
-sys.path.insert(0, str(ROOT / "tests"))  # the client is that of the tests
+sys.path.insert(0, str(ROOT / "tests"))  # the tests' client
 
 from arview.live.security.addresses import LOOPBACK
 from arview.video import Image, open_source
@@ -33,16 +33,16 @@ from helpers.live_client import Camera, Http, Phone
 from live_server import live_server
 
 FPS, WIDTH, HEIGHT = 30.0, 640, 360
-WARM_UP_SHARE = 0.2  # of the time: compiled loops, learned views and buffers are filled by then
-FEWEST_DROPS = 10
-MOST_GROWTH_MB, MOST_AGE_MS = 20.0, 500.0
+WARM_UP_SHARE = 0.2  # of the time, until kernels are compiled and buffers filled
+MIN_DROPS = 10
+MAX_GROWTH_MB, MAX_AGE_MS = 20.0, 500.0
 SLOW_FPS = 5.0
 MEDIANS = 10
 
 
 @dataclass
 class Screen:
-    """Watches by motion JPEG, in a thread; slow when told to be."""
+    """A screen that watches by motion JPEG in a thread, slowly when told so."""
 
     port: int
     token: str
@@ -52,7 +52,7 @@ class Screen:
     _thread: threading.Thread | None = field(default=None, repr=False)
 
     def start(self) -> None:
-        """Begin to watch."""
+        """Start to watch."""
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -75,7 +75,7 @@ class Screen:
 
 @dataclass
 class Sample:
-    """What was seen in one second."""
+    """Measurements of one second."""
 
     at_s: float
     memory_mb: float
@@ -88,11 +88,11 @@ class Sample:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    drops = f"phones that come and vanish at the end: 0, or at least {FEWEST_DROPS} (default: 50)"
+    drops = f"number of phones that connect and vanish at the end: 0, or at least {MIN_DROPS} (default: 50)"
     parser.add_argument("--drops", type=int, default=50, help=drops)
     parser.add_argument("--minutes", type=float, default=10.0, help="how long (default: 10)")
     chosen = parser.parse_args()
-    if chosen.drops and chosen.drops < FEWEST_DROPS:
+    if chosen.drops and chosen.drops < MIN_DROPS:
         parser.error(f"--drops {chosen.drops}: memory is compared with that after the first ten; give 0 or at least 10")
     arguments = [
         "--part", SAMPLE / "part.toml", "--inspection", SAMPLE / "inspection.json", "--camera", SAMPLE / "camera.json",
@@ -101,8 +101,8 @@ def main() -> None:
     with live_server(arguments) as (pid, link):
         page = urlsplit(link)
         port, token = page.port or 80, parse_qs(page.query)["token"][0]
-        seen = asyncio.run(_soak(pid, port, token, 60.0 * chosen.minutes))
-        is_good = _judge(seen)
+        samples = asyncio.run(_soak(pid, port, token, 60.0 * chosen.minutes))
+        is_good = _evaluate(samples)
         if chosen.drops:
             is_good &= asyncio.run(_drop(pid, port, token, chosen.drops))
     sys.exit(0 if is_good else 1)
@@ -110,7 +110,7 @@ def main() -> None:
 
 async def _soak(pid: int, port: int, token: str, seconds: float) -> list[Sample]:
     images = _images()
-    seen: list[Sample] = []
+    samples: list[Sample] = []
     screen = Screen(port, token)
     print(f"{'s':>5} {'memory MB':>10} {'answers/s':>10} {'age p95 ms':>11} {'server p95 ms':>14} {'dropped':>8}")
     async with Phone(Http(port, token), Camera(images, FPS), mode="video") as phone:
@@ -131,8 +131,8 @@ async def _soak(pid: int, port: int, token: str, seconds: float) -> list[Sample]
             server_ms = [one["server_ms"] for _, one in answers]
             dropped = answers[-1][1]["dropped"] if answers else 0
             one = Sample(passed_s, _memory_mb(pid), len(answers), _p95(ages), _p95(server_ms), dropped, screen.is_slow)
-            seen.append(one)
-            if len(seen) % max(1, round(seconds / 20)) == 0:
+            samples.append(one)
+            if len(samples) % max(1, round(seconds / 20)) == 0:
                 print(
                     f"{one.at_s:5.0f} {one.memory_mb:10.1f} {one.answers:10d} {one.age_p95_ms:11.0f} "
                     f"{one.server_p95_ms:14.0f} {one.dropped:8d} {'slow screen' if one.is_slow else ''}",
@@ -140,11 +140,11 @@ async def _soak(pid: int, port: int, token: str, seconds: float) -> list[Sample]
                 )
     screen.is_on = False
     print(f"the screen took {screen.pictures} pictures")
-    return seen
+    return samples
 
 
 async def _drop(pid: int, port: int, token: str, count: int) -> bool:
-    """Phones that vanish without a word; whether the server let go of all of them, and of their memory."""
+    """Connect phones that vanish without closing; True when the server released all of them and their memory."""
     images = _images(30)
     memory_mb = []
     for number in range(count):
@@ -155,18 +155,18 @@ async def _drop(pid: int, port: int, token: str, count: int) -> bool:
         await asyncio.sleep(0.5)
         memory_mb.append(_memory_mb(pid))
         if number == 0 or (number + 1) % 10 == 0:
-            print(f"{number + 1:3d} phones came and vanished: {memory_mb[-1]:.1f} MB", flush=True)
+            print(f"{number + 1:3d} phones connected and vanished: {memory_mb[-1]:.1f} MB", flush=True)
     clients = Http(port, token).json("GET", "/api/status")[1]["clients"]
     growth_mb = float(np.median(memory_mb[-5:]) - np.median(memory_mb[5:10]))
-    print(f"{clients} of them still take part; memory {growth_mb:+.1f} MB since the first ten")
-    return clients == 0 and growth_mb <= MOST_GROWTH_MB
+    print(f"{clients} of them are still connected; memory {growth_mb:+.1f} MB since the first ten")
+    return clients == 0 and growth_mb <= MAX_GROWTH_MB
 
 
-def _judge(seen: list[Sample]) -> bool:
-    """Print the figures; whether memory stayed flat and frames young."""
-    warm = [one for one in seen if one.at_s >= WARM_UP_SHARE * seen[-1].at_s]
+def _evaluate(samples: list[Sample]) -> bool:
+    """Print the figures; True when memory stayed flat and frames young."""
+    warm = [one for one in samples if one.at_s >= WARM_UP_SHARE * samples[-1].at_s]
     memory = np.array([one.memory_mb for one in warm])
-    # A search for a lost part takes and gives back some 50 MB within a second; what stays is in the medians.
+    # A search for a lost part allocates some 50 MB for a second: medians show what stays allocated.
     medians = np.array([np.median(part) for part in np.array_split(memory, MEDIANS)])
     growth_mb = float(np.polyfit([one.at_s for one in warm], memory, 1)[0] * (warm[-1].at_s - warm[0].at_s))
     print(f"memory after warm-up {memory.min():.1f} to {memory.max():.1f} MB in single seconds")
@@ -176,10 +176,10 @@ def _judge(seen: list[Sample]) -> bool:
     )
     ages = np.array([one.age_p95_ms for one in warm if one.answers])
     print(f"age of answers, p95 of each second: median {np.median(ages):.0f} ms, largest {ages.max():.0f} ms")
-    is_flat = abs(growth_mb) <= MOST_GROWTH_MB and float(np.ptp(medians)) <= 2 * MOST_GROWTH_MB
-    is_young = float(np.median(ages)) <= MOST_AGE_MS
-    print("flat" if is_flat else f"NOT FLAT: more than ±{MOST_GROWTH_MB:.0f} MB", end=", ")
-    print("young" if is_young else f"OLD: more than {MOST_AGE_MS:.0f} ms")
+    is_flat = abs(growth_mb) <= MAX_GROWTH_MB and float(np.ptp(medians)) <= 2 * MAX_GROWTH_MB
+    is_young = float(np.median(ages)) <= MAX_AGE_MS
+    print("flat" if is_flat else f"NOT FLAT: more than ±{MAX_GROWTH_MB:.0f} MB", end=", ")
+    print("young" if is_young else f"OLD: more than {MAX_AGE_MS:.0f} ms")
     return is_flat and is_young
 
 

@@ -20,7 +20,7 @@ from arview.geometry import Array
 from photos import all_photos
 from profile_ranker_examples import ALIKE_PIXELS, REFINED_NEAR, is_alike, is_near, pictures_of
 from recordings import scenes
-from suites.detection import Sections, recorded_views
+from suites.detection import DetectionSuite, recorded_views
 
 RECORDED_EACH, PHOTOS_EACH, RECORDED_WEIGHT = 40, 60, 2.0
 """Frames of each recording, photos without its part, and the weight of each."""
@@ -110,7 +110,7 @@ def _recorded(name: str) -> Iterator[LabelledPicture]:
 
 def _others() -> Iterator[tuple[str, float, Iterator[LabelledPicture]]]:
     """Pictures without each shape and recorded part, like those of the evaluation."""
-    sections = Sections(scenes(), {}, Path("out/sequences"))
+    sections = DetectionSuite(scenes(), {}, Path("out/sequences"))
     for number, name in enumerate([*sections.shapes, *sections.recorded]):
         without = sections.pictures_without(name, OTHERS_EACH, OTHERS_SEED + number)
         yield name, OTHERS_WEIGHT, ((detector, image, None) for detector, _, image in without)

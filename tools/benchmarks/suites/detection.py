@@ -1,4 +1,4 @@
-"""Sections of the evaluation on detection and on semi-synthetic sequences."""
+"""Evaluation of the detector and of tracking on semi-synthetic sequences, of false alarms and of look-alikes."""
 
 from __future__ import annotations
 
@@ -46,9 +46,10 @@ from arview.tracking import TrackingSession
 from arview.video import Image
 from photos import all_photos, background_photos
 from recordings import SAMPLE
-from rows import Line, timing, watched
+from rows import ResultRow, timing, watched
 
 SCENE_FRAMES = 200
+"""Frames of a semi-synthetic sequence."""
 LOOK_ALIKE_FRAMES = 60
 SEED = 1
 DETECT_FRAMES = {"real": 60, "semisynthetic": 25, "look-alike": 6}
@@ -56,21 +57,21 @@ FALSE_ALARM_FRAMES = 1000
 BOXES = ("cube", "teabox")
 TRACK_TARGETS = {1: 0.95, 2: 0.88, 3: 0.75, 4: 0.60}
 DETECT_TARGETS: dict[Variant, float] = {"regular": 0.95, "light": 0.93, "noise": 0.90, "occlusion": 0.85}
-LEAST_DIFFERENT = 0.01
-"""Frames in which the fault changes less of the part's picture do not show it."""
+MIN_DIFFERENT = 0.01
+"""Smallest share of the part's pixels that a fault changes in frames that show it."""
 
 
 @dataclass(frozen=True)
-class Sections:
-    """What the sections work on.
+class DetectionSuite:
+    """Sections of the evaluation, and what they share.
 
     Attributes:
         recorded: scenes by name.
         details: for evaluation.json; each section adds its own.
-        folder: of the semi-synthetic sequences, made when missing.
-        shapes: names of the shapes looked at.
-        frames: look at no more frames of a scene than these; None: each section's own number.
-        backgrounds: folder of photos, or None.
+        folder: of the semi-synthetic sequences, which are made when missing.
+        shapes: names of the shapes.
+        frames: largest number of frames of a scene; None for the default of each section.
+        backgrounds: folder of photos, or None for the default.
     """
 
     recorded: dict[str, Scene]
@@ -82,9 +83,9 @@ class Sections:
 
     # --- Real sequences ---------------------------------------------------------------------------------
 
-    def detect(self) -> list[Line]:
-        """The detector, without any hint, on single frames of the real sequences."""
-        lines = []
+    def detect(self) -> list[ResultRow]:
+        """The detector, without a prior, on single frames of the recorded sequences."""
+        rows = []
         for name, scene in watched(self.recorded.items(), "detect"):
             model = scene.part.model
             symmetries = box_symmetries(model) if name in BOXES else scene.part.symmetries
@@ -94,8 +95,8 @@ class Sections:
             tally = detect_in_frames(scene, frames, detector, partial(_plain_error, meter))
             self.details.setdefault("detect", {})[name] = asdict(tally)
             target = "≥ 95 % within 5 cm/5°, full sphere, no hint"
-            lines.append(Line("detect", name, detection_text(tally), target, tally.share >= 0.95))
-        return lines
+            rows.append(ResultRow("detect", name, detection_text(tally), target, tally.share >= 0.95))
+        return rows
 
     # --- Semi-synthetic sequences -----------------------------------------------------------------------
 
@@ -105,13 +106,13 @@ class Sections:
         return background_photos(self.backgrounds)
 
     def scene(self, name: str, variant: Variant) -> Scene:
-        """A sequence of a shape, made when it is not there."""
+        """A sequence of a shape, made when it is missing."""
         options = SequenceOptions(variant, SCENE_FRAMES, SEED)
         made = make_sequence(shape_job(name, options, self.photos), self.folder)
         return load_scene(made / "test" / "000001")
 
-    def semisynthetic_track(self) -> list[Line]:
-        """RBOT's protocol at four frame steps."""
+    def semisynthetic_track(self) -> list[ResultRow]:
+        """Tracking by the protocol of RBOT, at four frame steps."""
         tallies: dict[tuple[int, Variant, str], Tally] = {}
         for name in watched(self.shapes, "semisynthetic-track"):
             for variant in VARIANTS:
@@ -119,9 +120,9 @@ class Sections:
                 views = shape_views(scene.part.model)
                 for step in TRACK_TARGETS:
                     tallies[step, variant, name] = track_with_resets(scene, views, step, self.frames)
-        rows = [{"step": s, "variant": v, "shape": n, **asdict(t)} for (s, v, n), t in tallies.items()]
-        self.details["semisynthetic-track"] = rows
-        lines = []
+        records = [{"step": s, "variant": v, "shape": n, **asdict(t)} for (s, v, n), t in tallies.items()]
+        self.details["semisynthetic-track"] = records
+        rows = []
         for step, target in TRACK_TARGETS.items():
             of_step = {key: tally for key, tally in tallies.items() if key[0] == step}
             total = summed(of_step.values())
@@ -129,34 +130,34 @@ class Sections:
             by_shape = {n: summed(t for key, t in of_step.items() if key[2] == n) for n in self.shapes}
             text = f"{100 * total.share:.1f} % of {total.frames} ({shares(by_variant)}; {shares(by_shape)})"
             wanted = f"≥ {100 * target:.0f} % within 5 cm/5°"
-            lines.append(Line("semisynthetic track", f"frame step {step}", text, wanted, total.share >= target))
-        return lines
+            rows.append(ResultRow("semisynthetic track", f"frame step {step}", text, wanted, total.share >= target))
+        return rows
 
-    def semisynthetic_detect(self) -> list[Line]:
-        """The detector, without any hint, on single frames of every variant."""
+    def semisynthetic_detect(self) -> list[ResultRow]:
+        """The detector, without a prior, on single frames of every variant."""
         tallies: dict[tuple[Variant, str], Tally] = {}
         for name in watched(self.shapes, "semisynthetic-detect"):
             for variant in VARIANTS:
                 scene = self.scene(name, variant)
                 detector = Detector(shape_views(scene.part.model), scene.camera)
                 frames = spread_frames(scene, self.frames or DETECT_FRAMES["semisynthetic"])
-                measure = _AlikeMeter(scene, name)
+                measure = _IndistinguishableMeter(scene, name)
                 tallies[variant, name] = detect_in_frames(scene, frames, detector, measure)
-        rows = [{"variant": v, "shape": n, **asdict(t)} for (v, n), t in tallies.items()]
-        self.details["semisynthetic-detect"] = rows
-        lines = []
+        records = [{"variant": v, "shape": n, **asdict(t)} for (v, n), t in tallies.items()]
+        self.details["semisynthetic-detect"] = records
+        rows = []
         for variant, target in DETECT_TARGETS.items():
             by_shape = {n: tallies[variant, n] for n in self.shapes}
             total = summed(by_shape.values())
             text = f"{detection_text(total)} ({shares(by_shape)})"
             wanted = f"≥ {100 * target:.0f} % within 5 cm/5°, full sphere, no hint"
-            lines.append(Line("semisynthetic detect", variant, text, wanted, total.share >= target))
-        return lines
+            rows.append(ResultRow("semisynthetic detect", variant, text, wanted, total.share >= target))
+        return rows
 
     # --- Other things -----------------------------------------------------------------------------------
 
-    def false_alarms(self) -> list[Line]:
-        """The detectors of all parts on pictures without them, shared out among the parts."""
+    def false_alarms(self) -> list[ResultRow]:
+        """False alarms: the detector of each part on pictures without it."""
         parts = [*self.shapes, *self.recorded]
         each = self.frames or -(-FALSE_ALARM_FRAMES // len(parts))
         false: dict[str, list[str]] = {}
@@ -171,12 +172,16 @@ class Sections:
         count = sum(len(origins) for origins in false.values())
         named = ", ".join(f"{name} {len(origins)}" for name, origins in false.items() if origins)
         text = f"{count} of {looked}" + (f" ({named})" if named else "")
-        return [Line("false alarms", f"{len(parts)} parts", text, "none", count == 0)]
+        return [ResultRow("false alarms", f"{len(parts)} parts", text, "none", count == 0)]
 
     def pictures_without(self, name: str, count: int, seed: int) -> Iterator[tuple[Detector, str, Image]]:
-        """The detector of a part, and some pictures without it: photos and, for the shapes, pictures of others."""
+        """Pictures without a part: photos and, for the shapes, frames of other shapes.
+
+        Yields:
+            the detector of the part, where the picture comes from, and the picture.
+        """
         detector, camera = self._detector_of(name)
-        # Recorded parts are seen in the backgrounds of the semi-synthetic scenes.
+        # The backgrounds of the semi-synthetic scenes show the recorded parts.
         others = [other for other in self.shapes if other != name] if name in self.shapes else []
         scenes = [self.scene(other, "regular") for other in others]
         photos = all_photos(self.backgrounds, name)
@@ -190,8 +195,8 @@ class Sections:
         scene = self.scene(name, "regular")
         return Detector(shape_views(scene.part.model), scene.camera), scene.camera
 
-    def look_alikes(self) -> list[Line]:
-        """Whether a session says what is wrong with an assembly: of single frames, and walked round it."""
+    def look_alikes(self) -> list[ResultRow]:
+        """Whether a session names the fault of a look-alike, in single frames and while the camera moves around it."""
         models = {"assembly": shape("assembly")} if "assembly" in self.shapes else {}
         if (SAMPLE / "part.toml").is_file() and self.frames is None:
             models[SAMPLE.name] = load_part(SAMPLE / "part.toml").model
@@ -218,10 +223,10 @@ class Sections:
         cleanly = f"{clean} of {total}; {unnamed} with those whose wrong component is said to be unseen"
         all_named = percent(named_walks, len(walks))
         return [
-            Line("lookalike named", on, text, "≥ 90 %", total > 0 and named >= 0.9 * total),
-            Line("lookalike clean lock", on, cleanly, "none", total > 0 and clean == 0),
-            Line("lookalike named at last", after, all_named, "≥ 90 %", named_walks >= 0.9 * len(walks) > 0),
-            Line(
+            ResultRow("lookalike named", on, text, "≥ 90 %", total > 0 and named >= 0.9 * total),
+            ResultRow("lookalike clean lock", on, cleanly, "none", total > 0 and clean == 0),
+            ResultRow("lookalike named at last", after, all_named, "≥ 90 %", named_walks >= 0.9 * len(walks) > 0),
+            ResultRow(
                 "lookalike clean at last",
                 after,
                 f"{clean_walks} of {len(walks)}",
@@ -231,12 +236,12 @@ class Sections:
         ]
 
     def _walk(self, name: str, model: Model, look_alike: LookAlike) -> LookAlikeWalk | None:
-        """A walk round a look-alike; None when its fault shows in none of the frames."""
+        """A sequence around a look-alike; None when no frame shows its fault."""
         options = SequenceOptions("regular", LOOK_ALIKE_FRAMES, SEED)
         made = make_sequence(look_alike_job(name, model, look_alike, options, self.photos), self.folder / "look_alikes")
         scene = load_scene(made / "test" / "000001")
         infos = json.loads((scene.folder / "scene_gt_info.json").read_text())
-        shown = tuple(f for f in scene.frames if infos[str(f.index)][0]["different_fract"] >= LEAST_DIFFERENT)
+        shown = tuple(f for f in scene.frames if infos[str(f.index)][0]["different_fract"] >= MIN_DIFFERENT)
         if not shown:
             return None
         session = TrackingSession(
@@ -247,7 +252,7 @@ class Sections:
 
 @dataclass(frozen=True)
 class LookAlikeWalk:
-    """A look-alike, pictures from a walk round it, those of them that show its fault, and a session for the part."""
+    """A look-alike, a sequence around it, the frames that show its fault, and a session for the right part."""
 
     look_alike: LookAlike
     scene: Scene
@@ -255,20 +260,20 @@ class LookAlikeWalk:
     session: TrackingSession
 
     def single_frames(self, count: int) -> Iterator[LookAlikeResult]:
-        """What the session makes of some single frames that show the fault."""
+        """Results for some single frames that show the fault."""
         for frame in spread_frames(replace(self.scene, frames=self.shown), count):
             self.session.reset()
-            # A detection must hold a second frame before it is believed.
+            # A session confirms a detection in a second frame.
             picture = frame, self.scene.image(frame)
-            yield self._seen([picture, picture])
+            yield self._result_after([picture, picture])
 
     def to_the_end(self) -> LookAlikeResult:
-        """What it makes of all of them, one after the other."""
+        """The result after the whole sequence."""
         self.session.reset()
-        return self._seen((frame, self.scene.image(frame)) for frame in self.scene.frames)
+        return self._result_after((frame, self.scene.image(frame)) for frame in self.scene.frames)
 
-    def _seen(self, pictures: Iterable[tuple[SceneFrame, Image]]) -> LookAlikeResult:
-        """What the session says after some pictures."""
+    def _result_after(self, pictures: Iterable[tuple[SceneFrame, Image]]) -> LookAlikeResult:
+        """The result after some pictures."""
         for frame, image in pictures:
             pose = self.session.process(image, frame.index, frame.index / 30.0)
         found = pose.mismatches
@@ -281,7 +286,16 @@ class LookAlikeWalk:
 
 @dataclass(frozen=True)
 class LookAlikeResult:
-    """What a session made of pictures of a look-alike, and the last of them."""
+    """Result of a session for pictures of a look-alike, after the last of them.
+
+    Attributes:
+        look_alike: its name.
+        frame: index of the last picture.
+        state: of the session.
+        is_named: a wrong component is named.
+        mismatches, unverified: of the pose.
+        components: the wrong components.
+    """
 
     look_alike: str
     frame: int
@@ -293,17 +307,17 @@ class LookAlikeResult:
 
     @property
     def is_locked(self) -> bool:
-        """Whether it was found, as whatever."""
+        """True when the look-alike was found."""
         return self.state in (TrackingState.TRACKED, TrackingState.CRITICAL)
 
     @property
     def is_unnamed(self) -> bool:
-        """True when it was tracked and nothing named, whatever has not been seen yet."""
+        """True when it was tracked and no component was named, whatever is still unverified."""
         return self.state == TrackingState.TRACKED and not self.mismatches
 
     @property
     def is_clean(self) -> bool:
-        """True when it was taken for the right part: nothing was named, and what is wrong passed for seen."""
+        """True when it was taken for the right part: nothing is named, and the wrong components count as verified."""
         return self.is_unnamed and not any(part in self.unverified for part in self.components)
 
 
@@ -311,8 +325,8 @@ def _plain_error(meter: PoseMeter, estimate: Array, frame: SceneFrame) -> PoseEr
     return meter.measure(estimate, true_pose(frame))
 
 
-class _AlikeMeter:
-    """Errors against whichever of the poses that look the same in a picture is nearest."""
+class _IndistinguishableMeter:
+    """Errors to the nearest of the true poses that are indistinguishable in a picture."""
 
     def __init__(self, scene: Scene, name: str) -> None:
         self._scene, self._near = scene, near_symmetries(name)
@@ -325,19 +339,19 @@ class _AlikeMeter:
 
 
 def shape_views(model: Model) -> GuideViewSet:
-    """Guide views of a shape, from everywhere."""
+    """Guide views of a shape over the full sphere."""
     return full_sphere_views(model, SequenceOptions().motion.distance_mm)
 
 
 def recorded_views(scene: Scene) -> GuideViewSet:
-    """Guide views of a recorded part, from everywhere, at the distances of the recording."""
+    """Guide views of a recorded part over the full sphere, at the distances of the recording."""
     center = scene.part.model.center_in_model
     distances = [float((apply(pose, center) ** 2).sum() ** 0.5) for pose in scene.poses]
     return full_sphere_views(scene.part.model, (min(distances), max(distances)))
 
 
 def full_sphere_views(model: Model, distance_mm: tuple[float, float]) -> GuideViewSet:
-    """Guide views from everywhere, cached between runs."""
+    """Guide views over the full sphere, cached between runs."""
     view_range: ViewRange = full_sphere_range(*distance_mm)
     return cached_guide_views(model, view_range)
 

@@ -1,8 +1,8 @@
-"""The live page in Chromium on this machine: what the server adds, and how late the picture with its ghost is shown.
+"""Latency of the live page in Chromium on this machine: time added by the server, and glass to glass.
 
-Glass to glass: each picture of the film that is the browser's camera has a counter drawn into it. It is read off the
-camera's picture, whose moment the browser says (``captureTime``), and off the canvas right after the page has drawn it;
-the picture is on the screen when the next screen refresh begins.
+Glass to glass: each picture of the video that is the browser's camera has a counter drawn into it. The counter is read
+from the camera's picture, whose capture time the browser reports (``captureTime``), and from the canvas right after the
+page has drawn it; the picture is on the screen at the next screen refresh.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ import numpy as np
 from live_server import live_server
 from recordings import ROOT, SAMPLE, skip
 
-sys.path.insert(0, str(ROOT / "tests"))  # the browser and its film are those of the tests
+sys.path.insert(0, str(ROOT / "tests"))  # the tests' browser and video
 
 from helpers import live_browser
 
 WIDTH, HEIGHT, FPS, COUNT = 640, 480, 30, 44
 VIEWPORT = {"width": 660, "height": 760}
-WARM_UP_S, MEASURED_S, PATIENCE_S = 5, 20, 120
-WAYS = {"poses": "data channel", "video": "annotated video", "jpeg": "JPEG"}
+WARM_UP_S, MEASURED_S, TIMEOUT_S = 5, 20, 120
+TRANSPORTS = {"poses": "data channel", "video": "annotated video", "jpeg": "JPEG"}
 OBSERVER = """
 window.report = [];
 const cells = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
@@ -73,17 +73,17 @@ HTMLVideoElement.prototype.requestVideoFrameCallback = function (callback) {
 
 
 def live_latencies() -> Iterator[tuple[str, dict[str, Any]]]:
-    """For each way of the page: its name, and what was measured, ms; nothing, with a word, without a browser."""
+    """For each transport its name and the measured latencies, ms; nothing, with a message, without a browser."""
     if live_browser.CHROMIUM is None or find_spec("playwright") is None:
         skip("live", "needs Chromium and Playwright: apt-get install chromium, pip install playwright")
         return
     with tempfile.TemporaryDirectory() as folder, _server(Path(folder)) as link:
-        film = Path(folder) / "film.y4m"
+        video = Path(folder) / "video.y4m"
         images = live_browser.plain_frames(WIDTH, HEIGHT, 1, COUNT)
         played = live_browser.numbered([images[k] for k in live_browser.there_and_back(COUNT)])
-        live_browser.write_y4m(film, played, FPS)
-        with live_browser.browser(film) as browser:
-            for transport, name in WAYS.items():
+        live_browser.write_y4m(video, played, FPS)
+        with live_browser.browser(video) as browser:
+            for transport, name in TRANSPORTS.items():
                 context = browser.new_context(viewport=VIEWPORT)
                 try:
                     yield name, _measure(context.new_page(), link, transport)
@@ -92,6 +92,7 @@ def live_latencies() -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _measure(page: Any, link: str, transport: str) -> dict[str, Any]:
+    """Latencies of a page with one transport, after a warm-up."""
     observer = OBSERVER
     for word in ("EDGE", "CELL"):
         observer = observer.replace(word, str(getattr(live_browser, f"{word}_PX")))
@@ -101,24 +102,24 @@ def _measure(page: Any, link: str, transport: str) -> dict[str, Any]:
     page.goto(link)
     choice = page.locator(f"#transports input[value={transport}]")
     choice.evaluate("input => input.click()")
-    end_s = time.monotonic() + PATIENCE_S
+    end_s = time.monotonic() + TIMEOUT_S
     while not page.evaluate("window.report.some((one) => one.hasGhost)"):
         if time.monotonic() > end_s:
-            raise SystemExit(f"live, {transport}: no ghost within {PATIENCE_S} s; {page.inner_text('#state')!r}")
+            raise SystemExit(f"live, {transport}: no ghost within {TIMEOUT_S} s; {page.inner_text('#state')!r}")
         page.wait_for_timeout(500)
     page.wait_for_timeout(1e3 * WARM_UP_S)
     page.evaluate("window.report.length = 0")
     page.wait_for_timeout(1e3 * MEASURED_S)
-    seen = [one for one in page.evaluate("window.report") if one["hasGhost"]]
-    if not any("glassMs" in one for one in seen):
+    drawn = [one for one in page.evaluate("window.report") if one["hasGhost"]]
+    if not any("glassMs" in one for one in drawn):
         raise SystemExit(f"live, {transport}: no ghost was drawn for {MEASURED_S} s")
     return {
-        "frames_per_s": len(seen) / MEASURED_S,
-        "server_ms": _spread([one["serverMs"] for one in seen]),
-        "track_ms": _spread([one["trackMs"] for one in seen]),
-        "glass_to_glass_ms": _spread([one["glassMs"] for one in seen if "glassMs" in one]),
-        "said_by_the_page_ms": _spread([one["saidMs"] for one in seen]),
-        "counters_read": sum("glassMs" in one for one in seen),
+        "frames_per_s": len(drawn) / MEASURED_S,
+        "server_ms": _spread([one["serverMs"] for one in drawn]),
+        "track_ms": _spread([one["trackMs"] for one in drawn]),
+        "glass_to_glass_ms": _spread([one["glassMs"] for one in drawn if "glassMs" in one]),
+        "reported_by_the_page_ms": _spread([one["saidMs"] for one in drawn]),
+        "counters_read": sum("glassMs" in one for one in drawn),
     }
 
 
@@ -128,7 +129,7 @@ def _spread(values: list[float]) -> dict[str, float]:
 
 @contextmanager
 def _server(folder: Path) -> Iterator[str]:
-    """`arview live` on the loopback interface; the link to its page."""
+    """Run `arview live` on the loopback interface; yields the link to its page."""
     lens = live_browser.camera(WIDTH, HEIGHT)
     about = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     (folder / "camera.json").write_text(json.dumps({**about, "dist": lens.dist.tolist()}))

@@ -1,4 +1,4 @@
-"""Registrations of a simulated post: the exact surface and own ICP beside those of open3d and small_gicp."""
+"""Registration of a simulated post: the exact surface and ICP of arview beside open3d and small_gicp."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 
 import numpy as np
-from numpy.typing import NDArray
 
-from arview.geometry import apply
+from arview.geometry import Array, apply
 from arview.measurement.cloud.icp import (
     IcpOptions,
     IcpTarget,
@@ -19,14 +18,13 @@ from arview.measurement.cloud.registration import register_to_surface
 from arview.measurement.studies.common import EXACT, post
 from recordings import skip
 
-Array = NDArray[np.float64]
 REFERENCE, MEASURED = 240_965, 24_099
 SHIFT_MM = np.array([0.8, -0.6, 0.0])
 RUNS = 5
 
 
 def registrations() -> Iterator[tuple[str, float, float]]:
-    """Name, CPU seconds (median), and mean error of the centre in µm; reference tree and normals are included."""
+    """For each method its name, median CPU seconds with trees and normals, and mean error of the centre, µm."""
     surface, center = post()
 
     def exact(points: Array, reference: Array, normals: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Finding the part again after a loss on the recorded sequences, with and without learned views."""
+"""Relocalization after a loss on the recorded sequences, with and without learned views."""
 
 from __future__ import annotations
 
@@ -13,15 +13,22 @@ from arview.evaluation.protocols import box_symmetries
 from arview.evaluation.run import COARSE, IN_VIEW
 from arview.pose import TrackingState
 from arview.tracking import SessionOptions, TrackingSession
-from rows import Line, watched
+from rows import ResultRow, watched
 from suites.detection import BOXES, recorded_views
 
 LOSSES = 30
 
 
 @dataclass(frozen=True)
-class Relearned:
-    """Losses, how many the next frame ended, how many with a wrong pose, and the search's CPU time in each, ms."""
+class Relocalized:
+    """Results after losses of the part.
+
+    Attributes:
+        losses: number of losses.
+        found, wrong: of them, those that the next frame ended with a right and with a wrong pose.
+        cpu_ms: CPU time of each of these frames.
+        views: learned views at the end.
+    """
 
     losses: int
     found: int
@@ -31,31 +38,33 @@ class Relearned:
 
     @property
     def median_ms(self) -> float:
-        """Of the frames after a loss."""
+        """Median CPU time of the frames after a loss."""
         return float(np.median(self.cpu_ms)) if self.cpu_ms else float("inf")
 
     def format(self) -> str:
-        """For the table."""
+        """As text for the table."""
         return f"{self.found} of {self.losses}, {self.wrong} wrong, median {self.median_ms:.0f} ms CPU"
 
 
-def relearn_lines(found: dict[str, Scene], details: dict[str, Any], losses: int | None = None) -> list[Line]:
-    """A line a sequence."""
-    lines = []
-    for name, scene in watched(found.items(), "relearn"):
+def relocalization_rows(found: dict[str, Scene], details: dict[str, Any], losses: int | None = None) -> list[ResultRow]:
+    """A row for each sequence."""
+    rows = []
+    for name, scene in watched(found.items(), "relocalization"):
         without, learned = (lose_and_find(name, scene, use, losses or LOSSES) for use in (False, True))
-        details.setdefault("relearn", {})[name] = {"without": asdict(without), "learned": asdict(learned)}
+        details.setdefault("relocalization", {})[name] = {"without": asdict(without), "learned": asdict(learned)}
         text = f"{learned.format()}; without {without.format()}"
         reached = learned.wrong == 0 and learned.found >= without.found and learned.median_ms < without.median_ms
         target = "0 wrong; with learned views no fewer, sooner"
-        lines.append(Line("found in the frame after a loss", f"{name}, {learned.views} views", text, target, reached))
-    return lines
+        rows.append(
+            ResultRow("found in the frame after a loss", f"{name}, {learned.views} views", text, target, reached)
+        )
+    return rows
 
 
-def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: int) -> Relearned:
-    """Track the first half; before frames of the second the camera is covered until the part is lost.
+def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: int) -> Relocalized:
+    """Track the first half; in the second half, cover the camera before some frames until the part is lost.
 
-    The guide views are those of the full sphere. Where a frame does not find the part, the session goes on from truth.
+    The guide views cover the full sphere. Where a frame does not find the part, the session continues from the truth.
     """
     views, model = recorded_views(scene), scene.part.model
     meter = PoseMeter(
@@ -95,4 +104,4 @@ def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: 
             session = TrackingSession(views, scene.camera, model, options, initial_cam_from_model=frame.cam_from_model)
             session.appearance_memory = kept
             session.process(image, frame.index, number / 30.0)
-    return Relearned(count, right, wrong, tuple(cpu_ms), len(session.appearance_memory))
+    return Relocalized(count, right, wrong, tuple(cpu_ms), len(session.appearance_memory))
