@@ -105,7 +105,7 @@ def batch(
     counts = Counter(one.verdict.replace("_", " ") for one in results)
     kept = sum(one.is_kept for one in results)
     click.echo(f"{len(results)} jobs: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
-               + (f"; {kept} of them done before" if kept else ""))  # fmt: skip
+               + (f"; {kept} of them already done" if kept else ""))  # fmt: skip
     click.get_current_context().exit(worst_exit_code(results))
 
 
@@ -117,7 +117,7 @@ def worst_exit_code(results: list[JobResult]) -> ExitCode:
 
 
 def _line(result: JobResult) -> str:
-    kept = " (done before)" if result.is_kept else ""
+    kept = " (already done)" if result.is_kept else ""
     return f"{result.name}: {result.verdict.replace('_', ' ')}{kept}; {result.text}; {result.out}"
 
 

@@ -158,7 +158,7 @@ def lens(
         click.echo(f"wrote {picture}")
     not_enough = result.verdict.grade.value == "not enough"
     if not_enough and not (anyway and math.isfinite(result.verdict.focal_u)):
-        say("no camera was written; do as advised" + ("" if anyway else ", or take it --anyway"))
+        say("no camera was written; follow the advice" + ("" if anyway else ", or write it with --anyway"))
         click.get_current_context().exit(ExitCode.CANNOT_MEASURE)
     extra = record_of(result)
     if profile is not None:
@@ -173,7 +173,7 @@ def lens(
         say(f"use it with --camera profile:{kept.stem}")
     for kind, path in targets:
         if not holds_distortion(kind) and result.camera.is_distorted:
-            say(f"warning: {path}: BOP files hold no distortion; it is for pictures that were undistorted with it")
+            say(f"warning: {path}: BOP files hold no distortion; use this one with undistorted pictures only")
         write_camera(result.camera, path, kind, extra)
         click.echo(f"wrote {path}")
     if not_enough:
@@ -227,7 +227,7 @@ def _print(result: Calibration) -> None:
         more = f" and {len(names) - 3} more" if len(names) > 3 else ""
         say(f"left out {', '.join(names[:3])}{more}: {reason}")
     if len(reasons) > 12:
-        say(f"left out {sum(len(names) for names in list(reasons.values())[12:])} more, each for its reason")
+        say(f"left out {sum(len(names) for names in list(reasons.values())[12:])} more for other reasons")
     corners = sum(len(view.ids) for view in solution.views)
     click.echo(
         f"board found in {len(seen.views)} of {seen.searched} pictures of {seen.width}×{seen.height} px;"
@@ -257,5 +257,5 @@ def _camera_lines(result: Calibration) -> list[str]:
     return [
         f"camera: {', '.join(cells[:4])} px",
         f"lens: {', '.join(cells[4:])}",
-        f"uncertainty (k = 2): focal length {100 * verdict.focal_u:.2f} %, where a ray is seen {worst}",
+        f"uncertainty (k = 2): focal length {100 * verdict.focal_u:.2f} %, image position of a ray {worst}",
     ]

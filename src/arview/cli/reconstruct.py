@@ -159,7 +159,7 @@ def _print(result: Reconstruction, has_part: bool) -> None:
         camera = sparse.photos[0].camera
         click.echo(
             f"{quality.photos} of {quality.photos + len(sparse.unplaced)} photos placed, {quality.points} points, "
-            f"{quality.reprojection_rms_px:.2f} px rms, {quality.track_length:.1f} photos a point; focal "
+            f"{quality.reprojection_rms_px:.2f} px rms, {quality.track_length:.1f} photos per point; focal length "
             f"{camera.fx:.1f} px"
         )
     if scale is not None:

@@ -98,13 +98,13 @@ def _print(test: Verification, shows_all: bool) -> None:
         f" {max(o.known.mm for o in test.lengths):.1f} mm"
     )
     if test.u_held is UncertaintyCheck.NOT_STATED:
-        click.echo("U: not stated by what was measured")
+        click.echo("U: not stated in the measurement")
     else:
         low, high = test.expected
         why = "simulated, since lengths share marks" if test.is_shared else "binomial"
         click.echo(
             f"U (k = 2) {test.u_held}: {test.within} of {len(test.lengths)} errors are within it, {low} to {high} are"
-            f" expected if it is right ({why}); errors are {test.ratio:.2f} × what it says"
+            f" expected if it is right ({why}); the errors are {test.ratio:.2f} × the stated U"
         )
     if len(test.lengths) < FULL_TEST:
         click.echo(f"note: VDI/VDE 2634 part 1 asks for {FULL_TEST} lengths, five on each of seven lines")
