@@ -1,4 +1,4 @@
-"""Acceptance test by lengths: errors, limits, and whether the stated U held, on places with known errors."""
+"""Acceptance test with lengths: errors, limits and the check of U, on positions with known errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NAMES = [f"post_{k}" for k in range(16)]
 def measured(
     rng: np.random.Generator, std_mm: float, stated_mm: float | None = None, scale: float = 0.0
 ) -> MeasuredMarks:
-    """The places with errors of a size, and what is said of it."""
+    """Positions with errors of a given size and a stated uncertainty."""
     stated = std_mm if stated_mm is None else stated_mm
     marks = {
         name: Mark((1.0 + scale) * place + rng.normal(0.0, std_mm, 3), stated**2 * np.eye(3))
@@ -88,8 +88,8 @@ def test_lengths_without_common_marks_are_binomial() -> None:
     assert test.expected == tuple(int(v) for v in binom.interval(0.95, 8, 0.9545))
 
 
-def test_an_honest_u_is_believed_and_others_are_not() -> None:
-    """25 tests of 120 lengths: an honest U is hardly ever called false, half of it nearly always."""
+def test_a_correct_u_is_accepted_and_others_are_rejected() -> None:
+    """25 tests of 120 lengths: a correct U is hardly ever rejected, half of it nearly always."""
     wrong = {"honest": 0, "half": 0, "scale": 0}
     wide = 0
     for seed in range(25):
@@ -117,7 +117,7 @@ def test_shared_marks_widen_the_range() -> None:
 
 
 def inspection_and_truth(folder: Path, std_mm: float = 0.02, off_mm: float = 0.0) -> tuple[Path, Path]:
-    """An inspection of components that were moved and turned, and the truth of it."""
+    """An inspection of components that were moved and rotated, and its truth."""
     rng = np.random.default_rng(3)
     truth, components = {}, []
     for k, (name, center) in enumerate(zip(NAMES, RNG_PLACES, strict=True)):

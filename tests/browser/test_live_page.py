@@ -1,4 +1,4 @@
-"""The page in a real browser: where the ghost lies on each way, what the page says, what its buttons do."""
+"""The page in a real browser: alignment of the overlay with each transport, messages, buttons."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MEDIAN_PX, MAX_PX = 1.5, 4.0
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What Chromium's camera sees."""
+    """The film that Chromium plays as its camera."""
     path = tmp_path_factory.mktemp("film") / "part.y4m"
     images = live_browser.frames(WIDTH, HEIGHT)
     live_browser.write_y4m(path, [images[k] for k in live_browser.there_and_back()], FPS)
@@ -52,14 +52,14 @@ def chromium(film: Path) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def inspection(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sample's inspection as if it were of this hour."""
+    """The sample's inspection with a recent date."""
     path = tmp_path_factory.mktemp("inspection") / "inspection.json"
     write_inspection(path, timedelta(minutes=30))
     return path
 
 
 def write_inspection(path: Path, age: timedelta, **changes: Any) -> None:
-    """The sample's inspection of another age."""
+    """Write the sample's inspection with a given age."""
     record = json.loads(INSPECTION.read_text())
     record["created"] = (datetime.now(UTC) - age).strftime("%Y-%m-%dT%H:%M:%SZ")
     path.with_suffix(".new").write_text(json.dumps({**record, **changes}))
@@ -75,7 +75,7 @@ def server(inspection: Path) -> Iterator[Running]:
 
 @contextmanager
 def opened(chromium: Any, server: Running, script: str = "", viewport: dict[str, int] = VIEWPORT) -> Iterator[Any]:
-    """The page; afterwards it must have had no error of its own."""
+    """The open page; at the end it is checked that it raised no errors."""
     context = chromium.new_context(viewport=viewport, accept_downloads=True)
     page = context.new_page()
     troubles: list[str] = []
@@ -92,7 +92,7 @@ def opened(chromium: Any, server: Running, script: str = "", viewport: dict[str,
 
 
 def until(page: Any, condition: str | Callable[[], Any], timeout_s: float = TIMEOUT_S) -> Any:
-    """Wait for an expression in the page, or a function here, to come true; its value."""
+    """Wait until an expression of the page, or a function, is true; returns its value."""
     end_s = time.monotonic() + timeout_s
     while True:
         value = page.evaluate(condition) if isinstance(condition, str) else condition()
@@ -112,14 +112,14 @@ document.addEventListener("arview:drawn", (event) => { window.drawn = event.deta
 
 
 def choose(page: Any, transport: str, link: str, mode: str) -> None:
-    """Choose how the page is connected and wait until it is and the part is tracked."""
+    """Choose a transport and wait until the page is connected and the part is tracked."""
     page.locator(f"#transports input[value={transport}]").evaluate("input => input.click()")
     until(page, f"document.querySelector('#link-state').textContent.startsWith('Connected by {link}, {mode}')")
     until(page, "window.drawn?.pose?.state === 'tracked'")
 
 
 def freeze(page: Any) -> int:
-    """Stop the picture on a frame with a ghost; the number that the film has drawn into it."""
+    """Freeze a frame with an overlay; returns the number that the film shows in it."""
     until(page, "window.drawn?.pose?.state === 'tracked' && window.drawn.pose.cam_from_model !== null")
     page.keyboard.press(" ")
     until(page, "document.body.dataset.state === 'frozen'")
@@ -132,7 +132,7 @@ def freeze(page: Any) -> int:
 
 
 def check_outline(found: np.ndarray, number: int, gap_px: int = 1) -> None:
-    """The ghost's outline against the truth's, of the frame shown and not of its neighbours; narrower gaps are none."""
+    """Check the outline of the overlay against the truth of the frame shown; narrow gaps are ignored."""
     near = [n for n in (number - 1, number, number + 1) if 0 <= n < live_browser.COUNT]
     found = closed(found, gap_px)
     errors_px = {n: outline_errors_px(found, closed(true_mask(found.shape, n), gap_px)) for n in near}
@@ -174,7 +174,7 @@ def test_annotated_video(chromium: Any, server: Running) -> None:
 
 
 def test_station_camera(chromium: Any, inspection: Path, tmp_path: Path) -> None:
-    """The page only shows: plain pictures and poses come, and belong together."""
+    """The page shows a station: plain pictures and poses arrive and belong together."""
     path = tmp_path / "station.mp4"
     images = live_browser.frames(WIDTH, HEIGHT)
     with VideoSink(path, WIDTH, HEIGHT, FPS) as sink:
@@ -229,7 +229,7 @@ def test_labels_and_parts_say_what_was_measured(chromium: Any, server: Running) 
 
 
 def test_labels_stay_apart(chromium: Any, server: Running) -> None:
-    """In every shape of the screen: labels inside it, no two of them touching, buttons large enough for a glove."""
+    """For every shape of the screen: labels are inside it and do not overlap, and buttons are large enough."""
     with opened(chromium, server, WATCH) as page:
         until(page, "window.drawn?.pose?.state === 'tracked'")
         for width, height in ((390, 844), (844, 390), (1280, 800), (320, 568)):
@@ -246,7 +246,7 @@ def test_labels_stay_apart(chromium: Any, server: Running) -> None:
 
 
 def check_labels(page: Any, width: int, height: int) -> int:
-    """Number of labels, after each was found inside the screen and clear of the others."""
+    """Check that labels are inside the screen and do not overlap; returns their number."""
     boxes = page.evaluate(
         """[...document.querySelectorAll('#labels .label:not(.off)')].map((one) => {
             const {left, top, right, bottom} = one.getBoundingClientRect(); return [left, top, right, bottom]; })"""
@@ -289,8 +289,8 @@ def test_snapshot_and_recording(chromium: Any, server: Running) -> None:
         assert len(Path(download.value.path()).read_bytes()) > 10_000
 
 
-def test_words_for_every_trouble(chromium: Any, server: Running) -> None:
-    """No camera, no room, no connection: each is told, and the page goes on when it is over."""
+def test_every_failure_has_a_message(chromium: Any, server: Running) -> None:
+    """No camera, a busy server, no connection: each has a message, and the page recovers."""
     denied = "navigator.mediaDevices.getUserMedia = async () => { throw new DOMException('no', 'NotAllowedError'); };"
     with opened(chromium, server, denied) as page:
         until(page, "document.querySelector('#message').innerText.includes('may not use the camera')")
@@ -359,7 +359,7 @@ def test_screen_that_watches(chromium: Any, server: Running) -> None:
 
 
 def test_modules_agree_with_the_server(chromium: Any, server: Running) -> None:
-    """The page's stamp and lens are those of arview.live.stream.stamp and arview.camera."""
+    """Stamp and camera model of the page agree with arview.live.stream.stamp and arview.camera."""
     lens = live_browser.camera(WIDTH, HEIGHT)
     points = np.random.default_rng(1).uniform([-250, -140, 450], [250, 140, 650], (50, 3))
     fields = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}

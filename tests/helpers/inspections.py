@@ -1,4 +1,4 @@
-"""Inspections made up for tests: every kind of verdict, undetermined axes, things that are missing or foreign."""
+"""Synthetic inspections: every kind of verdict, undetermined axes, missing components and foreign objects."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def deviation(
     name: str, moved: tuple[float | None, float | None, float | None], center: Array, tolerance_mm: float | None = 0.5,
     uncertainty_mm: float = 0.06, turn_deg: float = 0.0, angle_tolerance_deg: float | None = None,
 ) -> ComponentDeviation:  # fmt: skip
-    """A component moved by what is given, and turned about z; the verdict by ISO 14253-1."""
+    """A component with a displacement and a rotation about z; the verdict follows ISO 14253-1."""
     seen = (True, True, True, *(value is not None for value in moved))
     distance = float(np.linalg.norm([value or 0.0 for value in moved]))
     rotation = exp_so3(np.array([0.0, 0.0, np.deg2rad(turn_deg)]))
@@ -66,7 +66,7 @@ def deviation(
 
 
 def missing(name: str, center: Array) -> ComponentDeviation:
-    """A component that is not there."""
+    """A missing component."""
     details = Details((float(center[0]), float(center[1]), float(center[2])))
     none = (None, None, None)
     return ComponentDeviation(
@@ -75,7 +75,7 @@ def missing(name: str, center: Array) -> ComponentDeviation:
 
 
 def not_measured(name: str, center: Array) -> ComponentDeviation:
-    """A component that no photo showed."""
+    """A component that was not measured."""
     details = Details((float(center[0]), float(center[1]), float(center[2])), notes=("seen by one photo",))
     return ComponentDeviation(name, (None,) * 3, None, NOTHING, None, 0.5, Verdict.NOT_MEASURED, details=details)
 
@@ -84,7 +84,7 @@ def inspection(
     model: Model, components: tuple[ComponentDeviation, ...], serial: str = "SN-7", foreign: bool = False,
     part: str = "bench", minutes: int = 0,
 ) -> Inspection:  # fmt: skip
-    """Of a model, with datums and provenance."""
+    """An inspection of a model, with datums and provenance."""
     chip = ForeignReport((80.0, 80.0, 2.0), (6.0, 5.0, 4.0), 90.0, "plate", 0.0, "foreign object on plate, 90 mm²")
     eye = tuple(tuple(float(v) for v in row) for row in np.eye(4))
     datums = (
@@ -112,7 +112,7 @@ def inspection(
 
 
 def bench_inspection(model: Model) -> Inspection:
-    """Of `photo_scene.bench`: one displaced, one with an undetermined axis, one missing, one not measured, a chip."""
+    """An inspection of `photo_scene.bench`: one component displaced, one with an undetermined axis, one missing, one not measured, a chip."""
     center = {c.name: c.bounds_in_model.mean(axis=0) for c in model.components}
     return inspection(
         model,

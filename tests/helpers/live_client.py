@@ -30,7 +30,7 @@ from arview.video import Image
 
 @dataclass
 class Running:
-    """A server that serves."""
+    """A running server."""
 
     server: LiveServer
     hub: Hub
@@ -49,7 +49,7 @@ class Running:
 
 @contextmanager
 def running(options: LiveOptions, load: Callable[[], Subject], until_ready: bool = True) -> Iterator[Running]:
-    """A server at a free port of the loopback interface; ends with the block."""
+    """A server at a free port of the loopback interface, which is stopped at the end of the block."""
     server = LiveServer(options, open_endpoint(None, 0, is_plain=True))
     ready = threading.Event()
     hubs: list[Hub] = []
@@ -83,7 +83,7 @@ def running(options: LiveOptions, load: Callable[[], Subject], until_ready: bool
 
 
 class Http:
-    """Requests of one page, one after another over one connection."""
+    """Requests of a page over one connection."""
 
     def __init__(self, port: int, token: str, headers: dict[str, str] | None = None) -> None:
         self._connection = http.client.HTTPConnection(LOOPBACK, port, timeout=30)
@@ -114,7 +114,7 @@ class Http:
         return status, json.loads(answer) if answer else None
 
     def join(self, **wanted: Any) -> str:
-        """Take part; the client's name."""
+        """Join; returns the name of the client."""
         status, answer = self.json("POST", "/api/clients", {"transport": "jpeg", "mode": "poses", **wanted})
         assert status == 201, answer
         return str(answer["client"])
@@ -124,7 +124,7 @@ class Http:
 
 
 class Camera(MediaStreamTrack):
-    """Stamped frames at a steady rate, over and over; notes when each id was sent."""
+    """Stamped frames at a constant rate in a loop; records when each id was sent."""
 
     kind = "video"
 
@@ -202,13 +202,13 @@ class Phone:
             await asyncio.to_thread(self.http.ask, "DELETE", f"/api/clients/{self.name}")
 
     async def vanish(self) -> None:
-        """Go without a word."""
+        """Disappear without closing the connection."""
         for task in self._tasks:
             task.cancel()
         await self._peer.close()
 
     async def until(self, condition: Callable[[], Any], timeout_s: float = 30.0) -> None:
-        """Wait for something to come true."""
+        """Wait until a condition is true."""
         async with asyncio.timeout(timeout_s):
             while not condition():
                 await asyncio.sleep(0.02)
@@ -241,7 +241,7 @@ class Phone:
 
 
 def wait(condition: Callable[[], Any], timeout_s: float = 60.0) -> Any:
-    """What the condition gives once it is true."""
+    """Wait until a condition is true; returns its value."""
     ends_s = time.monotonic() + timeout_s
     while not (value := condition()):
         assert time.monotonic() < ends_s, "it did not happen in time"

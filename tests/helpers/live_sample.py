@@ -1,4 +1,4 @@
-"""The sample clip as somebody's camera: small frames, their true poses, and how far a pose is from them."""
+"""The sample clip as the camera of a page: small frames, their true poses, and errors of poses."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def truth() -> list[Array]:
 
 
 def there_and_back() -> list[int]:
-    """Order in which the frames are played over and over, without a jump."""
+    """Order of the frames in a loop without jumps: forwards, then backwards."""
     return [*range(COUNT), *range(COUNT - 2, 0, -1)]
 
 
@@ -55,12 +55,12 @@ def options(**more: Any) -> LiveOptions:
 
 
 def loader(chosen: LiveOptions) -> Callable[[], Subject]:
-    """Loads the sample's part."""
+    """A function that loads the part of the sample."""
     return lambda: load_subject(str(PART), None, None, chosen)
 
 
 def errors(answer: dict[str, Any], cam_from_model: Array) -> tuple[float, float]:
-    """How far the middle of the part is off, mm, and the rotation, degrees."""
+    """Errors of a pose: of the centre of the part, mm, and of the rotation, degrees."""
     found = np.array(answer["cam_from_model"]).reshape(4, 4)
     center = np.append(CENTER_IN_MODEL, 1.0)
     turn = found[:3, :3].T @ cam_from_model[:3, :3]
@@ -69,5 +69,5 @@ def errors(answer: dict[str, Any], cam_from_model: Array) -> tuple[float, float]
 
 
 def nearest(answer: dict[str, Any]) -> int:
-    """Which of the frames has the pose that is nearest to the answer's."""
+    """Index of the frame whose true pose is nearest to the one of a response."""
     return int(np.argmin([errors(answer, pose)[0] for pose in truth()]))

@@ -1,4 +1,4 @@
-"""The results store: append-only, idempotent, two writers; trends, control limits and capability against truth."""
+"""The results store (append-only, idempotent, several writers), control charts and capability."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def saved(folder: Path, name: str, made: Inspection) -> Path:
 
 
 def built(index: int, dx: float, part: str = "bench", serial: str | None = None) -> Inspection:
-    """The part of a series: one block moved along x, measured an hour after the one before."""
+    """A part of a series: one block moved along x, measured an hour after the previous part."""
     serial = f"S{index:03d}" if serial is None else serial
     block = deviation("block_1", (dx, 0.02, -0.01), np.zeros(3), uncertainty_mm=0.02)
     return inspection(MODEL, (block,), serial, part=part, minutes=60 * index)
@@ -56,7 +56,7 @@ def store(tmp_path: Path) -> Iterator[HistoryStore]:
 
 @pytest.fixture(scope="module")
 def postgresql() -> Iterator[str]:
-    """The URL of a database server of our own, on a socket in a folder of its own."""
+    """The URL of a temporary database server on a socket in its own folder."""
     versions = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda p: int(p.parent.name))
     pytest.importorskip("psycopg")
     if not versions:
@@ -385,8 +385,8 @@ def test_signals() -> None:
     assert control_chart(rising).signals == dict.fromkeys((8, 9), "6 in a row that rise or fall")
 
 
-def test_false_alarms_are_as_rare_as_they_should_be() -> None:
-    """A value beyond three standard deviations is 0.27 %; limits from 100 values make it a little more."""
+def test_rate_of_false_alarms() -> None:
+    """0.27 % of the values are beyond three standard deviations; limits from 100 values increase this slightly."""
     rng = np.random.default_rng(1)
     beyond = [sum("beyond the control" in why for why in control_chart(rng.normal(size=100)).signals.values())
               for _ in range(400)]  # fmt: skip
@@ -407,8 +407,8 @@ def test_capability_by_hand() -> None:
 
 
 @pytest.mark.parametrize("count", [20, 100])
-def test_the_intervals_hold_the_truth_as_often_as_they_say(count: int) -> None:
-    """Cp 1.5 and Cpk 1.2 of a normal process: 95 % of the intervals should hold them."""
+def test_coverage_of_the_intervals(count: int) -> None:
+    """Cp 1.5 and Cpk 1.2 of a normal process: 95 % of the intervals should contain them."""
     rng = np.random.default_rng(count)
     held = np.zeros(2)
     for _ in range(600):
@@ -420,7 +420,7 @@ def test_the_intervals_hold_the_truth_as_often_as_they_say(count: int) -> None:
     assert (held / 600 < 0.985).all()
 
 
-def test_refusals_and_doubts() -> None:
+def test_errors_and_warnings() -> None:
     for values, lower, upper, message in (
         (NIST[:9], 0.0, 60.0, "need at least 10 values, there are 9"),
         (NIST, None, None, "there is no tolerance"),

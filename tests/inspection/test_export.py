@@ -71,7 +71,7 @@ def test_csv_starts_no_formula(model: Model) -> None:
     one = replace(one, components=(deviation("block_1", (-1.0, 0, 0), np.zeros(3)),))
     row = next(csv.DictReader(io.StringIO(to_csv(one))))
     assert row["serial"] == "'=HYPERLINK()"
-    assert row["dx_mm"] == "-1.000000"  # numbers are not texts
+    assert row["dx_mm"] == "-1.000000"  # numbers are not escaped
 
 
 def test_qif_has_the_structure_of_the_standard(found: Inspection) -> None:

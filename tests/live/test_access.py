@@ -1,4 +1,4 @@
-"""Who may ask for what: token, host, origin, paths, sizes, rates, slow and mad clients."""
+"""Access control: token, host, origin, paths, sizes, rates, slow and misbehaving clients."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def page(server: Running) -> Iterator[Http]:
 
 
 def raw(server: Running, content: bytes, timeout_s: float = 10.0) -> bytes:
-    """What the server says to these bytes until it closes or the time is up."""
+    """The response of the server to raw bytes, until it closes the connection or the time is up."""
     with socket.create_connection((LOOPBACK, server.port), timeout=timeout_s) as line:
         line.sendall(content)
         said = b""
@@ -91,7 +91,7 @@ def test_nothing_without_the_token(server: Running, path: str) -> None:
     for query in (f"?token={wrong}", "?token=", "?token", f"?token={'A' * 3000}", "?" + "&".join(["a=1"] * 300)):
         assert bare(server, path + query)[0] in (403, 414)
     if path not in ("/", "/watch"):
-        assert bare(server, f"{path}?token={server.token}")[0] == 403  # only a page's address may bring it
+        assert bare(server, f"{path}?token={server.token}")[0] == 403  # only the URL of a page may carry it
     else:
         assert b"Scan the code" in bare(server, path)[2]
 
@@ -168,7 +168,7 @@ def test_bodies_too_large_are_refused_by_what_they_say_and_by_what_they_are(serv
         assert (status, json.loads(content)["error"]) == (413, "too_large")
         connection = http.client.HTTPConnection(LOOPBACK, server.port, timeout=20)
         with suppress(ConnectionError):
-            # Chunked: the length is not told before.
+            # Chunked: the length is not declared.
             connection.request(
                 "POST", path, iter([b" " * 65536] * (2 + most // 65536)), {**page.headers, "Content-Type": kind},
                 encode_chunked=True,
@@ -223,8 +223,8 @@ def test_a_client_that_takes_no_answer_is_cut(server: Running, page: Http, monke
         assert taken < 20 * 448_168
 
 
-def test_snapshots_are_not_for_free() -> None:
-    # So few a second that a slow machine does not earn more while it draws them.
+def test_snapshots_are_rate_limited() -> None:
+    # A low rate, so that a slow machine gets no new tokens while it draws.
     chosen = options(requests=RequestLimits(snapshots_per_s=0.1))
     with running(chosen, loader(chosen)) as server:
         page = server.session()
@@ -265,8 +265,8 @@ def test_rate_limit_counts_by_address_and_forgets(monkeypatch: pytest.MonkeyPatc
     assert len(rate._buckets) <= MAX_ADDRESSES
 
 
-def test_a_mad_client_harms_nobody(server: Running) -> None:
-    """Random methods, paths, headers and bodies, by HTTP and as plain bytes, while a good page goes on."""
+def test_a_fuzzing_client_does_not_affect_others(server: Running) -> None:
+    """Random methods, paths, headers and bodies, by HTTP and as raw bytes, while another page is served."""
     rng = random.Random(7)
     good, mad = server.session(), server.session()
     good_name = good.join()
@@ -285,7 +285,7 @@ def test_a_mad_client_harms_nobody(server: Running) -> None:
         try:
             status, _, _ = mad.ask(method, path.encode("utf-8").decode("latin-1"), body, Content_Type=kind)
             statuses[status] = statuses.get(status, 0) + 1
-        except (ValueError, http.client.HTTPException, UnicodeError):  # our own library refuses to send it
+        except (ValueError, http.client.HTTPException, UnicodeError):  # the client library refuses to send it
             mad.close()
         if number % 1000 == 0:
             answer = good.ask(
@@ -314,7 +314,7 @@ def test_a_mad_client_harms_nobody(server: Running) -> None:
 
 
 def test_many_pages_at_once(server: Running) -> None:
-    """Twenty ask at the same time for four places: four get one, the others are told so, and those are served."""
+    """Twenty pages join at the same time and four are admitted; the others are refused, and the four are served."""
     from concurrent.futures import ThreadPoolExecutor
 
     pages = [server.session() for _ in range(20)]

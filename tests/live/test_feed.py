@@ -1,4 +1,4 @@
-"""What lies between network and page, with scripted trackers: newest only, recovery, drawing, recording, inspection."""
+"""Feeds, annotators, recordings and the inspection file, with scripted trackers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from helpers.live_sample import INSPECTION, PART, options
 
 
 class Session:
-    """Takes its time, stands still, fails when told to."""
+    """A session with a given duration per frame, a constant pose and a failure on demand."""
 
     def __init__(self, subject: Scripted) -> None:
         self.subject = subject
@@ -58,7 +58,7 @@ class Session:
 
 
 class Overlay:
-    """Writes the frame's index into the picture."""
+    """Draws the index of the frame into the picture."""
 
     def draw(self, image: Image, pose: Pose) -> Image:
         drawn = image.copy()
@@ -107,7 +107,7 @@ def closing() -> Iterator[Callable[[Feed], Feed]]:
 
 
 def test_a_slow_tracker_takes_the_newest_frame_and_counts_the_others(closing: Callable[[Feed], Feed]) -> None:
-    """30 frames a second into a tracker that manages 5: no answer is older than one frame's wait and two trackings."""
+    """30 frames per second into a tracker that manages 5: no pose is older than one waiting and one tracking."""
     feed = closing(feed_of(Scripted(pause_s=0.2)))
     tracked: list[TrackedFrame] = []
     feed.listen(tracked.append)
@@ -136,7 +136,7 @@ def test_memory_of_a_feed_is_bounded(closing: Callable[[Feed], Feed]) -> None:
     assert feed.find(199 - kept) is None and feed.find(199 - kept + 1) is not None
 
 
-def test_an_error_inside_the_tracker_is_told_and_tracking_begins_anew(closing: Callable[[Feed], Feed]) -> None:
+def test_an_error_of_the_tracker_is_reported_and_tracking_restarts(closing: Callable[[Feed], Feed]) -> None:
     subject = Scripted(fail_at=2)
     feed = closing(feed_of(subject))
     for number in range(5):
@@ -329,7 +329,7 @@ def test_inspection_file_keeps_the_last_good_one(tmp_path: Path, model: Model) -
     good = file.inspection
     assert not file.reload() and file.notices() == []
     path.write_text("{")
-    assert not file.reload() and file.notices() == []  # it may be being written
+    assert not file.reload() and file.notices() == []  # the file may be in the middle of a write
     assert not file.reload()
     (notice,) = file.notices()
     assert notice.code == "inspection_unreadable" and str(tmp_path) not in notice.text and file.inspection is good
@@ -340,7 +340,7 @@ def test_inspection_file_keeps_the_last_good_one(tmp_path: Path, model: Model) -
     file.reload()
     assert [notice.code for notice in file.notices()] == ["inspection_unreadable"]
     save_inspection(replace(good, serial="BP-2"), path)
-    assert not file.reload() and file.notices() == []  # the same again: nothing new to show
+    assert not file.reload() and file.notices() == []  # the same content: nothing new to show
 
 
 def test_inspection_that_is_old_or_of_another_part_is_told(tmp_path: Path, model: Model) -> None:

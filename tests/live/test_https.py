@@ -1,4 +1,4 @@
-"""HTTPS with a local authority: what it may sign, who may read its key, when it is renewed, how phones trust it."""
+"""HTTPS with a local authority: name constraints, permissions of keys, renewal, trust page."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_keys_are_for_this_user_only(tmp_path: Path) -> None:
     ]
     for path in folder.iterdir():
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    # Permissions that became loose are tightened.
+    # Permissions that were relaxed are restricted again.
     (folder / "authority.key").chmod(0o644)
     folder.chmod(0o755)
     local_certificates(HERE, folder, NOW)

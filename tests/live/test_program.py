@@ -1,4 +1,4 @@
-"""`arview live` as a program: what it prints, how it ends, and one line for each thing that is wrong."""
+"""`arview live` as a program: its output, its exit, and one line for each kind of invalid input."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LINK = re.compile(r"(https?)://127\.0\.0\.1:(\d+)/\?token=(\S+)")
 
 @contextmanager
 def program(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """The program, started in a folder; killed at the end if it still runs."""
+    """The program, started in a folder; killed at the end if it is still running."""
     process = subprocess.Popen(
         [sys.executable, "-m", "arview.cli", "live", *arguments],
         cwd=folder,
@@ -84,7 +84,7 @@ def test_it_serves_until_ctrl_c_and_finishes_the_recording(tmp_path: Path) -> No
         out, err = process.communicate(timeout=30)
         assert time.monotonic() - asked_s < 10
     assert process.returncode == 130, err
-    assert "█" not in out and "▀" not in out  # no code to scan when nobody sees a terminal
+    assert "█" not in out and "▀" not in out  # no QR code without a terminal
     assert err.splitlines()[-1] == "arview: ended; files are finished" and "Traceback" not in err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.mp4"]
     shown = list(open_source(tmp_path / "out.mp4"))

@@ -36,7 +36,7 @@ from helpers.live_sample import (
 
 
 def send(page: Http, name: str, index: int, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """A frame of the sample as JPEG, played there and back."""
+    """Send a frame of the sample as JPEG; the frames are played forwards and backwards."""
     order = there_and_back()
     image = frames()[order[index % len(order)]]
     return page.ask(
@@ -91,7 +91,7 @@ def test_annotated_picture_by_jpeg(page: Http) -> None:
     assert drawn.shape == (HEIGHT, WIDTH, 3)
     changed = np.abs(drawn - frames()[0]).max(axis=2) > 60
     assert 0.05 < changed.mean() < 0.6  # ghosts, labels and the status line, not the whole picture
-    # Less is drawn when the page asks for less.
+    # Fewer pixels are drawn when the page switches something off.
     page.json(
         "POST",
         f"/api/clients/{name}/control",
@@ -101,7 +101,7 @@ def test_annotated_picture_by_jpeg(page: Http) -> None:
     assert (np.abs(plain - frames()[1]).max(axis=2) > 60).mean() < 0.02
 
 
-def test_control_changes_what_is_asked_for_and_nothing_on_a_wrong_wish(page: Http) -> None:
+def test_control_changes_state_and_an_invalid_request_changes_nothing(page: Http) -> None:
     name = page.join()
     path = f"/api/clients/{name}/control"
     status, answer = page.json("POST", path, {"mode": "video", "style": {"opacity": 0.2, "only": "post_1"}})
@@ -155,7 +155,7 @@ def test_recording_from_the_page(page: Http) -> None:
     assert on["is_on"] and on["finished"] == []
     for index in range(1, 9):
         send(page, name, index)
-        time.sleep(0.1)  # a recorder that is behind takes the newest picture only
+        time.sleep(0.1)  # a slow recorder takes the newest picture only
     off = page.json("POST", f"/api/clients/{name}/control", {"record": False})[1]["recording"]
     assert not off["is_on"] and off["finished"] == [0]
     status, headers, content = page.ask("GET", "/api/recordings/0")
@@ -218,7 +218,7 @@ def test_one_picture_in_flight(phones: Running, page: Http) -> None:
 
 
 def test_phone_of_another_shape_is_refused_in_words(page: Http) -> None:
-    """The camera file is 16:9; a 4:3 picture cannot be its."""
+    """The camera file is for 16:9, so 4:3 pictures are refused."""
     name = page.join()
     square = to_jpeg(np.zeros((480, 640, 3), dtype=np.uint8))
     status, _, content = page.ask("POST", f"/api/clients/{name}/frame?id=0", square, Content_Type="image/jpeg")
@@ -227,7 +227,7 @@ def test_phone_of_another_shape_is_refused_in_words(page: Http) -> None:
     assert "camera.json" in answer["reason"] and str(CAMERA.parent) not in answer["reason"]
     notices = page.json("GET", f"/api/clients/{name}/status")[1]["notices"]
     assert "size_refused" in [notice["code"] for notice in notices]
-    # Held the other way it is the same phone, and upright it is too.
+    # Both landscape orientations and portrait belong to the same camera.
     assert json.loads(send(page, name, 0)[2])["state"] == "tracked"
     upright = to_jpeg(np.ascontiguousarray(np.rot90(frames()[0], -1)), 92)
     path = f"/api/clients/{name}/frame?id=1&turns=1"
@@ -264,7 +264,7 @@ def test_inspection_is_reloaded_and_garbage_keeps_the_last_good_one(page: Http, 
 
 
 def test_part_is_aligned_with_a_guide_view_when_asked_for() -> None:
-    """The outline of the answer is where the guide view is; far from it the part is not taken, near it it is."""
+    """The response has the pose of the guide view; the part is accepted near it only."""
     chosen = options(guide="az-110_el50_d550", max_age_s=None)
     with running(chosen, loader(chosen)) as server:
         page = server.session()

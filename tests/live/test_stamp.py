@@ -1,4 +1,4 @@
-"""The frame counter in the picture: through scaling, noise and encoders, and never a wrong one."""
+"""The stamp: it is read after scaling, noise and encoding, and never wrongly."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ SIZES = [(640, 480), (480, 640), (1280, 720), (720, 1280), (1920, 1080), (360, 6
 
 @cache
 def picture(width: int, height: int, seed: int = 0) -> np.ndarray:
-    """Blurred noise: a picture with structure at all places."""
+    """Blurred noise: a picture with structure everywhere."""
     noise = np.random.default_rng(seed).normal(size=(height, width, 3))
     smooth = cv2.GaussianBlur(noise, (0, 0), 4.0)
     return np.clip(128 + 400 * smooth, 0, 255).astype(np.uint8)
 
 
 def through(codec: str, images: list[np.ndarray], bit_rate: int) -> list[np.ndarray]:
-    """Pictures after an encoder in its live settings, and its decoder, (H,W) brightness."""
+    """Pictures after encoding with live settings and decoding, (H,W) brightness."""
     encoder = av.CodecContext.create(codec, "w")
     encoder.height, encoder.width = images[0].shape[:2]
     encoder.pix_fmt, encoder.bit_rate, encoder.framerate = "yuv420p", bit_rate, 30
@@ -72,7 +72,7 @@ def test_stamp_survives_scaling(width: int, height: int, scale: float) -> None:
 
 @pytest.mark.parametrize("codec", ["libvpx", "libx264"])
 def test_stamp_survives_encoders_at_a_low_rate(codec: str) -> None:
-    """300 kbit/s at 640×480 and 30 fps: what a browser sends over the worst network. No frame says a wrong number."""
+    """300 kbit/s at 640×480 and 30 fps, as browsers send over the worst networks: no stamp is read wrongly."""
     images = [stamped(np.roll(picture(640, 480), 3 * k, axis=1), 1000 + k) for k in range(30)]
     read = [read_stamp(gray) for gray in through(codec, images, 300_000)]
     assert len(read) >= 25
@@ -104,7 +104,7 @@ def test_pictures_too_small_for_a_stamp(shape: tuple[int, int]) -> None:
 
 
 def test_a_scaled_frame_is_scaled_back_where_the_intrinsics_say() -> None:
-    """A dot drawn at a projected point is found there again after the way through half the size: within 0.15 px."""
+    """A dot at a projected point is found within 0.15 px after scaling to half the size and back."""
     camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
     u, v = camera.project([20.0, -30.0, 500.0])
     image = np.full((480, 640, 3), 90, dtype=np.uint8)

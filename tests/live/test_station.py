@@ -1,4 +1,4 @@
-"""A station camera: played files, streams that break and come back, frozen pictures, screens that watch."""
+"""The station camera: files, streams that break and return, frozen pictures, screens that watch."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Cable(FrameSource):
         self._count = 0
 
     def open(self, spec: str, **timeouts: float) -> FrameSource:
-        if spec != "0":  # of another server that runs meanwhile
+        if spec != "0":  # of another server that runs at the same time
             return open_source(spec, **timeouts)
         if not self.is_plugged:
             raise InputError("camera 0: there is no camera 0, or it is in use")
@@ -96,7 +96,7 @@ def test_file_is_played_and_all_pages_see_its_poses(playing: Running) -> None:
         assert answer["id"] != last
         last = answer["id"]
         index = order[last % len(order)]
-        # The picture is that of the pose: nearest of all frames, and the pose is right.
+        # The picture belongs to the pose: it is the most similar frame, and the pose is correct.
         differences = [float(np.abs(picture.astype(int) - frame).mean()) for frame in frames()]
         assert int(np.argmin(differences)) == index
         if answer["cam_from_model"] is not None:
@@ -142,14 +142,14 @@ def test_screens_that_watch_get_motion_jpeg_and_only_so_many(playing: Running) -
     wait(lambda: playing.hub.watchers == 0)
 
 
-def test_twenty_pages_look_at_one_station(clip: Path) -> None:
-    """Each gets its pictures, plain or annotated; each picture is drawn and packed once, whoever asks."""
+def test_twenty_pages_show_one_station(clip: Path) -> None:
+    """Each page gets plain or annotated pictures; each picture is drawn and encoded once."""
     from concurrent.futures import ThreadPoolExecutor
 
     chosen = options(source=str(clip), max_age_s=None, clients=20)
     with running(chosen, loader(chosen)) as server:
 
-        def look(number: int) -> list[int]:
+        def fetch(number: int) -> list[int]:
             page = server.session()
             name = page.join(mode="video" if number % 2 else "poses")
             ids = []
@@ -160,7 +160,7 @@ def test_twenty_pages_look_at_one_station(clip: Path) -> None:
             return ids
 
         with ThreadPoolExecutor(20) as pool:
-            for ids in pool.map(look, range(20)):
+            for ids in pool.map(fetch, range(20)):
                 assert len(set(ids)) == 4
         assert len(server.hub.clients) == 20
         assert server.session().json("POST", "/api/clients", {"transport": "jpeg"})[0] == 503
@@ -248,7 +248,7 @@ def test_options_outside_their_range(wrong: dict[str, Any]) -> None:
 
 
 def _mpegts(clip: Path) -> bytes:
-    """The clip as an endless-looking stream that a player may join at its start."""
+    """The clip as an MPEG transport stream."""
     import io
 
     import av
@@ -264,7 +264,7 @@ def _mpegts(clip: Path) -> bytes:
 
 
 class _Stream:
-    """Gives a recorded stream slowly to whoever connects, until stopped."""
+    """A server that sends a recorded stream slowly until it is stopped."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content

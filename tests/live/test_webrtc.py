@@ -1,4 +1,4 @@
-"""WebRTC on the loopback interface: poses of the very frame, both ways back, faults, clients that vanish or lag."""
+"""WebRTC on the loopback interface: poses of the right frame, both modes, faults, lost and slow clients."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_annotated_video_comes_back_with_the_ids_of_its_frames(phones: Running) 
 
     phone = asyncio.run(go())
     ids = [frame_id for _, frame_id in phone.shown[5:]]
-    # A busy machine garbles some on their way; none may come back as another.
+    # A busy machine damages some frames; none may be read with the id of another.
     assert np.mean([frame_id is not None for frame_id in ids]) > 0.7
     known = [frame_id for frame_id in ids if frame_id is not None]
     assert known == sorted(known)
@@ -130,7 +130,7 @@ def test_station_sends_its_plain_picture_with_ids_and_poses(tmp_path_factory: py
 
 
 def test_frames_that_arrive_scaled_keep_their_poses_and_are_told(phones: Running) -> None:
-    """A browser short of bandwidth sends smaller pictures of the same frames."""
+    """A browser with little bandwidth sends smaller pictures of the same frames."""
 
     class Scaled(Camera):
         async def recv(self):  # type: ignore[no-untyped-def]
@@ -157,7 +157,7 @@ def test_frames_that_arrive_scaled_keep_their_poses_and_are_told(phones: Running
 
 
 def test_a_page_that_hides_its_addresses_is_reached_all_the_same(phones: Running) -> None:
-    """Browsers replace their addresses by names that only multicast DNS knows; the server does not ask for them."""
+    """Browsers replace their addresses by multicast DNS names, which the server does not resolve."""
 
     async def go() -> Phone:
         phone = Phone(phones.session(), camera())
@@ -210,7 +210,7 @@ def test_malformed_offers_are_refused_and_leave_nothing(phones: Running, sdp: st
 
 
 def test_damaged_offers(phones: Running) -> None:
-    """A good offer with bytes changed, taken away or doubled: refused, or a connection that never comes."""
+    """Valid offers with bytes changed, removed or duplicated: refused, or never connected."""
 
     async def offer() -> str:
         phone = Phone(phones.session(), camera())
@@ -243,7 +243,7 @@ def test_damaged_offers(phones: Running) -> None:
 def test_clients_that_vanish_again_and_again_leave_nothing_behind(
     phones: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pages that are closed, and pages whose network is cut, which only the lack of consent tells (RFC 7675)."""
+    """Pages that are closed, and pages whose network fails, which only missing consent reveals (RFC 7675)."""
     monkeypatch.setattr(aioice.ice, "CONSENT_INTERVAL", 0.1)
 
     async def one(is_cut: bool) -> None:
@@ -282,7 +282,7 @@ def test_an_offer_without_a_page_behind_it_is_forgotten() -> None:
 
     async def go(server: Running) -> None:
         phone = Phone(server.session(), camera())
-        # With another password than the peer's no check passes: however slow the machine, it never connects.
+        # With a wrong password no connectivity check succeeds, so the page never connects.
         phone.change_offer = lambda sdp: re.sub(r"(a=ice-pwd:)\S+", r"\g<1>" + 22 * "x", sdp)
         connecting = asyncio.ensure_future(phone.__aenter__())
         await phone.until(lambda: phone.name or connecting.done(), 30)
@@ -296,7 +296,7 @@ def test_an_offer_without_a_page_behind_it_is_forgotten() -> None:
 
 
 def test_a_slow_screen_gets_fewer_pictures_not_later_ones(phones: Running) -> None:
-    """One that takes 3 pictures a second and one that takes all: the second is not slowed, nothing piles up."""
+    """A screen that takes 3 pictures per second does not slow down another, and nothing queues up."""
 
     async def go() -> tuple[Phone, Phone]:
         async with (
@@ -314,7 +314,7 @@ def test_a_slow_screen_gets_fewer_pictures_not_later_ones(phones: Running) -> No
 
 
 def packets(count: int, marker_at: set[int], size: int = 4) -> list[RtpPacket]:
-    """Packets of frames of some packets each, with the marker where asked."""
+    """Packets of frames, with the marker bit at given numbers."""
     made = []
     for number in range(count):
         packet = RtpPacket(sequence_number=65530 + number & 0xFFFF, timestamp=number // size * 3000)
@@ -351,7 +351,7 @@ def test_a_decoder_that_cannot_keep_up_drops_all_and_asks_for_a_key_frame() -> N
     assert [waiting.get(), waiting.get()] == ["next", None]
 
 
-def test_candidates_elsewhere_are_never_called() -> None:
+def test_candidates_outside_the_network_are_removed() -> None:
     lines = ["m=video", "m=application", "a=end-of-candidates"]
     for address in (
         "192.168.1.7",

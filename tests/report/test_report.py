@@ -1,4 +1,4 @@
-"""The report of an inspection: its numbers, pictures, 3D view and PDF, and what it says of what is absent."""
+"""The report of an inspection: numbers, pictures, 3D view, PDF, and explanations of absent data."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_undetermined_is_a_word_and_minus_a_minus() -> None:
     open_z = deviation("x", (0.1, -0.05, None), np.zeros(3))
     assert "dz\u00a0undetermined" in finding_text(open_z)
     assert "dy\u00a0−0.050" in finding_text(open_z)
-    assert zone_text(open_z).startswith("≥ 0.224")  # an undetermined axis can only add
+    assert zone_text(open_z).startswith("≥ 0.224")  # an undetermined axis can only enlarge it
     assert zone_text(deviation("x", (0.3, 0.4, 0.0), np.zeros(3))) == "1.000 (1.000)"
 
 
@@ -147,7 +147,7 @@ def test_crops_show_the_ghost_at_the_design_place_and_the_arrow_where_it_points(
     assert 1.0 < zoom < 6.0  # the photo is enlarged, the arrow with it
     assert np.ptp(spread[:, 0]) > 4.0 * np.ptp(spread[:, 1]) > 0.0  # it points along the displacement
     assert drawn.max() < 0.5 * 480
-    # Rather from the side: the line of sight is more across the displacement than along it.
+    # The line of sight is more perpendicular than parallel to the displacement.
     ray = photo.centre_in_scan - center
     assert abs(ray @ SHIFT) / (np.linalg.norm(ray) * np.linalg.norm(SHIFT)) < 0.71
 
@@ -180,7 +180,7 @@ def test_the_ghost_lies_on_the_block_in_the_photo(
     cut = changed[
         max(0, bent[:, 1].min() - 6) : bent[:, 1].max() + 6, max(0, bent[:, 0].min() - 6) : bent[:, 0].max() + 6
     ]
-    assert (near & cut).sum() / (near | cut).sum() > 0.8  # the rim and holes of rounding are the rest
+    assert (near & cut).sum() / (near | cut).sum() > 0.8  # the rest is due to rounding at the rim and the holes
 
 
 def test_photos_that_are_gone_are_named(

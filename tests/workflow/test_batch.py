@@ -1,4 +1,4 @@
-"""Batches: nothing is lost with a worker, nothing is done twice, results are those of one after the other."""
+"""Batches: dead workers, resumed jobs, and results equal to those of serial runs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def key(job: InspectJob, folder: Path) -> str:
 
 
 def look(job: InspectJob, folder: Path) -> tuple[str, str]:
-    """A small measurement: the mean of noisy points; each try leaves a line beside the input."""
+    """A small measurement: the mean of noisy points; each attempt adds a line beside the input."""
     path = Path(job.photos or "")
     with path.with_suffix(".tries").open("a") as file:
         file.write(f"{os.getpid()}\n")

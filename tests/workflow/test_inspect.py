@@ -1,4 +1,4 @@
-"""`arview inspect`: verdicts as exit codes, what is finished is kept, and nothing in the folder is of other inputs."""
+"""`arview inspect`: exit codes, reuse of finished stages, and no results of other inputs in the folder."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PART = '[part]\nname = "bench"\ncad = "bench.obj"\nunit = "mm"\n[components.plat
 
 
 class Bench:
-    """A folder with inputs, and stand-ins for the stages that take minutes."""
+    """A folder with inputs, and fakes of the stages that take minutes."""
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
         self.folder, self.did = folder, []
