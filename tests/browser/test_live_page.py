@@ -346,7 +346,7 @@ def test_outline_to_align_with(chromium: Any, inspection: Path) -> None:
 def test_the_bar_says_what_has_not_been_seen_yet(chromium: Any, server: Running) -> None:
     with opened(chromium, server, WATCH) as page:
         until(page, "window.drawn?.pose?.state === 'tracked' && window.drawn.pose.unverified.length > 0")
-        until(page, lambda: "not yet verified: " in page.inner_text("#state"))
+        until(page, lambda: "Not yet verified: " in page.inner_text("#state"))
 
 
 def test_screen_that_watches(chromium: Any, server: Running) -> None:

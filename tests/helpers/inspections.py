@@ -112,7 +112,7 @@ def inspection(
 
 
 def bench_inspection(model: Model) -> Inspection:
-    """An inspection of `photo_scene.bench`: one component displaced, one with an undetermined axis, one missing, one not measured, a chip."""
+    """An inspection of `photo_scene.bench` with every kind of verdict and a foreign object."""
     center = {c.name: c.bounds_in_model.mean(axis=0) for c in model.components}
     return inspection(
         model,
