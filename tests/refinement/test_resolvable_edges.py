@@ -1,4 +1,4 @@
-"""Crowded design edges: small holes and thin ribs are, large holes and wide ribs are not."""
+"""Resolvable design edges: those of large holes and wide ribs are, those of small holes and thin ribs are not."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def model_of(*meshes: Mesh) -> Model:
 
 
 def design_points(views: GuideViewSet) -> tuple[Array, NDArray[np.bool_]]:
-    """Design edge points (N,3) of the views from straight above, and which of them are crowded."""
+    """Design edge points (N,3) of the views from straight above, and which of them are unresolvable."""
     raw = views.arrays
     kinds = np.asarray(raw["edge_kinds"])
     of_view = np.repeat(np.arange(len(views.directions)), np.diff(raw["edge_start"]))
@@ -50,7 +50,7 @@ def design_points(views: GuideViewSet) -> tuple[Array, NDArray[np.bool_]]:
     return np.asarray(raw["edge_points"], dtype=np.float64)[chosen], find_unresolvable(views)[chosen]
 
 
-def test_rims_of_small_holes_are_crowded_and_those_of_large_ones_are_not() -> None:
+def test_rims_of_small_holes_are_unresolvable_and_those_of_large_ones_are_not() -> None:
     points, unresolvable = design_points(perforated())
     on_small = np.any([np.linalg.norm(points[:, :2] - center, axis=1) < 1.2 * SMALL_MM for center in SMALL], axis=0)
     on_large = (np.linalg.norm(points[:, :2] - LARGE, axis=1) < 1.1 * LARGE_MM) & (points[:, 2] > 0.9)
@@ -60,7 +60,7 @@ def test_rims_of_small_holes_are_crowded_and_those_of_large_ones_are_not() -> No
 
 
 @pytest.mark.parametrize(("apart", "expected"), [(0.5 * MIN_SEPARATION, True), (3.0 * MIN_SEPARATION, False)])
-def test_edges_of_a_rib_are_crowded_where_it_is_thin(apart: float, expected: bool) -> None:
+def test_edges_of_a_thin_rib_are_unresolvable(apart: float, expected: bool) -> None:
     half_mm = 0.5 * apart * 126.0
     # So low that its foot is not seen beside it.
     views = views_of(box((-55.0, -30.0, 0.0), (55.0, 30.0, 8.0)), box((-40.0, -half_mm, 8.0), (40.0, half_mm, 9.0)))
@@ -70,7 +70,7 @@ def test_edges_of_a_rib_are_crowded_where_it_is_thin(apart: float, expected: boo
     assert (unresolvable[along].mean() > 0.95) if expected else (unresolvable[along].mean() < 0.3)
 
 
-def test_a_part_keeps_all_its_edges_beside_the_distinct_ones() -> None:
+def test_a_part_has_all_its_edges_and_the_resolvable_ones() -> None:
     views = perforated()
     part = PartView(views)
     all_kinds, resolvable_kinds, unresolvable = part.arrays[-1], part.resolvable[-1], find_unresolvable(views)

@@ -1,4 +1,4 @@
-"""Shading: it turns a pose to the true one where outlines cannot, and says nothing where it cannot know."""
+"""Shading modality: it refines poses of smooth parts and leaves poses alone that it does not determine."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from helpers.synthetic import CAMERA, assembly
 
 TRUTH = rigid(Rotation.from_euler("xyz", (20, -35, 50), degrees=True).as_matrix(), np.array([15.0, -10.0, 420.0]))
 WEAK = np.diag(np.r_[np.full(3, 3000.0), np.full(3, 100.0)])
-"""As outlines of smooth parts have it that hardly turn with the part: 1° and 0.1 mm, they say."""
+"""Information of the outline of a smooth part, which changes little when the part turns: 1° and 0.1 mm."""
 OPTIONS = ShadingOptions()
 LIGHT, SHINE = np.array([0.4, -0.6, -0.7]), 25.0
 
@@ -64,7 +64,7 @@ def corners_of(model: Model) -> NDArray[np.float32]:
 
 
 def picture(model: Model, pose: Array, noise: float, card: bool = False) -> NDArray[np.uint8]:
-    """A part that a lamp and its surroundings light, a little shiny, before grey; perhaps partly behind a card."""
+    """A slightly shiny part lit by a lamp and its surroundings, on grey; partly behind a card if wanted."""
     surface = surface_of(model)
     seen = apply(pose, surface.points.astype(np.float64))
     c = CAMERA
@@ -81,7 +81,7 @@ def picture(model: Model, pose: Array, noise: float, card: bool = False) -> NDAr
 
 
 def _normals_at(pixels: NDArray[np.int64], faces: NDArray[np.int32], seen: Array, model: Model, pose: Array) -> Array:
-    """Normals (N,3) towards the camera, where pixels (N,2) show some faces; between those at the corners."""
+    """Normals (N,3) towards the camera at pixels (N,2) of some faces, interpolated between the corners."""
     corners = seen[surface_of(model).faces[faces]]
     rays = CAMERA.unproject(pixels.astype(np.float64))
     shares = np.linalg.solve(corners.transpose(0, 2, 1), rays[..., None])[..., 0]
@@ -94,10 +94,10 @@ def _normals_at(pixels: NDArray[np.int64], faces: NDArray[np.int32], seen: Array
 def shaded(
     model: Model, image: NDArray[np.uint8], pose: Array, information: Array = WEAK
 ) -> tuple[Array, Array, float]:
-    look = crop_for_shading(image, CAMERA, model.diameter_mm, pose, OPTIONS)
-    assert look is not None
+    crop = crop_for_shading(image, CAMERA, model.diameter_mm, pose, OPTIONS)
+    assert crop is not None
     found, more, explained = refine_by_shading(
-        look, surface_of(model), corners_of(model), model.diameter_mm, pose, information, OPTIONS.gain
+        crop, surface_of(model), corners_of(model), model.diameter_mm, pose, information, OPTIONS.gain
     )
     return found, more, float(explained)
 
@@ -122,7 +122,7 @@ def test_a_smooth_part_is_turned_to_the_true_pose(noise: float, card: bool, most
     assert min(explained for _, _, explained in found) > 0.8
 
 
-def test_what_is_known_surely_is_not_moved() -> None:
+def test_a_pose_with_strong_information_is_not_moved() -> None:
     image = picture(blob(), TRUTH, 4.0)
     for start in turned(TRUTH, 4.0, 4):
         pose, information, _ = shaded(blob(), image, start, 1e4 * WEAK)
@@ -140,7 +140,7 @@ def test_the_turn_of_a_ball_stays_undetermined() -> None:
     assert known.max() < 0.02 * of_blob.min()
 
 
-def test_the_change_of_brightness_with_the_pose_is_that_of_drawn_pictures() -> None:
+def test_the_jacobian_is_that_of_drawn_pictures() -> None:
     surface, size, diameter_mm = surface_of(blob()), 96, blob().diameter_mm
     focal_px, middle_px = np.array([280.0, 280.0]), np.array([38.0, 54.0])
     light = np.array([80.0, 20.0, -30.0, 60.0, 8.0, -6.0, 9.0, 7.0, -5.0])
@@ -169,7 +169,7 @@ def test_the_change_of_brightness_with_the_pose_is_that_of_drawn_pictures() -> N
         assert np.dot(measured, motion[:, k]) / np.dot(motion[:, k], motion[:, k]) == pytest.approx(1.0, abs=0.05), k
 
 
-def test_only_parts_with_curved_surfaces_are_looked_at() -> None:
+def test_only_parts_with_curved_surfaces_use_shading() -> None:
     assert curved_share(surface_of(_of(trimesh.creation.box((40.0, 30.0, 20.0))))) == 0.0
     assert curved_share(surface_of(blob())) > 0.95
     assert curved_share(surface_of(_of(trimesh.creation.cylinder(20.0, 80.0, sections=64)))) > 0.5
@@ -183,7 +183,7 @@ def test_flat_faces_move_no_pose() -> None:
         assert np.rad2deg(rotation_angle_rad(shaded(box, image, start)[0], start)) < 0.5
 
 
-def test_outside_the_picture_nothing_is_looked_at() -> None:
+def test_there_is_no_crop_outside_the_picture() -> None:
     image = picture(blob(), TRUTH, 2.0)
     for way in ((900.0, 0.0, 0.0), (0.0, 0.0, -800.0), (np.nan, 0.0, 0.0)):
         pose = TRUTH.copy()
@@ -201,10 +201,10 @@ def test_a_picture_without_the_part_moves_a_pose_little() -> None:
 def test_a_pose_that_nothing_determines_stays_as_it_is() -> None:
     surface, corners = surface_of(blob()), corners_of(blob())
     flat = np.full((CAMERA.height, CAMERA.width), 90, dtype=np.uint8)
-    look = crop_for_shading(flat, CAMERA, blob().diameter_mm, TRUTH, OPTIONS)
-    assert look is not None
+    crop = crop_for_shading(flat, CAMERA, blob().diameter_mm, TRUTH, OPTIONS)
+    assert crop is not None
     pose, information, explained = refine_by_shading(
-        look, surface, corners, blob().diameter_mm, TRUTH, np.zeros((6, 6)), OPTIONS.gain
+        crop, surface, corners, blob().diameter_mm, TRUTH, np.zeros((6, 6)), OPTIONS.gain
     )
     np.testing.assert_array_equal(pose, TRUTH)
     assert not information.any() and explained == -1.0

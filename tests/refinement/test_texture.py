@@ -1,4 +1,4 @@
-"""Feature modality and ray caster against synthetic truth: a textured box seen by an exact numpy renderer."""
+"""Texture modality and ray caster against synthetic truth: a textured box drawn by an exact numpy renderer."""
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ def box(half=HALF, center=(0.0, 0.0, 0.0)):
     return signs * half + np.asarray(center), np.array(faces, dtype=np.int32)
 
 
-def texture(seed):
+def box_texture(seed):
     """(512,512) float32 of blobs about 4 px wide on a slower pattern."""
     rng = np.random.default_rng(seed)
     fine = cv2.GaussianBlur(rng.normal(size=(512, 512)).astype(np.float32), (0, 0), 3.0)
@@ -34,11 +34,11 @@ def texture(seed):
     return np.clip(128 + 45 * fine / fine.std() + 25 * slow / slow.std(), 5, 250)
 
 
-TEXTURES = [texture(k) for k in range(3)]
+TEXTURES = [box_texture(k) for k in range(3)]
 
 
 def picture(camera, cam_from_body, seed=0, gain=1.0, offset=0.0, noise=2.0):
-    """Gray picture (H,W) of the textured box before a noisy background, 4 samples a pixel."""
+    """Grey picture (H,W) of the textured box on a noisy background, 4 samples per pixel."""
     rng = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     body_from_cam = invert(cam_from_body)
@@ -122,43 +122,43 @@ def test_ray_caster_axis_parallel_rays_and_refusals():
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 def test_matches_are_exact_under_motion_noise_and_exposure(camera):
-    features = modality(camera)
-    assert features.add_keyframe(picture(camera, START, seed=1), START) >= 80
+    texture = modality(camera)
+    assert texture.add_keyframe(picture(camera, START, seed=1), START) >= 80
     moved = START @ exp_se3([0.05, -0.04, 0.06, 3.0, -4.0, 5.0])
     for gain, offset in ((1.0, 0.0), (0.7, 0.0), (1.0, 25.0)):
-        pyramid = features.pyramid(picture(camera, moved, seed=2, gain=gain, offset=offset))
-        matches = features.measure(pyramid, START)
+        pyramid = texture.pyramid(picture(camera, moved, seed=2, gain=gain, offset=offset))
+        matches = texture.measure(pyramid, START)
         error = errors_px(camera, moved, matches)
         assert len(error) >= 0.85 * matches.tried
         assert np.median(error) <= 0.15
         assert np.mean(error < 1.0) >= 0.97
-        pose = features.align(matches, START)
+        pose = texture.align(matches, START)
         assert rotation_angle_rad(pose, moved) < np.deg2rad(0.1)
         assert np.linalg.norm(pose[:3, 3] - moved[:3, 3]) < 0.6
 
 
 def test_prediction_wrong_by_25_px(first):
-    features = modality()
-    features.add_keyframe(first, START)
+    texture = modality()
+    texture.add_keyframe(first, START)
     for du, dv in ((25, 0), (-18, 18), (0, -25)):
         distance = START[2, 3]
         moved = START.copy()
         moved[:2, 3] += du * distance / CAMERA.fx, dv * distance / CAMERA.fy
-        matches = features.measure(features.pyramid(picture(CAMERA, moved, seed=3)), START)
+        matches = texture.measure(texture.pyramid(picture(CAMERA, moved, seed=3)), START)
         error = errors_px(CAMERA, moved, matches)
         assert len(error) >= 0.8 * matches.tried
         assert np.median(error) <= 0.15
 
 
 def test_hidden_half_is_rejected(first):
-    features = modality()
-    features.add_keyframe(first, START)
+    texture = modality()
+    texture.add_keyframe(first, START)
     moved = START @ exp_se3([0.02, 0.01, -0.02, 1.0, 1.0, 0.0])
     image = picture(CAMERA, moved, seed=4)
     split = int(CAMERA.project(moved[:3, 3])[0])
     other = cv2.GaussianBlur(np.random.default_rng(5).normal(size=image.shape), (0, 0), 2.0)
     image[:, split:] = np.clip(128 + 400 * other, 0, 255)[:, split:]
-    matches = features.measure(features.pyramid(image), START)
+    matches = texture.measure(texture.pyramid(image), START)
     truth = CAMERA.project(apply(moved, matches.points_in_body))
     hidden = truth[:, 0] > split + 5
     assert np.count_nonzero(hidden) <= 0.03 * matches.tried
@@ -167,17 +167,17 @@ def test_hidden_half_is_rejected(first):
 
 
 def test_nothing_is_found_without_the_part(first):
-    features = modality()
-    features.add_keyframe(first, START)
+    texture = modality()
+    texture.add_keyframe(first, START)
     rng = np.random.default_rng(6)
     other = cv2.GaussianBlur(rng.normal(size=first.shape), (0, 0), 3.0)
-    matches = features.measure(features.pyramid(np.clip(128 + 500 * other, 0, 255).astype(np.uint8)), START)
+    matches = texture.measure(texture.pyramid(np.clip(128 + 500 * other, 0, 255).astype(np.uint8)), START)
     assert len(matches.pixels) <= 0.05 * matches.tried
-    flat = features.measure(features.pyramid(np.full_like(first, 90)), START)
+    flat = texture.measure(texture.pyramid(np.full_like(first, 90)), START)
     assert len(flat.pixels) == 0
 
 
-def test_points_hidden_by_the_part_itself_are_not_tried(first):
+def test_points_hidden_by_the_part_itself_are_not_expected(first):
     vertices, faces = box()
     wall, wall_faces = box(np.array([30.0, 1.0, 30.0]), center=(30.0, -100.0, 30.0))
     both = np.concatenate([vertices, wall])
@@ -193,9 +193,9 @@ def test_points_hidden_by_the_part_itself_are_not_tried(first):
 
 
 def test_corners_keep_off_edges_and_background(first):
-    features = modality()
-    features.add_keyframe(first, START)
-    points = features.keyframes[0].anchors.points
+    texture = modality()
+    texture.add_keyframe(first, START)
+    points = texture.keyframes[0].anchors.points
     to_faces = HALF - np.abs(points)
     np.testing.assert_allclose(to_faces.min(axis=1), 0.0, atol=1e-6)
     # The second smallest is the distance to the nearest edge of the box, at about 1.8 px per mm.
@@ -203,38 +203,38 @@ def test_corners_keep_off_edges_and_background(first):
 
 
 def test_keyframe_bank_is_bounded_and_returns_to_known_views():
-    features = modality(options=TextureOptions(max_keyframes=3, max_corners=40))
+    texture = modality(options=TextureOptions(max_keyframes=3, max_corners=40))
     poses = [START @ exp_se3([0.0, 0.0, 0.3 * k, 0.0, 0.0, 0.0]) for k in range(4)]
     for k, pose in enumerate(poses):
-        assert features.wants_keyframe(pose, 100)
-        assert features.add_keyframe(picture(CAMERA, pose, seed=k), pose) > 0
-        assert not features.wants_keyframe(pose, 0)
-    assert len(features.keyframes) == 3
-    assert features.wants_keyframe(poses[0], 100)
+        assert texture.wants_keyframe(pose, 100)
+        assert texture.add_keyframe(picture(CAMERA, pose, seed=k), pose) > 0
+        assert not texture.wants_keyframe(pose, 0)
+    assert len(texture.keyframes) == 3
+    assert texture.wants_keyframe(poses[0], 100)
     near = poses[2] @ exp_se3([0.0, 0.02, 0.03, 0.0, 0.0, 0.0])
-    assert not features.wants_keyframe(near, 100)
-    matches = features.measure(features.pyramid(picture(CAMERA, near, seed=9)), near)
+    assert not texture.wants_keyframe(near, 100)
+    matches = texture.measure(texture.pyramid(picture(CAMERA, near, seed=9)), near)
     assert matches.tried <= 40
     assert np.median(errors_px(CAMERA, near, matches)) <= 0.15
-    assert features.add_keyframe(picture(CAMERA, near, seed=9), near) > 0
-    assert len(features.keyframes) == 3
+    assert texture.add_keyframe(picture(CAMERA, near, seed=9), near) > 0
+    assert len(texture.keyframes) == 3
 
 
-def test_features_that_disagree_lose_trust(first):
-    features = modality()
+def test_corners_that_disagree_lose_trust(first):
+    texture = modality()
     pasted = first.copy()
     pasted[200:260, 300:360] = TEXTURES[0][:60, :60]
-    features.add_keyframe(pasted, START)
+    texture.add_keyframe(pasted, START)
     moved = START.copy()
     moved[0, 3] += 2.6 * START[2, 3] / CAMERA.fx
     image = picture(CAMERA, moved, seed=10)
     image[200:260, 300:360] = pasted[200:260, 300:360]
-    pyramid = features.pyramid(image)
-    before = features.measure(pyramid, START)
+    pyramid = texture.pyramid(image)
+    before = texture.measure(pyramid, START)
     for _ in range(30):
-        features.measure(pyramid, START)
-        features.update_trust(moved)
-    after = features.measure(pyramid, START)
+        texture.measure(pyramid, START)
+        texture.update_trust(moved)
+    after = texture.measure(pyramid, START)
     wrong = errors_px(CAMERA, moved, before) > 2
     assert np.count_nonzero(wrong) >= 3
     assert np.count_nonzero(errors_px(CAMERA, moved, after) > 2) < 0.3 * np.count_nonzero(wrong)
@@ -262,13 +262,13 @@ def test_add_matches_solves_the_pose_despite_outliers():
 
 
 def test_bad_input_is_refused(first):
-    features = modality()
+    texture = modality()
     with pytest.raises(InputError, match="image is 320×240"):
-        features.pyramid(first[::2, ::2])
+        texture.pyramid(first[::2, ::2])
     with pytest.raises(InputError, match="levels is 1"):
         TextureOptions(levels=1)
-    assert features.add_keyframe(np.full_like(first, 128), START) == 0
+    assert texture.add_keyframe(np.full_like(first, 128), START) == 0
     away = START.copy()
     away[0, 3] += 5000
-    assert features.add_keyframe(first, away) == 0
-    assert features.measure(features.pyramid(first), START).tried == 0
+    assert texture.add_keyframe(first, away) == 0
+    assert texture.measure(texture.pyramid(first), START).tried == 0

@@ -1,4 +1,4 @@
-"""Learned views: kept where they show something new, found again near where they were seen, never believed alone."""
+"""Appearance memory: new views are kept, found again, and never accepted without the detector."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def estimate(pose: Array, quality: float = 1.0, support: float = 0.9, in_picture
 
 
 def taught(sides: list[tuple[int, int]], **options: int) -> AppearanceMemory:
-    """Views of the assembly from some sides, each seen for a while."""
-    learned = AppearanceMemory(assembly_views(), CAMERA, AppearanceMemoryOptions(**options))
+    """Memory of the assembly from some sides, each tracked for some frames."""
+    memory = AppearanceMemory(assembly_views(), CAMERA, AppearanceMemoryOptions(**options))
     for azimuth, elevation in sides:
         pose = pose_from(azimuth, elevation, 520)
         image = picture(pose, seed=100 + azimuth + elevation, scene=1)
         for _ in range(8):
-            learned.learn(image, estimate(pose), True)
-    return learned
+            memory.learn(image, estimate(pose), True)
+    return memory
 
 
 @cache
@@ -45,7 +45,7 @@ def six_sides() -> AppearanceMemory:
 
 
 def is_near(found: Array, truth: Array) -> bool:
-    """Within 15° and 15 % of the distance, and as near across."""
+    """Whether a pose is within 15°, 15 % of the distance and 15 % of the diameter sideways."""
     center = assembly().center_in_model
     a, b = apply(found, center), apply(truth, center)
     turned = np.rad2deg(rotation_angle_rad(found, truth))
@@ -54,7 +54,7 @@ def is_near(found: Array, truth: Array) -> bool:
 
 
 def moved(azimuth: float, elevation: float, rng: np.random.Generator) -> Array:
-    """About that side, at another place, distance and roll."""
+    """A pose from about that side at another place, distance and roll."""
     azimuth, elevation = azimuth + rng.uniform(-6, 6), elevation + rng.uniform(-6, 6)
     pose = pose_from(azimuth, elevation, rng.uniform(440, 620), None, rng.uniform(-180, 180))
     pose[:2, 3] += rng.uniform([-90, -50], [90, 50])
@@ -62,25 +62,25 @@ def moved(azimuth: float, elevation: float, rng: np.random.Generator) -> Array:
 
 
 def test_kept_sides_are_found_anywhere_in_other_scenes_and_light() -> None:
-    learned, rng = six_sides(), np.random.default_rng(5)
-    assert len(learned) == len(SIDES)
+    memory, rng = six_sides(), np.random.default_rng(5)
+    assert len(memory) == len(SIDES)
     right = 0
     for k in range(24):
         truth = moved(*SIDES[k % len(SIDES)], rng)
         image = picture(truth, seed=k, scene=k % 9, noise=6.0, gain=rng.uniform(0.7, 1.3))
-        proposals = learned.propose(image)
-        assert len(proposals) <= learned.options.search.max_results
+        proposals = memory.propose(image)
+        assert len(proposals) <= memory.options.search.max_results
         right += any(is_near(p.cam_from_model, truth) for p in proposals)
     assert right >= 16
 
 
-def test_near_the_last_pose_it_is_found_in_little_time() -> None:
-    learned, rng = taught(SIDES), np.random.default_rng(6)
+def test_a_search_near_the_last_pose_is_fast() -> None:
+    memory, rng = taught(SIDES), np.random.default_rng(6)
     for azimuth in range(-75, 76, 10):
         for elevation in (20, 42, 65):
             pose = pose_from(azimuth, elevation, 520)
-            learned.add(picture(pose, scene=1), pose, is_new=True)
-    assert len(learned) == learned.options.max_views
+            memory.add(picture(pose, scene=1), pose, is_new=True)
+    assert len(memory) == memory.options.max_views
     right, seconds = 0, []
     for k in range(12):
         last = pose_from(*SIDES[k % len(SIDES)], 520)
@@ -94,30 +94,30 @@ def test_near_the_last_pose_it_is_found_in_little_time() -> None:
         truth[:2, 3] += rng.uniform([-90, -50], [90, 50])
         image = picture(truth, seed=k, scene=k % 9)
         began = time.thread_time()
-        proposals = learned.propose(image, last)
+        proposals = memory.propose(image, last)
         seconds.append(time.thread_time() - began)
         right += any(is_near(p.cam_from_model, truth) for p in proposals)
     assert right >= 10
     assert np.median(seconds) < 0.1  # about 25 ms on a quiet core
 
 
-def test_memory_is_bounded_and_the_most_crowded_views_go() -> None:
-    learned = taught([*SIDES, (-40, 33), (37, 30)], max_views=4, view_step_deg=2)
-    assert len(learned) == 4
-    directions = learned.rotations[:, 2]
+def test_memory_is_bounded_and_views_close_together_are_dropped() -> None:
+    memory = taught([*SIDES, (-40, 33), (37, 30)], max_views=4, view_step_deg=2)
+    assert len(memory) == 4
+    directions = memory.rotations[:, 2]
     cosines = directions @ directions.T - 2 * np.eye(4)
     assert cosines.max() < np.cos(np.deg2rad(10.0))
 
 
-def test_only_what_is_tracked_well_and_new_is_learned() -> None:
-    learned = AppearanceMemory(assembly_views(), CAMERA)
+def test_only_new_views_of_a_well_tracked_part_are_learned() -> None:
+    memory = AppearanceMemory(assembly_views(), CAMERA)
     pose = pose_from(0, 40, 520)
     image = picture(pose, scene=1)
 
     def see(frames: int, seen: Estimate, is_sure: bool = True, shown: np.ndarray = image) -> int:
         for _ in range(frames):
-            learned.learn(shown, seen, is_sure)
-        return len(learned)
+            memory.learn(shown, seen, is_sure)
+        return len(memory)
 
     assert see(30, estimate(pose), is_sure=False) == 0
     assert see(30, estimate(pose, quality=0.5)) == 0
@@ -125,7 +125,7 @@ def test_only_what_is_tracked_well_and_new_is_learned() -> None:
     assert see(30, estimate(pose)) == 1
     assert see(60, estimate(pose)) == 1
     assert see(30, estimate(pose_from(30, 40, 520), support=0.5)) == 1  # a hand over it
-    # From the same side, but quite another look.
+    # From the same side, but with a different appearance.
     other = np.asarray(cv2.GaussianBlur(255 - image, (0, 0), 8))
     assert see(30, estimate(pose), shown=other) == 2
     began = time.thread_time()
@@ -150,7 +150,7 @@ def test_the_silhouette_is_that_of_the_part() -> None:
     assert cropper.crop(picture(None, scene=2), far) is None
 
 
-def test_nothing_is_believed_where_there_is_no_part_or_another_side_of_it() -> None:
+def test_no_pose_is_accepted_without_the_part() -> None:
     options = SessionOptions(eager_frames=0, search_every=1000)
     session = TrackingSession(assembly_views(), CAMERA, assembly(), options)
     session.appearance_memory = six_sides()
@@ -165,7 +165,7 @@ def test_nothing_is_believed_where_there_is_no_part_or_another_side_of_it() -> N
         assert session.process(image, k, 0.0).cam_from_model is None
 
 
-def test_a_lost_part_is_found_in_any_frame_where_it_looks_as_it_did() -> None:
+def test_a_lost_part_is_found_by_its_appearance() -> None:
     found = {}
     for use_appearance_memory in (True, False):
         # The detector never searches the whole picture.
@@ -185,14 +185,14 @@ def test_a_lost_part_is_found_in_any_frame_where_it_looks_as_it_did() -> None:
 
 
 def test_views_are_saved_and_loaded(tmp_path: Path) -> None:
-    learned, file = six_sides(), tmp_path / "assembly.learned"
-    learned.save(file)
+    memory, file = six_sides(), tmp_path / "assembly.learned"
+    memory.save(file)
     assert [p.name for p in tmp_path.iterdir()] == [file.name]
     other = AppearanceMemory(assembly_views(), CAMERA)
     other.load(file)
-    assert np.array_equal(other.rotations, learned.rotations)
+    assert np.array_equal(other.rotations, memory.rotations)
     image = picture(pose_from(2, 32, 500), scene=3)
-    mine, theirs = learned.propose(image), other.propose(image)
+    mine, theirs = memory.propose(image), other.propose(image)
     assert mine and np.allclose(mine[0].cam_from_model, theirs[0].cam_from_model)
     small = AppearanceMemory(assembly_views(), CAMERA, AppearanceMemoryOptions(max_views=3))
     small.load(file)
@@ -210,19 +210,19 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MismatchError, match=r"views\.learned: learned views of model 'assembly'.*'bracket'"):
         AppearanceMemory(bracket_views(), CAMERA).load(file)
     whole = file.read_bytes()
-    learned = AppearanceMemory(assembly_views(), CAMERA)
+    memory = AppearanceMemory(assembly_views(), CAMERA)
     for content in (b"", b"text", whole[: len(whole) // 2], whole[:-4000] + bytes(4000)):
         file.write_bytes(content)
         with pytest.raises(InputError, match=r"views\.learned.*delete the file") as caught:
-            learned.load(file)
+            memory.load(file)
         assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="cannot be read"):
-        learned.load(tmp_path / "none")
+        memory.load(tmp_path / "none")
     with pytest.raises(OutputError, match="cannot be written"):
-        learned.save(tmp_path / "no" / "folder")
+        memory.save(tmp_path / "no" / "folder")
 
 
-def test_options_without_sense_are_refused() -> None:
+def test_invalid_options_are_refused() -> None:
     with pytest.raises(InputError, match="max_views"):
         AppearanceMemoryOptions(max_views=0)
     with pytest.raises(InputError, match="stretch"):

@@ -1,4 +1,4 @@
-"""Why not: every reason on pictures that have it, and none of them on pictures that do not."""
+"""Diagnosis: each reason is given for pictures that have it, and for no others."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_the_width_of_edges_is_that_of_the_blur(sigma_px: float) -> None:
     assert np.all(np.isnan(edge_widths_px(np.full((480, 640), 128, dtype=np.uint8))))
 
 
-def test_large_pictures_are_judged_like_small_ones() -> None:
+def test_large_pictures_are_measured_like_small_ones() -> None:
     small = cv2.GaussianBlur(picture(TRUTH, scene=2, noise=0.0), (0, 0), 5.0)
     large = cv2.resize(small, (1920, 1440), interpolation=cv2.INTER_LINEAR)
     assert diagnose_picture(np.asarray(large)) == BLURRED
@@ -159,7 +159,7 @@ def test_low_contrast_of_the_part_against_its_background() -> None:
     part = picture(TRUTH, scene=1, noise=0.0, contrast=0.0).astype(np.float64)
     mask = np.any(part != picture(None, scene=1, noise=0.0), axis=2)
     faint = picture(None, scene=1, noise=3.0)
-    # The part in the colours of the wall right behind it; elsewhere the picture has contrast.
+    # The part has the colours of the wall behind it; the rest of the picture has contrast.
     left, right, top, bottom = *np.flatnonzero(mask.any(axis=0))[[0, -1]], *np.flatnonzero(mask.any(axis=1))[[0, -1]]
     faint[top - 25 : bottom + 25, left - 25 : right + 25] = 120
     faint[mask] = np.clip(120 + 0.1 * (part[mask] - 120), 0, 255)
@@ -171,7 +171,7 @@ def test_low_contrast_of_the_part_against_its_background() -> None:
 
 
 def lost(pose: Array, step_mm: float, in_picture: float, image: NDArray[np.uint8], is_possible: bool = True) -> str:
-    """Reason at a pose that the part reached in steps along the picture's rows."""
+    """Reason for the loss at a pose that the part reached in steps along the rows of the picture."""
     before = [pose.copy(), pose.copy()]
     before[0][0, 3] -= 2 * step_mm
     before[1][0, 3] -= step_mm

@@ -1,4 +1,4 @@
-"""Guide views: names to poses, the snap to them from nearby and never from elsewhere, the session, the outline."""
+"""Guided initialisation: guide views by name, the search around them, the session that waits, the outline."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def guided_init() -> GuidedInit:
 def moved(
     pose: Array, rng: np.random.Generator, turn_deg: float, depth: float, aside: float, reach: float = 1.0
 ) -> Array:
-    """The pose turned about the part's centre, nearer or farther, and aside by diameters; each up to its limit."""
+    """A pose turned about the part's centre, nearer or farther, and shifted by diameters, each up to its limit."""
     center = apply(pose, assembly().center_in_model)
     axis = rng.normal(size=3)
     angle = np.deg2rad(turn_deg) * rng.uniform(1.0 - reach, 1.0) ** (1 / 3)
@@ -165,12 +165,12 @@ def test_guides_of_a_part_file(tmp_path: Path) -> None:
         assert words in str(caught.value)
 
 
-# --- GuidedInit -----------------------------------------------------------------------------------------------
+# --- Guided initialisation ------------------------------------------------------------------------------
 
 
-def test_the_part_snaps_from_within_15_degrees_and_15_percent() -> None:
+def test_the_part_is_found_within_15_degrees_and_15_percent() -> None:
     rng = np.random.default_rng(21)
-    snapped = 0
+    found_count = 0
     for k in range(10):
         truth = pose_from(
             rng.uniform(-70, 70), rng.uniform(22, 68), rng.uniform(450, 600), roll_deg=rng.uniform(-15, 15)
@@ -180,11 +180,11 @@ def test_the_part_snaps_from_within_15_degrees_and_15_percent() -> None:
         if found is not None:
             mm, _, deg = error(found.cam_from_model, truth)
             assert mm < 5.0 and deg < 2.0
-            snapped += 1
-    assert snapped >= 9
+            found_count += 1
+    assert found_count >= 9
 
 
-def test_nothing_snaps_without_the_part_or_when_it_is_elsewhere() -> None:
+def test_nothing_is_found_without_the_part_or_when_it_is_far_away() -> None:
     rng = np.random.default_rng(22)
     for k in range(20):
         truth = pose_from(rng.uniform(-70, 70), rng.uniform(22, 68), rng.uniform(450, 600))
@@ -204,7 +204,7 @@ def test_nothing_snaps_without_the_part_or_when_it_is_elsewhere() -> None:
 
 
 def test_a_figure_inside_a_larger_one_is_not_taken_for_the_part() -> None:
-    """A small block in front of a large one of the same shape may be print on it."""
+    """A small block in front of a large one of the same shape could be print on it."""
     views = make_guide_views(block(), ViewRange((200.0, 800.0), (10.0, 70.0), (0.0, 90.0), (-20.0, 20.0)),
                              GuideViewOptions(subdivisions=3, renderer="zbuffer"))  # fmt: skip
     small, large = pose_from(40, 35, 560, block()), pose_from(40, 35, 260, block())
@@ -249,7 +249,7 @@ def aligning(count: int) -> list[Array]:
     return poses
 
 
-def test_the_session_waits_snaps_and_tracks() -> None:
+def test_the_session_waits_for_the_part_and_tracks_it() -> None:
     session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     poses = aligning(16)
     results = [session.process(picture(pose, seed=k, scene=3), k, 0.0) for k, pose in enumerate(poses)]
@@ -285,7 +285,7 @@ def test_the_outline_comes_back_when_a_lost_part_is_not_found_for_long() -> None
     assert back[-1].state == TrackingState.TRACKED
 
 
-def test_an_unconfirmed_snap_goes_back_to_waiting() -> None:
+def test_an_unconfirmed_pose_goes_back_to_waiting() -> None:
     session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     assert session.process(picture(GUIDE, seed=0, scene=3), 0, 0.0).state == TrackingState.CRITICAL
     result = session.process(picture(None, seed=1, scene=3), 1, 0.0)

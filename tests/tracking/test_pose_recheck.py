@@ -1,4 +1,4 @@
-"""The second look: a tracked pose that surprises is asked about, a wrong one is mended, a right one stays."""
+"""Pose recheck: poses far from the prediction are rechecked, wrong ones replaced, right ones kept."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def local() -> LocalSearch:
 
 
 @cache
-def second_look() -> LocalSearchRecheck:
+def recheck() -> LocalSearchRecheck:
     return LocalSearchRecheck(local())
 
 
@@ -44,13 +44,13 @@ def in_model(cam_from_body: Array) -> Array:
 
 
 def stuck(image: NDArray[np.uint8], cam_from_model: Array) -> Array:
-    """Where the tracker's last stages end from a pose: what edges nearby bear out."""
+    """Pose after the last stages of the tracker, which follow near edges."""
     gray = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (3, 3))
     return local().refiner.refine_fresh(image, gray, in_body(cam_from_model), LAST_STAGES)
 
 
 @pytest.mark.parametrize("noise", [3.0, 12.0])
-def test_a_pose_that_is_stuck_is_mended(noise: float) -> None:
+def test_a_wrong_pose_is_replaced(noise: float) -> None:
     rng = np.random.default_rng(4)
     mended = tried = 0
     for k in range(12):
@@ -60,7 +60,7 @@ def test_a_pose_that_is_stuck_is_mended(noise: float) -> None:
         if error(in_model(pose), truth)[2] < 6.0:
             continue
         tried += 1
-        better = second_look().better(image, pose, [in_body(wrong(truth, rng, 5.0, 5.0))])
+        better = recheck().better(image, pose, [in_body(wrong(truth, rng, 5.0, 5.0))])
         if better is not None:
             mm, _, deg = error(in_model(better), truth)
             mended += mm < 3.0 and deg < 1.5
@@ -68,25 +68,23 @@ def test_a_pose_that_is_stuck_is_mended(noise: float) -> None:
     assert mended >= 0.9 * tried
 
 
-def test_a_right_pose_stays() -> None:
+def test_a_right_pose_is_kept() -> None:
     rng = np.random.default_rng(5)
     for k in range(10):
         truth = pose_from(rng.uniform(-60, 60), rng.uniform(25, 65), rng.uniform(440, 620))
         card = half_hidden(truth) if k % 3 == 0 else None
         image = picture(truth, seed=k, scene=k, noise=8.0, card=card)
-        better = second_look().better(image, in_body(truth), [in_body(wrong(truth, rng, 10.0, 10.0))])
+        better = recheck().better(image, in_body(truth), [in_body(wrong(truth, rng, 10.0, 10.0))])
         if better is not None:
             mm, _, deg = error(in_model(better), truth)
             assert mm < 3.0 and deg < 1.5
 
 
-def test_a_part_at_the_rim_of_the_picture_is_looked_at_and_one_beside_it_is_not() -> None:
+def test_a_part_at_the_border_of_the_picture_is_rechecked_and_one_outside_is_not() -> None:
     truth = pose_from(30, 40, 520)
     truth[0, 3] += 190.0
     image = picture(truth, noise=6.0)
-    better = second_look().better(
-        image, stuck(image, wrong(truth, np.random.default_rng(1), 12.0, 8.0)), [in_body(truth)]
-    )
+    better = recheck().better(image, stuck(image, wrong(truth, np.random.default_rng(1), 12.0, 8.0)), [in_body(truth)])
     assert better is not None
     mm, _, deg = error(in_model(better), truth)
     assert mm < 4.0 and deg < 2.0
@@ -94,12 +92,12 @@ def test_a_part_at_the_rim_of_the_picture_is_looked_at_and_one_beside_it_is_not(
     beside[0, 3] += 600.0
     behind[2, 3] *= -1.0
     for pose in (beside, behind):
-        assert second_look().better(image, in_body(pose), [in_body(pose)]) is None
-        assert second_look().better(image, in_body(truth), [in_body(pose)]) is None
+        assert recheck().better(image, in_body(pose), [in_body(pose)]) is None
+        assert recheck().better(image, in_body(truth), [in_body(pose)]) is None
 
 
-def test_the_window_sees_what_the_picture_shows() -> None:
-    """A pose that is refined in a window is that refined in the whole picture."""
+def test_a_window_gives_the_same_pose_as_the_whole_picture() -> None:
+    """A pose refined in a window equals that refined in the whole picture."""
     truth = pose_from(-20, 45, 500)
     image = picture(truth, noise=6.0)
     start = PoseCandidate(1.0, in_body(wrong(truth, np.random.default_rng(2), 4.0, 4.0)))
@@ -126,7 +124,7 @@ def test_a_verified_hypothesis_keeps_its_place_in_the_list() -> None:
 
 
 class Watched(LocalSearchRecheck):
-    """Counts how often it is asked."""
+    """Counts its calls."""
 
     asked = 0
 
@@ -136,10 +134,10 @@ class Watched(LocalSearchRecheck):
 
 
 def follow(
-    poses: list[Array], second: LocalSearchRecheck | None, noise: float, is_hidden: bool = False
+    poses: list[Array], chosen: LocalSearchRecheck | None, noise: float, is_hidden: bool = False
 ) -> list[tuple[float, float, float]]:
-    """Errors of each frame: mm, mm across, degrees; begun again at the truth after each that is off by 5°."""
-    tracker = Tracker(assembly_views(), CAMERA, assembly(), TrackerOptions(use_texture=False), recheck=second)
+    """Errors of each frame: mm, mm across, degrees; tracking restarts at the truth after each that is off by 5°."""
+    tracker = Tracker(assembly_views(), CAMERA, assembly(), TrackerOptions(use_texture=False), recheck=chosen)
     tracker.start(picture(poses[0], noise=noise), poses[0])
     errors = []
     for k, truth in enumerate(poses[1:], 1):
@@ -151,7 +149,7 @@ def follow(
     return errors
 
 
-def test_it_is_taken_only_where_a_pose_surprises() -> None:
+def test_it_is_run_only_for_poses_far_from_the_prediction() -> None:
     watched = Watched(local())
     errors = follow(SLOW, watched, 4.0)
     assert watched.asked == 0 and max(deg for _, _, deg in errors) < 0.5
@@ -161,7 +159,7 @@ def test_it_is_taken_only_where_a_pose_surprises() -> None:
 
 
 def test_a_part_half_hidden_that_turns_in_jerks_is_followed_better_with_it() -> None:
-    """8° to 14° and 20 mm from frame to frame, in any direction: nothing predicts it."""
+    """The part turns by 8° to 14° and moves by 20 mm per frame in random directions, which no prediction follows."""
     rng = np.random.default_rng(11)
     poses = [pose_from(rng.uniform(-20, 20), rng.uniform(40, 55), 600)]
     while len(poses) < 40:
@@ -171,13 +169,13 @@ def test_a_part_half_hidden_that_turns_in_jerks_is_followed_better_with_it() -> 
         if 20.0 < elevation_deg < 70.0 and abs(np.rad2deg(np.arctan2(eye[1], eye[0]))) < 75.0:
             poses.append(turned)
     right = {}
-    for name, second in (("without", None), ("with", second_look())):
-        right[name] = sum(deg < 5.0 and mm < 50.0 for mm, _, deg in follow(poses, second, 10.0, is_hidden=True))
+    for name, chosen in (("without", None), ("with", recheck())):
+        right[name] = sum(deg < 5.0 and mm < 50.0 for mm, _, deg in follow(poses, chosen, 10.0, is_hidden=True))
     assert right["with"] >= 20
     assert right["with"] >= right["without"] + 8
 
 
-def test_strangeness_is_one_at_45_degrees_and_grows_with_the_square() -> None:
+def test_motion_distance_is_one_at_45_degrees_and_grows_with_the_square() -> None:
     pose = in_body(pose_from(30, 40, 520))
     diameter_mm = assembly_views().diameter_mm
     for turn_deg, expected in ((45.0, 1.0), (22.5, 0.25)):

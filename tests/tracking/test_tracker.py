@@ -37,11 +37,11 @@ MODALITIES = {
     "all": TrackerOptions(),
     "region": TrackerOptions(use_edge=False, use_texture=False),
     "edge": TrackerOptions(use_region=False, use_texture=False),
-    "feature": TrackerOptions(use_region=False, use_edge=False),
+    "texture": TrackerOptions(use_region=False, use_edge=False),
 }
 PATH = path(40)
 REAL_CAMERA = Camera(640, 480, 720.6, 722.6, 318.35, 242.25)
-"""What a careful calibration may miss: the focal length 0.1 % off, the middle 0.4 px."""
+"""Camera with errors that a careful calibration may leave: 0.1 % in focal length, 0.4 px in the principal point."""
 
 
 @cache
@@ -69,7 +69,7 @@ def follow(
         ("all", (0.35, 0.08), (0.8, 0.2)),
         ("edge", (0.35, 0.10), (0.9, 0.3)),
         ("region", (0.60, 0.25), (2.0, 0.8)),
-        ("feature", (0.25, 0.10), (0.6, 0.2)),
+        ("texture", (0.25, 0.10), (0.6, 0.2)),
     ],
 )
 def test_accuracy_of_each_modality(name: str, median: tuple[float, float], worst: tuple[float, float]) -> None:
@@ -123,7 +123,7 @@ def test_a_start_that_is_off_is_pulled_in() -> None:
 
 
 def test_a_part_that_moved_far_between_frames_is_found() -> None:
-    """20° to 35° and up to a quarter of the diameter aside in one frame; the next ones need no search."""
+    """20° to 35° and up to a quarter of the diameter sideways in one frame; the next frames need no search."""
     rng = np.random.default_rng(3)
     tracker = Tracker(assembly_views(), CAMERA, options=TrackerOptions(use_texture=False))
     right = 0
@@ -155,7 +155,7 @@ def test_a_part_that_moved_a_tenth_of_its_size_needs_no_search(monkeypatch: pyte
     assert right >= 10
 
 
-def test_tracking_before_a_start_is_a_mistake() -> None:
+def test_tracking_before_a_start_is_an_error() -> None:
     with pytest.raises(RuntimeError, match=r"before Tracker\.start"):
         Tracker(assembly_views(), CAMERA).track(clip()[0])
     with pytest.raises(InputError, match="at least one modality"):
@@ -197,8 +197,8 @@ def test_covariance_is_never_too_small_on_ideal_pictures_and_grows_with_hiding()
     assert np.linalg.det(unsure[3:, 3:]) > 2.0 * np.linalg.det(sure[3:, 3:])
 
 
-def test_quality_parts_right_from_wrong_poses() -> None:
-    """Wrong starts that the stages alone leave elsewhere must not be believed; the search finds the part from them."""
+def test_quality_separates_right_from_wrong_poses() -> None:
+    """Poses refined from wrong starts have a low quality, and the wide search finds the part from there."""
     rng = np.random.default_rng(5)
     tracker = Tracker(assembly_views(), CAMERA, options=TrackerOptions(use_texture=False))
     right, mistaken, found = [], [], 0
@@ -308,7 +308,7 @@ def test_a_part_that_leaves_the_picture_is_lost() -> None:
     assert TrackingState.LOST in states[:19]
 
 
-def test_an_initial_pose_is_snapped_to() -> None:
+def test_an_initial_pose_is_refined() -> None:
     start = wrong(PATH[0], np.random.default_rng(1), 4.0, 8.0)
     session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
     result = session.process(clip()[0], 0, 0.0)
@@ -342,7 +342,7 @@ def test_guide_views_of_another_model_are_refused() -> None:
         TrackingSession(make_guide_views(bracket(), ViewRange((400.0, 700.0)), coarse), CAMERA, assembly())
 
 
-def test_options_and_poses_without_sense_are_refused() -> None:
+def test_invalid_options_and_poses_are_refused() -> None:
     with pytest.raises(InputError, match="lost_quality"):
         SessionOptions(lost_quality=0.9)
     with pytest.raises(InputError, match="initial pose"):
