@@ -135,7 +135,7 @@ class _Projected(NamedTuple):
     depths: Array
 
 
-class _Points(NamedTuple):
+class _MeasuredPoints(NamedTuple):
     """Points measured: indices (C,K), how many (C,), and which are supported (C,K)."""
 
     chosen: NDArray[np.int64]
@@ -378,7 +378,7 @@ def measure_edge_support(picture, edges, projection, shifts, limits):  # type: i
     mark_owners(pixels, projected.depths, edges.component, picture.owners)
     found = np.full((6, count), -1.0)
     support = EdgeSupport(found[0], found[1], found[2], found[3], found[4], found[5])
-    points = _Points(
+    points = _MeasuredPoints(
         np.empty((count, limits.max_points), dtype=np.int64),
         np.zeros(count, dtype=np.int64),
         np.zeros((count, limits.max_points), dtype=np.bool_),
