@@ -86,6 +86,31 @@ def test_a_cache_that_cannot_be_written_is_done_without(tmp_path: Path) -> None:
     assert run(tmp_path) == (6.0, 0)
 
 
+def test_a_cached_signature_of_a_renamed_named_tuple_is_compiled_anew(tmp_path: Path) -> None:
+    program = """
+from typing import NamedTuple
+from arview.core.kernel import kernel
+
+class {name}(NamedTuple):
+    first: float
+    second: float
+
+@kernel
+def total(pair):
+    return pair.first + pair.second
+
+print(total({name}(1.0, 2.0)), sum(total.stats.cache_hits.values()))
+"""
+    environment = {**os.environ, "ARVIEW_CACHE": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+    said = []
+    for name in ("Two", "Both", "Both"):
+        (tmp_path / "pairs.py").write_text(program.format(name=name))
+        command = [sys.executable, "-c", "import pairs"]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+        said.append(done.stdout.split())
+    assert said == [["3.0", "0"], ["3.0", "0"], ["3.0", "1"]]
+
+
 def test_signatures_survive_json() -> None:
     values = (
         np.zeros((2, 3), np.float32),

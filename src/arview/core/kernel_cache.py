@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import pickle
 import time
 import types as python_types
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.registry import CPUDispatcher
 
 from arview.core.cache_folder import cache_folder
@@ -86,8 +87,25 @@ class _DigestImpl(CompileResultCacheImpl):
     _locator_classes = (_DigestLocator,)
 
 
+class _CacheFile(IndexDataCacheFile):
+    """Numba's file of a kernel's signatures and machine code.
+
+    A signature may name a named tuple that was renamed or moved since: such a file counts as empty.
+    """
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()
+        except (AttributeError, ImportError, EOFError, pickle.UnpicklingError):
+            return {}
+
+
 class _DigestCache(FunctionCache):
     _impl_class = _DigestImpl
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = _CacheFile(self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
 
 
 def kernel_folder() -> Path:
