@@ -72,7 +72,7 @@ def test_an_enclosed_component_is_said_to_be_hidden() -> None:
     inside = component("core", box((-5, -5, -6), (5, 5, -2)), (0.5, 0.5, 0.5))
     found = coverage(make_model("closed", (*part().components[:1], inside)), views(list(range(0, 360, 30))))
     assert found.advice == (
-        "core is seen in no photo; other components hide it from every side, so that photos cannot measure it",
+        "core is seen in no photo; other components hide it from every side, so it cannot be measured in photos",
     )
 
 

@@ -29,7 +29,7 @@ from arview.measurement.datums.alignment import Alignment
 from arview.measurement.folder import MetricReconstruction
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.types import Move
-from arview.measurement.uncertainty.budget import Placement, place, relative_twists
+from arview.measurement.uncertainty.budget import MeasuredPlacement, place, relative_twists
 from arview.measurement.uncertainty.combine import Agreement, CombinedMove, agreements
 from arview.measurement.uncertainty.decision import decide, worst, zone_diameter_mm
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
@@ -90,7 +90,7 @@ def component_record(
 
 
 def _verdict(
-    placed: Placement, tolerance_mm: float | None, settings: ComponentSettings, options: MeasureOptions,
+    placed: MeasuredPlacement, tolerance_mm: float | None, settings: ComponentSettings, options: MeasureOptions,
     notes: list[str],
 ) -> Verdict:  # fmt: skip
     """Verdict on the position and, where it has a tolerance, the angle; undetermined displacements cannot pass."""
@@ -116,7 +116,7 @@ def _verdict(
     return verdict if verdicts else Verdict.UNDECIDED
 
 
-def _details(placed: Placement, together: CombinedMove, settings: ComponentSettings) -> Details:
+def _details(placed: MeasuredPlacement, together: CombinedMove, settings: ComponentSettings) -> Details:
     """Details of a component's record."""
     rotation = exp_so3(placed.twist[:3])
     center, distance, angle = together.center_in_model, placed.distance, placed.angle
@@ -153,7 +153,7 @@ def _method_result(move: Move, alignment: Alignment) -> MethodResult:
     )  # fmt: skip
 
 
-def _axis(settings: ComponentSettings, placed: Placement, part: Part) -> Array:
+def _axis(settings: ComponentSettings, placed: MeasuredPlacement, part: Part) -> Array:
     """Axis for tilt and twist: that of symmetry, else the normal of the first datum plane, else +Z."""
     if settings.symmetry is not None:
         return np.array(settings.symmetry.axis_in_model)
@@ -165,7 +165,7 @@ def _axis(settings: ComponentSettings, placed: Placement, part: Part) -> Array:
     return planes[0] if planes else np.array([0.0, 0.0, 1.0])
 
 
-def tilt_and_twist(placed: Placement, axis: Array) -> tuple[float | None, float | None]:
+def tilt_and_twist(placed: MeasuredPlacement, axis: Array) -> tuple[float | None, float | None]:
     """Angle in degrees between a component's axis (3,) and its nominal direction, and rotation about it; or None."""
     if not placed.observable[:3].any():
         return None, None

@@ -1,1 +1,1 @@
-"""Photos → camera poses → metric scale → dense cloud."""
+"""Reconstruction: photos → camera poses → metric scale → dense cloud."""

@@ -1,6 +1,6 @@
-"""The one place that knows pycolmap: its import, its half pixel, its cameras and reconstructions.
+"""The only module that uses pycolmap directly for cameras and models: its import, half-pixel shift and conversions.
 
-COLMAP puts the centre of the first pixel at (0.5, 0.5), arview at (0, 0).
+COLMAP has the centre of the first pixel at (0.5, 0.5), arview at (0, 0).
 """
 
 from __future__ import annotations
@@ -21,13 +21,18 @@ from arview.geometry import Array, rigid
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
 
 HALF_PX = 0.5
+"""COLMAP's minus arview's pixel coordinates."""
 SELF_CALIBRATED_MODEL, CALIBRATED_MODEL = "RADIAL", "FULL_OPENCV"
+"""COLMAP's camera models: with intrinsics that are refined, and that are kept."""
 
 
 def import_pycolmap() -> Any:
-    """The module pycolmap, quiet, and loaded after Python's own zlib: the other order corrupts the heap.
+    """Import pycolmap with its logging silenced.
 
-    Raises MissingDependencyError when it is not installed.
+    It is loaded after Python's zlib, because the other order corrupts the heap.
+
+    Raises:
+        MissingDependencyError: pycolmap is not installed.
     """
     zlib.crc32(b"")
     try:
@@ -41,14 +46,14 @@ def import_pycolmap() -> Any:
 
 @lru_cache(maxsize=1)
 def _take_back_signals() -> None:
-    """Undo the handlers that pycolmap's logging sets when loaded: they print a stack trace when a run is ended."""
+    """Remove the signal handlers that pycolmap's logging installs: they print a stack trace when a run is ended."""
     for number in (signal.SIGTERM, signal.SIGINT):
-        with contextlib.suppress(ValueError):  # not in the main thread: left as they are
+        with contextlib.suppress(ValueError):  # not in the main thread, where handlers cannot be set
             signal.signal(number, signal.getsignal(number) or signal.SIG_DFL)
 
 
 def colmap_camera(camera: Camera, is_calibrated: bool) -> Any:
-    """A pycolmap camera: RADIAL (one focal length, k1, k2) to be refined, FULL_OPENCV when calibrated."""
+    """A pycolmap camera: RADIAL (one focal length, k1, k2) to be refined, or FULL_OPENCV if calibrated."""
     pycolmap = import_pycolmap()
     cx, cy = camera.cx + HALF_PX, camera.cy + HALF_PX
     k1, k2, p1, p2, k3 = camera.dist
@@ -62,7 +67,7 @@ def colmap_camera(camera: Camera, is_calibrated: bool) -> Any:
 
 
 def camera_of(camera: Any) -> Camera:
-    """A Camera from a pycolmap camera of one of the models that ``colmap_camera`` makes."""
+    """A Camera from a pycolmap camera of one of the models that `colmap_camera` creates."""
     params = np.asarray(camera.params, dtype=np.float64)
     if camera.model.name == SELF_CALIBRATED_MODEL:
         focal, cx, cy, k1, k2 = params
@@ -112,12 +117,12 @@ def sparse_model_of(
 
 
 def read_reconstruction(folder: Path) -> Any:
-    """The pycolmap reconstruction written in ``folder``."""
+    """Read the pycolmap reconstruction in a folder."""
     return import_pycolmap().Reconstruction(str(folder))
 
 
 def write_model(source: Path, target: Path, scale: float, new_from_scan: Array) -> None:
-    """Copy a COLMAP model, moved by ``x_new = new_from_scan @ (scale * x)``."""
+    """Write a copy of a COLMAP model transformed by ``x_new = new_from_scan @ (scale * x)``."""
     pycolmap = import_pycolmap()
     model = read_reconstruction(source)
     rotation = pycolmap.Rotation3d(new_from_scan[:3, :3])

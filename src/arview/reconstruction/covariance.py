@@ -1,4 +1,4 @@
-"""How well the camera poses are known, from bundle adjustment."""
+"""Covariance of the camera poses from bundle adjustment."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from arview.geometry import Array, skew
 from arview.reconstruction.colmap import import_pycolmap
 from arview.reconstruction.types import SparseModel
 
-# Ceres moves a unit quaternion by half the rotation vector: its covariance is a quarter of the rotation's.
 _RAD_PER_TANGENT = 2.0
+"""Rotation vector per tangent vector of Ceres, which changes a unit quaternion by half the rotation vector."""
 
 
 def pose_covariance(sparse: SparseModel, model: Any, adjuster: Any) -> Array | None:
-    """(6M,6M) covariance of the poses of ``sparse.photos``, see ``SparseModel``; None when it cannot be computed.
+    """(6M,6M) covariance of the poses of ``sparse.photos``, see `SparseModel`; None if it cannot be computed.
 
-    The inverse of the adjustment's information holds for observations with 1 px of noise and with three points
-    held. It is scaled by the noise that the residuals show, and moved to the frame in which the cameras together
-    vary least (S-transformation, Baarda 1973): no camera is then better than the others by being held.
+    The inverse of the adjustment's information is for observations with 1 px of noise and with three points fixed. It
+    is
+    scaled by the noise that the residuals show, and transformed to the frame in which the cameras together vary least
+    (S-transformation, Baarda 1973), so that no camera seems more accurate because it was fixed.
     """
     pycolmap = import_pycolmap()
     options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POSES)
@@ -31,7 +32,7 @@ def pose_covariance(sparse: SparseModel, model: Any, adjuster: Any) -> Array | N
     joint = np.zeros((size, size))
     maps = []
     for i, photo in enumerate(sparse.photos):
-        # COLMAP's parameters are the rotation, moved on the left, and the translation, moved by itself.
+        # COLMAP's parameters are the rotation, perturbed on the left, and the translation, perturbed by itself.
         twist_from_tangent = np.eye(6)
         twist_from_tangent[:3, :3] *= _RAD_PER_TANGENT
         twist_from_tangent[3:, :3] = _RAD_PER_TANGENT * skew(photo.cam_from_scan[:3, 3])
@@ -48,10 +49,10 @@ def pose_covariance(sparse: SparseModel, model: Any, adjuster: Any) -> Array | N
 
 
 def _noise_variance(sparse: SparseModel) -> float:
-    """Variance in px² of one coordinate of an observation, robust against the outliers that are left."""
+    """Variance in px² of one coordinate of an observation, robust against remaining outliers."""
     residuals = reprojection_residuals(sparse)
     unknowns = 3 * len(sparse.points_in_scan) + 6 * len(sparse.photos)
-    fit = residuals.size / max(1, residuals.size - unknowns)  # the unknowns take up a share of the noise
+    fit = residuals.size / max(1, residuals.size - unknowns)  # the fitted unknowns absorb a share of the noise
     return float((1.4826 * np.median(np.abs(residuals))) ** 2 * fit)
 
 
@@ -67,10 +68,12 @@ def reprojection_residuals(sparse: SparseModel) -> Array:
 
 
 def free_frame_projection(sparse: SparseModel) -> Array:
-    """(6M,6M) projection of left twists of the poses that leaves out what only moves, turns or scales the frame."""
+    """(6M,6M) projection that removes rotation, translation and scaling of the whole frame from left twists of the
+    poses.
+    """
     blocks = []
     for photo in sparse.photos:
-        # Left twists that a small turn, shift and scaling of the scan frame about its origin amount to.
+        # Left twists equivalent to a small rotation, translation and scaling of the scan frame about its origin.
         rotation, translation = photo.cam_from_scan[:3, :3], photo.cam_from_scan[:3, 3]
         block = np.zeros((6, 7))
         block[:3, :3] = rotation
@@ -81,7 +84,7 @@ def free_frame_projection(sparse: SparseModel) -> Array:
     gauge = np.concatenate(blocks)
     centres = np.array([photo.centre_in_scan for photo in sparse.photos])
     unit = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
-    # Lengths are weighed against angles by the size of the cameras' path.
+    # Lengths are converted to angles by the extent of the cameras' positions.
     weights = np.tile([1.0, 1.0, 1.0, 1.0 / unit, 1.0 / unit, 1.0 / unit], len(sparse.photos))
     weighed = gauge * weights[:, None]
     return np.eye(len(gauge)) - (gauge @ np.linalg.pinv(weighed)) * weights[None, :]

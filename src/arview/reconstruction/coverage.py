@@ -18,30 +18,31 @@ from arview.rendering.renderers import ZBufferRenderer
 
 @dataclass(frozen=True)
 class CoverageOptions:
-    """When a component counts as seen, and from how many places it should be."""
+    """When a component counts as seen, and from how many places it should be seen."""
 
-    max_side_px: int = 400  # of the pictures rendered; a component of 1 % of the width still has 16 px
-    min_px: int = 12  # visible pixels at that size, below which nothing can be matched on it
-    min_share: float = 0.3  # visible share of the component's own outline; less is a glimpse past others
+    max_side_px: int = 400  # of the rendered pictures; a component of 1 % of the width still has 16 px
+    min_px: int = 12  # visible pixels at that size, below which nothing on a component can be matched
+    min_share: float = 0.3  # visible share of a component's own silhouette that counts as seen
     direction_deg: float = 15.0  # views that differ by less count as one direction
-    photos_wanted: int = 4  # one more than the least that can contradict each other
-    directions_wanted: int = 3  # two give a distance, the third confirms it
-    one_side_deg: float = 40.0  # widest angle between two views of the part, below which depth is poorly known
-    alone_deg: float = 35.0  # a photo whose nearest neighbour is farther shares too little with it to be matched
-    gap_deg: float = 150.0  # azimuth range without photos that is worth a word
-    tried_directions: int = 80  # about 22° apart, from which a poorly seen component is looked for in the CAD
+    photos_wanted: int = 4  # one more than the minimum that can contradict each other
+    directions_wanted: int = 3  # two determine a distance, the third confirms it
+    one_side_deg: float = 40.0  # if no two views of the part differ by more, depth is poorly known
+    alone_deg: float = 35.0  # a photo farther than this from its nearest neighbour cannot be matched well
+    gap_deg: float = 150.0  # azimuth range without photos that is reported
+    tried_directions: int = 80  # about 22° apart, from which a poorly seen component is searched for in the CAD
 
 
 @dataclass(frozen=True)
 class ComponentCoverage:
-    """How one component is seen.
+    """Coverage of one component.
 
     Attributes:
         name: of the component.
         photos: indices of the poses from which it is seen.
-        directions: how many of its viewing directions differ by more than 15°.
-        spread_deg: widest angle between two of its viewing directions.
-        gap_deg: widest range of azimuth, about the axis of the photos' orbit, without a photo of it; 360 with none.
+        directions: number of its viewing directions that differ by more than ``direction_deg``.
+        spread_deg: largest angle between two of its viewing directions.
+        gap_deg: largest range of azimuth, about the axis of the photos' orbit, without a photo of it; 360 if there is
+            none.
     """
 
     name: str
@@ -53,7 +54,7 @@ class ComponentCoverage:
 
 @dataclass(frozen=True)
 class Coverage:
-    """Coverage of each component, and advice in words (empty when nothing is missing)."""
+    """Coverage of each component, and advice as messages (empty if nothing is missing)."""
 
     components: tuple[ComponentCoverage, ...]
     advice: tuple[str, ...]
@@ -65,16 +66,16 @@ def coverage(
     options: CoverageOptions | None = None,
     names: Sequence[str] | None = None,
 ) -> Coverage:
-    """From how many photos and directions each component is seen, not hidden by others.
+    """From how many photos and directions each component is seen without being hidden by others.
 
     Args:
         model: the nominal CAD.
         views: (camera, ``cam_from_model`` (4,4)) of each photo.
-        options: thresholds.
-        names: of the photos, for the advice; else they are numbered from 1.
+        options: see `CoverageOptions`.
+        names: of the photos, for the advice; default: numbers from 1.
 
     Raises:
-        InputError: no views, or names of another number.
+        InputError: there are no views, or the number of names differs.
     """
     options = options or CoverageOptions()
     if not views:
@@ -104,7 +105,7 @@ def coverage(
 
 
 def _seen(model: Model, camera: Camera, cam_from_model: Array, options: CoverageOptions) -> list[bool]:
-    """For each component whether the photo shows enough of it."""
+    """For each component, whether the photo shows enough of it."""
     scale = min(1.0, options.max_side_px / max(camera.width, camera.height))
     small = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     ids = ZBufferRenderer(model, small).render(cam_from_model).component_ids
@@ -125,6 +126,7 @@ def _seen(model: Model, camera: Camera, cam_from_model: Array, options: Coverage
 def _advice_on_part(
     model: Model, names: Sequence[str], centres: Array, axis: Array, options: CoverageOptions
 ) -> list[str]:
+    """Advice about directions from which the whole part should be photographed."""
     directions = _unit(centres - model.center_in_model)
     spread_deg = _spread_deg(directions)
     if spread_deg < options.one_side_deg:
@@ -155,6 +157,7 @@ def _advice_on_components(
     axis: Array,
     options: CoverageOptions,
 ) -> list[str]:
+    """Advice about components that are seen in too few photos or from too few directions."""
     poor = [
         index
         for index, covered in enumerate(components)
@@ -162,7 +165,7 @@ def _advice_on_components(
     ]
     if not poor:
         return []
-    # Where else each component could be seen from, as the CAD tells: cameras all around at the photos' distance.
+    # Directions from which each component would be visible: cameras all around, at the distance of the photos.
     distance_mm = float(np.median(np.linalg.norm(centres - model.center_in_model, axis=1)))
     tried = model.center_in_model + distance_mm * _sphere(options.tried_directions)
     up = np.array([0.0, 0.0, 1.0])
@@ -180,7 +183,7 @@ def _advice_on_components(
             state = f"{covered.name} is seen in no photo"
         where = visible[:, index] & in_reach if np.any(visible[:, index] & in_reach) else visible[:, index]
         if not where.any():
-            advice.append(f"{state}; other components hide it from every side, so that photos cannot measure it")
+            advice.append(f"{state}; other components hide it from every side, so it cannot be measured in photos")
             continue
         candidates = _unit(tried[where] - middle)
         taken = _unit(centres[list(covered.photos)] - middle)
@@ -192,7 +195,7 @@ def _advice_on_components(
 
 
 def _sphere(count: int) -> Array:
-    """Directions (count, 3) spread evenly over the sphere (Fibonacci lattice)."""
+    """Directions (count,3) spread evenly over the sphere (Fibonacci lattice)."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
     flat = np.sqrt(1.0 - z * z)
@@ -200,7 +203,7 @@ def _sphere(count: int) -> Array:
 
 
 def _orbit_axis(directions: Array) -> Array:
-    """The axis about which the photos were taken: normal to their widest plane, on their side of the part."""
+    """The axis about which the photos were taken: normal of their best plane, on their side of the part."""
     mean = directions.mean(axis=0)
     if len(directions) < 3:
         return _unit(mean)
@@ -209,7 +212,7 @@ def _orbit_axis(directions: Array) -> Array:
 
 
 def _count_separated(directions: Array, apart_deg: float) -> int:
-    """How many directions (N,3) remain when those closer than an angle to one already kept are left out."""
+    """Number of directions (N,3) left when those within an angle of one already kept are dropped."""
     kept: list[Array] = []
     for direction in directions:
         if all(direction @ other < math.cos(math.radians(apart_deg)) for other in kept):
@@ -218,13 +221,14 @@ def _count_separated(directions: Array, apart_deg: float) -> int:
 
 
 def _spread_deg(directions: Array) -> float:
+    """Largest angle between two directions (N,3)."""
     if len(directions) < 2:
         return 0.0
     return math.degrees(math.acos(float(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
 
 
 def _gap(directions: Array, axis: Array) -> tuple[float, Array]:
-    """Widest range of azimuth about ``axis`` without a direction, in degrees, and the unit vector into its middle."""
+    """Largest range of azimuth about ``axis`` without a direction, in degrees, and the unit vector to its middle."""
     across = _unit(np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0]))
     up = np.cross(axis, across)
     off_axis = directions[np.linalg.norm(np.cross(directions, axis), axis=1) > math.sin(math.radians(5.0))]
@@ -238,7 +242,7 @@ def _gap(directions: Array, axis: Array) -> tuple[float, Array]:
 
 
 def _named(direction: Array) -> str:
-    """A direction by the model's axes, e.g. ``+x −y``."""
+    """A direction in terms of the model's axes, e.g. ``+x −y``."""
     words = [
         f"{'+' if value > 0 else '−'}{name}" for name, value in zip("xyz", direction, strict=True) if abs(value) > 0.38
     ]

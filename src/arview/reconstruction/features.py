@@ -19,22 +19,22 @@ Descriptors = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """How features are found."""
+    """Options of feature detection."""
 
-    max_features: int = 6000  # a photo; more cost time and add little but short tracks
-    max_side_px: int = 2000  # larger photos are reduced to this: SIFT's time grows with the area
-    contrast_threshold: float = 0.02  # OpenCV's default 0.04 leaves little on mill scale and brushed metal
+    max_features: int = 6000  # per photo; more cost time and add mainly short tracks
+    max_side_px: int = 2000  # larger photos are reduced to this, because SIFT's time grows with the area
+    contrast_threshold: float = 0.02  # OpenCV's default of 0.04 finds little on mill scale and brushed metal
 
 
 @dataclass(frozen=True)
 class Features:
-    """Features of one photo, the strongest of every region of it first.
+    """Features of one photo, the strongest of every region first.
 
     Attributes:
         points_px: (N,2) float32 in the photo at full size; integers are pixel centres.
         descriptors: (N,128) float32 unit vectors, RootSIFT (Arandjelović and Zisserman 2012).
         sizes_px: (N,) float32 diameter of the described neighbourhood.
-        colors: (N,3) uint8 RGB there.
+        colors: (N,3) uint8 RGB at the points.
     """
 
     points_px: NDArray[np.float32]
@@ -54,7 +54,7 @@ _NONE = Features(
 def find_features(image: NDArray[np.uint8], options: FeatureOptions | None = None) -> Features:
     """SIFT features of an (H,W,3) RGB picture, spread over it.
 
-    ``enable_precise_upscale`` matters: without it OpenCV's key points are shifted by a quarter of a pixel.
+    ``enable_precise_upscale`` is required: without it OpenCV's key points are shifted by a quarter of a pixel.
     """
     options = options or FeatureOptions()
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -88,7 +88,7 @@ def find_features(image: NDArray[np.uint8], options: FeatureOptions | None = Non
 
 
 def _spread(points: NDArray[np.float32], strength: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """The order in which the first n, for any n, are strong and spread over an 8×8 grid of the picture."""
+    """Order in which, for any n, the first n features are strong and spread over an 8×8 grid of the picture."""
     cells = np.minimum((points / (shape[1], shape[0]) * 8).astype(int), 7)
     cell = np.maximum(cells, 0) @ (1, 8)
     by_cell = np.lexsort((-strength, cell))
@@ -101,9 +101,10 @@ def _spread(points: NDArray[np.float32], strength: NDArray[np.float64], shape: t
 def find_all_features(
     photos: Sequence[Photo], options: FeatureOptions, threads: int, progress: StepProgress | None = None
 ) -> list[Features]:
-    """Features of every photo, in their order; photos are read and searched by ``threads`` at a time.
+    """Features of every photo, in their order; ``threads`` photos are processed at a time.
 
-    Raises InputError when a photo cannot be read.
+    Raises:
+        InputError: a photo cannot be read.
     """
     found: list[Features] = []
     with ThreadPoolExecutor(threads) as pool:

@@ -1,4 +1,4 @@
-"""Which features of two photos are the same place: by appearance, then along the epipolar lines."""
+"""Matching of features between photos: by appearance, and then along epipolar lines."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from arview.reconstruction.features import Descriptors, Features
 
 Matches = NDArray[np.uint32]
 
-MAX_RATIO = 0.8  # angle to the best against the second best; Lowe 2004
-MAX_ANGLE_RAD = 0.7  # between descriptors of one place
-_BLOCK = 512  # rows of similarities held at a time: they stay in the cache
+MAX_RATIO = 0.8  # of the angles to the best and the second best descriptor; Lowe 2004
+MAX_ANGLE_RAD = 0.7  # between descriptors of the same place
+_BLOCK = 512  # rows of similarities computed at a time, which fit into the processor's cache
 
 
 @kernel
 def _best(similarity, first_row, partner, best, second, column_best, column_row):  # type: ignore[no-untyped-def]
-    """Best and second best column of each row, best row of each column; rows start at ``first_row``."""
+    """Best and second best column of each row, and best row of each column; rows start at ``first_row``."""
     for i in range(similarity.shape[0]):
         row = i + first_row
         high, next_high, at = np.float32(-2.0), np.float32(-2.0), 0
@@ -37,7 +37,7 @@ def _best(similarity, first_row, partner, best, second, column_best, column_row)
 
 
 def match_descriptors(ones: Descriptors, others: Descriptors) -> Matches:
-    """(M,2) rows of ``ones`` and ``others`` that are each other's nearest and clearly nearer than the next."""
+    """(M,2) rows of ``ones`` and ``others`` that are mutual nearest neighbours and pass the ratio test."""
     if len(ones) < 2 or len(others) < 2:
         return np.zeros((0, 2), np.uint32)
     partner = np.empty(len(ones), np.int32)
@@ -53,12 +53,12 @@ def match_descriptors(ones: Descriptors, others: Descriptors) -> Matches:
 
 
 def epipolar_inliers(ones: Features, others: Features, matches: Matches, max_error_px: float) -> Matches:
-    """The matches that lie near epipolar lines of one fundamental matrix (MAGSAC++, Barath 2020)."""
+    """The matches near epipolar lines of one fundamental matrix (MAGSAC++, Barath 2020)."""
     if len(matches) < 8:
         return matches[:0]
     points = ones.points_px[matches[:, 0]].astype(np.float64)
     partners = others.points_px[matches[:, 1]].astype(np.float64)
-    # OpenCV's USAC starts from a fixed seed: the same matches give the same inliers.
+    # OpenCV's USAC has a fixed seed, so the same matches give the same inliers.
     matrix, mask = cv2.findFundamentalMat(points, partners, cv2.USAC_MAGSAC, max_error_px, 0.999, 5000)
     if matrix is None or mask is None:
         return matches[:0]
@@ -87,8 +87,9 @@ def _match_along(  # type: ignore[no-untyped-def]
 ):
     """Best and second best of ``others`` within ``band_px`` of each ray's epipolar line.
 
-    ``rays`` are ideal directions (N,2), ``other_px`` ideal pixels about the principal point; ``cells`` lists
-    the features of each cell of a grid over ``other_px`` from ``starts``.
+    ``rays`` are ideal directions (N,2), ``other_px`` ideal pixels about the principal point; ``cells`` lists the
+    features of
+    each cell of a grid over ``other_px``, from ``starts``.
     """
     low_x, low_y = cell_px[1], cell_px[2]
     step = cell_px[0]
@@ -104,7 +105,7 @@ def _match_along(  # type: ignore[no-untyped-def]
         is_flat = abs(b) > abs(a)
         high, next_high, at = np.float32(-2.0), np.float32(-2.0), -1
         for along in range(columns if is_flat else rows):
-            # Where the line crosses this column (row) of cells, and the cells within the band of it.
+            # The cells within the band around the line in this column (row) of cells.
             if is_flat:
                 u0, u1 = low_x + along * step, low_x + (along + 1) * step
                 v0, v1 = -(a * u0 + c) / b, -(a * u1 + c) / b
@@ -128,7 +129,7 @@ def _match_along(  # type: ignore[no-untyped-def]
                     value = np.float32(0.0)
                     for d in range(descriptors.shape[1]):
                         value += descriptors[i, d] * others[j, d]
-                    # A key point may be there twice, with two directions: it is no rival of itself.
+                    # A key point may occur twice, with two orientations; it does not compete with itself.
                     is_same = at >= 0 and (
                         abs(other_px[j, 0] - other_px[at, 0]) + abs(other_px[j, 1] - other_px[at, 1]) < band_px
                     )
@@ -144,11 +145,16 @@ def _match_along(  # type: ignore[no-untyped-def]
 def match_along_lines(
     rays: tuple[Array, Array], focal_px: float, features: tuple[Features, Features], essential: Array, band_px: float
 ) -> Matches:
-    """Matches of two photos whose relative pose is known, searched along the epipolar lines only.
+    """Match two photos whose relative pose is known, along the epipolar lines only.
 
-    ``rays`` are the ideal directions (N,2), at z = 1, of the features of both photos, ``essential`` (3,3) maps a ray
-    of the first to its line in the second. So few candidates are compared that weak features, and those that
-    occur many times in a photo, find their partners too.
+    So few candidates are compared that weak features, and features that occur many times in a photo, are matched too.
+
+    Args:
+        rays: ideal directions (N,2) at z = 1 of the features of both photos.
+        focal_px: focal length of the photos.
+        features: of both photos.
+        essential: (3,3) maps a ray of the first photo to its line in the second.
+        band_px: half width of the band around the line.
     """
     there = _along_one_way(rays, focal_px, features, essential, band_px)
     back = _along_one_way(rays[::-1], focal_px, features[::-1], essential.T.copy(), band_px)
@@ -160,7 +166,7 @@ def match_along_lines(
 def _along_one_way(
     rays: tuple[Array, ...], focal_px: float, features: tuple[Features, ...], essential: Array, band_px: float
 ) -> NDArray[np.int32]:
-    """For each feature of the first photo its partner in the second, or −1."""
+    """(N,) partner in the second photo of each feature of the first, or −1."""
     ones, others = features
     partner = np.full(len(ones), -1, np.int32)
     if len(ones) == 0 or len(others) == 0:

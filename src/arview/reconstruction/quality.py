@@ -1,4 +1,4 @@
-"""What a reconstruction says of its own quality."""
+"""Quality figures of a reconstruction."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from arview.reconstruction.types import DenseCloud, SparseModel
 
 @dataclass(frozen=True)
 class Quality:
-    """Figures of a reconstruction. They do not prove it right: a consistency check with the CAD or lengths does.
+    """Figures of a reconstruction. They do not prove it right; a consistency check with the CAD or known lengths does.
 
     Attributes:
-        photos, points, observations: numbers placed and found.
-        reprojection_rms_px: of all observations.
-        reprojection_median_px: length of the residual.
-        track_length: photos that see a point, in the mean.
+        photos, points, observations: numbers of placed photos, points and observations.
+        reprojection_rms_px: over all observations.
+        reprojection_median_px: median length of the residuals.
+        track_length: mean number of photos that see a point.
         points_of_photo: points seen in each photo, by its name; few mean a weakly placed photo.
         cloud_points: of the dense cloud; 0 without one.
-        cloud_sigma: median standard deviation of its points along their normals, unit of the model.
+        cloud_sigma: median standard deviation of its points along their normals, in the unit of the model.
         cloud_views: median number of photos that agree on a point.
     """
 
@@ -38,12 +38,12 @@ class Quality:
     cloud_views: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The figures for JSON."""
         return asdict(self)
 
 
 def quality_of(sparse: SparseModel, cloud: DenseCloud | None) -> Quality:
-    """The figures of a sparse model and, where there is one, its cloud."""
+    """Figures of a sparse model and, if there is one, its cloud."""
     lengths = np.linalg.norm(reprojection_residuals(sparse), axis=1)
     counts = np.bincount(sparse.observed_photo, minlength=len(sparse.photos))
     has_cloud = cloud is not None and len(cloud.points) > 0

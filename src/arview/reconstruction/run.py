@@ -1,16 +1,17 @@
-"""Photos or a video → poses → millimetres in the rough CAD frame → dense cloud, stage by stage into a folder.
+"""From photos or a video to poses, millimetres in the approximate CAD frame and a dense cloud, in stages, into a
+folder.
 
 | file | stage |
 |---|---|
-| ``photos.json`` | intake: what each photo is worth, what was left out and why |
+| ``photos.json`` | intake: checks of each photo, and which were rejected and why |
 | ``frames/`` | the chosen frames, of a video |
 | ``sparse/model/``, ``sparse/database.db`` | COLMAP model in its own unit, features and matches |
-| ``sparse/points.ply``, ``sparse/covariance.npy`` | its points; covariance of the poses, see ``SparseModel`` |
-| ``scale.json`` | mm per unit and rough CAD frame, with what they come from |
-| ``metric/`` | the COLMAP model in mm in the rough CAD frame |
+| ``sparse/points.ply``, ``sparse/covariance.npy`` | its points; covariance of the poses, see `SparseModel` |
+| ``scale.json`` | mm per unit and approximate CAD frame, with the evidence |
+| ``metric/`` | the COLMAP model in mm in the approximate CAD frame |
 | ``dense/stereo/`` | depth and normal maps in COLMAP's format |
 | ``cloud.ply`` | the dense cloud |
-| ``reconstruction.json`` | summary of all |
+| ``reconstruction.json`` | summary |
 """
 
 from __future__ import annotations
@@ -43,13 +44,15 @@ from arview.version import __version__
 
 Stage = Literal["photos", "sparse", "scale", "dense"]
 STAGES: tuple[Stage, ...] = ("photos", "sparse", "scale", "dense")
+"""Stages in their order."""
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mts", ".3gp"})
+"""Files with these suffixes are videos."""
 
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """Options of a run: those of its stages, and how far to go."""
+    """Options of the stages, and the last stage to run."""
 
     video: VideoIntakeOptions = field(default_factory=VideoIntakeOptions)
     sparse: SparseOptions = field(default_factory=SparseOptions)
@@ -57,22 +60,22 @@ class ReconstructOptions:
     sources: ScaleSources = field(default_factory=ScaleSources)
     dense: DenseOptions = field(default_factory=DenseOptions)
     last_stage: Stage = "dense"
-    starts_over: bool = False  # forget what an earlier run left in the folder
+    starts_over: bool = False  # discard what an earlier run left in the folder
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What a run found.
+    """Result of a reconstruction.
 
     Attributes:
-        folder: where its files are.
-        intake: photos and what is wrong with them.
-        sparse: poses and points; in mm in the rough CAD frame when ``scale.similarity`` is known.
-        scale: None when the run ended before.
-        cloud: in the frame of ``sparse``; None when the run ended before.
+        folder: of its files.
+        intake: the photos.
+        sparse: poses and points; in mm in the approximate CAD frame if ``scale.similarity`` is known.
+        scale: None if the run ended before.
+        cloud: in the frame of ``sparse``; None if the run ended before.
         coverage: of the part's components; None without a frame.
         quality: reprojection error, tracks, noise.
-        seconds: wall time of each stage that was done now; finished ones of an earlier run are missing.
+        seconds: wall time of each stage; stages finished by an earlier run are missing.
     """
 
     folder: Path
@@ -86,7 +89,7 @@ class Reconstruction:
 
     @property
     def is_metric(self) -> bool:
-        """True when lengths are in mm."""
+        """Whether lengths are in mm."""
         return self.scale is not None and self.scale.scale is not None
 
 
@@ -119,12 +122,14 @@ def reconstruct(
     check_type(source, PATH, "reconstruct: source")
     check_type(folder, PATH, "reconstruct: folder")
     check_type(part, (Part, NoneType), "reconstruct: part")
-    run = _Run(Path(folder), part, options or ReconstructOptions(), progress or (lambda what, done, total: None))
+    run = _ReconstructionRun(
+        Path(folder), part, options or ReconstructOptions(), progress or (lambda what, done, total: None)
+    )
     return run.all(source, camera)
 
 
-class _Run:
-    """One run: its folder, its options and the time its stages took."""
+class _ReconstructionRun:
+    """One run, with its folder and options and the time of its stages."""
 
     def __init__(self, folder: Path, part: Part | None, options: ReconstructOptions, tell: Progress) -> None:
         self.folder, self.part, self.options, self.tell = folder, part, options, tell
@@ -135,7 +140,7 @@ class _Run:
                 self.stages.restart(stage)
 
     def all(self, source: str | Path, camera: str | None) -> Reconstruction:
-        """The stages in their order."""
+        """Run the stages in their order."""
         intake = self._photos(source, camera)
         sparse, scale, cloud, cover = None, None, None, None
         last = STAGES.index(self.options.last_stage)
@@ -157,7 +162,7 @@ class _Run:
         write_json(self.folder / "reconstruction.json", summary(result))
         return result
 
-    def _timed(self, name: str, began: float) -> None:
+    def _record_time(self, name: str, began: float) -> None:
         self.seconds[name] = round(time.perf_counter() - began, 2)
 
     def _photos(self, source: str | Path, camera: str | None) -> Intake:
@@ -167,7 +172,7 @@ class _Run:
         else:
             intake = intake_photos(source, camera, progress=lambda i, n: self.tell("photos", i, n))
         write_json(self.folder / "photos.json", intake_summary(intake))
-        self._timed("photos", began)
+        self._record_time("photos", began)
         return intake
 
     def _frames(self, video: Path, camera: str | None) -> Intake:
@@ -191,7 +196,7 @@ class _Run:
         sparse = reconstruct_sparse(photos, folder, self.options.sparse, self.tell)
         _write_sparse(folder, sparse)
         self.stages.finish("sparse", key)
-        self._timed("sparse", began)
+        self._record_time("sparse", began)
         return sparse
 
     def _scale(self, sparse: SparseModel, key: str) -> ScaleResult:
@@ -203,11 +208,11 @@ class _Run:
         scale = find_scale(sparse, self.part, self.options.sources, self.options.scale, progress=self.tell)
         write_json(path, scale.provenance())
         self.stages.finish("scale", key)
-        self._timed("scale", began)
+        self._record_time("scale", began)
         return scale
 
     def _metric(self, sparse: SparseModel, scale: ScaleResult) -> tuple[SparseModel, Cad | None]:
-        """The model in mm and, where the CAD was found, in its frame; a COLMAP model of it is written."""
+        """The model in mm and, if the CAD was found, in its frame; also written as a COLMAP model."""
         if scale.scale is None:
             return sparse, None
         frame = scale.model_from_scan if scale.model_from_scan is not None else np.eye(4)
@@ -232,7 +237,7 @@ class _Run:
         cloud = reconstruct_dense(sparse, self.options.dense, cad, self.folder / "dense", self.tell)
         write_ply(cloud, path)
         self.stages.finish("dense", key)
-        self._timed("dense", began)
+        self._record_time("dense", began)
         return cloud
 
 
@@ -240,7 +245,7 @@ class _Run:
 
 
 def _write_sparse(folder: Path, sparse: SparseModel) -> None:
-    """What COLMAP's model, already in the folder, does not hold."""
+    """Write what COLMAP's model, which is already in the folder, does not contain."""
     write_json(folder / "unplaced.json", dict(sparse.unplaced))
     try:
         if sparse.pose_covariance is not None:
@@ -253,7 +258,7 @@ def _write_sparse(folder: Path, sparse: SparseModel) -> None:
 
 
 def _read_sparse(folder: Path, photos: tuple[Photo, ...]) -> SparseModel:
-    """What ``reconstruct_sparse`` and ``_write_sparse`` left. Raises InputError when files are missing."""
+    """Read what `reconstruct_sparse` and `_write_sparse` wrote. Raises InputError when files are missing."""
     try:
         unplaced = json.loads((folder / "unplaced.json").read_text(encoding="utf-8"))
         sparse = sparse_model_of(read_reconstruction(folder / "model"), photos, tuple(unplaced.items()))
@@ -264,7 +269,7 @@ def _read_sparse(folder: Path, photos: tuple[Photo, ...]) -> SparseModel:
 
 
 def points_ply(sparse: SparseModel) -> bytes:
-    """The sparse points as a binary PLY."""
+    """The sparse points as binary PLY."""
     rows = np.zeros(len(sparse.points_in_scan), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
     rows["xyz"], rows["rgb"] = sparse.points_in_scan, sparse.colors
     fields = [*(f"float {name}" for name in "xyz"), *(f"uchar {name}" for name in ("red", "green", "blue"))]
@@ -277,7 +282,7 @@ def points_ply(sparse: SparseModel) -> bytes:
 
 
 def intake_summary(intake: Intake) -> dict[str, Any]:
-    """Intake for ``photos.json``."""
+    """Content of ``photos.json``."""
     return {
         "photos": [
             {
@@ -299,7 +304,7 @@ def intake_summary(intake: Intake) -> dict[str, Any]:
 
 
 def summary(result: Reconstruction) -> dict[str, Any]:
-    """A run for ``reconstruction.json``; transforms are 4×4 row-major."""
+    """Content of ``reconstruction.json``; transforms are 4×4, row-major."""
     content: dict[str, Any] = {
         "version": __version__,
         "unit": "mm" if result.is_metric else None,
@@ -335,7 +340,7 @@ def summary(result: Reconstruction) -> dict[str, Any]:
 
 
 def camera_summary(camera: Any) -> dict[str, Any]:
-    """A Camera for JSON, in arview's own format."""
+    """A camera for JSON, in arview's own format."""
     return {
         "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx,
         "cy": camera.cy, "dist": camera.dist.tolist(),
@@ -343,12 +348,14 @@ def camera_summary(camera: Any) -> dict[str, Any]:
 
 
 def pose_deviations(sparse: SparseModel) -> Array | None:
-    """(M,2) standard deviation of each photo's rotation (rad) and centre (unit), per axis in the mean."""
+    """(M,2) standard deviations of each photo's rotation (rad) and centre (unit), as means over the axes; None if
+    unknown.
+    """
     if sparse.pose_covariance is None:
         return None
     rows = []
     for i in range(len(sparse.photos)):
         block = sparse.pose_covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
-        # A left twist (w, v) moves the centre, seen from the camera, by −v alone: the centre is its origin.
+        # The centre is the origin of the camera frame, so a left twist (w, v) moves it by −v alone.
         rows.append(np.sqrt([np.trace(block[:3, :3]) / 3.0, np.trace(block[3:, 3:]) / 3.0]))
     return np.array(rows)

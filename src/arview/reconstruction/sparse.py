@@ -34,21 +34,21 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True)
 class SparseOptions:
-    """How photos are placed."""
+    """Options of structure from motion."""
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
-    first_features: int = 2500  # a photo, in the first pass: matching by appearance grows with the square
-    preview_features: int = 400  # a photo, to choose the pairs worth matching; Wu 2013
-    preview_matches: int = 5  # of those, in a pair worth matching; chance gives 0 to 3
-    all_pairs_up_to: int = 12  # photos; every pair is matched
-    neighbours: int = 3  # next photos in order that are matched in any case: a walk round the part, a video
-    max_epipolar_px: float = 4.0  # first pass, before the distortion is known
-    band_px: float = 2.0  # second pass, about the epipolar lines
-    min_matches: int = 15  # a pair with fewer is chance
-    max_error_px: float = 2.0  # observations further from their point are left out of the last adjustment
-    min_centre_move: float = 0.001  # of the longer side; smaller moves of the principal point are not believed
-    max_centre_move: float = 0.05  # and larger ones are not a lens's: the views do not determine it
-    min_angle_deg: float = 1.5  # between two rays to a point: depth is not determined below
+    first_features: int = 2500  # per photo in the first pass; matching by appearance grows with the square
+    preview_features: int = 400  # per photo, to choose the pairs to match; Wu 2013
+    preview_matches: int = 5  # of these that a chosen pair needs; chance gives 0 to 3
+    all_pairs_up_to: int = 12  # photos; up to this number every pair is matched
+    neighbours: int = 3  # following photos that are always matched: a walk around the part, a video
+    max_epipolar_px: float = 4.0  # in the first pass, before the distortion is known
+    band_px: float = 2.0  # half width of the band around epipolar lines in the second pass
+    min_matches: int = 15  # pairs with fewer matches are due to chance
+    max_error_px: float = 2.0  # observations with larger errors are left out of the last adjustment
+    min_centre_move: float = 0.001  # of the longer side; smaller moves of the principal point are not significant …
+    max_centre_move: float = 0.05  # … and larger ones mean that the views do not determine it
+    min_angle_deg: float = 1.5  # between two rays to a point; smaller angles do not determine depth
     seed: int = 0
     threads: int = 0  # 0: all cores
 
@@ -56,9 +56,10 @@ class SparseOptions:
 def reconstruct_sparse(
     photos: Sequence[Photo], folder: Path, options: SparseOptions | None = None, progress: Progress | None = None
 ) -> SparseModel:
-    """Poses and points of the photos; COLMAP's database and model are left in ``folder``.
+    """Reconstruct poses and points of the photos; COLMAP's database and model are left in ``folder``.
 
-    Raises CannotMeasureError when fewer than three photos can be placed together, with the likely reason.
+    Raises:
+        InputError: fewer than three photos can be placed together; the message gives the likely reason.
     """
     options = options or SparseOptions()
     tell = progress or (lambda stage, done, total: None)
@@ -97,7 +98,7 @@ def _match_by_appearance(
         return epipolar_inliers(one, other, matches, options.max_epipolar_px)
 
     found: dict[Pair, Matches] = {}
-    # Products of descriptors run one a thread: threads of the BLAS library below them would only wait for each other.
+    # One BLAS thread for each product of descriptors, because the products already run in parallel.
     with ThreadPoolExecutor(threads) as pool, threadpool_limits(1, "blas"):
         chosen = _promising_pairs(features, options, pool)
         for done, (pair, matches) in enumerate(zip(chosen, pool.map(match, chosen), strict=True)):
@@ -172,8 +173,8 @@ def _write_database(
 def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tell: Progress) -> list[Any]:
     """The reconstructions that COLMAP's incremental mapper finds."""
     pycolmap = import_pycolmap()
-    # In one thread: in several COLMAP starts from whichever good pair is found first, another one from run to run.
-    # Threads save no time here (24 photos: 1.2 s either way), its small adjustments run in one all the same.
+    # In one thread, because with several COLMAP starts from whichever good pair is found first, which varies between
+    # runs. Threads would save no time here: the small adjustments run in one thread anyway.
     mapping = pycolmap.IncrementalPipelineOptions(
         random_seed=options.seed, min_model_size=3, extract_colors=False, num_threads=1
     )
@@ -194,7 +195,7 @@ def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tel
 
 
 def _emptied(folder: Path) -> Path:
-    """The folder, there and without files of an earlier run."""
+    """The folder, created if missing, without files of an earlier run."""
     folder.mkdir(exist_ok=True)
     for old in folder.rglob("*"):
         if old.is_file():
@@ -245,7 +246,7 @@ def _cameras_and_poses(model: Any, photos: Sequence[Photo]) -> tuple[dict[int, C
 
 
 MAX_PAIR_ANGLE_DEG = 45.0
-"""Between the viewing directions of a pair: SIFT finds nothing in common beyond."""
+"""Largest angle between the viewing directions of a pair; beyond it SIFT finds nothing in common."""
 
 
 def _pairs_in_common_view(model: Any, poses: dict[int, Array]) -> list[Pair]:
@@ -255,7 +256,7 @@ def _pairs_in_common_view(model: Any, poses: dict[int, Array]) -> list[Pair]:
 
 
 def _write_matches(path: Path, pairs: dict[Pair, Matches]) -> None:
-    """Put the matches of the second pass in the place of the first ones."""
+    """Replace the matches of the first pass by those of the second."""
     pycolmap = import_pycolmap()
     with pycolmap.Database.open(str(path)) as database:
         database.clear_matches()
@@ -294,10 +295,11 @@ def _triangulate_and_adjust(
 
 
 def _adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> bool:
-    """Adjust everything, the principal points too; put back those that moved less than they are known by.
+    """Adjust everything including the principal points, and restore those that moved less than their uncertainty.
 
-    Returns whether the principal points are to be refined from here on. Feature errors that go together move a
-    principal point by half a pixel on good photos, and the focal length with it, so a small move is no finding.
+    Returns whether the principal points are to be refined from here on. Correlated errors of features move a principal
+    point
+    by half a pixel on good photos, and the focal length with it, so a small move is not significant.
     """
     before = {key: np.array(camera.params[1:3]) for key, camera in model.cameras.items() if _is_refined(camera)}
     adjust(model, threads, refines_centre=True, iterations=12)
@@ -353,7 +355,7 @@ def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25)
 # --- what could not be placed ----------------------------------------------------------------------------
 
 FEW_FEATURES = 200
-"""A photo with fewer is blurred, or shows nothing but bare surfaces."""
+"""A photo with fewer features is blurred, or shows only bare surfaces."""
 
 
 def _unplaced(
@@ -378,7 +380,7 @@ def _unplaced(
             reason = "nothing in common with the other photos: another part, or a view too far from the others"
         elif not partners & placed:
             company = _some((group or partners) - {photo.name})
-            reason = f"has something in common only with {company}, not with the other {len(placed)}"
+            reason = f"has something in common only with {company}, but not with the other {len(placed)}"
         else:
             reason = "too little in common with the placed photos: take more photos between this view and theirs"
         reasons.append((photo.name, reason))
@@ -390,13 +392,13 @@ def _names(model: Any) -> set[str]:
 
 
 def _some(names: Iterable[str]) -> str:
-    """The first names of many, for a message."""
+    """The first few of some names, for a message."""
     listed = sorted(names)
     return ", ".join(listed[:3]) + (f" and {len(listed) - 3} more" if len(listed) > 3 else "")
 
 
 def _why_nothing(photos: Sequence[Photo], features: Sequence[Features], pairs: dict[Pair, Matches]) -> str:
-    """Why no three photos fit together, and what to do."""
+    """Why no three photos could be placed together, and what to do."""
     poor = [photo.name for photo, found in zip(photos, features, strict=True) if len(found) < FEW_FEATURES]
     if 2 * len(poor) > len(photos):
         return (

@@ -1,4 +1,4 @@
-"""What the stages of a reconstruction hand to each other."""
+"""Data that the stages of a reconstruction exchange."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Photo:
     """One photo that passed intake.
 
     Attributes:
-        name: unique in the reconstruction; the path below the photo folder, or ``frame_000123.png`` of a video.
-        path: file on disk; of a video frame, the picture that intake wrote.
+        name: unique in the reconstruction: the path below the photo folder, or ``frame_000123.png`` of a video.
+        path: of the file; for a video frame, of the picture that intake wrote.
         width, height: in px, upright (EXIF orientation applied).
-        lens: photos of the same lens, zoom and size share this key and their intrinsics.
-        camera: first guess of the intrinsics, upright; exact when ``is_calibrated``.
-        is_calibrated: True when the camera came from a calibration, which self-calibration must not change.
+        lens: key shared by photos of the same lens, zoom and size, which share their intrinsics.
+        camera: initial intrinsics, upright; exact if ``is_calibrated``.
+        is_calibrated: the camera came from a calibration, which self-calibration must not change.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class PosedPhoto:
-    """A photo with the camera that SfM found: intrinsics with distortion, and ``cam_from_scan`` (4,4)."""
+    """A photo with the camera found by structure from motion: intrinsics with distortion, ``cam_from_scan`` (4,4)."""
 
     name: str
     path: Path
@@ -54,20 +54,21 @@ class PosedPhoto:
 
 @dataclass(frozen=True)
 class SparseModel:
-    """Camera poses and the points they were found with, in the ``scan`` frame and its unit.
+    """Camera poses and points in the ``scan`` frame and its unit.
 
-    The unit is arbitrary until ``transformed`` has brought the model to millimetres in the CAD's rough frame.
+    The unit is arbitrary until `transformed` brings the model to millimetres in the approximate CAD frame.
 
     Attributes:
         photos: placed photos.
         points_in_scan: (N,3).
         colors: (N,3) uint8 RGB.
         point_errors_px: (N,) mean reprojection error.
-        observed_point, observed_photo: (K,) int32 indices, one entry for each time a point was seen.
-        observed_px: (K,2) where, in the distorted photo; integers are pixel centres.
+        observed_point, observed_photo: (K,) int32 indices, one entry for each observation.
+        observed_px: (K,2) observed pixel in the distorted photo; integers are pixel centres.
         unplaced: (name, reason) of photos that could not be placed.
-        pose_covariance: (6M,6M) of the poses together, from bundle adjustment: for each photo a twist (rad, unit)
-            applied on the left of ``cam_from_scan``. The scan frame is that in which the cameras together vary least.
+        pose_covariance: (6M,6M) joint covariance of the poses from bundle adjustment: for each photo a twist (rad,
+            unit)
+            applied on the left of ``cam_from_scan``, in the scan frame in which the cameras together vary least.
     """
 
     photos: tuple[PosedPhoto, ...]
@@ -87,7 +88,9 @@ class SparseModel:
             raise InputError("sparse model: a point is NaN or infinite")
 
     def transformed(self, scale: float, new_from_scan: Array) -> SparseModel:
-        """The model after ``x_new = new_from_scan @ (scale * x_scan)``; scale > 0, ``new_from_scan`` rigid (4,4)."""
+        """The model after ``x_new = new_from_scan @ (scale * x_scan)``, with scale > 0 and ``new_from_scan`` (4,4)
+        rigid.
+        """
         if not scale > 0:
             raise InputError(f"sparse model: scale {scale} is not positive")
         photos = []
@@ -104,14 +107,14 @@ class SparseModel:
 
 @dataclass(frozen=True)
 class DenseCloud:
-    """A fused cloud in the frame of the sparse model that it was made with.
+    """A fused cloud in the frame of its sparse model.
 
     Attributes:
         points: (N,3) float64.
         normals: (N,3) float32 unit, towards the cameras.
         colors: (N,3) uint8 RGB.
-        sigma: (N,) float32, standard deviation of the point along its normal, unit of ``points``.
-        views: (N,) uint8, number of photos that agree on it.
+        sigma: (N,) float32 standard deviation along the normal, in the unit of ``points``.
+        views: (N,) uint8, number of photos that agree on the point.
     """
 
     points: Array

@@ -81,7 +81,7 @@ class Length:
 
 
 @dataclass(frozen=True)
-class Placement:
+class MeasuredPlacement:
     """Position of a component in the datum frame.
 
     Attributes:
@@ -114,7 +114,7 @@ class Placement:
 
 def place(
     combined: CombinedMove, alignment: Alignment, poses: Array | None = None, options: UncertaintyOptions | None = None
-) -> Placement:
+) -> MeasuredPlacement:
     """Position of a component relative to the datum frame, with every contribution to its uncertainty.
 
     Args:
@@ -156,7 +156,9 @@ def place(
         some = None if deviations is None else deviations[:, part] * seen
         block = covariance[part, part] * np.outer(seen, seen)
         lengths.append(length_of(twist[part] * seen, block, some, int(seen.sum()), options))
-    return Placement(twist, covariance, contributions, combined.undetermined, observable, lengths[0], lengths[1])
+    return MeasuredPlacement(
+        twist, covariance, contributions, combined.undetermined, observable, lengths[0], lengths[1]
+    )
 
 
 def relative_twists(moves: Array, frames: Array, combined: CombinedMove, alignment: Alignment) -> Array:
@@ -245,7 +247,7 @@ def _draw(contributions: Sequence[Contribution], options: UncertaintyOptions, sa
     return total
 
 
-def total_budget(placements: Mapping[str, Placement]) -> tuple[tuple[str, float], ...]:
+def total_budget(placements: Mapping[str, MeasuredPlacement]) -> tuple[tuple[str, float], ...]:
     """Root mean square over components of each line of the budget, mm, largest first."""
     sums: dict[str, list[float]] = {}
     for placement in placements.values():

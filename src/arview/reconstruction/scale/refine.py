@@ -97,7 +97,7 @@ class Fit:
     covariance: Array
     sigma_px: float
     displacements_mm: Array
-    samples: list[EdgeSamples]
+    samples: list[CadEdgePoints]
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Support:
 
 
 @dataclass(frozen=True)
-class EdgeSamples:
+class CadEdgePoints:
     """Visible CAD edge points of one view.
 
     Attributes:
@@ -175,7 +175,7 @@ class JointRefiner:
         self._edges = mesh_edges(model)
         self._is_base = np.array([component.name in base for component in model.components])
 
-    def samples(self, view: ScaleView, cam_from_model: Array) -> EdgeSamples:
+    def samples(self, view: ScaleView, cam_from_model: Array) -> CadEdgePoints:
         """Edge points that the view shows, without joints between components and folds of curved surfaces."""
         o = self.options
         shrink = min(1.0, o.drawn_width_px / max(view.camera.width, view.camera.height))
@@ -197,7 +197,7 @@ class JointRefiner:
         points, tangents, component = (
             found.points_in_model[is_good], found.tangents_in_model[is_good], found.component[is_good]
         )  # fmt: skip
-        return EdgeSamples(points, tangents, component, self._features(points, tangents, component))
+        return CadEdgePoints(points, tangents, component, self._features(points, tangents, component))
 
     def rough(self, start: Similarity) -> tuple[Similarity, Support]:
         """Refine from a distant start, with all components and with the base alone; keep the result with better base
@@ -234,7 +234,7 @@ class JointRefiner:
         covariance = system.covariance() + self._systematic(similarity, samples)
         return Fit(similarity, covariance, system.sigma_px, displacements, samples)
 
-    def _systematic(self, similarity: Similarity, samples: Sequence[EdgeSamples]) -> Array:
+    def _systematic(self, similarity: Similarity, samples: Sequence[CadEdgePoints]) -> Array:
         """(7,7) covariance of errors that residuals do not show: all edges a little too far out, or to one side."""
         points = np.concatenate([s.points for s in samples]) - self.center
         if not len(points):
@@ -247,7 +247,7 @@ class JointRefiner:
         shift_mm = float(np.hypot(sigma_mm, self.options.base_sigma_mm))
         return np.diag(np.repeat([sigma_mm / radius_mm, shift_mm, sigma_mm / radius_mm], [3, 3, 1]) ** 2)
 
-    def support(self, similarity: Similarity, samples: Sequence[EdgeSamples] | None = None) -> Support:
+    def support(self, similarity: Similarity, samples: Sequence[CadEdgePoints] | None = None) -> Support:
         """Share of predicted edges that the views show, compared with the share found beside them."""
         o = self.options
         samples = samples or self.sample_all(similarity)
@@ -269,7 +269,7 @@ class JointRefiner:
         )
 
     def measure(
-        self, view: ScaleView, samples: EdgeSamples, cam_from_model: Array, reach_px: float, shift_px: float = 0.0
+        self, view: ScaleView, samples: CadEdgePoints, cam_from_model: Array, reach_px: float, shift_px: float = 0.0
     ) -> EdgeResiduals:
         """Find steps of brightness near the predicted edges, and their derivatives by a step of the similarity.
 
@@ -303,24 +303,24 @@ class JointRefiner:
         )  # fmt: skip
 
     def measure_all(
-        self, start: Similarity, samples: Sequence[EdgeSamples], reach_px: float, shift_px: float = 0.0
+        self, start: Similarity, samples: Sequence[CadEdgePoints], reach_px: float, shift_px: float = 0.0
     ) -> list[EdgeResiduals]:
         """`measure` for every view."""
 
-        def one(pair: tuple[ScaleView, EdgeSamples]) -> EdgeResiduals:
+        def one(pair: tuple[ScaleView, CadEdgePoints]) -> EdgeResiduals:
             return self.measure(pair[0], pair[1], start.cam_from_model(pair[0].cam_from_scan), reach_px, shift_px)
 
         return list(pool().map(one, zip(self.views, samples, strict=True)))
 
-    def sample_all(self, start: Similarity, components: NDArray[np.bool_] | None = None) -> list[EdgeSamples]:
+    def sample_all(self, start: Similarity, components: NDArray[np.bool_] | None = None) -> list[CadEdgePoints]:
         """`samples` of every view, optionally of some ``components`` (C,) only."""
 
-        def one(view: ScaleView) -> EdgeSamples:
+        def one(view: ScaleView) -> CadEdgePoints:
             found = self.samples(view, start.cam_from_model(view.cam_from_scan))
             if components is None:
                 return found
             of = components[found.component]
-            return EdgeSamples(found.points[of], found.tangents[of], found.component[of], found.feature[of])
+            return CadEdgePoints(found.points[of], found.tangents[of], found.component[of], found.feature[of])
 
         return list(pool().map(one, self.views))
 
