@@ -2,8 +2,7 @@
 
 Each view carries information on the intrinsics, with its own pose unknown; views are chosen one after the other such
 that the determinant of the information grows most (D-optimal design, Fedorov 1972). This prefers tilted views, views
-near
-the picture's corners and views at different distances.
+near the picture's corners and views at different distances.
 """
 
 from __future__ import annotations

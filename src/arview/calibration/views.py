@@ -150,8 +150,7 @@ def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgre
 
     Raises:
         InputError: no source can be read, no camera took more than half of the pictures, or none of them shows the
-            board;
-            the message says what was found instead.
+            board; the message says what was found instead.
     """
     finder = BoardFinder(board)
     if not sources:

@@ -1,8 +1,7 @@
 """Sub-pixel steps of brightness across predicted edges.
 
 One-dimensional search along the normal (Harris, RAPID 1990; several hypotheses per point: Vacchetti, Lepetit & Fua,
-ISMAR
-2004). Profiles are means over short parallel lines, in linear light, where blur does not displace a step.
+ISMAR 2004). Profiles are means over short parallel lines, in linear light, where blur does not displace a step.
 """
 
 from __future__ import annotations
@@ -40,8 +39,7 @@ def find_steps(gray, pixels, normals, reach_px, half_width_px, threshold):  # ty
 
     Returns:
         offsets (N,K) px along the normal; slopes (N,K) signed grey levels per px, 0 = none; seen (N,) whether the
-        profile
-        lies inside the picture.
+        profile lies inside the picture.
     """
     height, width = gray.shape
     count = pixels.shape[0]

@@ -1,8 +1,7 @@
 """A ChArUco board as a page to print: PDF in true scale, with two rulers that show whether the printer kept it.
 
 The page is drawn in millimetres: its content stream sets 72/25.4 pt as the unit once, so that every number after it is
-a
-length on paper. Viewers are asked to print without scaling (PDF 1.7, 12.2 ViewerPreferences).
+a length on paper. Viewers are asked to print without scaling (PDF 1.7, 12.2 ViewerPreferences).
 """
 
 from __future__ import annotations

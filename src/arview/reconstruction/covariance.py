@@ -18,9 +18,8 @@ def pose_covariance(sparse: SparseModel, model: Any, adjuster: Any) -> Array | N
     """(6M,6M) covariance of the poses of ``sparse.photos``, see `SparseModel`; None if it cannot be computed.
 
     The inverse of the adjustment's information is for observations with 1 px of noise and with three points fixed. It
-    is
-    scaled by the noise that the residuals show, and transformed to the frame in which the cameras together vary least
-    (S-transformation, Baarda 1973), so that no camera seems more accurate because it was fixed.
+    is scaled by the noise that the residuals show, and transformed to the frame in which the cameras together vary
+    least (S-transformation, Baarda 1973), so that no camera seems more accurate because it was fixed.
     """
     pycolmap = import_pycolmap()
     options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POSES)

@@ -88,8 +88,7 @@ def _match_along(  # type: ignore[no-untyped-def]
     """Best and second best of ``others`` within ``band_px`` of each ray's epipolar line.
 
     ``rays`` are ideal directions (N,2), ``other_px`` ideal pixels about the principal point; ``cells`` lists the
-    features of
-    each cell of a grid over ``other_px``, from ``starts``.
+    features of each cell of a grid over ``other_px``, from ``starts``.
     """
     low_x, low_y = cell_px[1], cell_px[2]
     step = cell_px[0]

@@ -298,8 +298,7 @@ def _adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> boo
     """Adjust everything including the principal points, and restore those that moved less than their uncertainty.
 
     Returns whether the principal points are to be refined from here on. Correlated errors of features move a principal
-    point
-    by half a pixel on good photos, and the focal length with it, so a small move is not significant.
+    point by half a pixel on good photos, and the focal length with it, so a small move is not significant.
     """
     before = {key: np.array(camera.params[1:3]) for key, camera in model.cameras.items() if _is_refined(camera)}
     adjust(model, threads, refines_centre=True, iterations=12)

@@ -67,8 +67,7 @@ class SparseModel:
         observed_px: (K,2) observed pixel in the distorted photo; integers are pixel centres.
         unplaced: (name, reason) of photos that could not be placed.
         pose_covariance: (6M,6M) joint covariance of the poses from bundle adjustment: for each photo a twist (rad,
-            unit)
-            applied on the left of ``cam_from_scan``, in the scan frame in which the cameras together vary least.
+            unit) applied on the left of ``cam_from_scan``, in the scan frame in which the cameras together vary least.
     """
 
     photos: tuple[PosedPhoto, ...]

@@ -193,8 +193,7 @@ def spin_moves(component: Component, surface: MeshSurface, part: Part | None, mi
     """(K,6) orthonormal motions about the centre of a component's bounding box that leave its shape unchanged.
 
     These are motions along which the whole surface slides within itself (Gelfand & Guibas, SGP 2004), and the
-    continuous
-    symmetry declared in the part file. Rotations are scaled by half the diagonal of the box.
+    continuous symmetry declared in the part file. Rotations are scaled by half the diagonal of the box.
     """
     center = component.bounds_in_model.mean(axis=0)
     radius_mm = 0.5 * float(np.linalg.norm(np.ptp(component.bounds_in_model, axis=0)))

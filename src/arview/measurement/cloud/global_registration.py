@@ -3,8 +3,7 @@
 Rotations that turn a principal direction of the cloud's normals onto one of the CAD's are tried all around it; for each
 the translation follows from a correlation of both as voxels (by FFT, as in Padfield, CVPR 2010). The best poses are
 refined on the exact surface, and the fit of the whole part decides: wrong poses of symmetric parts fit the base, but
-not
-the components.
+not the components.
 """
 
 from __future__ import annotations

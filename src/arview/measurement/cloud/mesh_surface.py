@@ -38,8 +38,7 @@ class ClosestPoints:
         faces: (N,) int64 index of the triangle, -1 where none is within reach (other values are NaN there).
         distances: (N,) mm, positive outside.
         normals: (N,3) unit: on smooth areas the interpolated normal of the curved surface, on edges the direction in
-            which
-            ``distances`` increases.
+            which ``distances`` increases.
         is_edge: (N,) whether the closest point lies on an edge or corner of the shape, or on the border of an open
             surface; such a point does not constrain the surface along its normal.
     """
@@ -137,8 +136,8 @@ class MeshSurface:
 
         Returns:
             (F,7,3) normals of the face, its sides 01 12 20 and its corners, which determine the side of the surface;
-            (F,7)
-            which of these are sharp; (F,3,3) normals at the corners of the smooth surface to which the face belongs.
+            (F,7) which of these are sharp; (F,3,3) normals at the corners of the smooth surface to which the face
+            belongs.
         """
         # Files often repeat vertices for each face; coinciding vertices of two components stay separate.
         _, same = np.unique(np.round(self.vertices / _WELD_MM).astype(np.int64), axis=0, return_inverse=True)

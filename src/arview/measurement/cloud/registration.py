@@ -32,8 +32,7 @@ class RegistrationOptions:
 
     Attributes:
         kernel: weighting of residuals: ``tukey`` ignores outliers, ``huber`` limits them, ``none`` is least squares.
-            Its
-            width starts at the first distance and shrinks to the noise; with a narrow kernel from the start, a face
+            Its width starts at the first distance and shrinks to the noise; with a narrow kernel from the start, a face
             displaced by more than the noise would be taken for an outlier.
         trim: share of the points, those with the largest residuals, that each iteration leaves out.
         first_distance_mm: maximum distance of points from the surface in the first iteration.
@@ -241,8 +240,7 @@ def register_from_starts(
     """Best of the minima found from several starts, with the next best one as ``runner_up``.
 
     All starts are tried on few points; the best minimum is refined on all points. The cost of a minimum is the mean of
-    its
-    squared residuals, each limited to three times the best minimum's noise.
+    its squared residuals, each limited to three times the best minimum's noise.
 
     Args:
         points, surface, normals, point_weights, options, given: see `register_to_surface`.

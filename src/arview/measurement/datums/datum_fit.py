@@ -74,8 +74,7 @@ def robust_weights(design: Array, values: Array, variances: Array) -> tuple[Arra
     """Robust fit of a linear model by iteratively reweighted least squares.
 
     The first steps use Cauchy weights, which do not depend on a good start; Tukey's biweight follows. The scale is that
-    of
-    the median residual.
+    of the median residual.
 
     Args:
         design: (N,K) linear model.
@@ -110,8 +109,7 @@ def correlation_factor(points: Array, residuals: Array, max_points: int = 600) -
     """Factor, at least 1, by which correlation of neighbouring residuals increases the variance of their mean.
 
     It is 1 plus the sum of a residual's correlations with all others, estimated from products of pairs binned by
-    distance,
-    up to the first distance at which they are uncorrelated.
+    distance, up to the first distance at which they are uncorrelated.
 
     Args:
         points: (N,3) where the residuals are.
@@ -145,8 +143,8 @@ def block_factor(points: Array, residuals: Array, rank: int, blocks: int = 12) -
     """The same factor as `correlation_factor`, from the means of residuals (N,) in blocks of neighbouring points (N,3).
 
     It captures errors that are correlated over a large part of a feature, most of which the fit has absorbed; ``rank``
-    is
-    the number of parameters fitted. Blocks hold equal numbers of points: around a rim they are arcs, on a face cells.
+    is the number of parameters fitted. Blocks hold equal numbers of points: around a rim they are arcs, on a face
+    cells.
     """
     count = len(points)
     if count < 8 * blocks or rank >= blocks - 2:

@@ -191,8 +191,7 @@ def _peaks(scores: Array, count: Array, steps: Array, on: Array, chosen: Indices
     """Sub-pixel position of the best score by a parabola, with its variance.
 
     The sum of squared differences of m views from their mean is (m - 1)(1 - score). Its second derivative, and the
-    pixel
-    variance that its minimum shows, give the variance of the position.
+    pixel variance that its minimum shows, give the variance of the position.
     """
     n, pitch = len(scores), steps[1] - steps[0]
     best = np.clip(np.argmax(scores, axis=1), 1, len(steps) - 2)

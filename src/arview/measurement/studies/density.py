@@ -35,8 +35,7 @@ def density_study(
     """Register a post displaced by 1 mm to its exact surface, and by ICP to sampled references.
 
     The exact surface needs no reference points: its rows differ in the measured points only. Every run samples both
-    clouds
-    anew. CPU seconds are the mean of the first runs, including search tree and normals of the reference, but not
+    clouds anew. CPU seconds are the mean of the first runs, including search tree and normals of the reference, but not
     sampling.
 
     Args:

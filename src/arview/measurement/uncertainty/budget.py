@@ -187,9 +187,8 @@ def length_of(
     """Length of a measured vector, with its uncertainty.
 
     Far from zero, U is k standard uncertainties along the vector. Near zero every error increases the length; there U
-    is
-    the length below which pure noise stays with the given probability, so that the interval covers the true length with
-    that probability whatever it is.
+    is the length below which pure noise stays with the given probability, so that the interval covers the true length
+    with that probability whatever it is.
 
     Args:
         vector: (3,) measured.

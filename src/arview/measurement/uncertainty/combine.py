@@ -62,10 +62,8 @@ def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove
 
     Methods that differ by more than their covariances allow have an error that neither of them knows. For rotations and
     translations separately, the covariance is then inflated until it explains the difference (Birge 1932), and the
-    scatter
-    of the methods about the mean is added along the difference. A direction that only one method determines is taken
-    from
-    that method.
+    scatter of the methods about the mean is added along the difference. A direction that only one method determines is
+    taken from that method.
 
     Args:
         moves: at least one, all about the same centre.

@@ -24,8 +24,7 @@ def decide(value: float | None, uncertainty: float | None, tolerance: float | No
     """Verdict on a value with its expanded uncertainty U, all in the unit of the tolerance.
 
     It passes if ``value + guard · U`` is within the tolerance, fails if ``value − guard · U`` is not, and is undecided
-    in
-    between or without a tolerance. Without a value it is not measured.
+    in between or without a tolerance. Without a value it is not measured.
     """
     if value is None or uncertainty is None:
         return Verdict.NOT_MEASURED

@@ -24,9 +24,8 @@ def shifts_from_poses(points: Array, photos: Sequence[PosedPhoto], sees: NDArray
     """(N,3,6M) derivative of triangulated points (N,3) by left twists of the photos' poses.
 
     The pixels of a point are fixed while the poses change. With P_v the projector across its ray in view v, divided by
-    the
-    squared distance, δx = (Σ P_v)⁻¹ Σ P_v δx_v, where δx_v = −Rᵀ (ω × y + t) for the point y in the camera and a twist
-    (ω, t).
+    the squared distance, δx = (Σ P_v)⁻¹ Σ P_v δx_v, where δx_v = −Rᵀ (ω × y + t) for the point y in the camera and a
+    twist (ω, t).
 
     Args:
         points: in the frame and unit of the poses.

@@ -53,8 +53,7 @@ def rice_estimate(lengths: ArrayLike, sigma: float, axes: int = 2) -> float:
     """Most likely true length for measured lengths (N,), or a single one; 0 where noise alone explains them.
 
     The maximum of the likelihood satisfies A = mean of r · I_{n/2}(rA/σ²) / I_{n/2 − 1}(rA/σ²); it is at 0 where the
-    mean
-    square is at most n σ².
+    mean square is at most n σ².
 
     Raises:
         InputError: no lengths, or one that is not finite; see also `rice_density`.

@@ -44,8 +44,7 @@ def reconstruct_dense(
         sparse: poses with distorted cameras, points and observations; in mm when ``cad`` is given.
         options: see `DenseOptions`.
         cad: the part's model and its approximate pose. It limits the work to the part's region and provides start
-            values;
-            the photos alone decide where the surface is.
+            values; the photos alone decide where the surface is.
         folder: depth and normal maps of each photo are written below it in COLMAP's format.
         progress: called with a stage's name, photos done and photos in all.
 

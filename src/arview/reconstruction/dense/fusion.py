@@ -47,8 +47,7 @@ class _Stack:
 
     Attributes:
         elements: (P,6) float32: plane n·X = 1 in the camera (normal divided by the plane's distance), variance of w, w
-            at
-            the pixel (0: none), and 1 where the element may become a point itself instead of only confirming others.
+            at the pixel (0: none), and 1 where the element may become a point itself instead of only confirming others.
         layout: (V,3) first pixel, width, height.
         cameras: (V,4) fx fy cx cy.
         poses: (V,3,4) cam_from_scan.
@@ -114,8 +113,7 @@ def _best_of_cells(
     """Indices of the most accurate point of each cell; cells are longer along the axis nearest to the normal.
 
     Where two cells behind each other hold points of one surface, only the more accurate point is kept, so that the
-    density
-    of points does not depend on where a surface crosses the borders of cells.
+    density of points does not depend on where a surface crosses the borders of cells.
     """
     if len(points) == 0:
         return np.empty(0, dtype=np.int64)

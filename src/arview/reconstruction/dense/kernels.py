@@ -2,8 +2,7 @@
 
 A surface element at pixel (x, y) is the plane w(x + dx, y + dy) = w + dx du + dy dv of inverse depth. In a source with
 p = A (x, y, 1) + w t its window is warped exactly (a homography), sampled bilinearly and compared with the view's
-window
-by a weighted normalised cross-correlation (ZNCC). Everything is float32, which places pixels within 1e-4 px.
+window by a weighted normalised cross-correlation (ZNCC). Everything is float32, which places pixels within 1e-4 px.
 
 The kernels take plain arrays, the fields of `Problem` and the scratch: numba counts references of the arrays in a tuple
 at each use, which would double the time.
@@ -53,8 +52,7 @@ class Problem(NamedTuple):
         sizes: (S,6) int32, first pixel, width and height of the picture and of the map.
         warps: (S,13) float32, A row by row, t, and the parallax in px per unit of w.
         numbers: (8,) float32, variance of the noise, cost of one pixel of disagreement, pixels of this level per pixel
-            of
-            the maps, number of best sources, fx, fy, cx, cy.
+            of the maps, number of best sources, fx, fy, cx, cy.
     """
 
     grey: NDArray[np.float32]

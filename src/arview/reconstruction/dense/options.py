@@ -29,8 +29,7 @@ class DenseOptions:
             point.
         min_views: photos that must agree on a point of the cloud, including its own. Each was matched with several.
         agreement_px: two depth maps agree if the point moves by less than this in the photo, in pixels of the maps
-            (half
-            the working size) …
+            (half the working size) …
         normal_angle_deg: … and their normals differ by less than this.
         grazing_deg: surfaces seen at a larger angle from their normal are not used.
         threads: photos worked on at a time; 0 for one per core.

@@ -1,8 +1,7 @@
 """Least-squares matching: refines a surface element to the grey levels of the sources, with its standard deviation.
 
 Gauss-Newton on inverse depth and its two slopes over all sources that see the element, each with its own gain and
-offset
-(Gruen 1985; Furukawa & Ponce 2010). The result depends on the photos, not on the hypothesis it started from.
+offset (Gruen 1985; Furukawa & Ponce 2010). The result depends on the photos, not on the hypothesis it started from.
 """
 
 from __future__ import annotations
@@ -141,8 +140,8 @@ def polish(p, s, index, planes, scores, sigmas, step_px, iterations, unit_w):  #
     """Refine the planes (H,W,3) in place; write mean correlation (H,W) and standard deviation of w (H,W).
 
     The problem is ``step_px`` (1 or 2) times as fine as the planes, and ``unit_w`` is the change of w that moves a
-    pixel by
-    one in the sources. A pixel that fewer than two sources see, or that moves by more than two pixels, gets score 0.
+    pixel by one in the sources. A pixel that fewer than two sources see, or that moves by more than two pixels, gets
+    score 0.
     """
     grey, region, pixels, _, sizes, warps, numbers = p
     height, width = scores.shape

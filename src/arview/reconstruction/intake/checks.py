@@ -71,11 +71,9 @@ def blur_and_texture(gray: Pixels) -> tuple[float, float]:
     """Edge spread in px (NaN without edges) and share of tiles with edges of a (H,W) uint8 picture.
 
     An edge of spread s has a gradient of 1 / sqrt(s² + t²) after smoothing with t. The ratio of the gradients at two
-    scales
-    gives s independently of contrast, so that a sharp photo with little texture counts as sharp (Zhuo and Sim 2011,
-    Defocus
-    map estimation from a single image). The result is the median over the strongest quarter of the edge points, in the
-    direction where it is largest.
+    scales gives s independently of contrast, so that a sharp photo with little texture counts as sharp (Zhuo and Sim
+    2011, Defocus map estimation from a single image). The result is the median over the strongest quarter of the edge
+    points, in the direction where it is largest.
     """
     fine = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), _FINE)
     coarse = cv2.GaussianBlur(fine, (0, 0), float(np.sqrt(_COARSE**2 - _FINE**2)))
@@ -149,8 +147,7 @@ def same_views(thumbnails: list[Pixels], options: CheckOptions) -> list[tuple[in
     """Pairs (i < j) of pictures taken from the same place in the same direction, whatever their size and exposure.
 
     Candidates are found by correlation of tiny pictures. In every tile of a candidate pair the difference, after
-    fitting
-    brightness and contrast, must be smaller than that of the picture to itself displaced by ``same_shift``.
+    fitting brightness and contrast, must be smaller than that of the picture to itself displaced by ``same_shift``.
     """
     if len(thumbnails) < 2:
         return []

@@ -43,11 +43,9 @@ def lenses_of(exifs: Sequence[PhotoExif], camera: str | Path | None) -> tuple[li
     """The lens of each photo, or why the given camera does not fit it; and warnings.
 
     Photos share a lens when make, model, focal lengths (within the rounding of EXIF), digital zoom, upright size and,
-    where
-    known, the serial number agree; without EXIF data, when their sizes agree. Calibrated lenses are also distinguished
-    by
-    orientation, because rotation moves the principal point. The focal length comes from ``camera``, else the 35 mm
-    equivalent, else the focal length and the sensor's width, else it is 1.2 × the longer side.
+    where known, the serial number agree; without EXIF data, when their sizes agree. Calibrated lenses are also
+    distinguished by orientation, because rotation moves the principal point. The focal length comes from ``camera``,
+    else the 35 mm equivalent, else the focal length and the sensor's width, else it is 1.2 × the longer side.
 
     Args:
         exifs: of the photos.

@@ -71,10 +71,8 @@ def intake_photos(
     """Read and check the photos of a folder.
 
     Rejected, with a reason, are files that cannot be read, thumbnails, panoramas, photos without texture, duplicates,
-    photos
-    too blurred for use, and those that the camera file does not fit. Photos that are merely poor are kept with a
-    warning.
-    Photos of something else are only found later, when photos are matched.
+    photos too blurred for use, and those that the camera file does not fit. Photos that are merely poor are kept with a
+    warning. Photos of something else are only found later, when photos are matched.
 
     Args:
         source: folder, glob, or list of photo files; other files in a folder are ignored.

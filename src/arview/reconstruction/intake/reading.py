@@ -69,8 +69,7 @@ def glance(data: bytes) -> Glance:
     """Decode all of a photo's bytes, at half, quarter or eighth size where that is enough.
 
     Pillow detects truncated files, but decodes JPEGs with damaged data without an error. FFmpeg's decoder reports
-    these, so
-    JPEGs are decoded by it too.
+    these, so JPEGs are decoded by it too.
 
     Raises:
         InputError: what is wrong, without the file's name.
@@ -106,10 +105,8 @@ def photo_paths(source: str | Path | Sequence[str | Path]) -> tuple[list[Path], 
     """Photo files of a folder, glob, file or list of these in natural order, with a unique name for each.
 
     Of a folder its own photos are taken, or if it has none those of its subfolders, so that results written below the
-    photos
-    are not taken for photos. Hidden files, and raw files beside a JPEG of the same name, are skipped. Names are paths
-    below
-    the folder.
+    photos are not taken for photos. Hidden files, and raw files beside a JPEG of the same name, are skipped. Names are
+    paths below the folder.
 
     Raises:
         InputError: the folder does not exist, or there is no photo in it.

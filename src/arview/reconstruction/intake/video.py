@@ -52,8 +52,7 @@ def intake_video(
     """Choose frames of a video and write them into ``folder`` as ``frame_000123.png``, numbered as in the video.
 
     A first pass measures the motion of the picture (median motion of tracked corners) and the sharpness of each frame.
-    The
-    path of the motion is cut into equal steps, and the sharpest frame in the middle of each step is chosen.
+    The path of the motion is cut into equal steps, and the sharpest frame in the middle of each step is chosen.
 
     Args:
         path: video file, or folder or glob of its frames.

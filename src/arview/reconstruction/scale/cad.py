@@ -146,8 +146,7 @@ def search_ranges(part: Part, cameras: Sequence[Camera], spans: tuple[float, flo
     them.
 
     Photos are taken from all around, whatever azimuth is declared for tracking. Distances follow from the lenses, in
-    steps
-    of √2 so that cached guide views can be reused.
+    steps of √2 so that cached guide views can be reused.
     """
     longer = np.array([camera.fx / max(camera.width, camera.height) for camera in cameras])
     diameter = part.model.diameter_mm

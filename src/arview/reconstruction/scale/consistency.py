@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from arview.cad.model import Model
@@ -13,26 +15,44 @@ from arview.reconstruction.scale.types import Consistency
 from arview.reconstruction.types import SparseModel
 from arview.rendering.renderers import ZBufferRenderer
 
-DRAWN_PX = 600
-"""Longer side at which the CAD is rendered for the check of the points."""
-NEAR_SHARE = 0.006
-"""Distance in diameters of the part below which points lie on the CAD's surface: rough surfaces, displaced components.
-"""
-RIM_PX = 3
-"""Points this near to an outline, in rendered px, may belong to what is behind it."""
-MIN_PHOTOS = 3
-"""Points observed in fewer photos are often wrong matches."""
-MIN_POINTS = 60
-"""Points on the part that the check of the points needs."""
-MIN_NEAR, MAX_BEHIND = 0.6, 0.15
-"""Smallest share of points near the surface, and largest share behind it, of a consistent reconstruction."""
-MIN_EDGES, MIN_OF_OTHERS = 0.25, 0.45
-"""Smallest share of edges found beyond chance, in all photos; and in one photo, relative to the median photo."""
-MAX_MISFITS = 0.1
-"""Largest share of photos that may not fit."""
+
+@dataclass(frozen=True)
+class ConsistencyOptions:
+    """Thresholds of the consistency check.
+
+    Attributes:
+        max_side_px: longer side at which the CAD is rendered for the check of the points.
+        near_share: distance, in diameters of the part, below which points lie on the CAD's surface; it allows for
+            rough surfaces and displaced components.
+        rim_px: points this near to an outline, in rendered px, may belong to what is behind it.
+        min_photos: points observed in fewer photos are often wrong matches.
+        min_points: points on the part that the check of the points needs.
+        min_near: smallest share of points near the surface.
+        max_behind: largest share of points behind the surface.
+        min_edges: smallest share of edges found beyond chance, in the median photo.
+        min_relative_edges: the same in one photo, relative to the median photo; a photo below does not fit.
+        max_misfits: largest share of photos that do not fit.
+    """
+
+    max_side_px: int = 600
+    near_share: float = 0.006
+    rim_px: int = 3
+    min_photos: int = 3
+    min_points: int = 60
+    min_near: float = 0.6
+    max_behind: float = 0.15
+    min_edges: float = 0.25
+    min_relative_edges: float = 0.45
+    max_misfits: float = 0.1
 
 
-def check_consistency(sparse: SparseModel, model: Model, found: CadFind, similarity: Similarity) -> Consistency:
+def check_consistency(
+    sparse: SparseModel,
+    model: Model,
+    found: CadFind,
+    similarity: Similarity,
+    options: ConsistencyOptions | None = None,
+) -> Consistency:
     """Check the edges of the CAD in every photo, and the sparse points against the CAD's surface.
 
     Args:
@@ -40,25 +60,27 @@ def check_consistency(sparse: SparseModel, model: Model, found: CadFind, similar
         model: the CAD.
         found: the CAD as it was found in the photos.
         similarity: the similarity to check.
+        options: see `ConsistencyOptions`.
     """
+    o = options or ConsistencyOptions()
     support = found.refiner.support(similarity)
     usual = float(np.nanmedian(support.by_view))
-    is_misfit = support.by_view < MIN_OF_OTHERS * usual
+    is_misfit = support.by_view < o.min_relative_edges * usual
     misfits = tuple(v.name for v, bad in zip(found.refiner.views, is_misfit, strict=True) if bad)
-    offsets = points_before_surface(sparse, model, similarity)
-    tolerance_mm = NEAR_SHARE * model.diameter_mm
-    near = float(np.mean(np.abs(offsets) < tolerance_mm)) if len(offsets) >= MIN_POINTS else None
-    behind = float(np.mean(offsets < -tolerance_mm)) if len(offsets) >= MIN_POINTS else None
+    offsets = points_before_surface(sparse, model, similarity, o)
+    tolerance_mm = o.near_share * model.diameter_mm
+    near = float(np.mean(np.abs(offsets) < tolerance_mm)) if len(offsets) >= o.min_points else None
+    behind = float(np.mean(offsets < -tolerance_mm)) if len(offsets) >= o.min_points else None
     against = []
-    if usual < MIN_EDGES:
+    if usual < o.min_edges:
         against.append(
             f"only {100 * support.share:.0f} % of the CAD's edges are where they should be "
             f"({100 * support.chance:.0f} % would be by chance)"
         )
-    if len(misfits) > MAX_MISFITS * len(is_misfit):
+    if len(misfits) > o.max_misfits * len(is_misfit):
         names = ", ".join(misfits[:5]) + (" …" if len(misfits) > 5 else "")
         against.append(f"{len(misfits)} of {len(is_misfit)} photos do not fit the CAD where the others do: {names}")
-    if near is not None and behind is not None and (near < MIN_NEAR or behind > MAX_BEHIND):
+    if near is not None and behind is not None and (near < o.min_near or behind > o.max_behind):
         against.append(
             f"of the points on the part only {100 * near:.0f} % lie within {tolerance_mm:.1f} mm of the CAD's surface, "
             f"{100 * behind:.0f} % lie behind it"
@@ -74,18 +96,18 @@ def check_consistency(sparse: SparseModel, model: Model, found: CadFind, similar
     )  # fmt: skip
 
 
-def points_before_surface(sparse: SparseModel, model: Model, similarity: Similarity) -> Array:
+def points_before_surface(sparse: SparseModel, model: Model, similarity: Similarity, o: ConsistencyOptions) -> Array:
     """Signed distances (N,) in mm by which sparse points on the part lie in front of the CAD's surface.
 
     Negative values are behind the surface, where nothing is visible if the CAD is right. Each value is the median over
-    the
-    photos that see the point on the part; points are left out if more than half of their photos see them off the part.
+    the photos that see the point on the part; points are left out if more than half of their photos see them off the
+    part.
     """
     points = similarity.points_in_model(sparse.points_in_scan)
 
     def offsets_in(index: int) -> tuple[Array, Array]:
         photo = sparse.photos[index]
-        shrink = min(1.0, DRAWN_PX / max(photo.camera.width, photo.camera.height))
+        shrink = min(1.0, o.max_side_px / max(photo.camera.width, photo.camera.height))
         camera = photo.camera.without_distortion().scaled(
             round(photo.camera.width * shrink), round(photo.camera.height * shrink)
         )
@@ -94,11 +116,11 @@ def points_before_surface(sparse: SparseModel, model: Model, similarity: Similar
         which = sparse.observed_point[sparse.observed_photo == index]
         in_cam = apply(pose, points[which])
         pixels = camera.project(in_cam)
-        ok = np.all(np.isfinite(pixels) & (pixels >= RIM_PX), axis=1)
-        ok &= np.all(pixels < np.array([camera.width, camera.height]) - RIM_PX - 1, axis=1)
+        ok = np.all(np.isfinite(pixels) & (pixels >= o.rim_px), axis=1)
+        ok &= np.all(pixels < np.array([camera.width, camera.height]) - o.rim_px - 1, axis=1)
         before = np.full(len(which), np.nan)
         u, v = np.round(pixels[ok]).astype(np.intp).T
-        around = [depth[v + dv, u + du] for dv in (-RIM_PX, 0, RIM_PX) for du in (-RIM_PX, 0, RIM_PX)]
+        around = [depth[v + dv, u + du] for dv in (-o.rim_px, 0, o.rim_px) for du in (-o.rim_px, 0, o.rim_px)]
         lowest, highest = np.min(around, axis=0), np.max(around, axis=0)
         # A point between the nearest and the farthest surface around its pixel counts as on it: steps and slopes.
         z = in_cam[ok, 2]
@@ -112,7 +134,7 @@ def points_before_surface(sparse: SparseModel, model: Model, similarity: Similar
     which, before = np.concatenate([s[0] for s in seen]), np.concatenate([s[1] for s in seen])
     is_on = np.isfinite(before)
     on, total = np.bincount(which[is_on], minlength=len(points)), np.bincount(which, minlength=len(points))
-    kept = is_on & (on >= 2)[which] & (total >= MIN_PHOTOS)[which] & (2 * on >= total)[which]
+    kept = is_on & (on >= 2)[which] & (total >= o.min_photos)[which] & (2 * on >= total)[which]
     order = np.lexsort((before[kept], which[kept]))
     values, owners = before[kept][order], which[kept][order]
     starts = np.flatnonzero(np.r_[True, owners[1:] != owners[:-1]]) if len(owners) else np.zeros(0, dtype=np.intp)

@@ -113,8 +113,8 @@ def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:
     """Weighted mean of the evidence by inverse variance; None without any.
 
     Evidence that differs from more trusted evidence by more than MAX_SIGMAS standard deviations is rejected, with a
-    warning
-    that names both. If the rest scatters by more than its standard deviations allow, that of the mean is increased.
+    warning that names both. If the rest scatters by more than its standard deviations allow, that of the mean is
+    increased.
     """
     ordered = sorted(evidence, key=lambda e: TRUST.index(e.kind))
     checked: list[ScaleEvidence] = []

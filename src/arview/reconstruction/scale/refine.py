@@ -106,8 +106,7 @@ class Support:
 
     Attributes:
         by_view, by_component: share of edge points with a step of brightness where predicted, beyond chance: 0 = no
-            more
-            than beside the edges, 1 = all; NaN where nothing was searched.
+            more than beside the edges, 1 = all; NaN where nothing was searched.
         share, chance: shares over all points, at the edges and beside them.
         is_base: (C,) which components define the frame.
     """

@@ -60,8 +60,7 @@ def fit_points(points_in_scan: Array, points_in_mm: Array, scale: float | None =
     """Least-squares similarity from points (N,3) of the reconstruction to the same points in mm.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (PAMI 1991); the
-    uncertainty
-    of the scale follows from the residuals. With ``scale`` given, only the rigid motion is fitted.
+    uncertainty of the scale follows from the residuals. With ``scale`` given, only the rigid motion is fitted.
 
     Raises:
         InputError: there are fewer than three points, or all coincide.

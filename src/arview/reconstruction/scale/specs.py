@@ -92,8 +92,7 @@ def load_scale_file(path: str | Path) -> ScaleSources:
     """Read scale sources from a TOML file with ``[[board]]``, ``[[tag]]``, ``[[scale_bar]]`` and ``[rig]``.
 
     A board has ``spec`` as on the command line; a tag ``dictionary``, ``side_mm`` and optionally ``ids``; a bar ``ids``
-    (two),
-    ``length_mm`` and optionally ``dictionary`` and ``std_mm``; the rig what `load_rig` reads.
+    (two), ``length_mm`` and optionally ``dictionary`` and ``std_mm``; the rig what `load_rig` reads.
 
     Raises:
         InputError: the file cannot be read, is not TOML, or a key or value is invalid.
