@@ -117,8 +117,7 @@ def place_board(board: Board, paper_mm: tuple[float, float]) -> Sheet:
 
 
 def rectangles_mm(board: Board) -> tuple[Array, Array]:
-    """Black (N,4) and, on top of them, white (M,4) rectangles (left, top, width, height) in mm from the upper left
-    corner.
+    """Black (N,4) and, on top, white (M,4) rectangles (left, top, width, height), mm from the upper left corner.
 
     Squares without a marker are black; a marker is a black square with white bits.
     """

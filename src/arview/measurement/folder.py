@@ -122,8 +122,7 @@ def _any_ply(path: Path) -> DenseCloud:
 
 
 def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricReconstruction:
-    """The reconstruction in the frame of the CAD, found from the cloud's shape; unchanged if its frame is known
-    already.
+    """The reconstruction in the frame of the CAD, found from the cloud's shape unless its frame is known.
 
     Raises:
         InputError: the part is not found in the cloud, or the scale is unknown and no two datums have a distance.

@@ -167,9 +167,7 @@ def align_to_datums(
     reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, base: Sequence[str],
     results: Mapping[str, ComponentMeasurement], options: MeasureOptions,
 ) -> Alignment:  # fmt: skip
-    """The datum frame of the part file; directions that it leaves free, or all without datums, follow from the base's
-    fit.
-    """
+    """The datum frame of the part file; what it leaves free follows from the base's fit, as does all without datums."""
     fitted = {}
     for name in [*base, *(datum.component for datum in part.datums)]:
         together = combined_of(results[name]) if name in results else None
@@ -201,9 +199,7 @@ def align_to_datums(
 def _plane_of_base(
     views: PhotoViews, model: Model, base: Sequence[str], options: MeasureOptions
 ) -> list[DatumEquations]:
-    """Equations of the base's large flat face, whose height is known better than that of its edges; none without such a
-    face.
-    """
+    """Equations of the base's large flat face, whose height is known better than that of its edges; or none."""
     component = model.component(base[0])
     plane = base_plane(component, views.centres.mean(axis=0) - component.bounds_in_model.mean(axis=0))
     if plane is None:

@@ -67,9 +67,7 @@ def reprojection_residuals(sparse: SparseModel) -> Array:
 
 
 def free_frame_projection(sparse: SparseModel) -> Array:
-    """(6M,6M) projection that removes rotation, translation and scaling of the whole frame from left twists of the
-    poses.
-    """
+    """(6M,6M) projection that removes a rotation, translation or scaling of the whole frame from left twists."""
     blocks = []
     for photo in sparse.photos:
         # Left twists equivalent to a small rotation, translation and scaling of the scan frame about its origin.

@@ -1,5 +1,4 @@
-"""From photos or a video to poses, millimetres in the approximate CAD frame and a dense cloud, in stages, into a
-folder.
+"""From photos or a video to poses, millimetres in the approximate CAD frame and a dense cloud, in stages.
 
 | file | stage |
 |---|---|
@@ -348,9 +347,7 @@ def camera_summary(camera: Any) -> dict[str, Any]:
 
 
 def pose_deviations(sparse: SparseModel) -> Array | None:
-    """(M,2) standard deviations of each photo's rotation (rad) and centre (unit), as means over the axes; None if
-    unknown.
-    """
+    """(M,2) standard deviations of each photo's rotation (rad) and centre (unit), means over the axes; or None."""
     if sparse.pose_covariance is None:
         return None
     rows = []

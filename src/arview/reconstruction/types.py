@@ -87,9 +87,7 @@ class SparseModel:
             raise InputError("sparse model: a point is NaN or infinite")
 
     def transformed(self, scale: float, new_from_scan: Array) -> SparseModel:
-        """The model after ``x_new = new_from_scan @ (scale * x_scan)``, with scale > 0 and ``new_from_scan`` (4,4)
-        rigid.
-        """
+        """The model after ``x_new = new_from_scan @ (scale * x_scan)``; scale > 0, ``new_from_scan`` (4,4) rigid."""
         if not scale > 0:
             raise InputError(f"sparse model: scale {scale} is not positive")
         photos = []

@@ -92,9 +92,7 @@ def find_model_in_cloud(
 
 
 def _some_points(cloud: DenseCloud, o: GlobalRegistrationOptions) -> tuple[Array, Array, bool]:
-    """Points (N,3) spread evenly over a cloud, their normals, and whether the sign of these is known; otherwise
-    estimated.
-    """
+    """Points (N,3) spread evenly over a cloud, their normals, and whether these are oriented (else estimated)."""
     points, own = np.asarray(cloud.points, dtype=np.float64), np.asarray(cloud.normals, dtype=np.float64)
     sound = np.isfinite(points).all(axis=1)
     points, own = points[sound], np.nan_to_num(own[sound])

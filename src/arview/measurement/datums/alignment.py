@@ -199,9 +199,7 @@ def _result(
 
 
 def _solver(design: Array, one: DatumEquations, fit: DatumFit, scale_std: float | None) -> Array:
-    """(K,N) least-squares solution matrix of the directions from the offsets; (K,N+1) with the prior scale as last
-    value.
-    """
+    """(K,N) matrix that maps offsets to the least-squares directions; (K,N+1) with the prior scale as last value."""
     columns = design.shape[1]
     weights = fit.weights / fit.weights.max()
     if one.by_radius is not None:

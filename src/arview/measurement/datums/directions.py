@@ -8,15 +8,11 @@ from arview.geometry import Array
 from arview.measurement.datums.equations import DOF_NAMES
 
 MIN_SHARE_OF_SIZE = 0.02
-"""A datum determines a direction when a motion along it displaces its points by more than this share of the part's
-size.
-"""
+"""Displacement, in sizes of the part, of a datum's points by a unit motion, from which the motion is determined."""
 
 
 def shift_origin(origin: Array) -> Array:
-    """(3,7) matrix that moves equations from the model's origin to another: subtract ``normals @
-    shift_origin(origin)``.
-    """
+    """(3,7) matrix for another origin of equations: subtract ``normals @ shift_origin(origin)`` from their rows."""
     x, y, z = origin
     shift = np.zeros((3, 7))
     shift[:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
@@ -42,9 +38,7 @@ def intersection(a: Array, b: Array) -> Array:
 
 
 def orthogonal_complement(free: Array, columns: Array) -> Array:
-    """Orthonormal basis of the part of ``free`` (6,F) that is orthogonal to the orthonormal directions ``columns``
-    (6,K).
-    """
+    """Orthonormal basis of the part of ``free`` (6,F) that is orthogonal to the orthonormal ``columns`` (6,K)."""
     columns = columns[:, np.abs(columns).max(axis=0) > 0]
     left, values, _ = np.linalg.svd(free - columns @ (columns.T @ free))
     return left[:, : free.shape[1]][:, values[: free.shape[1]] > 0.5]

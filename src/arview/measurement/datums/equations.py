@@ -60,9 +60,7 @@ class AlignmentOptions:
 
 
 def point_from_move(arms: Array) -> Array:
-    """(N,3,7) derivative of the displacement ω × a + t + s a of points by (ω, t, s); ``arms`` a (N,3) are from the
-    origin.
-    """
+    """(N,3,7) derivative of the displacement ω × a + t + s a by (ω, t, s), for arms a (N,3) from the origin."""
     rows = np.zeros((len(arms), 3, 7))
     x, y, z = arms.T
     rows[:, 0, 1], rows[:, 0, 2] = z, -y

@@ -1,6 +1,4 @@
-"""Datum features measured in the photos: planes, cylinders and points by the sweep, rims and edges by steps of
-brightness.
-"""
+"""Datum features measured in the photos: faces and points by the sweep, rims and edges by steps of brightness."""
 
 from __future__ import annotations
 

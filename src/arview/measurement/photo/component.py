@@ -49,9 +49,7 @@ class MeasuredComponent:
         return float(np.abs(twist * np.repeat([self.radius_mm, 1.0], 3)).max())
 
     def is_same(self, place: Array, other: Array) -> bool:
-        """Whether two places differ by less than a quarter of a pixel at all corners, too little to change what is
-        visible.
-        """
+        """Whether two places differ at all corners by less than a quarter of a pixel, so that the same is visible."""
         apart = apply(place, self.corners) - apply(other, self.corners)
         return float(np.linalg.norm(apart, axis=1).max()) < 0.25 * self.px_mm
 

@@ -118,9 +118,7 @@ def edge_offsets(
 
 
 def _across(camera: Camera, in_cam: Array, pixels: Array, tangents: Array) -> tuple[Array, Array]:
-    """(N,2) unit normals of edges in the picture, and (N,3) derivative of the pixel along them by mm in the camera
-    frame.
-    """
+    """(N,2) unit normals of edges in the picture, and (N,3) px along them by mm in the camera frame."""
     # Numerical derivative through the lens, with steps of one micrometre per mm of depth.
     delta = 1e-6 * in_cam[:, 2:]
     by_cam = np.stack([(camera.project(in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)], axis=2)
@@ -264,9 +262,7 @@ class ComponentEdges:
         self, edges: EdgePoints, found: EdgeOffsets, ok: NDArray[np.bool_], place: Array, dark_mm: float,
         is_last: bool = True,
     ) -> tuple[RigidFit, float]:  # fmt: skip
-        """Fit with all edges shifted to the dark side by ``dark_mm``, as the previous round found; also the new such
-        shift.
-        """
+        """Fit with all edges shifted to the dark side by ``dark_mm``; also return the shift for the next round."""
         o = self.options.edges
         size, slope = found.mm_per_px[ok], found.slopes[ok]
         sigmas = _SIGMA_PX * size * np.sqrt((np.abs(slope) + o.half_slope) / np.abs(slope))

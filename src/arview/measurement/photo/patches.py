@@ -61,9 +61,7 @@ def cut_patches(
 
 
 def shades_of(is_on: NDArray[np.bool_]) -> Array:
-    """(N,P,3) brightness changes that shading may add to patches: constant and two slopes, orthonormal over the points
-    on.
-    """
+    """(N,P,3) brightness changes that shading may add: constant and two slopes, orthonormal over the points on."""
     width = int(np.sqrt(is_on.shape[1]))
     a, b = (grid.ravel() for grid in np.meshgrid(*2 * [np.linspace(-1.0, 1.0, width)]))
     plain = np.stack([np.ones_like(a), a, b], axis=1)[None] * is_on[..., None]
@@ -110,8 +108,7 @@ def near_edges(points: Array, component: Component, reach_mm: float) -> NDArray[
 
 
 def free_directions(component: Component, part: Part | None, center: Array, radius_mm: float) -> Array:
-    """(K,6) orthonormal motions (rotation times ``radius_mm``, translation of the centre) that leave the shape
-    unchanged.
+    """(K,6) orthonormal motions (rotation times ``radius_mm``, translation of the centre) that keep the shape.
 
     These follow from continuous symmetries, found in the mesh or declared in the part file.
     """

@@ -107,9 +107,7 @@ def _rows(found: EdgeOffsets, outward: Array) -> Array:
 
 
 def _seen(views: PhotoViews, rim: Array, radial: Array, around: Array, axis: Array) -> tuple[EdgePoints, Array]:
-    """Points of the rim that each photo shows, and their outward directions (N,3); visibility is tested just above the
-    rim.
-    """
+    """Points of the rim that each photo shows, tested just above the rim, and their outward directions (N,3)."""
     points, tangents, outward, owner = [], [], [], []
     groups = (rim + 0.1 * axis)[:, None]
     for view in range(len(views.cameras)):

@@ -333,9 +333,7 @@ class ComponentSweep:
         return patches, is_on
 
     def _coarse(self, chosen: Indices, seen: NDArray[np.bool_]) -> Array:
-        """Place within the capture range at which most samples look alike: votes for translations, then a fit to near
-        peaks.
-        """
+        """Place within the capture range at which most samples look alike: votes for translations, then a fit."""
         o = self.options.sweep
         # Choose the resolution such that the range has about forty steps, with patches of matching size.
         level = int(np.clip(np.round(np.log2(0.4 / self.body.px_mm)) + 1, 1, 2))
@@ -376,9 +374,7 @@ class ComponentSweep:
         )  # fmt: skip
 
     def _places(self, samples: Samples) -> Array:
-        """(N,6) positions in patch widths and scaled normals, so that faces of different orientation are far from each
-        other.
-        """
+        """(N,6) positions in patch widths and scaled normals, so that faces of different orientation are far apart."""
         return np.concatenate([samples.points / self.patch_mm, 8.0 * samples.normals], axis=1)
 
     def _not(self, reason: str) -> NotMeasured:

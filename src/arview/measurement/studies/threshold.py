@@ -23,8 +23,7 @@ TRUE_MM = 1.0
 
 
 def threshold_study(is_quick: bool = False, seed: int = 0, runs: int = 20) -> Study:
-    """Register a post displaced by 1 mm, with 24,099 points without noise, for thresholds of 0.1 to 1e-5 mm and
-    degrees.
+    """Register a post displaced by 1 mm, with 24,099 points without noise, for several thresholds.
 
     The reference of the clouds is another sample of the surface, or the measured points themselves before they were
     moved:

@@ -162,9 +162,7 @@ def place(
 
 
 def relative_twists(moves: Array, frames: Array, combined: CombinedMove, alignment: Alignment) -> Array:
-    """(D,6) twists of a component in the datum frame, from its twists (D,6) and the frame's moves (D,7) in the rough
-    frame.
-    """
+    """(D,6) twists of a component in the datum frame, from its twists (D,6) and the frame's moves (D,7)."""
     center, origin = combined.center_in_model, alignment.origin_in_model
     arm = center - origin
     turned = rotate(-frames[:, :3], arm + moves[:, 3:] - frames[:, 3:6]) / (1.0 + frames[:, 6:])

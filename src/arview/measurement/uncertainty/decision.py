@@ -36,9 +36,7 @@ def decide(value: float | None, uncertainty: float | None, tolerance: float | No
 
 
 def worst(verdicts: Iterable[Verdict]) -> Verdict:
-    """Verdict on several characteristics of a component: one that fails fails it, else one undecided leaves it
-    undecided.
-    """
+    """Verdict on a component with several characteristics: fail if one fails, else undecided if one is undecided."""
     order = (Verdict.PASS, Verdict.NOT_MEASURED, Verdict.UNDECIDED, Verdict.FAIL)
     return max(verdicts, key=order.index, default=Verdict.NOT_MEASURED)
 

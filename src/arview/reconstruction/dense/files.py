@@ -55,8 +55,10 @@ def read_map(path: Path) -> Floats:
 
 
 def write_maps(folder: Path, name: str, m: DepthMap) -> None:
-    """Write depth (0: none) and normals in the camera frame, towards the camera, below ``folder/stereo``. Raises
-    OutputError.
+    """Write depth (0: none) and normals in the camera frame, towards the camera, below ``folder/stereo``.
+
+    Raises:
+        OutputError: the folder cannot be written to.
     """
     camera, w = m.camera, m.planes[..., 0]
     is_known = (w > 0) & (m.scores > 0)

@@ -44,7 +44,7 @@ _SLOPE_PRIOR = 0.05
 
 @kernel(fastmath=True, numpy_errors=True)
 def _normal_equations(pixels, sizes, warps, s, index, k, h, variance, noise, system):  # type: ignore[no-untyped-def]
-    """Add source k to the system (upper half of H, gradient, squares) with gain and offset eliminated; return its
+    """Add source k, with gain and offset eliminated, to the system (upper H, gradient, squares); return its
     correlation.
     """
     sample(pixels, sizes, s, index, k, h)

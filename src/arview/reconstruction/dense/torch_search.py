@@ -234,9 +234,7 @@ class _Search:
         return self.torch.where(is_better[:, None], plane, best), self.torch.where(is_better, cost, costs)
 
     def sweep(self, color: int, step_w: float, step_tilt: float, seed: int) -> None:
-        """See `patchmatch.sweep`. A sweep reads only the other colour, so all pixels of one colour can be processed at
-        once.
-        """
+        """See `patchmatch.sweep`; all pixels of one colour at once, because a sweep reads only the other colour."""
         torch, numbers = self.torch, self.numbers
         height, width = self.costs.shape
         rows, columns = (torch.arange(n, device=self.device) for n in (height, width))

@@ -133,9 +133,7 @@ def _lens_from_exif(key: str, exif: PhotoExif) -> Lens:
 
 
 def _drop_calibration_of_other_zooms(lenses: list[Lens | MismatchError], firsts: Sequence[PhotoExif]) -> list[str]:
-    """Replace the calibration of lenses with another focal length in EXIF, if that of other lenses fits; return
-    warnings.
-    """
+    """Replace the calibration of lenses whose EXIF gives another zoom, if it fits other lenses; return warnings."""
     off = {}
     for index, (lens, exif) in enumerate(zip(lenses, firsts, strict=True)):
         focal_px = focal_length_px(exif, *exif.upright_size)

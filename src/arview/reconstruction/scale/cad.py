@@ -142,8 +142,7 @@ def shrunk(camera: Camera, image: Pixels, max_side_px: int) -> tuple[Camera, Pix
 
 
 def search_ranges(part: Part, cameras: Sequence[Camera], spans: tuple[float, float]) -> list[ViewRange]:
-    """View ranges to search, the more likely one first: from above, then from below, as far as the part file declares
-    them.
+    """View ranges to search, the more likely one first: from above, from below, as far as the part file declares them.
 
     Photos are taken from all around, whatever azimuth is declared for tracking. Distances follow from the lenses, in
     steps of √2 so that cached guide views can be reused.
@@ -206,9 +205,7 @@ def _search(
     options: CadOptions,
     progress: Progress | None,
 ) -> tuple[list[Vote], Array, NotFound]:
-    """Votes of the detections, rotations (N,3,3) under which the part looks similar, and the reason if there is no
-    vote.
-    """
+    """Votes of the detections, rotations (N,3,3) under which the part looks similar, and the reason without a vote."""
     from arview.detection.detector import options_for
     from arview.tracking.diagnosis import diagnose_search
 

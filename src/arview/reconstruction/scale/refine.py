@@ -199,8 +199,8 @@ class JointRefiner:
         return CadEdgePoints(points, tangents, component, self._features(points, tangents, component))
 
     def rough(self, start: Similarity) -> tuple[Similarity, Support]:
-        """Refine from a distant start, with all components and with the base alone; keep the result with better base
-        support.
+        """Refine from a distant start, with all components and with the base alone; keep the one that fits the base
+        better.
         """
         tried = []
         for components in (np.ones_like(self._is_base), self._is_base):
@@ -216,8 +216,8 @@ class JointRefiner:
         reaches_px: Sequence[float] | None = None,
         components: NDArray[np.bool_] | None = None,
     ) -> Fit:
-        """Refine from a near start to the similarity on which the edges of all views agree; ``components`` (C,) selects
-        some.
+        """Refine from a near start to the similarity on which the edges of all views, or of some ``components`` (C,),
+        agree.
         """
         o = self.options
         reaches = reaches_px or o.reaches_px

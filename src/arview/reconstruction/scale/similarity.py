@@ -12,9 +12,7 @@ from arview.geometry import Array, apply, exp_se3, invert, orthonormalise, rigid
 
 @dataclass(frozen=True)
 class Similarity:
-    """``x_model = model_from_scan @ (scale * x_scan)``, with ``scale`` in mm per unit and ``model_from_scan`` (4,4)
-    rigid.
-    """
+    """``x_model = model_from_scan @ (scale * x_scan)``; ``scale`` is in mm per unit, ``model_from_scan`` (4,4) rigid."""
 
     scale: float
     model_from_scan: Array
@@ -29,7 +27,7 @@ class Similarity:
         return apply(self.model_from_scan, self.scale * points_in_scan)
 
     def moved(self, step: Array, center_in_model: Array) -> Similarity:
-        """The similarity after a step (7,): twist about the model's centre on the right of ``cam_from_model``, and d
+        """The similarity after a step (7,): twist about the model's centre, right of ``cam_from_model``, and d
         log(scale).
 
         The change of scale leaves the centre where it is in the reconstruction.

@@ -100,9 +100,7 @@ def _rotation(sighting: Sighting) -> Array:
 
 
 def _fit(sightings: Sequence[Sighting], center_in_model: Array) -> Similarity | None:
-    """Least-squares similarity: the mean rotation, then the position and scale at which all see the centre where
-    detected.
-    """
+    """Least-squares similarity: the mean rotation, then the position and scale that fit the detected centres."""
     rotation = orthonormalise(rigid(np.mean([_rotation(s) for s in sightings], axis=0), np.zeros(3)))[:3, :3]
     rows, right = [], []
     for s in sightings:
