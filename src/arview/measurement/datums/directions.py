@@ -12,7 +12,7 @@ MIN_SHARE_OF_SIZE = 0.02
 
 
 def shift_origin(origin: Array) -> Array:
-    """(3,7) matrix for another origin of equations: subtract ``normals @ shift_origin(origin)`` from their rows."""
+    """(3,7) matrix S that moves equations to another origin: subtract ``normals @ S`` from their rows."""
     x, y, z = origin
     shift = np.zeros((3, 7))
     shift[:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]

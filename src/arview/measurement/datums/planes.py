@@ -12,7 +12,7 @@ from arview.measurement.photo.patches import tangents_of
 
 
 def base_plane(component: Component, toward: Array) -> Datum | None:
-    """The largest flat face that faces ``toward`` (3,), as a datum; None if it is less than a fifth of the component."""
+    """The largest flat face that faces ``toward`` (3,), as a datum; None if it is below a fifth of the component."""
     corners = component.vertices_in_model[component.faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(doubled, axis=1)

@@ -12,7 +12,7 @@ from arview.geometry import Array, apply, exp_se3, invert, orthonormalise, rigid
 
 @dataclass(frozen=True)
 class Similarity:
-    """``x_model = model_from_scan @ (scale * x_scan)``; ``scale`` is in mm per unit, ``model_from_scan`` (4,4) rigid."""
+    """``x_model = model_from_scan @ (scale * x_scan)``; scale in mm per unit, ``model_from_scan`` (4,4) rigid."""
 
     scale: float
     model_from_scan: Array
