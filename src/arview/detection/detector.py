@@ -1,8 +1,8 @@
-"""Detector: finds the part in a single frame from its guide views, with no pose to start from.
+"""Detector: finds the part in a single image from its guide views, without a pose to start from.
 
-Coarse to fine: templates over all directions, rolls, distances and places, improved as outlines in the picture
-(`first_search`); then the `local_search` around the best. A quick search comes first; what it does not settle is
-looked for among many more matches.
+Coarse to fine: the global search matches templates over all directions, rolls, distances and places and improves them
+as outlines in the image; the local search refines and verifies the best of them. A quick search comes first; where it
+does not give a sure result, wider searches follow.
 """
 
 from __future__ import annotations
@@ -10,52 +10,57 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.checks import check_type
-from arview.core.parallel import pool
-from arview.detection.confidence import ConfidenceTerms, Margins, confidence_terms, pose_probability
+from arview.detection.confidence import (
+    ConfidenceOptions,
+    ConfidenceTerms,
+    Margins,
+    confidence_terms,
+    pose_probability,
+)
+from arview.detection.disambiguation import DisambiguationOptions, Disambiguator, is_rotated_by
 from arview.detection.features.image_pyramid import ImagePyramid
-from arview.detection.scoring.pair_comparator import PairComparator
 from arview.detection.search.global_search import (
     GRADIENTS_ONLY,
     QUICK,
     UNTRIMMED,
     WIDE,
     GlobalSearch,
+    GlobalSearchOptions,
     PoseCandidate,
     SearchBudget,
-    reach_mm,
+    search_distances_mm,
 )
-from arview.detection.search.local_search import Hypothesis, LocalSearch, LocalSearchOptions
-from arview.detection.symmetry import LEAD, TELLING, find_symmetries, rotations_about, telling
+from arview.detection.search.hypothesis import Hypothesis
+from arview.detection.search.local_search import LocalSearch, LocalSearchOptions
+from arview.detection.symmetry import SymmetryOptions, find_rotational_symmetries
 from arview.errors import InputError
-from arview.geometry import Array, turned
+from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
 from arview.refinement.evidence import PoseEvidence
 
-MIN_QUICK_QUALITY = 0.6
-"""So much is wanted of a quick search alone: with few rivals looked at, a lead says less. Of 600 semi-synthetic frames
-it is right in 9 of the 12 in which it ends at 0.6 to 0.75, and in 30 of the 36 in which it ends at 0.75 to 0.9."""
-ALIKE_ASIDE, ALIKE_ALONG, ALIKE_DEG = 0.12, 0.15, 20.0
-"""Hypotheses this near, across in diameters and along as a share of the distance, are no rivals of each other."""
-MOST_RIVALS = 12
-"""Of more twins the likeliest are told apart."""
-SPINS_DEG = range(0, 360, 5)
-"""Turns about the axis of a nearly round part that are looked at."""
-MOST_SPUN = 6
-"""Of those so many are refined: in 98 pictures of a flange the right one is among the first four by its edges in 90."""
-LEAD_TELLS = 0.2
-"""A lead of 1 counts so much beside what the pair comparator and the edges tell of two twins. Of 162 pictures of nearly
-symmetric random solids in which the right pose is among the twins it is ahead in 135 with all three, in 130 without the
-edges, in 129 by the network alone, and in 113 by what speaks for each pose on its own."""
-HERE_ASIDE, HERE_ALONG = 0.35, 0.25
-"""Rivals this near are at the same place."""
+
+@dataclass(frozen=True)
+class MarginOptions:
+    """When two hypotheses compete, and whether they are at one place.
+
+    Attributes:
+        same_aside, same_along, same_deg: offset across the line of sight in diameters, offset along it as a share of
+            the distance, and rotation within which two hypotheses are one, badly refined.
+        nearby_aside, nearby_along: offsets within which competing hypotheses are at the same place.
+    """
+
+    same_aside: float = 0.12
+    same_along: float = 0.15
+    same_deg: float = 20.0
+    nearby_aside: float = 0.35
+    nearby_along: float = 0.25
 
 
 @dataclass(frozen=True)
@@ -63,47 +68,67 @@ class DetectorOptions:
     """Options of the detector.
 
     Attributes:
-        radius_px: half the part's diameter in the templates.
-        roll_step_deg: spacing of the templates.
+        radius_px: half the part's diameter in the templates, 10 to 60.
+        roll_step_deg: spacing of the templates in roll.
         subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
-        budgets: of the searches, each made if those before it did not settle the matter.
-        local: of the search around the best matches; its radius_px is that of the templates.
-        min_quality: a weaker result is no detection.
+        budgets: of the searches; each is made only if those before it gave no sure result.
+        min_quality: probability below which a result is no detection.
+        min_quick_quality: probability above which a search ends without a wider one; margins over few competitors
+            overstate it.
+        global_search: of the search for rough poses; its radius, roll step and subdivisions are those above.
+        local: of the search around rough poses; its radius is that above.
+        symmetry: of the search for symmetries of the part.
+        disambiguation: of near-symmetric poses.
+        margins: of the margins over competing hypotheses.
+        confidence: limits on the terms of the probability.
+
+    Raises:
+        InputError: ``radius_px`` is out of range.
     """
 
     radius_px: float = 20.0
     roll_step_deg: float = 18.0
     subdivisions: int = 2
     budgets: tuple[SearchBudget, ...] = (QUICK, WIDE, GRADIENTS_ONLY, UNTRIMMED)
-    local: LocalSearchOptions = field(default_factory=LocalSearchOptions)
     min_quality: float = 0.5
+    min_quick_quality: float = 0.6
+    global_search: GlobalSearchOptions = field(default_factory=GlobalSearchOptions)
+    local: LocalSearchOptions = field(default_factory=LocalSearchOptions)
+    symmetry: SymmetryOptions = field(default_factory=SymmetryOptions)
+    disambiguation: DisambiguationOptions = field(default_factory=DisambiguationOptions)
+    margins: MarginOptions = field(default_factory=MarginOptions)
+    confidence: ConfidenceOptions = field(default_factory=ConfidenceOptions)
 
     def __post_init__(self) -> None:
         if not 10 <= self.radius_px <= 60:
             raise InputError(f"detector: radius_px = {self.radius_px}, expected 10 to 60")
 
 
-NARROW_DETAIL = DetectorOptions(radius_px=26.0, roll_step_deg=12.0, subdivisions=3)
-"""Finer templates, for ranges in which they are few."""
-FEW_TEMPLATES = 1500
+NARROW_RANGE = DetectorOptions(radius_px=26.0, roll_step_deg=12.0, subdivisions=3)
+"""Finer templates, for declared ranges in which they are few."""
 
 
-def options_for(views: GuideViewSet) -> DetectorOptions:
-    """The options that suit the declared range."""
-    fine = NARROW_DETAIL
+def options_for(views: GuideViewSet, max_templates: int = 1500) -> DetectorOptions:
+    """The options that suit the declared range of guide views.
+
+    Args:
+        views: of the part.
+        max_templates: number of fine templates per scale up to which `NARROW_RANGE` is used.
+    """
+    fine = NARROW_RANGE
     directions = views.view_range.contains_direction(icosphere_directions(fine.subdivisions), 3.0)
     count = np.count_nonzero(directions) * len(views.view_range.rolls_deg(fine.roll_step_deg))
-    return fine if count <= FEW_TEMPLATES else DetectorOptions()
+    return fine if count <= max_templates else DetectorOptions()
 
 
 @dataclass(frozen=True)
 class Detection:
-    """A place where the part was found.
+    """A pose at which the part was found.
 
     Attributes:
         cam_from_model: (4,4) mm.
         quality: 0–1, probability that the pose is right.
-        alternatives: other poses (4,4) that the picture bears out as well; not empty: the view is ambiguous.
+        alternatives: other poses (4,4) that the image supports equally well; if there are any, the view is ambiguous.
     """
 
     cam_from_model: Array
@@ -113,7 +138,13 @@ class Detection:
 
 @dataclass(frozen=True)
 class RejectedHypothesis:
-    """The best hypothesis that the detector did not believe: ``cam_from_model`` (4,4), evidence and quality."""
+    """The best hypothesis of an image in which nothing was found.
+
+    Attributes:
+        cam_from_model: (4,4) mm.
+        evidence: edge and colour evidence at the pose.
+        quality: 0–1, probability that the pose is right.
+    """
 
     cam_from_model: Array
     evidence: PoseEvidence
@@ -123,15 +154,25 @@ class RejectedHypothesis:
 def local_search_for(views: GuideViewSet, camera: Camera, options: DetectorOptions | None = None) -> LocalSearch:
     """The local search that a detector with these options uses."""
     o = options or options_for(views)
-    return LocalSearch(views, camera, replace(o.local, radius_px=o.radius_px), reach_mm(views.view_range))
+    return LocalSearch(views, camera, replace(o.local, radius_px=o.radius_px), search_distances_mm(views.view_range))
 
 
 class Detector:
     """Detection of one part with one camera over the declared range of its guide views.
 
-    ``best_rejected`` is the best hypothesis of the last frame when nothing was found, for the diagnosis.
-    ``exact_rotations`` (N,3,3) are the rotations that map the part onto itself, the identity among them; ``turns`` also
-    hold those that nearly do. ``local`` is the search around rough poses, see `local_search_for`.
+    Args:
+        views: guide views of the part.
+        camera: of the images.
+        options: see `DetectorOptions`; None: those of `options_for`.
+        local: local search to share; None: that of `local_search_for`.
+
+    Attributes:
+        best_rejected: best hypothesis of the last image, if nothing was found in it.
+        symmetries: rotational symmetries of the part.
+        disambiguator: chooses among near-symmetric poses.
+
+    Raises:
+        InputError: no guide view shows an outline.
     """
 
     def __init__(
@@ -149,13 +190,12 @@ class Detector:
         self.camera = camera
         self.best_rejected: RejectedHypothesis | None = None
         self.local = local or local_search_for(views, camera, o)
-        self._pair_comparator = PairComparator(self.local.refiner.part)
-        self.symmetries = find_symmetries(views)
-        self.exact_rotations = np.concatenate([np.eye(3)[None], self.symmetries.exact])
-        self.turns = np.concatenate([self.exact_rotations, self.symmetries.near])
-        self.global_search = GlobalSearch(
-            views, self.local.refiner.part, camera, o.radius_px, o.roll_step_deg, o.subdivisions, self.symmetries.exact
+        self.symmetries = find_rotational_symmetries(views, o.symmetry)
+        self.disambiguator = Disambiguator(self.local, self.symmetries, o.disambiguation)
+        searched = replace(
+            o.global_search, radius_px=o.radius_px, roll_step_deg=o.roll_step_deg, subdivisions=o.subdivisions
         )
+        self.global_search = GlobalSearch(views, self.local.refiner.part, camera, searched, self.symmetries.exact)
 
     def detect(
         self,
@@ -164,180 +204,117 @@ class Detector:
         is_thorough: bool = True,
         guesses: Sequence[Array] = (),
     ) -> list[Detection]:
-        """Poses of the part in a frame, best first; an empty list when it is not found.
+        """Poses of the part in an image, best first; an empty list when it is not found.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
-            max_results: at most so many, all above the quality threshold and apart from each other.
-            is_thorough: search on among less likely matches when the likeliest come to nothing.
-            guesses: rough poses (4,4) ``cam_from_model``; where one of them leads to the part, that is all.
+            max_results: maximum number of poses; all are above the quality threshold and apart from each other.
+            is_thorough: search more widely when the quick search gives no sure result.
+            guesses: rough poses (4,4) ``cam_from_model``; if one of them leads to the part, nothing else is searched.
         """
-        picture = self.local.pyramid(image)
-        if found := self._found_near(picture, guesses):
+        pyramid = self.local.pyramid(image)
+        if found := self._detect_near(pyramid, guesses):
             return found
-        least = self.options.min_quality if is_thorough else max(MIN_QUICK_QUALITY, self.options.min_quality)
-        return self._found(picture, self.hypotheses(picture, is_thorough), max_results, least)
+        o = self.options
+        min_quality = o.min_quality if is_thorough else max(o.min_quick_quality, o.min_quality)
+        return self._detections(pyramid, self.hypotheses(pyramid, is_thorough), max_results, min_quality)
 
     def detect_near(self, image: NDArray[np.uint8], guesses: Sequence[Array]) -> list[Detection]:
-        """The best pose (or none) that one of some rough poses (4,4) ``cam_from_model`` leads to."""
-        return self._found_near(self.local.pyramid(image), guesses)
+        """The best pose, or none, that some rough poses lead to.
 
-    def _found_near(self, picture: ImagePyramid, guesses: Sequence[Array]) -> list[Detection]:
-        starts = [PoseCandidate(1.0, guess @ self.local.refiner.part.model_from_body) for guess in guesses]
-        settled = self.local.refine_and_verify(picture, self.local.pattern_search(picture, starts)) if starts else []
-        return self._found(picture, settled, 1, self.options.min_quality)
+        Args:
+            image: (H,W,3) uint8 RGB of the camera's size.
+            guesses: rough poses (4,4) ``cam_from_model``.
+        """
+        return self._detect_near(self.local.pyramid(image), guesses)
 
-    def _found(
-        self, picture: ImagePyramid, settled: list[Hypothesis], max_results: int, least: float
-    ) -> list[Detection]:
-        """The hypotheses of at least a quality, best first."""
-        qualities = self.qualities(settled)
-        self.best_rejected = None
-        if not settled or qualities[0] < least:
-            if settled:
-                best = settled[0]
-                self.best_rejected = RejectedHypothesis(self._in_model(best), best.evidence, qualities[0])
-            return []
-        best, twins = self._disambiguate(picture, settled[0], settled[1:])
-        found = [self._detection(best, qualities[0], twins)]
-        for hypothesis, quality in zip(settled[1:], qualities[1:], strict=True):
-            is_apart = all(not self._is_equal(hypothesis, h, self.turns, 0.25) for h in (best, *twins))
-            if quality >= least and is_apart:
-                found.append(self._detection(hypothesis, min(quality, qualities[0]), []))
-        return sorted(found, key=lambda detection: -detection.quality)[:max_results]
+    def hypotheses(self, pyramid: ImagePyramid, is_thorough: bool = True) -> list[Hypothesis]:
+        """All verified hypotheses of the searches, right or wrong, apart from each other, best first.
 
-    def _detection(self, hypothesis: Hypothesis, quality: float, twins: list[Hypothesis]) -> Detection:
-        return Detection(self._in_model(hypothesis), quality, tuple(map(self._in_model, twins)))
-
-    def hypotheses(self, picture: ImagePyramid, is_thorough: bool = True) -> list[Hypothesis]:
-        """All that came out of the search, right or wrong, apart from each other, best first."""
-        settled: list[Hypothesis] = []
-        least = max(MIN_QUICK_QUALITY, self.options.min_quality)
-        for effort in self.options.budgets if is_thorough else self.options.budgets[:1]:
-            starts = self.local.pattern_search(picture, self.global_search.starts(picture, effort), effort.kept)
-            settled = self.local.deduplicate([*settled, *self.local.refine_and_verify(picture, starts)], 5.0)
-            if settled and self.qualities(settled)[0] >= least:
+        Args:
+            pyramid: of the image, see `LocalSearch.pyramid`.
+            is_thorough: make all searches until one gives a sure result, not only the first.
+        """
+        o, local = self.options, self.local
+        hypotheses: list[Hypothesis] = []
+        min_quality = max(o.min_quick_quality, o.min_quality)
+        for budget in o.budgets if is_thorough else o.budgets[:1]:
+            starts = local.pattern_search(pyramid, self.global_search.starts(pyramid, budget), budget.kept)
+            found = local.refine_and_verify(pyramid, starts)
+            hypotheses = local.deduplicate([*hypotheses, *found], local.options.distinct_deg)
+            if hypotheses and self.qualities(hypotheses)[0] >= min_quality:
                 break
-        return settled
+        return hypotheses
 
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
-        """Probability that each of several hypotheses, best first, is right: see `pose_probability`."""
+        """Probability that each of several hypotheses, best first, is right; see `pose_probability`."""
         return [pose_probability(self.terms(h, hypotheses[k + 1 :])) for k, h in enumerate(hypotheses)]
 
     def terms(self, best: Hypothesis, others: list[Hypothesis]) -> ConfidenceTerms:
-        """What speaks for a hypothesis before others, see `confidence_terms`."""
-        leads, shown = self.margins(best, others), best.view_lines / self.local.mean_view_lines
+        """Terms of the probability of a hypothesis that competes with others."""
         return confidence_terms(
-            best.appearance_score,
-            best.evidence_logit,
-            best.profile_score,
-            best.contour_score,
-            leads,
-            shown,
-            best.radius_px,
+            appearance=best.appearance_score,
+            evidence=best.evidence_logit,
+            profile=best.profile_score,
+            contour=best.contour_score,
+            margins=self.margins(best, others),
+            relative_lines=best.view_lines / self.local.mean_view_lines,
+            radius_px=best.radius_px,
+            options=self.options.confidence,
         )
 
     def margins(self, best: Hypothesis, others: list[Hypothesis]) -> Margins:
-        """Margins of a hypothesis over others for other poses; one a little aside of it is the same, badly settled."""
-        here = elsewhere = -math.inf
+        """Margins of a hypothesis over competing ones; copies of it that are badly refined do not compete."""
+        o = self.options.margins
+        nearby = distant = -math.inf
         place = best.cam_from_body[:3, 3]
         distance_mm = float(np.linalg.norm(place))
         for other in others:
             offset = other.cam_from_body[:3, 3] - place
             along_mm = abs(float(offset @ place)) / distance_mm
             aside = math.sqrt(max(float(offset @ offset) - along_mm**2, 0.0)) / self.views.diameter_mm
-            is_alike = self._is_turned(best, other, self.turns, ALIKE_DEG)
-            if aside < ALIKE_ASIDE and along_mm < ALIKE_ALONG * distance_mm and is_alike:
+            is_similar = is_rotated_by(best, other, self.disambiguator.all_rotations, o.same_deg)
+            if aside < o.same_aside and along_mm < o.same_along * distance_mm and is_similar:
                 continue
-            if aside < HERE_ASIDE and along_mm < HERE_ALONG * distance_mm:
-                here = max(here, other.logit)
+            if aside < o.nearby_aside and along_mm < o.nearby_along * distance_mm:
+                nearby = max(nearby, other.logit)
             else:
-                elsewhere = max(elsewhere, other.logit)
-        return Margins(best.logit - here, best.logit - elsewhere)
+                distant = max(distant, other.logit)
+        return Margins(best.logit - nearby, best.logit - distant)
+
+    def _detect_near(self, pyramid: ImagePyramid, guesses: Sequence[Array]) -> list[Detection]:
+        local = self.local
+        starts = [PoseCandidate(1.0, guess @ local.refiner.part.model_from_body) for guess in guesses]
+        found = local.refine_and_verify(pyramid, local.pattern_search(pyramid, starts)) if starts else []
+        return self._detections(pyramid, found, 1, self.options.min_quality)
+
+    def _detections(
+        self, pyramid: ImagePyramid, hypotheses: list[Hypothesis], max_results: int, min_quality: float
+    ) -> list[Detection]:
+        """The hypotheses above a quality, best first; of none the best one is remembered as rejected."""
+        qualities = self.qualities(hypotheses)
+        self.best_rejected = None
+        if not hypotheses or qualities[0] < min_quality:
+            if hypotheses:
+                rejected = hypotheses[0]
+                self.best_rejected = RejectedHypothesis(self._in_model(rejected), rejected.evidence, qualities[0])
+            return []
+        best, alternatives = self.disambiguator.choose(pyramid, hypotheses[0], hypotheses[1:])
+        found = [self._detection(best, qualities[0], alternatives)]
+        for hypothesis, quality in zip(hypotheses[1:], qualities[1:], strict=True):
+            is_apart = all(not self._is_equal(hypothesis, h) for h in (best, *alternatives))
+            if quality >= min_quality and is_apart:
+                found.append(self._detection(hypothesis, min(quality, qualities[0]), []))
+        return sorted(found, key=lambda detection: -detection.quality)[:max_results]
+
+    def _detection(self, hypothesis: Hypothesis, quality: float, alternatives: list[Hypothesis]) -> Detection:
+        return Detection(self._in_model(hypothesis), quality, tuple(map(self._in_model, alternatives)))
 
     def _in_model(self, hypothesis: Hypothesis) -> Array:
         return np.asarray(hypothesis.cam_from_body @ self.local.refiner.part.body_from_model)
 
-    def _disambiguate(
-        self, picture: ImagePyramid, best: Hypothesis, others: list[Hypothesis]
-    ) -> tuple[Hypothesis, list[Hypothesis]]:
-        """The pose that is borne out best among the near symmetries of one found, and those that do as well.
-
-        What tells is what the pair comparator says of two, the edges that only one of them has, and all that speaks for
-        either. Those from which these do not part the best one are alternatives, unless an exact symmetry makes them
-        the same pose.
-        """
-        pose = best.cam_from_body
-        starts = turned(pose, self.symmetries.near) + self._rotation_sweep(picture, pose)
-        reach_mm = 0.25 * self.views.diameter_mm
-        rivals = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
-        rivals = self.local.deduplicate(
-            [best, *self.local.verify(picture, self.local.refine_fine(picture, starts)), *rivals], 5.0
-        )
-        first = rivals[0]
-        near = [h for h in rivals[1:] if h.logit_without_contour > first.logit_without_contour - LEAD]
-        rivals = [first, *(h for h in near if self._is_twin(h, first) or self._is_spun(h, first))][:MOST_RIVALS]
-        if len(rivals) == 1:
-            return first, []
-        ahead = self._evidence_margins(picture, rivals)
-        # Ahead of all others, or by the least behind any.
-        leader = int(np.argmax((ahead + np.diag(np.full(len(rivals), np.inf))).min(axis=1)))
-        best = rivals[leader]
-        twins = [h for k, h in enumerate(rivals) if k != leader and ahead[leader, k] < TELLING]
-        return best, [h for h in twins if not self._is_turned(h, best, self.exact_rotations, ALIKE_DEG)]
-
-    def _rotation_sweep(self, picture: ImagePyramid, pose: Array) -> list[Array]:
-        """A pose turned about each axis about which the part is nearly round, to where its edges are seen best.
-
-        Such an outline holds at any turn; what breaks it are a few small edges, which no search is led by.
-        """
-        refiner = self.local.refiner
-
-        def seen(spun: Array) -> float:
-            support = refiner.edge_steps(picture.gray, spun).support
-            return float(support.mean()) if len(support) else 0.0
-
-        starts = []
-        for axis in self.symmetries.axes:
-            poses = turned(pose, rotations_about(axis, SPINS_DEG))
-            support = np.array(list(pool().map(seen, poses)))
-            peaks = np.flatnonzero((support >= np.roll(support, 1)) & (support > np.roll(support, -1)))
-            starts += [poses[k] for k in peaks[np.argsort(-support[peaks], kind="stable")][:MOST_SPUN]]
-        return starts
-
-    def _is_twin(self, a: Hypothesis, b: Hypothesis) -> bool:
-        """Whether one of the turns that nearly take the part onto itself brings a pose to another, or near it.
-
-        One a little aside of another is the same, badly settled: what speaks for either tells them apart.
-        """
-        is_alike = self._is_turned(a, b, self.exact_rotations, ALIKE_DEG)
-        return not is_alike and self._is_turned(a, b, self.turns, ALIKE_DEG)
-
-    def _is_spun(self, a: Hypothesis, b: Hypothesis) -> bool:
-        """Whether two are turned against each other about an axis about which the part is nearly round, if at all."""
-        axes = self.symmetries.axes
-        cosines = np.sum((axes @ a.cam_from_body[:3, :3].T) * (axes @ b.cam_from_body[:3, :3].T), axis=1)
-        return bool(np.any(cosines > np.cos(np.deg2rad(ALIKE_DEG))))
-
-    def _evidence_margins(self, picture: ImagePyramid, rivals: list[Hypothesis]) -> Array:
-        """By how much each of some twins is borne out better than each other (N,N)."""
-        refiner = self.local.refiner
-        logits = np.array([h.logit_without_contour for h in rivals])
-        ahead = self._pair_comparator.log_odds(picture, [h.cam_from_body for h in rivals])
-        ahead += LEAD_TELLS * (logits[:, None] - logits)
-        steps = list(pool().map(lambda h: refiner.edge_steps(picture.gray, h.cam_from_body), rivals))
-        for a, b in combinations(range(len(rivals)), 2):
-            told = telling(steps[a], steps[b])
-            ahead[a, b] += told
-            ahead[b, a] -= told
-        return ahead
-
-    def _is_equal(self, a: Hypothesis, b: Hypothesis, turns: Array, reach: float = 0.08) -> bool:
-        """Whether two are the same pose, by one of some turns (N,3,3); ``reach`` is in diameters."""
+    def _is_equal(self, a: Hypothesis, b: Hypothesis, place_share: float = 0.25, angle_deg: float = 8.0) -> bool:
+        """Whether two hypotheses are one pose up to a symmetry; ``place_share`` is in diameters."""
         apart_mm = np.linalg.norm(a.cam_from_body[:3, 3] - b.cam_from_body[:3, 3])
-        return bool(apart_mm <= reach * self.views.diameter_mm) and self._is_turned(a, b, turns, 8.0)
-
-    def _is_turned(self, a: Hypothesis, b: Hypothesis, turns: Array, angle_deg: float) -> bool:
-        """Whether one of some turns (N,3,3) brings a rotation nearer to another than an angle."""
-        cosine = 0.5 * (np.einsum("ij,nij->n", a.cam_from_body[:3, :3], b.cam_from_body[:3, :3] @ turns) - 1.0)
-        return bool(np.any(cosine > np.cos(np.deg2rad(angle_deg))))
+        is_near = bool(apart_mm <= place_share * self.views.diameter_mm)
+        return is_near and is_rotated_by(a, b, self.disambiguator.all_rotations, angle_deg)

@@ -18,8 +18,8 @@ from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.detection.features.response_maps import response_maps, score_around
+from arview.detection.search.nms import select_distinct
 from arview.detection.search.pattern_search import search_poses
-from arview.detection.search.template_bank import select_distinct
 from arview.geometry import Array, turn_ball
 from arview.refinement.modalities.region import BINS, ColorModel
 from arview.refinement.view_model import ViewArrays

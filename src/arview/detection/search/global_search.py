@@ -1,15 +1,14 @@
-"""The first search of the detector: where in the picture might which view of the part be, over the whole range?
+"""Global search: rough poses of the part anywhere in an image, over the whole declared range.
 
-Templates (`templates`) give thousands of rough matches. In clutter the right one is seldom among the first hundred of
-them, but often among the first five thousand; and once each is improved as an outline in the picture
-(`search_outlines`, some 30 µs), on maps of a finer and finer scale, it comes to the front: the larger the part in the
-picture, the fewer wrong poses fit by chance. This is what makes clutter tractable on a CPU; own here, measured on
-semi-synthetic sequences. What their responses leave open, the `judge` decides.
+Template matching gives thousands of rough matches. In clutter the right one is seldom among the first hundred of them,
+but often among the first five thousand. Each match is therefore improved as an outline in the image, on maps of growing
+resolution; there it rises to the front, because the larger the part in the image, the fewer wrong poses fit by chance.
+This keeps search in clutter affordable on a CPU. A profile ranker orders what remains.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -25,109 +24,129 @@ from arview.detection.features.image_pyramid import (
     step_for,
 )
 from arview.detection.scoring.profile_ranker import ProfileRanker
+from arview.detection.search.nms import select_distinct
 from arview.detection.search.pattern_search import search_outlines
 from arview.detection.search.template_bank import (
     GROUPS,
-    decimate,
+    OutlineOptions,
     make_bank,
     make_outlines,
-    match_templates,
-    outlines_around,
-    select_distinct,
+    outlines_near_icosphere,
 )
+from arview.detection.search.template_matching import decimate, match_templates
 from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
 from arview.refinement.view_model import PartView
 
-POINTS = 64
-"""Points of an outline, a multiple of `FIRST_POINTS`, see `sector_order`."""
-GRID_PX = 4
-"""Places that templates are matched at are so far apart."""
-LARGEST_SCALE = 1.5
-"""The picture is not enlarged more than this."""
-LOWEST_SCORE = 0.3
-"""Template matches below this are noise."""
-RESPONSE_WORTH = 20.0
-"""A mean response of 1 more is worth as much of what the judge says: it knows gradients only. In 96 pictures of random
-solids a right start is first in 55 with it, in 47 without."""
-NEARER, FARTHER = 0.85, 1.18
-"""Poses are looked for so far beyond the declared distances, as shares of them."""
-CELL_PX, CELL_ROLL = 4.0, 0.33
-"""Of matches whose place and roll (rad) fall in one cell, of one scale and group of views, the best is enough."""
 DOMAIN_DIRECTION = np.array([0.36, 0.48, 0.8])
-"""On no axis or plane that a part's symmetries are likely to have."""
-WANTED_MARGIN_DEG = 14.0
-"""Near the border the templates on both sides matter: 192 of 200 frames of the recorded cube, 189 with 9 (193 with all
-directions)."""
-ALIKE = 5
-"""So many matches are there for one that is left then."""
+"""Direction that chooses one of several symmetric views; it lies on no axis or plane of a likely symmetry."""
 
 
 @dataclass(frozen=True)
 class RefinementStep:
-    """A round in which matches are improved as outlines on larger maps.
+    """One round in which matches are improved as outlines on larger maps.
 
     Attributes:
-        steps_up: maps so many scale steps larger than those before.
-        roll_step_rad, stretch_step: first steps of the roll and, as a share, of the size.
-        is_fine: with the nearest other directions, not those further away.
+        scale_steps: scale steps by which the maps are larger than those before.
+        roll_step_rad: step of the roll.
+        stretch_step: step of the size as a share of it.
+        is_fine: try the nearest neighbouring views, not the far ones.
     """
 
-    steps_up: int
+    scale_steps: int
     roll_step_rad: float
     stretch_step: float
     is_fine: bool
 
 
-REFINEMENT_STEPS = (
-    RefinementStep(2, 0.16, 0.07, False),
-    RefinementStep(2, 0.16, 0.07, False),
-    RefinementStep(2, 0.08, 0.04, True),
-)
-"""From half diameters of 20 px by 28 and 40 to 57."""
-GROWTH_ROUNDS, SHIFT_PX = 2, 2
-"""Over all steps; places are tried so far away."""
+@dataclass(frozen=True)
+class GlobalSearchOptions:
+    """Options of the global search.
+
+    Attributes:
+        radius_px: half the part's diameter in the templates.
+        roll_step_deg: spacing of the templates in roll.
+        subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
+        outlines: see `OutlineOptions`.
+        grid_px: spacing of the places at which templates are matched.
+        max_scale: largest factor by which the image is enlarged for near distances.
+        min_score: mean response below which template matches are noise.
+        cell_px, cell_roll_rad: size in place and roll of the cells of which only the best match is kept.
+        matches_per_kept: matches gathered per match kept after duplicates are removed.
+        steps: rounds of improvement, from half diameters of 20 px over 28 and 40 to 57 px.
+        rounds: maximum number of passes over all changes of view, roll and size in one round of improvement.
+        shift_px: range and step of the shifts tried with each change.
+        distinct_px, distinct_rad, distinct_ratio: offset at the scale of the templates, rotation and distance ratio
+            within which improved matches are duplicates.
+        response_weight: weight of the mean response beside the profile score, which sees neither all lines nor views.
+    """
+
+    radius_px: float = 20.0
+    roll_step_deg: float = 18.0
+    subdivisions: int = 2
+    outlines: OutlineOptions = field(default_factory=OutlineOptions)
+    grid_px: int = 4
+    max_scale: float = 1.5
+    min_score: float = 0.3
+    cell_px: float = 4.0
+    cell_roll_rad: float = 0.33
+    matches_per_kept: int = 5
+    steps: tuple[RefinementStep, ...] = (
+        RefinementStep(scale_steps=2, roll_step_rad=0.16, stretch_step=0.07, is_fine=False),
+        RefinementStep(scale_steps=2, roll_step_rad=0.16, stretch_step=0.07, is_fine=False),
+        RefinementStep(scale_steps=2, roll_step_rad=0.08, stretch_step=0.04, is_fine=True),
+    )
+    rounds: int = 2
+    shift_px: int = 2
+    distinct_px: float = 6.0
+    distinct_rad: float = 0.15
+    distinct_ratio: float = 1.06
+    response_weight: float = 20.0
 
 
 @dataclass(frozen=True)
 class SearchBudget:
-    """How far a search goes.
+    """How far one search goes.
 
     Attributes:
-        matches: of templates that are improved as outlines.
-        improved: of these, how many are improved in the last round too.
-        looked_at: of these, how many are judged.
-        starts: of these, how many poses are searched around.
-        kept: hypotheses left after each level of that search.
-        scale_step: templates are matched at one of so many scales.
-        is_trimmed: a quarter of the outline does not count, that of which the least is seen.
-        use_edge_net: what the line network sees counts until poses are judged, as much as gradients do.
+        matches: template matches that are improved as outlines.
+        refined: matches that are improved in the last round, too.
+        ranked: improved matches that are ranked.
+        starts: ranked poses from which the local search starts.
+        kept: hypotheses kept after each level of the pattern search.
+        scale_stride: templates are matched at every so many scale steps.
+        is_trimmed: leave out the quarter of each outline with the lowest responses, which may be occluded.
+        use_edge_net: edge responses weigh as much as gradients until poses are ranked.
     """
 
     matches: int
-    improved: int
-    looked_at: int
+    refined: int
+    ranked: int
     starts: int
     kept: tuple[int, ...]
-    scale_step: int
+    scale_stride: int
     is_trimmed: bool
     use_edge_net: bool = True
 
 
-QUICK = SearchBudget(400, 200, 100, 16, (6, 4), 2, False)
-WIDE = SearchBudget(2500, 1400, 700, 160, (60, 20), 1, True)
-"""For clutter, in which thousands of wrong matches come before the right one, and for what is partly hidden: of three
-parts behind things, 75 frames, a right pose is among the likely ones in 64 if a quarter is spared, in 55 if not."""
+QUICK = SearchBudget(matches=400, refined=200, ranked=100, starts=16, kept=(6, 4), scale_stride=2, is_trimmed=False)
+"""Enough for parts in plain sight before little clutter."""
+WIDE = SearchBudget(matches=2500, refined=1400, ranked=700, starts=160, kept=(60, 20), scale_stride=1, is_trimmed=True)
+"""For clutter, in which thousands of wrong matches score higher than the right one, and for occluded parts."""
 GRADIENTS_ONLY = replace(WIDE, is_trimmed=False, use_edge_net=False)
+"""For materials to which the edge network does not respond."""
 UNTRIMMED = replace(WIDE, is_trimmed=False)
-"""For what these miss: what is in plain sight but of little contrast, and what the line network does not know. Of the
-52 of 600 semi-synthetic frames in which the two before find nothing, the part is found in 10 with these, and in none at
-a wrong pose; of 1,001 pictures without the part 3 instead of 4 are taken for it, for a wrong pose has more rivals."""
+"""For unoccluded parts of low contrast, of which a trimmed score sees too little."""
 
 
 @dataclass(frozen=True)
 class PoseCandidate:
-    """A hypothesis: score for comparing, and the pose it stands for, about the model's centre."""
+    """A rough pose.
+
+    Attributes:
+        score: compares the candidates of one image.
+        cam_from_body: (4,4) about the part's centre.
+    """
 
     score: float
     cam_from_body: Array
@@ -135,13 +154,15 @@ class PoseCandidate:
 
 @dataclass(frozen=True)
 class TemplateMatches:
-    """TemplateMatches of outlines in the picture.
+    """Matches of outlines in the image.
 
     Attributes:
         keys: (M,) by which they compare.
-        steps: (M,) scales, in steps.
-        views: (M,) of the outlines; rolls: (M,) rad.
-        radii_px: (M,) half diameters; places: (M,2) px of the part's centre, both at that scale.
+        steps: (M,) scale steps.
+        views: (M,) indices of the outlines.
+        rolls: (M,) rad.
+        radii_px: (M,) half diameters at that scale.
+        places: (M,2) px of the part's centre at that scale.
     """
 
     keys: Array
@@ -151,71 +172,88 @@ class TemplateMatches:
     radii_px: Array
     places: Array
 
-    def best(self, most: int) -> TemplateMatches:
-        """The best, best first."""
-        return self.of(np.argsort(-self.keys, kind="stable")[:most])
+    def best(self, count: int) -> TemplateMatches:
+        """The ``count`` best matches, best first."""
+        return self.select(np.argsort(-self.keys, kind="stable")[:count])
 
-    def of(self, index: NDArray[np.intp]) -> TemplateMatches:
-        """Some of them."""
+    def select(self, index: NDArray[np.intp]) -> TemplateMatches:
+        """The matches of some indices."""
         return TemplateMatches(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 class CandidatePoses(NamedTuple):
-    """Poses (N,4,4) about the model's centre, best first by ``responses`` (N,) 0–1 and the ``lines`` (N,) they show."""
+    """Poses before they are ranked, best first by their responses.
+
+    Attributes:
+        poses: (N,4,4) ``cam_from_body``.
+        view_lines: (N,) distinct lines that the views at the poses show.
+        responses: (N,) mean responses 0–1.
+    """
 
     poses: Array
-    lines: Array
+    view_lines: Array
     responses: Array
 
 
 NO_CANDIDATES = CandidatePoses(np.empty((0, 4, 4)), np.empty(0), np.empty(0))
 
 
-def _joined(parts: list[TemplateMatches]) -> TemplateMatches:
+def _concatenated(parts: list[TemplateMatches]) -> TemplateMatches:
     return TemplateMatches(
-        *(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(TemplateMatches))
+        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(TemplateMatches))
     )
 
 
-def in_fundamental_domain(directions: Array, turns: Array, view_range: ViewRange) -> NDArray[np.bool_]:
-    """Which of the directions (V,3) to the camera to look for: of those that turns make the same, one and a margin.
+def in_fundamental_domain(
+    directions: Array, turns: Array, view_range: ViewRange, margin_deg: float = 14.0
+) -> NDArray[np.bool_]:
+    """Which of the directions to the camera represent all those that symmetries make equal.
 
-    The part of the sphere nearer to one fixed direction than to its images under the turns; images outside the
-    declared range do not count, nor does any symmetry where not all rolls are declared.
+    The fundamental domain is the part of the sphere that is closer to `DOMAIN_DIRECTION` than to its images under the
+    symmetries. Images outside the declared range are ignored, and so are all symmetries where the rolls are limited.
+
+    Args:
+        directions: (V,3) unit vectors.
+        turns: (R,3,3) rotations of the part onto itself.
+        view_range: declared range.
+        margin_deg: width by which the domain is extended, because templates on both sides of its border matter.
     """
-    wanted = np.ones(len(directions), dtype=np.bool_)
+    is_inside = np.ones(len(directions), dtype=np.bool_)
     low, high = view_range.roll_deg
     if high - low < 360.0:
-        return wanted
+        return is_inside
     for turn in turns:
         across = turn @ DOMAIN_DIRECTION - DOMAIN_DIRECTION
-        is_farther = directions @ across > np.sin(np.deg2rad(WANTED_MARGIN_DEG)) * np.linalg.norm(across)
-        wanted &= ~(is_farther & view_range.contains_direction(directions @ turn))
-    return wanted
+        is_farther = directions @ across > np.sin(np.deg2rad(margin_deg)) * np.linalg.norm(across)
+        is_inside &= ~(is_farther & view_range.contains_direction(directions @ turn))
+    return is_inside
 
 
-def reach_mm(view_range: ViewRange) -> tuple[float, float]:
-    """The distances in which poses are looked for: those declared and a little more."""
+def search_distances_mm(view_range: ViewRange, nearest: float = 0.85, farthest: float = 1.18) -> tuple[float, float]:
+    """Shortest and longest distance at which poses are searched.
+
+    Args:
+        view_range: declared range.
+        nearest, farthest: shares of the declared shortest and longest distance.
+    """
     low, high = view_range.distance_mm
-    return NEARER * low, FARTHER * high
+    return nearest * low, farthest * high
 
 
-def weighed(scores: Array, lines: Array) -> Array:
-    """Scores by which poses of different views compare: one that shows few distinct lines often fits by chance."""
-    return np.asarray(scores * lines**0.25)
+def weight_by_lines(scores: Array, view_lines: Array) -> Array:
+    """Scores that compare across views: a view that shows few distinct lines often fits by chance."""
+    return np.asarray(scores * view_lines**0.25)
 
 
 class GlobalSearch:
-    """The first search for one part with one camera.
+    """The global search for one part with one camera.
 
     Args:
-        views: of the part, for the declared range.
-        part: the same for the kernels.
-        camera: of the pictures.
-        radius_px: half the part's diameter in the templates.
-        roll_step_deg: spacing of the templates.
-        subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
-        turns: (N,3,3) of the part onto itself: of views that these make the same one is looked for.
+        views: guide views of the part over the declared range.
+        part: the same views for the kernels.
+        camera: of the images.
+        options: see `GlobalSearchOptions`.
+        turns: (N,3,3) rotations of the part onto itself; of the views that they make equal one is searched.
 
     Raises:
         InputError: no view shows an outline.
@@ -226,143 +264,157 @@ class GlobalSearch:
         views: GuideViewSet,
         part: PartView,
         camera: Camera,
-        radius_px: float,
-        roll_step_deg: float,
-        subdivisions: int,
+        options: GlobalSearchOptions,
         turns: Array,
     ) -> None:
         self.camera = camera
-        self._radius_px = radius_px
+        self.options = o = options
         self._diameter_mm = views.diameter_mm
         self._focal_px = 0.5 * (camera.fx + camera.fy)
-        self._part = part
         self._ranker = ProfileRanker(part)
-        self.outlines = make_outlines(views, part.model_from_body, POINTS)
-        # Scale steps of the templates, large distances (large pictures) first.
+        self.outlines = make_outlines(views, part.model_from_body, o.outlines)
+        # Scale steps of the templates, from far to near: large images first.
         low, high = views.view_range.distance_mm
-        self._reach_mm = reach_mm(views.view_range)
+        self._distances_mm = search_distances_mm(views.view_range)
         near, far = self.step_at(low), self.step_at(high)
-        top = int(np.floor(STEPS_PER_OCTAVE * np.log2(LARGEST_SCALE)))
+        top = int(np.floor(STEPS_PER_OCTAVE * np.log2(o.max_scale)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
-        chosen = outlines_around(views, self.outlines, subdivisions)
+        chosen = outlines_near_icosphere(views, self.outlines, o.subdivisions)
         chosen = chosen[in_fundamental_domain(-self.outlines.rotations[chosen, 2], turns, views.view_range)]
         self._groups = len(np.unique(self.outlines.groups[chosen]))
-        rolls = np.deg2rad(views.view_range.rolls_deg(roll_step_deg))
+        rolls = np.deg2rad(views.view_range.rolls_deg(o.roll_step_deg))
         focals_px = {step: self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE) for step in self._steps}
         self.banks = {
-            step: make_bank(self.outlines, chosen, rolls, radius_px, radius_px / focal_px)
+            step: make_bank(self.outlines, chosen, rolls, o.radius_px, o.radius_px / focal_px)
             for step, focal_px in focals_px.items()
         }
 
     def step_at(self, distance_mm: float) -> float:
         """Scale step at which the part at a distance has the size of the templates."""
-        return step_for(self._focal_px * 0.5 * self._diameter_mm / distance_mm, self._radius_px)
+        return step_for(self._focal_px * 0.5 * self._diameter_mm / distance_mm, self.options.radius_px)
 
-    def starts(self, picture: ImagePyramid, effort: SearchBudget = QUICK) -> list[PoseCandidate]:
-        """Poses for the best matches over the whole range, apart from each other, best first."""
-        return self.rank(picture, self.candidates(picture, effort), effort)
+    def starts(self, pyramid: ImagePyramid, budget: SearchBudget = QUICK) -> list[PoseCandidate]:
+        """Poses of the best matches over the whole range, apart from each other, best first."""
+        return self.rank(pyramid, self.candidates(pyramid, budget), budget)
 
     def _are_in_reach(self, distances_mm: Array) -> NDArray[np.bool_]:
-        low, high = self._reach_mm
+        low, high = self._distances_mm
         return np.asarray((low <= distances_mm) & (distances_mm <= high))
 
-    def rank(self, picture: ImagePyramid, likely: CandidatePoses, effort: SearchBudget = QUICK) -> list[PoseCandidate]:
-        """The starts among likely poses, best first."""
-        scores = self._ranker.scores(picture, likely.poses, likely.lines) + RESPONSE_WORTH * likely.responses
-        best = np.argsort(-scores, kind="stable")[: effort.starts]
-        return [PoseCandidate(float(scores[k]), likely.poses[k]) for k in best]
+    def rank(
+        self, pyramid: ImagePyramid, candidates: CandidatePoses, budget: SearchBudget = QUICK
+    ) -> list[PoseCandidate]:
+        """The candidates with the highest profile scores and responses, best first."""
+        scores = self._ranker.scores(pyramid, candidates.poses, candidates.view_lines)
+        scores = scores + self.options.response_weight * candidates.responses
+        best = np.argsort(-scores, kind="stable")[: budget.starts]
+        return [PoseCandidate(float(scores[k]), candidates.poses[k]) for k in best]
 
-    def candidates(self, picture: ImagePyramid, effort: SearchBudget = QUICK) -> CandidatePoses:
-        """Poses for the best matches by their responses."""
-        scales = self._steps[:: effort.scale_step]
-        if not effort.use_edge_net:
-            picture = picture.without_edge_net
-        picture.make_maps(scales)
-        phases = list(pool().map(lambda step: decimate(picture.maps(step)[0], GRID_PX), scales))
+    def candidates(self, pyramid: ImagePyramid, budget: SearchBudget = QUICK) -> CandidatePoses:
+        """Poses of the best matches by their responses: matched as templates, then improved as outlines."""
+        if not budget.use_edge_net:
+            pyramid = pyramid.without_edge_net
+        matches = self._match_all(pyramid, budget)
+        if not len(matches.keys):
+            return NO_CANDIDATES
+        *first_steps, last_step = self.options.steps
+        for step in first_steps:
+            matches = self._refine(pyramid, matches, step, budget.is_trimmed)
+        matches = self._refine(pyramid, matches.best(budget.refined), last_step, budget.is_trimmed)
+        if not len(matches.keys):
+            return NO_CANDIDATES
+        matches = self._select_distinct(matches, budget.ranked)
+        poses = np.stack([rigid(r, p) for r, p in zip(*self._posed(matches), strict=True)])
+        view_lines = self.outlines.view_lines[matches.views]
+        return CandidatePoses(poses, view_lines, matches.keys / weight_by_lines(np.ones(len(view_lines)), view_lines))
+
+    def _match_all(self, pyramid: ImagePyramid, budget: SearchBudget) -> TemplateMatches:
+        """The best template matches at all scales, without duplicates."""
+        o = self.options
+        scales = self._steps[:: budget.scale_stride]
+        pyramid.make_maps(scales)
+        phases = list(pool().map(lambda step: decimate(pyramid.maps(step)[0], o.grid_px), scales))
         count = len(next(iter(self.banks.values())).bins)
         halves = [0, count // 2, count]
         votes = {step: np.zeros((GROUPS, 1024), dtype=np.int64) for step in scales}
-        # Of each group of views at each scale as many; most that are found are alike.
-        kept = ALIKE * -(-effort.matches // (self._groups * len(scales)))
+        # Every group of views keeps equally many at each scale; most of them are duplicates.
+        kept = o.matches_per_kept * -(-budget.matches // (self._groups * len(scales)))
         levels = list(zip(scales, phases, strict=True))
         jobs = [(*level, first, last) for level in levels for first, last in pairwise(halves)]
-        found = pool().map(lambda job: self._match(votes[job[0]], kept, effort.is_trimmed, picture, *job), jobs)
-        raw = [m for m in found if m is not None]
-        if not raw:
-            return NO_CANDIDATES
-        matches = self._distinct(_joined(raw), effort.matches)
-        if not len(matches.keys):
-            return NO_CANDIDATES
-        for growth in REFINEMENT_STEPS[:-1]:
-            matches = self._improved(picture, matches, growth, effort.is_trimmed)
-        matches = self._improved(picture, matches.best(effort.improved), REFINEMENT_STEPS[-1], effort.is_trimmed)
-        if not len(matches.keys):
-            return NO_CANDIDATES
-        matches = self._best_apart(matches, 6.0, 0.15, 1.06, effort.looked_at)
-        poses = np.stack([rigid(r, p) for r, p in zip(*self._posed(matches), strict=True)])
-        lines = self.outlines.lines[matches.views]
-        return CandidatePoses(poses, lines, matches.keys / weighed(np.ones(len(lines)), lines))
+        found = pool().map(lambda job: self._match(votes[job[0]], kept, budget.is_trimmed, pyramid, *job), jobs)
+        return self._without_duplicates(_concatenated([self._no_matches(), *found]), budget.matches)
+
+    @staticmethod
+    def _no_matches() -> TemplateMatches:
+        empty = np.empty(0)
+        return TemplateMatches(empty, np.empty(0, np.int64), np.empty(0, np.int32), empty, empty, np.empty((0, 2)))
 
     def _match(
         self,
         votes: NDArray[np.int64],
         kept: int,
         is_trimmed: bool,
-        picture: ImagePyramid,
+        pyramid: ImagePyramid,
         step: int,
         phases: NDArray[np.uint8],
         first: int,
         last: int,
-    ) -> TemplateMatches | None:
-        """The matches of some templates at one scale."""
+    ) -> TemplateMatches:
+        """The matches of the templates ``first`` to ``last`` at one scale."""
         bank = self.banks[step]
-        maps, _ = picture.maps(step)
-        if min(maps.shape[1:]) < 24 + 2 * picture.pad_px:
-            return None
+        maps, _ = pyramid.maps(step)
+        if min(maps.shape[1:]) < 24 + 2 * pyramid.pad_px:
+            return self._no_matches()
         keys, templates, places = match_templates(
-            phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, LOWEST_SCORE, votes, is_trimmed
-        )
-        return TemplateMatches(
-            keys, np.full(len(keys), step), bank.views[templates], bank.rolls[templates],
-            np.full(len(keys), self._radius_px), places + bank.origins[templates] - picture.pad_px,
+            phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, self.options.min_score, votes,
+            is_trimmed,
         )  # fmt: skip
+        return TemplateMatches(
+            keys=keys,
+            steps=np.full(len(keys), step),
+            views=bank.views[templates],
+            rolls=bank.rolls[templates],
+            radii_px=np.full(len(keys), self.options.radius_px),
+            places=places + bank.origins[templates] - pyramid.pad_px,
+        )
 
     def _posed(self, matches: TemplateMatches) -> tuple[Array, Array]:
         """Rotations (M,3,3) and positions (M,3) mm of the part's centre."""
         scales = 2.0 ** (matches.steps / STEPS_PER_OCTAVE)
         rays = self.camera.unproject((matches.places + 0.5) / scales[:, None] - 0.5)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        distances_mm = self._distances_mm(matches)
+        distances_mm = self._match_distances_mm(matches)
         c, s, zero = np.cos(matches.rolls), np.sin(matches.rolls), np.zeros(len(matches.rolls))
         turns = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], axis=1).reshape(-1, 3, 3)
         rotations = turns @ self.outlines.rotations[matches.views]
         return turns_to_rays(rays) @ rotations, rays * distances_mm[:, None]
 
-    def _distances_mm(self, matches: TemplateMatches) -> Array:
-        """(M,) of the part's centre."""
+    def _match_distances_mm(self, matches: TemplateMatches) -> Array:
+        """Distances (M,) of the part's centre."""
         scales = 2.0 ** (matches.steps / STEPS_PER_OCTAVE)
         return np.asarray(self._focal_px * 0.5 * self._diameter_mm * scales / matches.radii_px)
 
-    def _best_apart(
-        self, matches: TemplateMatches, reach_px: float, angle_rad: float, ratio: float, most: int
-    ) -> TemplateMatches:
-        """The best, none near a better one."""
-        matches = matches.of(np.argsort(-matches.keys, kind="stable"))
+    def _select_distinct(self, matches: TemplateMatches, count: int) -> TemplateMatches:
+        """The best ``count`` matches, none close to a better one."""
+        o = self.options
+        matches = matches.select(np.argsort(-matches.keys, kind="stable"))
         rotations, positions = self._posed(matches)
-        # Pixels of the templates' scale: as many times further off as the part is larger than there.
-        reach = np.full(len(positions), reach_px / self._radius_px) * 0.5 * self._diameter_mm
-        return matches.of(
-            select_distinct(rotations, positions, reach / positions[:, 2], np.cos(angle_rad), ratio, most)
+        # In pixels at the scale of the templates: the larger the part is in the image, the larger the offset.
+        reach = np.full(len(positions), o.distinct_px / o.radius_px) * 0.5 * self._diameter_mm
+        cosine = np.cos(o.distinct_rad)
+        return matches.select(
+            select_distinct(rotations, positions, reach / positions[:, 2], cosine, o.distinct_ratio, count)
         )
 
-    def _distinct(self, matches: TemplateMatches, most: int) -> TemplateMatches:
-        """The best, one for each cell of places, scales and rotations.
+    def _without_duplicates(self, matches: TemplateMatches, count: int) -> TemplateMatches:
+        """The best ``count`` matches, one for each cell of place, scale and rotation.
 
         The best of each group of views at each scale come first, then all second best, and so on.
         """
+        o = self.options
         matches = matches.best(len(matches.keys))
-        cells = np.floor(matches.places / CELL_PX).astype(np.int64) + 4096
-        rolls = np.floor(matches.rolls / CELL_ROLL).astype(np.int64) + 64
+        cells = np.floor(matches.places / o.cell_px).astype(np.int64) + 4096
+        rolls = np.floor(matches.rolls / o.cell_roll_rad).astype(np.int64) + 64
         groups = self.outlines.groups[matches.views].astype(np.int64) * 128 + matches.steps + 64
         _, first = np.unique(((groups * 8192 + cells[:, 0]) * 8192 + cells[:, 1]) * 128 + rolls, return_index=True)
         first.sort()
@@ -370,36 +422,37 @@ class GlobalSearch:
         _, starts, counts = np.unique(groups[first][by_group], return_index=True, return_counts=True)
         rank = np.empty(len(first), dtype=np.int64)
         rank[by_group] = np.arange(len(first)) - np.repeat(starts, counts)
-        return matches.of(first[np.argsort(rank, kind="stable")[:most]])
+        return matches.select(first[np.argsort(rank, kind="stable")[:count]])
 
-    def _improved(
-        self, picture: ImagePyramid, matches: TemplateMatches, growth: RefinementStep, is_trimmed: bool
+    def _refine(
+        self, pyramid: ImagePyramid, matches: TemplateMatches, refinement: RefinementStep, is_trimmed: bool
     ) -> TemplateMatches:
-        """The matches improved each by itself, on larger maps; those that leave the declared distances are dropped."""
+        """Matches improved independently on larger maps, without those that leave the searched distances."""
         if not len(matches.keys):
             return matches
-        shapes = self.outlines
-        around = shapes.near if growth.is_fine else shapes.far
+        o, outlines = self.options, self.outlines
+        around = outlines.near if refinement.is_fine else outlines.far
         jobs = []
         for step in np.unique(matches.steps):
             group = np.flatnonzero(matches.steps == step)
-            jobs += [(min(0, step + growth.steps_up), part) for part in np.array_split(group, 2)]
-        picture.make_maps([step for step, _ in jobs])
+            jobs += [(min(0, step + refinement.scale_steps), part) for part in np.array_split(group, 2)]
+        pyramid.make_maps([step for step, _ in jobs])
 
-        def improve(job: tuple[int, NDArray[np.intp]]) -> TemplateMatches:
+        def refine(job: tuple[int, NDArray[np.intp]]) -> TemplateMatches:
             step, index = job
-            some = matches.of(index)
+            some = matches.select(index)
             focal_px = self._focal_px * 2.0 ** (step / STEPS_PER_OCTAVE)
             scale = 2.0 ** ((step - some.steps) / STEPS_PER_OCTAVE)
-            maps, _ = picture.maps(step)
-            places = (some.places + 0.5) * scale[:, None] - 0.5 + picture.pad_px
-            scores, views, rolls, radii, places = search_outlines(
-                maps, shapes.points, shapes.angles, around.views, around.turns, some.views, some.rolls,
-                some.radii_px * scale, places, focal_px, growth.roll_step_rad, growth.stretch_step, GROWTH_ROUNDS,
-                SHIFT_PX, SHIFT_PX, is_trimmed,
+            maps, _ = pyramid.maps(step)
+            places = (some.places + 0.5) * scale[:, None] - 0.5 + pyramid.pad_px
+            scores, views, rolls, radii_px, places = search_outlines(
+                maps, outlines.points, outlines.angles, around.views, around.rolls, some.views, some.rolls,
+                some.radii_px * scale, places, focal_px, refinement.roll_step_rad, refinement.stretch_step, o.rounds,
+                o.shift_px, o.shift_px, is_trimmed,
             )  # fmt: skip
-            keys = weighed(scores, shapes.lines[views])
-            improved = TemplateMatches(keys, np.full(len(keys), step), views, rolls, radii, places - picture.pad_px)
-            return improved.of(np.flatnonzero(self._are_in_reach(self._distances_mm(improved))))
+            keys = weight_by_lines(scores, outlines.view_lines[views])
+            steps = np.full(len(keys), step)
+            refined = TemplateMatches(keys, steps, views, rolls, radii_px, places - pyramid.pad_px)
+            return refined.select(np.flatnonzero(self._are_in_reach(self._match_distances_mm(refined))))
 
-        return _joined(list(pool().map(improve, jobs)))
+        return _concatenated(list(pool().map(refine, jobs)))
