@@ -12,24 +12,23 @@ import pytest
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.detection import Detector, DetectorOptions
-from arview.detection.detector import MIN_QUICK_QUALITY
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.search.global_search import (
     DOMAIN_DIRECTION,
-    FARTHER,
     GRADIENTS_ONLY,
-    NEARER,
     QUICK,
-    RESPONSE_WORTH,
     UNTRIMMED,
     WIDE,
     CandidatePoses,
+    GlobalSearchOptions,
     PoseCandidate,
     SearchBudget,
     in_fundamental_domain,
+    search_distances_mm,
 )
-from arview.detection.search.local_search import BEFORE_WORTH, Hypothesis
-from arview.detection.symmetry import find_symmetries, telling
+from arview.detection.search.hypothesis import Hypothesis
+from arview.detection.search.local_search import LocalSearchOptions
+from arview.detection.symmetry import edge_margin, find_rotational_symmetries
 from arview.errors import InputError
 from arview.geometry import apply, are_near, exp_so3, rigid, turned
 from arview.guideviews import GuideViewOptions, make_guide_views
@@ -56,7 +55,7 @@ from helpers.synthetic import (
 
 SIGNS = tuple(product((-1.0, 1.0), repeat=3))
 CLEAR = 1.25
-"""Deviations, see `telling`."""
+"""Deviations, see `edge_margin`."""
 
 
 @cache
@@ -128,11 +127,11 @@ def test_what_was_rejected_is_told() -> None:
 
 def test_symmetries_are_discovered() -> None:
     block_views = make_guide_views(block(), ViewRange((200.0, 500.0)), GuideViewOptions(subdivisions=2))
-    half_turns = find_symmetries(block_views).exact
+    half_turns = find_rotational_symmetries(block_views).exact
     assert len(half_turns) == 3
     assert np.allclose(np.trace(half_turns, axis1=1, axis2=2), -1.0, atol=1e-9)
-    assert len(find_symmetries(assembly_views()).exact) == 0
-    assert len(find_symmetries(assembly_views()).near) == 0
+    assert len(find_rotational_symmetries(assembly_views()).exact) == 0
+    assert len(find_rotational_symmetries(assembly_views()).near) == 0
 
 
 def test_fifths_are_discovered() -> None:
@@ -144,7 +143,7 @@ def test_fifths_are_discovered() -> None:
     key = component("key", box((48, -4, 12), (56, 4, 18)), grey)
     for parts, kind in ((wheel, "exact"), ([*wheel, key], "near")):
         views = make_guide_views(make_model("wheel", tuple(parts)), ViewRange((200.0, 500.0)), GuideViewOptions(2))
-        found = find_symmetries(views)
+        found = find_rotational_symmetries(views)
         turns = getattr(found, kind)
         assert len(found.exact) + len(found.near) == len(turns) == 4
         angles_deg = np.rad2deg(np.arctan2(turns[:, 1, 0], turns[:, 0, 0])) % 360.0
@@ -192,7 +191,7 @@ def test_of_views_that_symmetries_make_the_same_one_and_a_margin_is_looked_for()
 
 def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
     sought = Detector(make_guide_views(block(), ViewRange((250.0, 500.0)), GuideViewOptions(subdivisions=3)), CAMERA)
-    assert len(sought.exact_rotations) == 4
+    assert len(sought.disambiguator.exact_rotations) == 4
     rng = np.random.default_rng(5)
     found, wrong_ones = 0, 0
     for k in range(16):
@@ -202,7 +201,8 @@ def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
         if detections:
             body = detections[0].cam_from_model @ sought.local.refiner.part.model_from_body
             alike = [
-                body @ rigid(t, np.zeros(3)) @ sought.local.refiner.part.body_from_model for t in sought.exact_rotations
+                body @ rigid(t, np.zeros(3)) @ sought.local.refiner.part.body_from_model
+                for t in sought.disambiguator.exact_rotations
             ]
             mm, _, deg = min((error(one, truth, block()) for one in alike), key=lambda of: of[2])
             found += mm < 8.0 and deg < 2.0
@@ -248,9 +248,11 @@ def test_a_pose_settled_a_little_aside_is_no_twin(monkeypatch: pytest.MonkeyPatc
     (pose,) = turned(right.cam_from_body, [exp_so3(np.deg2rad([0.0, 10.0, 0.0]))])
     aside = replace(right, cam_from_body=pose, contour_score=right.contour_score - 2.0)
     against = np.array([[0.0, -9.0], [9.0, 0.0]])
-    monkeypatch.setattr(detector(), "_evidence_margins", lambda of, rivals: against[: len(rivals), : len(rivals)])
+    monkeypatch.setattr(
+        detector().disambiguator, "evidence_margins", lambda of, rivals: against[: len(rivals), : len(rivals)]
+    )
     monkeypatch.setattr(detector().local, "refine_fine", lambda of, starts: [])
-    best, twins = detector()._disambiguate(seen, right, [aside])
+    best, twins = detector().disambiguator.choose(seen, right, [aside])
     assert best is right and not twins
 
 
@@ -286,16 +288,19 @@ def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
         truth = pose_from(20.0 + 80.0 * k, 45.0, 380.0, model)
         seen = sought.local.pyramid(picture(truth, model, seed=k, scene=k))
         (spun,) = turned(truth @ part.model_from_body, [exp_so3(np.deg2rad([0.0, 0.0, 23.0]))])
-        starts = sought._rotation_sweep(seen, spun)
+        starts = sought.disambiguator.rotation_sweep(seen, spun)
         assert min(error(start @ part.body_from_model, truth, model)[2] for start in starts[:3]) < 6.0
         best = sought.local.verify(seen, sought.local.refine_fine(seen, [spun]))[0]
-        found, _ = sought._disambiguate(seen, best, [])
+        found, _ = sought.disambiguator.choose(seen, best, [])
         assert error(found.cam_from_body @ part.body_from_model, truth, model)[2] < 2.0
 
 
 def test_a_part_with_few_near_turns_is_not_spun() -> None:
     assert not len(detector().symmetries.axes)
-    assert detector()._rotation_sweep(detector().local.pyramid(picture(pose_from(30, 40, 500.0))), np.eye(4)) == []
+    assert (
+        detector().disambiguator.rotation_sweep(detector().local.pyramid(picture(pose_from(30, 40, 500.0))), np.eye(4))
+        == []
+    )
 
 
 def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
@@ -312,14 +317,14 @@ def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
             np.concatenate([shared, own]) + jitter, normals, np.r_[np.full(200, 0.6), np.full(30, support)] + noise
         )
 
-    assert telling(steps(only_a, 0.6), steps(only_b, 0.0)) > CLEAR
-    assert telling(steps(only_b, 0.0), steps(only_a, 0.6)) < -CLEAR
-    assert abs(telling(steps(only_a, 0.6), steps(only_b, 0.55))) < CLEAR
+    assert edge_margin(steps(only_a, 0.6), steps(only_b, 0.0)) > CLEAR
+    assert edge_margin(steps(only_b, 0.0), steps(only_a, 0.6)) < -CLEAR
+    assert abs(edge_margin(steps(only_a, 0.6), steps(only_b, 0.55))) < CLEAR
     # Edges that are there although the other pose has none in their place tell, too.
-    assert telling(steps(only_a, 0.6), steps(shared[:30], 0.6)) > CLEAR
-    assert telling(steps(only_a, 0.0), steps(shared[:30], 0.6)) < -CLEAR
+    assert edge_margin(steps(only_a, 0.6), steps(shared[:30], 0.6)) > CLEAR
+    assert edge_margin(steps(only_a, 0.0), steps(shared[:30], 0.6)) < -CLEAR
     # Nothing tells them apart where all edges are shared.
-    assert telling(steps(shared[:30], 0.6), steps(shared[:30], 0.0)) == 0.0
+    assert edge_margin(steps(shared[:30], 0.6), steps(shared[:30], 0.0)) == 0.0
 
 
 def test_a_small_part_a_plain_view_and_a_close_rival_are_doubted_and_a_pose_a_little_aside_is_no_rival() -> None:
@@ -381,19 +386,6 @@ def test_what_hides_half_of_the_part_does_not_pull_the_pose_away() -> None:
     assert np.median(errors, axis=0)[0] < 1.5
 
 
-def test_a_detection_names_the_component_that_is_not_there() -> None:
-    sought = Detector(assembly_views(), CAMERA, model=assembly())
-    without_post = make_model("look-alike", tuple(p for p in assembly().components if p.name != "post_3"))
-    right, named = [], 0
-    for k in range(5):
-        truth = pose_from(-60.0 + 30.0 * k, 45.0, 480.0, roll_deg=5.0 * k)
-        right += [d.mismatches for d in sought.detect(picture(truth, seed=k, scene=k), max_results=1)]
-        for found in sought.detect(picture(truth, without_post, seed=k, scene=k), max_results=1):
-            named += found.mismatches == ("mismatch: post_3 not seen where expected",)
-    assert right == [()] * 5
-    assert named >= 4
-
-
 def test_results_are_apart_and_no_more_than_asked_for() -> None:
     image = picture(pose_from(30, 40, 520), seed=1)
     assert len(detector().detect(image, max_results=1)) == 1
@@ -407,13 +399,13 @@ def test_options_without_sense_are_refused() -> None:
 
 def test_no_search_looks_beyond_the_declared_distances() -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0), noise=12.0))
-    low, high = detector().views.view_range.distance_mm
+    nearest_mm, farthest_mm = search_distances_mm(detector().views.view_range)
     likely = detector().global_search.candidates(seen, WIDE).poses
     climbed = detector().local.pattern_search(seen, detector().global_search.starts(seen, WIDE), WIDE.kept)
     poses = np.concatenate([likely, [candidate.cam_from_body for candidate in climbed]])
     distances_mm = np.linalg.norm(poses[:, :3, 3], axis=1)
     assert len(likely) > 100 and climbed
-    assert distances_mm.min() >= NEARER * low and distances_mm.max() <= FARTHER * high
+    assert distances_mm.min() >= nearest_mm and distances_mm.max() <= farthest_mm
 
 
 def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None:
@@ -423,12 +415,12 @@ def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None
     alike = CandidatePoses(np.stack([pose] * 3), np.full(3, 12.0), responses)
     found = detector().global_search.rank(seen, alike)
     scores = [candidate.score for candidate in found]
-    assert scores[0] - scores[1] == pytest.approx(0.3 * RESPONSE_WORTH) and scores[1] > scores[2]
+    assert scores[0] - scores[1] == pytest.approx(0.3 * GlobalSearchOptions().response_weight) and scores[1] > scores[2]
 
 
 def test_matches_that_all_leave_the_declared_distances_are_no_detection(monkeypatch: pytest.MonkeyPatch) -> None:
-    search = detector().search
-    monkeypatch.setattr(search, "_reach_mm", (1.0, 2.0))
+    search = detector().global_search
+    monkeypatch.setattr(search, "_distances_mm", (1.0, 2.0))
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
     likely, lines, _ = search.candidates(seen, WIDE)
     assert likely.shape == (0, 4, 4) and lines.shape == (0,)
@@ -450,16 +442,17 @@ def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
 
 def test_a_quick_search_ends_the_matter_only_when_it_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
-    likely, budgets = detector().search.likely, []
+    candidates, budgets = detector().global_search.candidates, []
 
-    def watched(of: ImagePyramid, effort: SearchBudget = QUICK) -> CandidatePoses:
-        budgets.append(effort)
-        return likely(of, effort)
+    def watched(of: ImagePyramid, budget: SearchBudget = QUICK) -> CandidatePoses:
+        budgets.append(budget)
+        return candidates(of, budget)
 
-    monkeypatch.setattr(detector().search, "likely", watched)
+    monkeypatch.setattr(detector().global_search, "candidates", watched)
+    sure = detector().options.min_quick_quality
     for quality, expected in (
-        (MIN_QUICK_QUALITY, [QUICK]),
-        (MIN_QUICK_QUALITY - 0.01, [QUICK, WIDE, GRADIENTS_ONLY, UNTRIMMED]),
+        (sure, [QUICK]),
+        (sure - 0.01, [QUICK, WIDE, GRADIENTS_ONLY, UNTRIMMED]),
     ):
         monkeypatch.setattr(detector(), "qualities", lambda found, quality=quality: [quality] * len(found))
         budgets.clear()
@@ -477,5 +470,5 @@ def test_what_spoke_for_a_pose_at_one_level_counts_at_the_next() -> None:
     )
     alone = detector().local.pattern_search(seen, [PoseCandidate(0.0, poses[-1])])
     np.testing.assert_allclose(found[0].cam_from_body, alone[0].cam_from_body, atol=1e-9)
-    assert found[0].score == pytest.approx(alone[0].score + 1000.0 * BEFORE_WORTH**2)
+    assert found[0].score == pytest.approx(alone[0].score + 1000.0 * LocalSearchOptions().previous_weight ** 2)
     assert not np.allclose(plain[0].cam_from_body, alone[0].cam_from_body, atol=1e-3)

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from arview.cad import Model, make_model
 from arview.cad.view_range import ViewRange
+from arview.detection.disambiguation import DisambiguationOptions
 from arview.detection.features.edge_net import EdgeNet
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pair_comparator import PairComparator
-from arview.detection.symmetry import TELLING
 from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.refinement.view_model import PartView
@@ -75,7 +75,7 @@ def test_what_hides_the_difference_decides_nothing() -> None:
     flat = np.clip(np.random.default_rng(0).normal(120.0, 4.0, (CAMERA.height, CAMERA.width, 3)), 0, 255)
     seen = ImagePyramid(flat.astype(np.uint8), CAMERA, 12, EdgeNet())
     told = PairComparator(part_of(10.0)).log_odds(seen, twins_of(truth, 10.0))
-    assert np.abs(told).max() < TELLING, np.round(told, 1)
+    assert np.abs(told).max() < DisambiguationOptions().min_margin, np.round(told, 1)
 
 
 def test_twins_that_differ_nowhere_are_equal() -> None:

@@ -10,11 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from arview.detection.detector import local_search_for
-from arview.detection.search.local_search import (
-    FINE_TOLERANCE_PX,
-    LocalSearch,
-    PoseCandidate,
-)
+from arview.detection.search.global_search import PoseCandidate
+from arview.detection.search.local_search import LocalSearch
 from arview.geometry import Array, exp_so3, rigid
 from arview.refinement.schedules import LAST_STAGES
 from arview.tracking import Tracker, TrackerOptions
@@ -117,7 +114,7 @@ def test_a_verified_hypothesis_keeps_its_place_in_the_list() -> None:
     truth = pose_from(30, 40, 520)
     seen = local().pyramid(picture(truth, noise=6.0))
     far = rigid(exp_so3(np.array([0.0, 0.6, 0.0])) @ in_body(truth)[:3, :3], in_body(truth)[:3, 3])
-    found = local().refine_starts_through(seen, [(far, ()), (in_body(truth), ())], FINE_TOLERANCE_PX)
+    found = local().evaluate(seen, [far, in_body(truth)])
     verified = local().verify(seen, found)
     assert [np.allclose(a.cam_from_body, b.cam_from_body) for a, b in zip(found, verified, strict=True)] == [True] * 2
     assert verified[1].logit > verified[0].logit + 3.0

@@ -91,7 +91,7 @@ def _outcomes(part: str, weight: float, pictures: Iterator[LabelledPicture]) -> 
             yield BestHypothesis(terms, False, part, weight)
             continue
         pose = best.cam_from_body[None]
-        near = is_near(detector, pose, truth, detector.turns, *REFINED_NEAR)
+        near = is_near(detector, pose, truth, detector.disambiguator.all_rotations, *REFINED_NEAR)
         if near[0] or is_alike(detector, pose, truth, REFINED_NEAR[1], ALIKE_PIXELS)[0]:
             yield BestHypothesis(terms, True, part, weight)
 

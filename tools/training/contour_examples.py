@@ -14,7 +14,7 @@ from arview.core.atomic import replacing
 from arview.detection import Detector, DetectorOptions
 from arview.detection.scoring.contour_verifier import contour_profiles
 from arview.detection.search.global_search import PoseCandidate
-from arview.detection.search.local_search import Hypothesis
+from arview.detection.search.hypothesis import Hypothesis
 from arview.geometry import Array
 from profile_ranker_examples import REFINED_APART, REFINED_NEAR, label_poses, pictures_of
 from seeded_files import missing_files
@@ -52,7 +52,7 @@ def collect_contours(seeds: range, photos: Sequence[Path], folder: Path) -> None
     for seed, path in missing_files(seeds, folder, "contours_{}.pkl", "solids"):
         examples = []
         for detector, image, truth in pictures_of(seed, photos, DetectorOptions().budgets):
-            detector.local.options = replace(detector.local.options, verified=VERIFIED)
+            detector.local.options = replace(detector.local.options, max_verified=VERIFIED)
             example = contours_of(seed, detector, image, truth)
             examples += [example] if example is not None else []
         with replacing(path) as file:

@@ -15,7 +15,7 @@ from arview.detection import Detector
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pair_comparator import pair_crops
 from arview.detection.search.global_search import QUICK
-from arview.detection.search.local_search import Hypothesis
+from arview.detection.search.hypothesis import Hypothesis
 from arview.evaluation.semisynthetic.random_solids import random_near_symmetric, random_solid
 from arview.geometry import Array, exp_so3, log_so3, rigid, turned
 from profile_ranker_examples import REFINED_APART, REFINED_NEAR, is_near, pictures_of
@@ -80,7 +80,7 @@ def near_symmetric_poses(
     )
     poses = np.array([h.cam_from_body for h in found]).reshape(-1, 4, 4)
     limits = (REFINED_NEAR, REFINED_APART)
-    right, near = (is_near(detector, poses, truth, detector.exact_rotations, *limit) for limit in limits)
+    right, near = (is_near(detector, poses, truth, detector.disambiguator.exact_rotations, *limit) for limit in limits)
     # Poses between the two limits have no label.
     kept: list[Hypothesis] = [h for h, is_known in zip(found, right | ~near, strict=True) if is_known]
     right = right[right | ~near]

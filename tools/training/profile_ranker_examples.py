@@ -20,7 +20,7 @@ from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.crops import pose_crop
 from arview.detection.scoring.profile_ranker import RADII_PX, describe_poses
 from arview.detection.search.global_search import WIDE, PoseCandidate, SearchBudget
-from arview.detection.search.local_search import Hypothesis
+from arview.detection.search.hypothesis import Hypothesis
 from arview.errors import InputError
 from arview.evaluation.protocols import full_sphere_range
 from arview.evaluation.semisynthetic import (
@@ -365,10 +365,10 @@ def label_poses(
     if truth is None:
         return np.zeros(len(poses), dtype=bool), np.ones(len(poses), dtype=bool)
     angle_deg, place = (share * limit for limit in near)
-    right = is_near(detector, poses, truth, detector.exact_rotations, angle_deg, place)
+    right = is_near(detector, poses, truth, detector.disambiguator.exact_rotations, angle_deg, place)
     right |= is_alike(detector, poses, truth, place, SAME_PIXELS)
     angle_deg, place = (share * limit for limit in apart)
-    uncertain = is_near(detector, poses, truth, detector.turns, angle_deg, place)
+    uncertain = is_near(detector, poses, truth, detector.disambiguator.all_rotations, angle_deg, place)
     return right, right | ~(uncertain | is_alike(detector, poses, truth, place, ALIKE_PIXELS))
 
 

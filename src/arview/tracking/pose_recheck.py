@@ -16,12 +16,8 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.detection.search.global_search import PoseCandidate
-from arview.detection.search.local_search import (
-    FINE_TOLERANCE_PX,
-    Hypothesis,
-    LocalSearch,
-    LocalSearchOptions,
-)
+from arview.detection.search.hypothesis import Hypothesis
+from arview.detection.search.local_search import LocalSearch, LocalSearchOptions
 from arview.geometry import Array
 from arview.tracking.motion import squared_motion_distance
 
@@ -44,7 +40,7 @@ class RecheckOptions:
     """
 
     search: LocalSearchOptions = field(
-        default_factory=lambda: LocalSearchOptions(tried=6, finalists=3, rivals=0, verified=3)
+        default_factory=lambda: LocalSearchOptions(max_coarse=6, max_fine=3, max_competitors=0, max_verified=3)
     )
     kept: tuple[int, ...] = (6, 4)
     reach: float = 1.25
@@ -81,7 +77,7 @@ class LocalSearchRecheck:
         left, top, camera = window
         local = self._local.with_camera(camera)
         picture = local.pyramid(np.ascontiguousarray(image[top : top + camera.height, left : left + camera.width]))
-        found = local.refine_starts_through(picture, [(cam_from_body, ())], FINE_TOLERANCE_PX)
+        found = local.evaluate(picture, [cam_from_body])
         starts = local.pattern_search(picture, [PoseCandidate(1.0, pose) for pose in poses], self.options.kept)
         found = local.verify(picture, [*found, *local.refine_starts(picture, starts)])
         scores = [self._score(h, predicted[0]) for h in found]

@@ -121,25 +121,24 @@ def mean_edge_response(maps, part, pose, intrinsics, step_mm):  # type: ignore[n
         intrinsics: (10,) of the maps.
         step_mm: length over which directions are projected.
     """
-    directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
     height, width = maps.shape[1], maps.shape[2]
-    view = nearest_view(directions, pose)
+    view = nearest_view(part.directions, pose)
     sums = np.zeros(2)
     counts = np.zeros(2)
     for group in range(2):
-        starts = c_start if group == 0 else e_start
+        starts = part.contour_starts if group == 0 else part.edge_starts
         first, last = starts[view], starts[view + 1]
         if group == 0:
             px, normals, depths = project_lines(
-                c_points[first:last], c_normals[first:last], False, pose, intrinsics, step_mm
+                part.contour_points[first:last], part.contour_normals[first:last], False, pose, intrinsics, step_mm
             )
         else:
             px, normals, depths = project_lines(
-                e_points[first:last], e_tangents[first:last], True, pose, intrinsics, step_mm
+                part.edge_points[first:last], part.edge_tangents[first:last], True, pose, intrinsics, step_mm
             )
         for i in range(px.shape[0]):
             if group == 1:
-                kind = e_kinds[first + i]
+                kind = part.edge_kinds[first + i]
                 if (kind & EDGE_CONTOUR) > 0 or (kind & EDGE_SHARP) == 0:
                     continue
             if depths[i] <= 0.0:

@@ -165,26 +165,27 @@ def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_co
 
     ``points`` (3,N) int64 receives their columns, rows and orientation bins; see `score_around` for the rest.
     """
-    _, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
     count = 0
     for group in range(2):
         if group == 0:
-            first, last = c_start[view], c_start[view + 1]
+            first, last = part.contour_starts[view], part.contour_starts[view + 1]
             stride = max(1, (last - first) // contour_count)
             limit = contour_count + 32
             px, normals, depths = project_lines(
-                c_points[first:last:stride], c_normals[first:last:stride], False, pose, intrinsics, step_mm
-            )
+                part.contour_points[first:last:stride], part.contour_normals[first:last:stride], False, pose,
+                intrinsics, step_mm,
+            )  # fmt: skip
         else:
-            first, last = e_start[view], e_start[view + 1]
+            first, last = part.edge_starts[view], part.edge_starts[view + 1]
             stride = max(1, (last - first) // (2 * edge_count))
             limit = points.shape[1]
             px, normals, depths = project_lines(
-                e_points[first:last:stride], e_tangents[first:last:stride], True, pose, intrinsics, step_mm
-            )
+                part.edge_points[first:last:stride], part.edge_tangents[first:last:stride], True, pose, intrinsics,
+                step_mm,
+            )  # fmt: skip
         for i in range(px.shape[0]):
             if group == 1:
-                kind = e_kinds[first + i * stride]
+                kind = part.edge_kinds[first + i * stride]
                 if (kind & EDGE_CONTOUR) > 0 or (kind & EDGE_SHARP) == 0:
                     continue
             if depths[i] <= 0 or count >= limit:
@@ -232,7 +233,7 @@ def score_around(  # type: ignore[no-untyped-def]
                     + turns[t, i, 1] * cam_from_body[1, j]
                     + turns[t, i, 2] * cam_from_body[2, j]
                 )
-        view = nearest_view(part[0], pose)
+        view = nearest_view(part.directions, pose)
         for d in range(stretches.shape[0]):
             index = t * stretches.shape[0] + d
             for i in range(3):

@@ -327,12 +327,11 @@ def draw_edges(part, pose, intrinsics, step_mm, zoom, shift, drawn):  # type: ig
         drawn: (2,S,S) float32, receives the signed distance to the outline (more than 1 far from it) and the nearness
             of design edges.
     """
-    directions, c_start, c_points, c_normals, _, e_start, e_points, e_tangents, e_kinds = part
     side = drawn.shape[1]
-    view = nearest_view(directions, pose)
-    first, last = c_start[view], c_start[view + 1]
+    view = nearest_view(part.directions, pose)
+    first, last = part.contour_starts[view], part.contour_starts[view + 1]
     pixels, normals, depths = project_lines(
-        c_points[first:last], c_normals[first:last], False, pose, intrinsics, step_mm
+        part.contour_points[first:last], part.contour_normals[first:last], False, pose, intrinsics, step_mm
     )
     nearest = np.full((side, side), BAND_PX * BAND_PX, dtype=np.float32)
     reach = int(BAND_PX) + 1
@@ -354,12 +353,12 @@ def draw_edges(part, pose, intrinsics, step_mm, zoom, shift, drawn):  # type: ig
                     across = distance if across > 0.0 else -distance
                 drawn[0, v, u] = min(max(across / BAND_PX, -1.0), 1.0)
     drawn[1] = 0.0
-    first, last = e_start[view], e_start[view + 1]
+    first, last = part.edge_starts[view], part.edge_starts[view + 1]
     pixels, normals, depths = project_lines(
-        e_points[first:last], e_tangents[first:last], True, pose, intrinsics, step_mm
+        part.edge_points[first:last], part.edge_tangents[first:last], True, pose, intrinsics, step_mm
     )
     for i in range(pixels.shape[0]):
-        kind = e_kinds[first + i]
+        kind = part.edge_kinds[first + i]
         if (kind & EDGE_CONTOUR) > 0 or (kind & EDGE_SHARP) == 0 or depths[i] <= 0.0:
             continue
         x, y = pixels[i, 0] * zoom + shift[0], pixels[i, 1] * zoom + shift[1]

@@ -353,26 +353,25 @@ def _compare_sides(sides, mean_colour, step, profiles):  # type: ignore[no-untyp
 @kernel
 def sample_lines(part, pose, max_outline, max_inner):  # type: ignore[no-untyped-def]
     """`SampledLines` of the view nearest to a pose, with at most so many rows of outline and of design edges."""
-    view_directions, c_start, c_points, c_normals, c_runs, e_start, e_points, e_tangents, e_kinds = part
-    view = nearest_view(view_directions, pose)
+    view = nearest_view(part.directions, pose)
     points = np.empty((max_outline + max_inner, 3), dtype=np.float32)
     directions = np.empty((max_outline + max_inner, 3), dtype=np.float32)
     runs = np.empty((max_outline, 2), dtype=np.float32)
-    first, length = c_start[view], c_start[view + 1] - c_start[view]
+    first, length = part.contour_starts[view], part.contour_starts[view + 1] - part.contour_starts[view]
     outline = min(max_outline, length)
     for i in range(outline):
         k = first + (i * length) // outline
-        points[i], directions[i], runs[i] = c_points[k], c_normals[k], c_runs[k]
+        points[i], directions[i], runs[i] = part.contour_points[k], part.contour_normals[k], part.contour_runs_mm[k]
     design = 0
-    for k in range(e_start[view], e_start[view + 1]):
-        design += int((e_kinds[k] & EDGE_CONTOUR) == 0 and (e_kinds[k] & EDGE_SHARP) > 0)
+    for k in range(part.edge_starts[view], part.edge_starts[view + 1]):
+        design += int((part.edge_kinds[k] & EDGE_CONTOUR) == 0 and (part.edge_kinds[k] & EDGE_SHARP) > 0)
     inner, passed = 0, 0
     wanted = min(max_inner, design)
-    for k in range(e_start[view], e_start[view + 1]):
-        if (e_kinds[k] & EDGE_CONTOUR) > 0 or (e_kinds[k] & EDGE_SHARP) == 0:
+    for k in range(part.edge_starts[view], part.edge_starts[view + 1]):
+        if (part.edge_kinds[k] & EDGE_CONTOUR) > 0 or (part.edge_kinds[k] & EDGE_SHARP) == 0:
             continue
         if inner < wanted and passed * wanted >= inner * design:
-            points[max_outline + inner], directions[max_outline + inner] = e_points[k], e_tangents[k]
+            points[max_outline + inner], directions[max_outline + inner] = part.edge_points[k], part.edge_tangents[k]
             inner += 1
         passed += 1
     return SampledLines(points, directions, runs, outline, inner, length)

@@ -35,7 +35,7 @@ def pose_score(maps, part, pose, intrinsics, step_mm, contour_count, edge_count,
         buffer: (3, contour_count + edge_count + 96) int64 work buffer.
         sums: (S,S) int32 work buffer for the S² shifts.
     """
-    view = nearest_view(part[0], pose)
+    view = nearest_view(part.directions, pose)
     count = collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, buffer)
     if count < 16:
         return 0.0, 0, 0

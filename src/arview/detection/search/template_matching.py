@@ -101,7 +101,7 @@ def _surviving(keys, groups, found, votes, kept):  # type: ignore[no-untyped-def
     return np.array([i for i in range(found) if keys[i] >= thresholds[groups[i]]], dtype=np.int64)
 
 
-@kernel
+@kernel(inline=True)
 def _place_points(offsets, bins, step, columns, source, shift):  # type: ignore[no-untyped-def]
     """Write plane and offset of each point of a template in the decimated maps, and return its largest dx and dy."""
     reach_x = 0
@@ -115,7 +115,7 @@ def _place_points(offsets, bins, step, columns, source, shift):  # type: ignore[
     return reach_x, reach_y
 
 
-@kernel
+@kernel(inline=True)
 def _sum_first_points(total, own, lowest, flat, source, shift, span, is_trimmed):  # type: ignore[no-untyped-def]
     """Write the sums of the first points at ``span`` places to ``total``, tile by tile."""
     for start in range(0, span, TILE):
@@ -127,7 +127,7 @@ def _sum_first_points(total, own, lowest, flat, source, shift, span, is_trimmed)
             _add_points(total[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
 
 
-@kernel
+@kernel(inline=True)
 def _typical_score(total, span, full):  # type: ignore[no-untyped-def]
     """Mean score of the first points over sampled places, times `TYPICAL_SHARE`; ``full`` is the largest sum."""
     count = 0
@@ -140,7 +140,7 @@ def _typical_score(total, span, full):  # type: ignore[no-untyped-def]
     return TYPICAL_SHARE * sampled / (count * full)
 
 
-@kernel
+@kernel(inline=True)
 def _is_peak(total, k, span, columns):  # type: ignore[no-untyped-def]
     """Whether place ``k`` is the maximum among its four neighbours; of equal neighbours the last one is."""
     value = total[k]
@@ -150,18 +150,27 @@ def _is_peak(total, k, span, columns):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sum_all_points(flat, source, shift, k, first_sum, is_trimmed, sums):  # type: ignore[no-untyped-def]
-    """Sum of the responses under all points at place ``k``; ``sums`` (SECTORS,) is a work buffer."""
-    points = len(source)
-    if is_trimmed:
-        sums[:] = 0
-        for i in range(points):
-            sums[sector_of(i)] += np.int64(flat[source[i], shift[i] + k])
-        return np.sum(sums) - min_adjacent_pair(sums)
-    total = np.int64(first_sum)
-    for i in range(FIRST_POINTS, points):
-        total += np.int64(flat[source[i], shift[i] + k])
-    return total
+def _compact(keys, templates, cells, groups, found, votes, kept):  # type: ignore[no-untyped-def]
+    """Move the surviving matches to the front of full buffers, and return their number.
+
+    More than half of the buffer survives only if thousands have the same key; any of these will do.
+    """
+    left = _surviving(keys, groups[templates], found, votes, kept)
+    found = min(len(left), len(keys) // 2)
+    keys[:found] = keys[left[:found]]
+    templates[:found] = templates[left[:found]]
+    cells[:found] = cells[left[:found]]
+    return found
+
+
+@kernel
+def _places(cells, columns, step):  # type: ignore[no-untyped-def]
+    """Places (M,2) int32 in full pixels of cells (M,) of the grid."""
+    places = np.empty((len(cells), 2), dtype=np.int32)
+    for n in range(len(cells)):
+        places[n, 0] = cells[n] % columns * step
+        places[n, 1] = cells[n] // columns * step
+    return places
 
 
 @kernel
@@ -196,8 +205,7 @@ def match_templates(  # type: ignore[no-untyped-def]
     own, lowest = np.empty((SECTORS, TILE), dtype=np.uint16), np.empty(TILE, dtype=np.uint16)
     sums = np.empty(SECTORS, dtype=np.int64)
     counted = 1.0 - TRIMMED_SHARE if is_trimmed else 1.0
-    full = 63.0 * points * counted
-    first_full = 63.0 * FIRST_POINTS * counted
+    full, first_full = 63.0 * points * counted, 63.0 * FIRST_POINTS * counted
     for t in range(first_template, last_template):
         reach_x, reach_y = _place_points(offsets[t], bins[t], step, columns, source, shift)
         last_row = rows - reach_y // step - 1
@@ -221,24 +229,24 @@ def match_templates(  # type: ignore[no-untyped-def]
             for k in range(start, stop):
                 if total[k] < limit or k % columns >= last_column or not _is_peak(total, k, span, columns):
                     continue
-                share = _sum_all_points(flat, source, shift, k, total[k], is_trimmed, sums) / full
+                if is_trimmed:
+                    sums[:] = 0
+                    for i in range(points):
+                        sums[sector_of(i)] += np.int64(flat[source[i], shift[i] + k])
+                    sum_all = np.sum(sums) - min_adjacent_pair(sums)
+                else:
+                    sum_all = np.int64(total[k])
+                    for i in range(FIRST_POINTS, points):
+                        sum_all += np.int64(flat[source[i], shift[i] + k])
+                share = sum_all / full
                 if share < required:
                     continue
                 if found == room:
-                    left = _surviving(keys, groups[templates], found, votes, kept)
-                    # More than half survive only if thousands have the same key: any of them will do.
-                    found = min(len(left), room // 2)
-                    keys[:found] = keys[left[:found]]
-                    templates[:found] = templates[left[:found]]
-                    cells[:found] = cells[left[:found]]
+                    found = _compact(keys, templates, cells, groups, found, votes, kept)
                 keys[found] = (share - typical) * gains[t]
                 templates[found] = t
                 cells[found] = k
                 votes[groups[t], min(int(keys[found] / KEY_STEP), votes.shape[1] - 1)] += 1
                 found += 1
     best = _surviving(keys, groups[templates[:found]], found, votes, kept)
-    places = np.empty((len(best), 2), dtype=np.int32)
-    for n in range(len(best)):
-        places[n, 0] = cells[best[n]] % columns * step
-        places[n, 1] = cells[best[n]] // columns * step
-    return keys[best], templates[best], places
+    return keys[best], templates[best], _places(cells[best], columns, step)
