@@ -22,11 +22,6 @@ CELL_PX = 8
 """The network takes images whose sides are multiples of this."""
 INPUT_MEAN, INPUT_SCALE = 128.0, 64.0
 """Grey level subtracted from the network's input, and the grey levels that input and output are divided by."""
-_LAPLACIAN = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
-_LAPLACIAN_DEVIATION = 6.0
-"""Standard deviation of the Laplacian for noise of standard deviation 1."""
-_MEDIAN_DEVIATIONS = 0.6745
-"""Median of the absolute value of a standard normal variable."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +48,15 @@ def noise_level(image: NDArray[np.uint8], stride: int = 3) -> float:
         image: RGB.
         stride: every so many rows and columns are sampled.
     """
+    laplacian = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
     green = image[..., 1].copy()
     sampled = np.s_[1::stride, 1::stride]
-    differences, values = cv2.filter2D(green, cv2.CV_16S, _LAPLACIAN)[sampled], green[sampled]
+    differences, values = cv2.filter2D(green, cv2.CV_16S, laplacian)[sampled], green[sampled]
     magnitudes = np.abs(differences[(values > 2) & (values < 253)])
     if not len(magnitudes):
         return 0.0
-    return float(np.median(magnitudes)) / _MEDIAN_DEVIATIONS / _LAPLACIAN_DEVIATION
+    # The median of |x| of a standard normal x is 0.6745; the filter multiplies the deviation of noise by 6.
+    return float(np.median(magnitudes)) / 0.6745 / 6.0
 
 
 class Denoiser:

@@ -26,10 +26,6 @@ from arview.refinement.projection import intrinsics_of
 
 STEPS_PER_OCTAVE = 4
 """Scale steps per factor of two; also the spacing of the template distances."""
-SPREAD_PX = 1
-"""Radius by which responses are dilated, in pixels of the maps; tolerates small errors of a pose."""
-NO_RESPONSES = np.zeros((ORIENTATIONS + 1, 1, 1), dtype=np.uint8)
-"""Edge responses without a network: zero everywhere."""
 
 
 class PyramidLevel(NamedTuple):
@@ -87,15 +83,24 @@ class ImagePyramid:
         camera: of the image.
         pad_px: empty border of the response maps.
         edge_net: its edge responses weigh as much as gradients in the response maps; None: gradients alone count.
+        spread_px: radius by which responses are dilated, in pixels of the maps, which tolerates small errors of a pose.
     """
 
-    def __init__(self, image: NDArray[np.uint8], camera: Camera, pad_px: int, edge_net: EdgeNet | None = None) -> None:
+    def __init__(
+        self,
+        image: NDArray[np.uint8],
+        camera: Camera,
+        pad_px: int,
+        edge_net: EdgeNet | None = None,
+        spread_px: int = 1,
+    ) -> None:
         self.image = image
         self.gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         self.pad_px = pad_px
         self.focal_px = 0.5 * (camera.fx + camera.fy)
         self._camera = camera
         self._edge_net = edge_net
+        self._spread_px = spread_px
         self._halved = _halve_image(image)
         self._responses: list[NDArray[np.uint8]] = []
         self._lock = Lock()
@@ -145,7 +150,8 @@ class ImagePyramid:
         if step not in self._levels:
             width, height = self._size(step)
             self._predict()
-            responses = _smallest_covering(self._responses, width, 2) if self._responses else NO_RESPONSES
+            none = np.zeros((ORIENTATIONS + 1, 1, 1), dtype=np.uint8)
+            responses = _smallest_covering(self._responses, width, 2) if self._responses else none
             image = self._resized(width, height)
             self._levels[step] = make_level(image, responses, intrinsics_of(self._camera.scaled(width, height)))
         return self._levels[step]
@@ -160,7 +166,7 @@ class ImagePyramid:
         """Dilated edge responses (8,height,width)."""
         if not self._responses:
             return np.zeros((ORIENTATIONS, height, width), dtype=np.uint8)
-        return resize_responses(_smallest_covering(self._responses, width, 2), width, height, SPREAD_PX)
+        return resize_responses(_smallest_covering(self._responses, width, 2), width, height, self._spread_px)
 
     def _make_maps(self, step: int) -> tuple[NDArray[np.uint8], Array]:
         width, height = self._size(step)
@@ -168,7 +174,7 @@ class ImagePyramid:
         per_map = 2 if 2.0 ** (step / STEPS_PER_OCTAVE) <= 0.5 else 1
         intrinsics = intrinsics_of(self._camera.scaled(width, height))
         intrinsics[2:4] += self.pad_px
-        maps = response_maps(self._resized(per_map * width, per_map * height), SPREAD_PX, self.pad_px, per_map)
+        maps = response_maps(self._resized(per_map * width, per_map * height), self._spread_px, self.pad_px, per_map)
         if self._responses:
             inside = maps[:, self.pad_px : self.pad_px + height, self.pad_px : self.pad_px + width]
             for plane, responses in zip(inside, self._responses_at(width, height), strict=True):

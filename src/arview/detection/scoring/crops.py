@@ -58,7 +58,6 @@ MIN_GRADIENT = 0.02
 """Added to the mean gradient, in such deviations per pixel."""
 OUTLINE_REACH = 0.6
 """Distance from the outline, in `BAND_PX`, within which gradients belong to it."""
-_ORIGIN, _ANY_DIRECTION = np.zeros((1, 3), np.float32), np.array([[1.0, 0.0, 0.0]], np.float32)
 
 
 class PoseCrop(NamedTuple):
@@ -130,8 +129,9 @@ class CropWindow:
         return PoseCrop(self.pixels, drawn, cropped)
 
     def _center_px(self, pose: Array) -> Array:
-        intrinsics = self._level.intrinsics
-        return np.asarray(project_lines(_ORIGIN, _ANY_DIRECTION, True, pose, intrinsics, 1.0)[0][0])
+        """Pixel (2,) of the part's centre in the level of the pyramid."""
+        center, any_direction = np.zeros((1, 3), np.float32), np.array([[1.0, 0.0, 0.0]], np.float32)
+        return np.asarray(project_lines(center, any_direction, True, pose, self._level.intrinsics, 1.0)[0][0])
 
 
 def pose_crop(pyramid: ImagePyramid, part: PartView, pose: Array, radius_px: float) -> PoseCrop:

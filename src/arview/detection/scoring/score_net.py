@@ -17,8 +17,6 @@ from arview.detection.scoring.crops import NORMAL_X, NORMAL_Y
 from arview.geometry import Array
 from arview.weights import load_network
 
-MAX_BATCH = 8
-"""Inputs that the network takes in one run."""
 REFERENCE_RADIUS_PX, REFERENCE_CONTRAST = 80.0, 40.0
 """Half diameter in pixels and contrast in grey levels relative to which scalar inputs are given."""
 
@@ -41,18 +39,20 @@ class ScoreNet:
     Args:
         name: of its file, see `arview.weights.load_network`.
         mirrors: (left-right, upside-down) of each form in which an input is scored.
+        max_batch: number of inputs that the network takes in one run.
     """
 
-    def __init__(self, name: str, mirrors: Sequence[tuple[bool, bool]] = ((False, False),)) -> None:
+    def __init__(self, name: str, mirrors: Sequence[tuple[bool, bool]] = ((False, False),), max_batch: int = 8) -> None:
         self._network = load_network(name)
         self._mirrors = mirrors
+        self._max_batch = max_batch
 
     def scores(self, inputs: Sequence[NetworkInput], in_mirrors: bool = True) -> Array:
         """Scores (N,): means over all mirrored forms, or of the first form alone."""
         mirrors = self._mirrors if in_mirrors else self._mirrors[:1]
         scores = np.empty(len(inputs))
-        for first in range(0, len(inputs), MAX_BATCH):
-            batch = slice(first, first + MAX_BATCH)
+        for first in range(0, len(inputs), self._max_batch):
+            batch = slice(first, first + self._max_batch)
             channels, scalars = map(np.stack, zip(*inputs[batch], strict=True))
             forms = [mirrored(channels, *mirror) for mirror in mirrors]
             predicted = self._network(seen=np.concatenate(forms), both=np.concatenate([scalars] * len(forms)))

@@ -38,23 +38,11 @@ from arview.refinement.view_model import PartView
 Schedule = tuple[Stage, ...]
 
 
-def _coarse_stage(region_scale: int, edge_reach: int, edge_step_px: float, edge_spread_px: float) -> Stage:
-    return Stage(
-        region_scale=region_scale,
-        edge_reach=edge_reach,
-        edge_step_px=edge_step_px,
-        edge_spread_px=edge_spread_px,
-        updates=2,
-        region_gain=1.0,
-        stride=2,
-    )
-
-
 COARSE_STAGES: Schedule = (
-    _coarse_stage(6, 12, 2.0, 10.0),
-    _coarse_stage(4, 12, 2.0, 7.0),
-    _coarse_stage(4, 12, 1.5, 5.0),
-    _coarse_stage(3, 10, 1.0, 3.5),
+    Stage(region_scale=6, edge_reach=12, edge_step_px=2.0, edge_spread_px=10.0, stride=2),
+    Stage(region_scale=4, edge_reach=12, edge_step_px=2.0, edge_spread_px=7.0, stride=2),
+    Stage(region_scale=4, edge_reach=12, edge_step_px=1.5, edge_spread_px=5.0, stride=2),
+    Stage(region_scale=3, edge_reach=10, edge_step_px=1.0, edge_spread_px=3.5, stride=2),
 )
 """Coarse refinement in which edges dominate."""
 COARSE_COLOUR_STAGES: Schedule = tuple(replace(stage, region_gain=20.0) for stage in COARSE_STAGES)
