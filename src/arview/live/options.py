@@ -42,7 +42,7 @@ class RecordingOptions:
 
     min_free_bytes: int = 500_000_000  # free disk space that is left to other programs
     max_duration_s: float = 3600.0
-    check_interval_s: float = 5.0  # time between two looks at the free disk space
+    check_interval_s: float = 5.0  # time between two checks of the free disk space
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ class LiveOptions:
     frame_wait_s: float = 5.0  # time that a request for a station's next frame waits
     tick_s: float = 0.25  # interval of the regular work: clients that are gone, changed inspections, status messages
     status_interval_s: float = 1.0  # a status is sent at least this often
-    reload_interval_s: float = 1.0  # time between two looks at the inspection file
-    renewal_interval_s: float = 12 * 3600.0  # time between two looks at the age of the certificate
+    reload_interval_s: float = 1.0  # time between two checks of the inspection file
+    renewal_interval_s: float = 12 * 3600.0  # time between two checks of the age of the certificate
     workers: int = 16  # threads for drawing, JPEG and files; most of them wait for a renderer
     feed: FeedOptions = field(default_factory=FeedOptions)
     station: StationOptions = field(default_factory=StationOptions)

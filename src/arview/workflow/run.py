@@ -109,10 +109,10 @@ def inspect_part(
     folder = Path(folder)
     prepared = prepare(job, folder)
     with exclusive_access(folder, ".lock", waits=False):
-        return _Run(prepared, folder, progress or (lambda what, done, total: None)).execute(starts_over)
+        return _InspectionRun(prepared, folder, progress or (lambda what, done, total: None)).execute(starts_over)
 
 
-class _Run:
+class _InspectionRun:
     """One run: its inputs, and the stages and warnings so far."""
 
     def __init__(self, prepared: Prepared, folder: Path, progress: Progress) -> None:

@@ -237,7 +237,7 @@ class Hub:
         if self._shared is not None:
             await asyncio.to_thread(self._shared[0].close)
 
-    # --- inside ---------------------------------------------------------------------------------------
+    # --- internals ---------------------------------------------------------------------------------------
 
     async def _connect(self, client: Client, sdp: str) -> str:
         def ended() -> None:
