@@ -1,4 +1,4 @@
-"""Metrics against figures worked out by hand; the range that covers poses; the BOP reader on a tiny scene."""
+"""Error metrics against values computed by hand, ranges that cover poses, and the BOP reader on a tiny scene."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_contour_distance_is_that_of_the_picture(views: GuideViewSet) -> None:
     assert error.contour_median_px == pytest.approx(2 * 400 / 395, rel=0.02)
 
 
-def test_declared_symmetry_forgives_its_turns_only() -> None:
+def test_declared_symmetry_accepts_only_its_rotations() -> None:
     half_turn = Symmetry((0.0, 0.0, 1.0), (30.0, 30.0, 5.0), 2)
     truth = rigid(exp_so3([0.3, -0.2, 0.5]), [5.0, -4.0, 400.0])
     turned = truth @ about(half_turn, np.pi)
@@ -97,7 +97,7 @@ def test_declared_symmetry_forgives_its_turns_only() -> None:
     assert off.rotation_deg == pytest.approx(np.rad2deg(1.0))
 
 
-def test_free_axis_forgives_any_angle_about_it() -> None:
+def test_continuous_symmetry_accepts_any_angle() -> None:
     free = Symmetry((0.0, 0.6, 0.8), (3.0, -2.0, 7.0), None)
     truth = rigid(exp_so3([0.3, -0.2, 0.5]), [5.0, -4.0, 400.0])
     meter = PoseMeter(brick(), CAMERA, symmetries=(free,))
@@ -185,7 +185,7 @@ def test_scene_is_read_with_its_own_frame_ids(tmp_path: Path) -> None:
     assert image.shape == (240, 320, 3) and image[5, 5].tolist() == [50, 50, 50]
 
 
-def test_reference_file_stands_in_where_there_is_no_truth(tmp_path: Path) -> None:
+def test_reference_file_is_used_for_frames_without_truth(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "brick", truths=1)
     peer = {str(k): {"R": np.eye(3).ravel().tolist(), "t_mm": [0.0, 0.0, 300.0 + k]} for k in (4, 5)}
     write_json(tmp_path / "brick" / "peer_visp.json", peer)
@@ -198,7 +198,7 @@ def test_reference_file_stands_in_where_there_is_no_truth(tmp_path: Path) -> Non
     assert scene.frames[2].cam_from_model is None
 
 
-def test_pictures_of_another_matrix_are_brought_to_the_first(tmp_path: Path) -> None:
+def test_pictures_with_another_matrix_are_warped_to_the_first(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "brick")
     cameras = json.loads((folder / "scene_camera.json").read_text())
     cameras["5"]["cam_K"][2] += 20.0

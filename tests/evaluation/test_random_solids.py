@@ -1,4 +1,4 @@
-"""Random solids: of every kind, of a part's size, closed bodies, and the same from the same seed."""
+"""Random solids: closed bodies of every kind, of a part's size, and the same from the same seed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SEEDS = range(30)
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("made", [random_solid, random_near_symmetric])
-def test_a_solid_is_made_of_closed_bodies_of_a_parts_size(made: Callable[[int], Model], seed: int) -> None:
+def test_a_solid_consists_of_closed_bodies_of_a_parts_size(made: Callable[[int], Model], seed: int) -> None:
     try:
         solid = made(seed)
     except ValueError:
@@ -33,7 +33,7 @@ def test_a_solid_is_made_of_closed_bodies_of_a_parts_size(made: Callable[[int], 
         assert np.einsum("ij,ij->i", a, crosses).sum() / 6.0 > 0.0
 
 
-def test_the_same_seed_gives_the_same_solid_and_another_another() -> None:
+def test_solids_depend_only_on_their_seed() -> None:
     one, again, other = random_solid(3), random_solid(3), random_solid(10)
     assert all(
         np.array_equal(a.vertices_in_model, b.vertices_in_model)
@@ -42,7 +42,7 @@ def test_the_same_seed_gives_the_same_solid_and_another_another() -> None:
     assert one.diameter_mm != other.diameter_mm
 
 
-def test_most_of_a_twin_half_a_turn_or_another_takes_onto_itself_but_not_all_of_it() -> None:
+def test_a_near_symmetric_solid_is_symmetric_but_for_a_few_features() -> None:
     seen = 0
     for seed in SEEDS:
         try:

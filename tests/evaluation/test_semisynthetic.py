@@ -1,4 +1,4 @@
-"""Semi-synthetic sequences: truth against what was drawn, speed, determinism, look-alikes, files, errors."""
+"""Semi-synthetic sequences: true poses against the pictures, speed, determinism, look-alikes, files, errors."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_what_is_outside_the_picture_counts_as_not_visible() -> None:
     assert half.pixels_in_picture == pytest.approx(half.mask.sum())
 
 
-def test_part_in_front_hides_what_the_mask_says() -> None:
+def test_the_occluder_hides_what_the_mask_leaves_out() -> None:
     model, options = shape("block"), SequenceOptions("occlusion", frames=5, seed=3, sensor_noise=0.0)
     poses = trajectory(model, options)
     photo = background(1, 800, 600)
@@ -209,7 +209,7 @@ def test_moving_light_changes_the_part_and_not_its_place() -> None:
     assert np.ptp(pictures["light"]) > 25.0
 
 
-def test_noise_has_the_deviation_asked_for() -> None:
+def test_noise_has_the_wanted_standard_deviation() -> None:
     model = shape("block")
     photo = np.full((600, 800, 3), 128, np.uint8)
     frame = next(render_sequence(model, oblique(model)[None], photo, SequenceOptions("noise", noise=12.0)))
@@ -258,7 +258,7 @@ def test_colours_of_cad_become_those_of_a_real_part() -> None:
 
 
 @pytest.mark.parametrize("name", ["block", "flange"])
-def test_trajectory_is_as_fast_as_asked_and_sees_every_side(name: str) -> None:
+def test_trajectory_has_the_wanted_speed_and_shows_every_side(name: str) -> None:
     model = shape(name)
     center = model.center_in_model
     poses = trajectory(model, SequenceOptions(frames=400, seed=5))
@@ -283,7 +283,7 @@ def apply_all(poses: Array, point: Array) -> Array:
     return np.stack([apply(pose, point) for pose in poses])
 
 
-def test_same_seed_same_pictures_and_other_seed_others() -> None:
+def test_pictures_depend_only_on_their_seed() -> None:
     model, photo = shape("bracket"), background(2, 800, 600)
     options = SequenceOptions("noise", frames=2, seed=4)
     first, again = (
@@ -299,7 +299,7 @@ def test_same_seed_same_pictures_and_other_seed_others() -> None:
 # --- Look-alikes ----------------------------------------------------------------------------------------
 
 
-def test_look_alikes_name_what_is_wrong() -> None:
+def test_look_alikes_list_their_faulty_components() -> None:
     model = shape("assembly")
     found = {look_alike.name: look_alike for look_alike in look_alikes(model)}
     places = {c.name: c.bounds_in_model for c in model.components}
@@ -338,7 +338,7 @@ def test_look_alike_of_one_component_is_refused() -> None:
 # --- Ambiguity ------------------------------------------------------------------------------------------
 
 
-def test_a_notch_behind_something_tells_nothing() -> None:
+def test_an_occluded_notch_leaves_the_pose_ambiguous() -> None:
     model, near = shape("flange"), near_symmetries("flange")
     center = model.center_in_model
     above = look_at(center + np.array([100.0, 50.0, 550.0]), center, [0, 1.0, 0])
@@ -355,7 +355,7 @@ def test_a_notch_behind_something_tells_nothing() -> None:
     assert np.rad2deg(rotation_angle_rad(alike[1][:3, :3], above[:3, :3])) == pytest.approx(60.0, abs=1e-4)
 
 
-def test_sixths_of_the_flange_are_alike_only_where_the_notch_is_hidden() -> None:
+def test_the_flange_is_ambiguous_only_where_its_notch_is_hidden() -> None:
     model, near = shape("flange"), near_symmetries("flange")
     center = model.center_in_model
     above = look_at(center + np.array([100.0, 50.0, 550.0]), center, [0, 1.0, 0])
@@ -392,7 +392,7 @@ def test_scene_is_read_back_with_its_truth(tmp_path: Path, photos: tuple[Path, .
         assert info["visib_fract"] == pytest.approx(info["px_count_visib"] / info["px_count_all"], abs=1e-3)
 
 
-def test_what_is_there_is_kept_and_other_options_replace_it(tmp_path: Path, photos: tuple[Path, ...]) -> None:
+def test_an_existing_sequence_is_reused_unless_its_options_differ(tmp_path: Path, photos: tuple[Path, ...]) -> None:
     job = shape_job("block", SequenceOptions(frames=2), photos)
     picture = make_sequence(job, tmp_path) / "test" / "000001" / "rgb" / "000000.jpg"
     made = picture.stat().st_mtime_ns
@@ -410,7 +410,7 @@ def test_folder_of_something_else_is_left_alone(tmp_path: Path, photos: tuple[Pa
         make_sequence(shape_job("block", SequenceOptions(frames=1), photos), tmp_path)
 
 
-def test_look_alike_scene_says_what_is_wrong(tmp_path: Path, photos: tuple[Path, ...]) -> None:
+def test_look_alike_scene_records_its_fault(tmp_path: Path, photos: tuple[Path, ...]) -> None:
     model = shape("assembly")
     wrong = look_alikes(model)[0]
     target = make_sequence(look_alike_job("assembly", model, wrong, SequenceOptions(frames=2), photos), tmp_path)
@@ -445,7 +445,7 @@ def test_no_background_is_one_clear_line(tmp_path: Path) -> None:
         make_sequence(shape_job("block", SequenceOptions(frames=1), (small,)), tmp_path)
 
 
-def test_frames_without_the_part_are_as_many_as_asked(tmp_path: Path, photos: tuple[Path, ...]) -> None:
+def test_frames_without_the_part_have_the_wanted_number(tmp_path: Path, photos: tuple[Path, ...]) -> None:
     other = make_sequence(shape_job("flange", SequenceOptions(frames=4), photos), tmp_path)
     scene = load_scene(other / "test" / "000001")
     found = list(frames_without_part(photos, [scene], 320, 240, 12))
@@ -502,7 +502,9 @@ class _Answers:
         return self._answers.pop(0)
 
 
-def test_ambiguous_answers_with_the_right_pose_are_counted_apart(tmp_path: Path, photos: tuple[Path, ...]) -> None:
+def test_ambiguous_detections_with_the_right_pose_are_counted_separately(
+    tmp_path: Path, photos: tuple[Path, ...]
+) -> None:
     made = make_sequence(shape_job("flange", SequenceOptions(frames=4), photos), tmp_path)
     scene = load_scene(made / "test" / "000001")
     meter = PoseMeter(scene.part.model, scene.camera)
@@ -537,7 +539,7 @@ def test_spread_frames_leave_out_what_is_hidden(tmp_path: Path, photos: tuple[Pa
     assert [frame.index for frame in chosen] == [1, 3, 5]
 
 
-def test_a_turned_part_is_the_same_however_it_is_turned_about_its_axis_and_not_when_it_is_tilted() -> None:
+def test_a_turned_part_changes_when_tilted_but_not_when_rotated_about_its_axis() -> None:
     shaft = [cylinder((0.0, 0.0), radius, *ends) for radius, ends in ((20.0, (-40.0, 10.0)), (12.0, (10.0, 40.0)))]
     plain = make_model("shaft", tuple(component(f"part_{k}", mesh, (0.6, 0.6, 0.6)) for k, mesh in enumerate(shaft)))
     key = component("key", box((-2, 12, 12), (2, 16, 38)), (0.6, 0.6, 0.6))

@@ -1,4 +1,4 @@
-"""The pipeline with scripted sources, sessions and overlays: order, files, Ctrl-C, errors, bounded memory."""
+"""annotate with scripted sources, sessions and overlays: order, files, Ctrl-C, errors, bounded memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The overlay against geometry worked out by other means, and the layout's promises over moving pictures."""
+"""The overlay against independently computed geometry, and the label layout over moving pictures."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def test_cylinder_shows_its_silhouette_and_no_facets() -> None:
     assert row.min() < 319 < row.max()
 
 
-def test_colours_tell_the_verdict() -> None:
+def test_colours_show_the_verdict() -> None:
     centers = [(-90, 0, 0), (-30, 0, 0), (30, 0, 0), (90, 0, 0)]
     model = make_model("m", tuple(box(f"b{i}", c, (40, 40, 40)) for i, c in enumerate(centers)))
     unmeasured = ComponentDeviation("b3", (None, None, None), None, (False,) * 6, None, 0.5, Verdict.NOT_MEASURED)
@@ -219,7 +219,7 @@ def test_failures_come_first(plate: Model, record: Inspection) -> None:
     assert {label.key for label in placed()} == {entry.name for entry in order[:3]}
 
 
-def test_arrow_shows_the_way() -> None:
+def test_arrow_points_along_the_displacement() -> None:
     model = make_model("m", (box("a", (0, 0, 0), (40, 40, 40)),))
     result = inspection(model, deviation("a", (0.5, 0.0, 0.0), "fail", 0.2))
     cam_from_model = look_at([0.0, 0.0, 500.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
@@ -254,7 +254,7 @@ def test_without_a_pose_only_the_status_line_is_drawn(plate: Model, record: Insp
     assert not changed(none.draw(GREY, lost)).any()
 
 
-def test_the_status_line_says_what_has_not_been_seen_yet(plate: Model, record: Inspection) -> None:
+def test_the_status_line_names_unverified_components(plate: Model, record: Inspection) -> None:
     renderer = OverlayRenderer(plate, CAMERA, record)
     seen = pose(orbit(20.0))
     plain, one, many = (
@@ -268,7 +268,7 @@ def test_the_status_line_says_what_has_not_been_seen_yet(plate: Model, record: I
     assert lost.remark == "too dark"
 
 
-def test_on_one_row_what_has_not_been_seen_gives_way_to_the_errors(plate: Model, record: Inspection) -> None:
+def test_on_one_row_unverified_components_give_way_to_the_inspection(plate: Model, record: Inspection) -> None:
     line = StatusLine(1600, 480, 18, record, None)
     assert line.rows == 1
     bars = []
@@ -315,7 +315,7 @@ def test_refusals(plate: Model, record: Inspection) -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_odd_poses_do_not_break_it(plate: Model, record: Inspection, camera: Camera) -> None:
+def test_unusual_poses_are_drawn_without_error(plate: Model, record: Inspection, camera: Camera) -> None:
     renderer = OverlayRenderer(plate, camera, record, OverlayOptions(show_edges="all"))
     front = orbit(20.0)
     for t_z in (-500.0, 0.0, 30.0, 120.0, 1e6):
@@ -440,7 +440,7 @@ def test_layout_with_more_labels_than_room() -> None:
     assert {"l0", "l1", "l2"} <= seen
 
 
-def test_labels_avoid_what_they_should_not_cover() -> None:
+def test_labels_avoid_covering_components() -> None:
     layout = LabelLayout(640, 10, 440, 10, 6, 150)
     cells = np.zeros((480 // CELL_PX, 640 // CELL_PX), dtype=np.float32)
     cells[20:30, :] = CELL_PX**2

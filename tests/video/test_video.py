@@ -1,4 +1,4 @@
-"""Video in and out: numbers of what is read and written, and one clear line for each bad input."""
+"""Video sources and sinks: frames and time stamps read and written, and one clear line for each bad input."""
 
 import resource
 import subprocess
