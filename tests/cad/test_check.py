@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arview.cad import Finding, ViewRange, check_part, load_part, make_model
+from arview.cad import PartFinding, ViewRange, check_part, load_part, make_model
 from arview.cad.check import can_confuse
 from arview.cad.model import Component
 from arview.cad.part import ComponentSettings, Part
@@ -221,7 +221,7 @@ def test_the_report_is_text(tmp_path):
     assert "camera (guessed): 1280×720, focal length 1536 px" in text
     assert "view range (default): 244 to 976 mm, every direction, any roll" in text
     assert "note: renamed something" in text
-    check = check_part(part).with_findings([Finding("problem", "views 3 and 7 look alike")])
+    check = check_part(part).with_findings([PartFinding("problem", "views 3 and 7 look alike")])
     assert check.has_problems
     assert check.findings[0].text == "views 3 and 7 look alike"
 

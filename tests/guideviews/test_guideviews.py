@@ -14,11 +14,11 @@ from arview.cad.view_range import ViewRange
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, invert
 from arview.guideviews import GuideViewOptions, GuideViewSet, load_guide_views, make_guide_views
-from arview.guideviews.findings import most_confusable, uniqueness_findings
+from arview.guideviews.findings import confusable_pair, uniqueness_findings
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_CREASE, EDGE_SHARP, EDGE_SILHOUETTE
 from arview.guideviews.sheet import CONFUSABLE_COLOR, CONTOUR_COLOR, PLAIN_COLOR, contact_sheet
 from arview.guideviews.sphere import icosphere_directions, view_poses
-from arview.guideviews.surface import MOST_FACES, reduced_surface
+from arview.guideviews.surface import MAX_FACES, reduced_surface
 from arview.guideviews.uniqueness import assess
 from arview.guideviews.views import guide_camera
 from arview.rendering.renderers import ZBufferRenderer
@@ -249,10 +249,10 @@ def test_the_surface_of_a_small_mesh_is_kept_as_it_is() -> None:
 def test_a_fine_mesh_is_reduced_and_stays_where_it_was() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=6, radius=50.0)
     model = make_model("ball", (Component("ball", sphere.vertices + 20.0, sphere.faces.astype(np.int32)),))
-    assert len(sphere.faces) > 3 * MOST_FACES
+    assert len(sphere.faces) > 3 * MAX_FACES
     points, faces, component = reduced_surface(model)
     assert len(component) == len(faces)
-    assert 1000 < len(faces) <= MOST_FACES
+    assert 1000 < len(faces) <= MAX_FACES
     assert np.linalg.norm(points - 20.0, axis=1) == pytest.approx(50.0, abs=0.2)
     reduced = trimesh.Trimesh(points, faces, process=False)
     assert reduced.area == pytest.approx(sphere.area, rel=0.01)
@@ -370,7 +370,7 @@ def test_views_of_a_block_are_alike_from_opposite_sides() -> None:
     found = make_guide_views(block(), SPHERE, GuideViewOptions(subdivisions=2, renderer="zbuffer"))
     unique = assess(found)
     assert np.median(unique.likeness) > 0.97
-    words = most_confusable(found, unique)
+    words = confusable_pair(found, unique)
     assert "azimuth" in words
     assert "likeness 0.9" in words or "likeness 1.0" in words
 
@@ -392,14 +392,14 @@ def has_color(image: np.ndarray, color: tuple[int, int, int]) -> bool:
 
 
 def test_the_sheet_shows_the_views_and_frames_weak_ones(views: GuideViewSet) -> None:
-    sheet = contact_sheet(assembly(), views, columns=5, tile_px=120, most=10)
+    sheet = contact_sheet(assembly(), views, columns=5, tile_px=120, max_views=10)
     assert sheet.dtype == np.uint8
     assert sheet.shape[1] == 5 * 126 + 6
     assert sheet.shape[0] > 2 * 154
     assert has_color(sheet, CONTOUR_COLOR)
     plain = make_guide_views(block(), SPHERE, COARSE)
-    legend_only = contact_sheet(assembly(), views, columns=5, tile_px=120, most=1)
-    framed = contact_sheet(block(), plain, columns=5, tile_px=120, most=10)
+    legend_only = contact_sheet(assembly(), views, columns=5, tile_px=120, max_views=1)
+    framed = contact_sheet(block(), plain, columns=5, tile_px=120, max_views=10)
     tiles = framed[-2 * 160 :]
     assert has_color(tiles, PLAIN_COLOR) or has_color(tiles, CONFUSABLE_COLOR)
     assert legend_only.shape[1] == 132

@@ -1,6 +1,6 @@
-"""CAD in: models of named components, part files, ranges of viewpoints, fitness for tracking."""
+"""CAD: models of named components, part files, ranges of viewpoints, and checks of a part."""
 
-from arview.cad.check import Finding, PartCheck, check_part
+from arview.cad.check import PartCheck, PartFinding, check_part
 from arview.cad.load import load_model
 from arview.cad.model import Component, Model, make_model
 from arview.cad.part import ComponentSettings, Datum, Part, default_view_range
@@ -13,10 +13,10 @@ __all__ = [
     "Component",
     "ComponentSettings",
     "Datum",
-    "Finding",
     "Model",
     "Part",
     "PartCheck",
+    "PartFinding",
     "Symmetry",
     "ViewRange",
     "check_part",

@@ -1,4 +1,4 @@
-"""check_part: what is in a part, and what will be hard about finding, tracking and inspecting it."""
+"""Check of a part: its content, and what will make it hard to detect, track and inspect."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from arview.geometry import Array, exp_so3
 Severity = Literal["problem", "warning", "note"]
 
 GUESSED_CAMERA = Camera(width=1280, height=720, fx=1536.0, fy=1536.0, cx=639.5, cy=359.5)
-"""Stands in where no camera is given: a focal length of 1.2 times the longer side of a 720p picture."""
+"""Camera when none is given: a focal length of 1.2 times the longer side of a 720p picture."""
 
 SMALL_PX = 12.0
-"""A component less than this across (its middle extent) gives the contour too few lines to be seen by."""
+"""Middle extent of a component in the picture below which its contour has too few lines."""
 
 THIN_PX = 3.0
-"""A component thinner than this shows both its edges as one line when seen edge-on."""
+"""Thickness in the picture below which both edges of a component seen edge-on merge."""
 
 SHEET_FRACTION = 1e-3
-"""A component whose smallest extent is below this share of its largest has no thickness worth the name."""
+"""Ratio of the smallest to the largest extent below which a component counts as a sheet."""
 
 MOVING_SHARE = 0.02
-"""A component breaks a near-symmetry when this share of its own surface has no counterpart."""
+"""Unmatched share of a component's surface above which it breaks a near-symmetry."""
 
 MANY_TRIANGLES = 200_000
-"""Rendering guide views gets slow beyond, with nothing gained."""
+"""Number of triangles above which guide views are rendered slowly, without any gain."""
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One remark: a ``problem`` fails unless something is done, a ``warning`` is hard, a ``note`` helps."""
+class PartFinding:
+    """A remark on a part: a ``problem`` causes failure, a ``warning`` makes it hard to use, a ``note`` informs."""
 
     severity: Severity
     text: str
@@ -48,9 +48,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class ComponentCheck:
-    """One component: its settings, its mesh, its apparent size, its own symmetries.
+    """The check of one component.
 
-    ``pixels_across`` is its middle extent in px at the farthest and the nearest declared distance.
+    Attributes:
+        component: that was checked.
+        settings: of the part file.
+        fitness: properties of its mesh.
+        pixels_across: its middle extent, px, at the farthest and the nearest declared distance.
+        symmetries: of the component alone.
     """
 
     component: Component
@@ -66,10 +71,10 @@ class PartCheck:
 
     Attributes:
         part: that was checked.
-        camera: given, or GUESSED_CAMERA.
-        is_camera_guessed: none was given.
-        view_range: declared, or the default.
-        components: those of the model.
+        camera: the given one, or GUESSED_CAMERA.
+        is_camera_guessed: True when none was given.
+        view_range: declared or default range.
+        components: of the model.
         symmetries: exact and near ones of the whole part.
         findings: problems first, then warnings, then notes.
     """
@@ -80,15 +85,15 @@ class PartCheck:
     view_range: ViewRange
     components: tuple[ComponentCheck, ...]
     symmetries: tuple[FoundSymmetry, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[PartFinding, ...]
 
     @property
     def has_problems(self) -> bool:
-        """True when something will fail unless it is changed."""
+        """True when a finding is a problem."""
         return any(finding.severity == "problem" for finding in self.findings)
 
-    def with_findings(self, findings: list[Finding]) -> PartCheck:
-        """The same report with further findings (of guide views, say) sorted in."""
+    def with_findings(self, findings: list[PartFinding]) -> PartCheck:
+        """The report with further findings, such as those of guide views, sorted in."""
         return replace(self, findings=_sorted([*self.findings, *findings]))
 
     def format(self) -> str:
@@ -146,9 +151,11 @@ class PartCheck:
 
 
 def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
-    """Describe a part and judge what will be hard, for a camera (None: GUESSED_CAMERA).
+    """Check a part: its components, symmetries, sizes in the picture and meshes.
 
-    Nothing here is an error; a part with problems can be used where they do not matter.
+    Args:
+        part: to be checked; one with problems can still be used.
+        camera: None for GUESSED_CAMERA.
     """
     check_type(part, Part, "check_part: part")
     check_type(camera, (Camera, NoneType), "check_part: camera")
@@ -159,7 +166,7 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
     vertices, faces, owners = part.model.mesh
     symmetries = find_symmetries(vertices, faces.astype(np.int64), owners.astype(np.int64))
     findings = [
-        *[Finding("note", note) for note in part.notes],
+        *[PartFinding("note", note) for note in part.notes],
         *_view_findings(part, camera, view_range),
         *_symmetry_findings(part, view_range, symmetries),
     ]
@@ -179,7 +186,7 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
     )
 
 
-def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:
+def _sorted(findings: list[PartFinding]) -> tuple[PartFinding, ...]:
     order: tuple[Severity, ...] = ("problem", "warning", "note")
     return tuple(sorted(findings, key=lambda finding: order.index(finding.severity)))
 
@@ -197,13 +204,13 @@ def _check_component(part: Part, component: Component, camera: Camera, view_rang
     )
 
 
-def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Finding]:
+def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[PartFinding]:
     findings = []
     diameter_mm = part.model.diameter_mm
     near_mm, far_mm = view_range.distance_mm
     if near_mm <= 0.5 * diameter_mm:
         findings.append(
-            Finding(
+            PartFinding(
                 "problem",
                 f"the nearest distance {near_mm:.0f} mm lies inside the part (half its diameter is "
                 f"{0.5 * diameter_mm:.0f} mm); distance_mm is from the camera to the part's middle",
@@ -212,7 +219,7 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Fi
     elif camera.fx * diameter_mm / near_mm > 2.0 * max(camera.width, camera.height):
         share = camera.fx * diameter_mm / near_mm / max(camera.width, camera.height)
         findings.append(
-            Finding(
+            PartFinding(
                 "warning",
                 f"at {near_mm:.0f} mm the part is {share:.1f} pictures wide: little contour is seen",
             )
@@ -220,12 +227,12 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Fi
     across_px = camera.fx * diameter_mm / far_mm
     if across_px < 60.0:
         findings.append(
-            Finding("problem", f"at {far_mm:.0f} mm the whole part is {across_px:.0f} px across; come nearer")
+            PartFinding("problem", f"at {far_mm:.0f} mm the whole part is {across_px:.0f} px across; come nearer")
         )
     triangles = len(part.model.mesh[1])
     if triangles > MANY_TRIANGLES:
         findings.append(
-            Finding(
+            PartFinding(
                 "warning",
                 f"{triangles:,} triangles make guide views slow; decimate, or for STEP raise tol_linear_mm",
             )
@@ -233,33 +240,33 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Fi
     return findings
 
 
-def _symmetry_findings(part: Part, view_range: ViewRange, symmetries: tuple[FoundSymmetry, ...]) -> list[Finding]:
-    """Turns of the whole part that look the same, or nearly, judged by what the view range lets happen."""
+def _symmetry_findings(part: Part, view_range: ViewRange, symmetries: tuple[FoundSymmetry, ...]) -> list[PartFinding]:
+    """Exact and near symmetries of the whole part, weighed by the declared view range."""
     findings = []
     for declared in part.symmetries:
         if not any(found.is_exact and _covers(found.symmetry, declared) for found in symmetries):
             text = f"the declared symmetry of the part, {declared.describe()}, is not in its geometry"
-            findings.append(Finding("warning", text))
+            findings.append(PartFinding("warning", text))
     ambiguous, excluded = [], []
     for found in symmetries:
         what = found.symmetry.describe()
         if not can_confuse(found.symmetry, view_range):
             excluded.append(what)
         elif any(_covers(declared, found.symmetry) for declared in part.symmetries):
-            findings.append(Finding("note", f"the part is symmetric as declared: {what}"))
+            findings.append(PartFinding("note", f"the part is symmetric as declared: {what}"))
         elif found.is_exact:
             ambiguous.append(what)
         else:
-            findings.append(Finding("warning", _near_text(part, found)))
+            findings.append(PartFinding("warning", _near_text(part, found)))
     if ambiguous:
         text = (
             f"the part looks the same when turned by {_listed(ambiguous, 4)}: its pose is ambiguous; "
             "restrict [view_range], declare it as [[symmetry]] if it does not matter, or rely on its texture"
         )
-        findings.append(Finding("problem", text))
+        findings.append(PartFinding("problem", text))
     if excluded:
         text = f"looks (nearly) the same when turned, but the view range keeps apart: {_listed(excluded, 4)}"
-        findings.append(Finding("note", text))
+        findings.append(PartFinding("note", text))
     return findings
 
 
@@ -274,10 +281,10 @@ def _near_text(part: Part, found: FoundSymmetry) -> str:
 
 
 def can_confuse(symmetry: Symmetry, view_range: ViewRange) -> bool:
-    """True when two allowed views of a part show the same because of a symmetry.
+    """Whether two viewpoints of the range look the same because of a symmetry.
 
-    A view from direction d with image-up u looks like the one from S d with image-up S u, for every turn S
-    of the symmetry; both must be in the range, roll included.
+    The view from direction d with image-up u equals that from S d with image-up S u, for every rotation S of the
+    symmetry; both must be in the range, roll included.
     """
     if symmetry.order is None:
         return True
@@ -300,56 +307,56 @@ def can_confuse(symmetry: Symmetry, view_range: ViewRange) -> bool:
 
 
 def _image_up(directions: Array) -> Array:
-    """(N,3) unit vectors across directions (N,3) that lie closest to +Z: up in a picture of roll 0."""
+    """(N,3) unit vectors perpendicular to directions (N,3), closest to +Z: up in a picture of roll 0."""
     up = np.array([0.0, 0.0, 1.0]) - directions * directions[:, 2:]
     return up / np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-12)
 
 
 def _angle_about_deg(axes: Array, start: Array, end: Array) -> Array:
-    """(N,) signed angles in deg about unit axes (N,3) from start to end (N,3), both across the axis."""
+    """(N,) signed angles, deg, about unit axes (N,3) from start to end (N,3), both perpendicular to the axis."""
     sine = np.einsum("ij,ij->i", axes, np.cross(start, end))
     return np.asarray(np.rad2deg(np.arctan2(sine, np.einsum("ij,ij->i", start, end))))
 
 
-def _size_findings(check: ComponentCheck, view_range: ViewRange) -> list[Finding]:
+def _size_findings(check: ComponentCheck, view_range: ViewRange) -> list[PartFinding]:
     near_mm, far_mm = view_range.distance_mm
     far_px, near_px = check.pixels_across
     name = check.component.name
     is_judged = check.settings.role == "inspect"
     if near_px < SMALL_PX:
         text = f"{name} is too small to see: {near_px:.1f} px across even at {near_mm:.0f} mm"
-        return [Finding("problem" if is_judged else "warning", text)]
+        return [PartFinding("problem" if is_judged else "warning", text)]
     if far_px < SMALL_PX:
         limit_mm = near_mm * near_px / SMALL_PX
         text = f"{name} is small: {far_px:.1f} px across at {far_mm:.0f} mm; well seen up to {limit_mm:.0f} mm"
-        return [Finding("warning", text)]
+        return [PartFinding("warning", text)]
     thin_px = far_px * check.fitness.extents_mm[2] / check.fitness.extents_mm[1]
     if thin_px < THIN_PX:
         text = f"{name} is thin: {thin_px:.1f} px at {far_mm:.0f} mm when seen edge-on"
-        return [Finding("note", text)]
+        return [PartFinding("note", text)]
     return []
 
 
-def _mesh_findings(check: ComponentCheck) -> list[Finding]:
+def _mesh_findings(check: ComponentCheck) -> list[PartFinding]:
     fitness, name = check.fitness, check.component.name
     findings = []
     if fitness.thickness_mm < SHEET_FRACTION * fitness.extents_mm[0]:
         text = f"{name} is a sheet without thickness ({fitness.thickness_mm:.3g} mm): give it one in the CAD"
-        findings.append(Finding("warning", text))
+        findings.append(PartFinding("warning", text))
     elif fitness.open_edge_count:
         text = f"{name} is not closed: {fitness.open_edge_count} open edges; they will show as contours"
-        findings.append(Finding("warning", text))
+        findings.append(PartFinding("warning", text))
     if fitness.non_manifold_edge_count:
         count = fitness.non_manifold_edge_count
         text = f"{name} has {count} edges shared by more than two triangles (non-manifold)"
-        findings.append(Finding("warning", text))
+        findings.append(PartFinding("warning", text))
     if not fitness.is_consistent:
-        findings.append(Finding("warning", f"{name} has triangles that face the wrong way"))
+        findings.append(PartFinding("warning", f"{name} has triangles that face the wrong way"))
     return findings
 
 
-def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[Finding]:
-    """Judged components that can be turned about themselves unseen, and declared turns that are not there."""
+def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[PartFinding]:
+    """Inspected bodies of revolution without a declared symmetry, and declared symmetries missing in the geometry."""
     findings = []
     spinning = []
     for check in checks:
@@ -357,34 +364,34 @@ def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[Finding]:
         exact = [found.symmetry for found in check.symmetries]
         if declared is not None and not any(_covers(symmetry, declared) for symmetry in exact):
             name, what = check.component.name, declared.describe()
-            findings.append(Finding("warning", f"{name}: the declared symmetry, {what}, is not in its geometry"))
+            findings.append(PartFinding("warning", f"{name}: the declared symmetry, {what}, is not in its geometry"))
         spins = [symmetry for symmetry in exact if symmetry.order is None]
         if check.settings.role == "inspect" and declared is None and spins:
             spinning.append(f"{check.component.name} ({spins[0].describe().removeprefix('any angle about ')})")
     if spinning:
         text = f"bodies of revolution, whose turn about their axis cannot be measured: {_listed(spinning, 8)}"
-        findings.append(Finding("note", text))
+        findings.append(PartFinding("note", text))
     return findings
 
 
-def _tolerance_findings(part: Part) -> list[Finding]:
+def _tolerance_findings(part: Part) -> list[PartFinding]:
     open_ended = [name for name in part.inspected if part.component_settings(name).position_tolerance_mm is None]
     if not open_ended:
         return []
     names = _listed(open_ended, 6)
-    return [Finding("note", f"no position_tolerance_mm, so measured but not judged: {names}")]
+    return [PartFinding("note", f"no position_tolerance_mm, so measured but not judged: {names}")]
 
 
 def _covers(wide: Symmetry, narrow: Symmetry) -> bool:
-    """True when every turn of ``narrow`` is one of ``wide`` (about the same direction)."""
+    """True when every rotation of ``narrow`` is one of ``wide``, about the same direction."""
     if not wide.is_same_axis(narrow):
         return False
     return wide.order is None or (narrow.order is not None and wide.order % narrow.order == 0)
 
 
-def _listed(items: list[str], most: int, separator: str = ", ") -> str:
-    rest = f" and {len(items) - most} more" if len(items) > most else ""
-    return separator.join(items[:most]) + rest
+def _listed(items: list[str], limit: int, separator: str = ", ") -> str:
+    rest = f" and {len(items) - limit} more" if len(items) > limit else ""
+    return separator.join(items[:limit]) + rest
 
 
 def _extent(size_mm: Array) -> str:

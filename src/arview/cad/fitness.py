@@ -1,4 +1,4 @@
-"""Cleaning of triangle meshes as they come from files, and what to know about one before tracking it."""
+"""Cleaning of triangle meshes from files, and the properties of a mesh that matter for tracking."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from arview.geometry import Array
 Faces = NDArray[np.int64]
 
 MERGE_FRACTION = 1e-5
-"""Vertices closer than this share of the mesh's diagonal are one: 1 µm on 100 mm, above float32's grain."""
+"""Vertices closer than this share of the mesh's diagonal are merged: 1 µm on 100 mm, above float32's resolution."""
 
 
 @dataclass(frozen=True)
 class MeshFitness:
-    """What a component's mesh is like.
+    """Properties of the mesh of a component.
 
     Attributes:
         triangle_count: number of triangles.
-        open_edge_count: edges with a triangle on one side only (0 for a closed surface).
+        open_edge_count: edges with a triangle on one side only; 0 for a closed surface.
         non_manifold_edge_count: edges shared by more than two triangles.
-        is_consistent: neighbouring triangles wind the same way.
-        volume_mm3: enclosed volume, None unless closed and consistent.
+        is_consistent: neighbouring triangles have the same winding.
+        volume_mm3: enclosed volume; None unless the mesh is closed and consistent.
         extents_mm: (3,) sides of a tight box around it, largest first.
     """
 
@@ -48,7 +48,7 @@ class MeshFitness:
 
 
 def inspect_mesh(component: Component) -> MeshFitness:
-    """Count open and non-manifold edges, and measure a component's volume and principal extents (mm)."""
+    """Open and non-manifold edges, volume and principal extents of the mesh of a component."""
     faces = component.faces.astype(np.int64)
     counts, balance, _ = _edges(faces, len(component.vertices_in_model))
     open_edges = int(np.count_nonzero(counts == 1))
@@ -66,10 +66,16 @@ def inspect_mesh(component: Component) -> MeshFitness:
 
 
 def clean_mesh(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
-    """Mesh with coincident vertices merged and degenerate, double and unused items removed, wound outwards.
+    """Merge coincident vertices, drop degenerate, duplicate and unused items, and wind the triangles outwards.
 
-    Takes and returns vertices (V,3) and faces (F,3) in any unit; F may come out 0. Surfaces that are not
-    closed are made consistent, their outside stays as the file has it for most of their area.
+    Surfaces that are not closed get a consistent winding; their outside is that of most of their area in the file.
+
+    Args:
+        vertices: (V,3) in any unit.
+        faces: (F,3) vertex indices.
+
+    Returns:
+        vertices and faces of the clean mesh, perhaps without faces.
     """
     vertices, faces = _merge_vertices(vertices, faces)
     faces = _drop_degenerate(vertices, faces)
@@ -93,7 +99,7 @@ def face_areas(vertices: Array, faces: Faces) -> Array:
 
 
 def surface_moments(vertices: Array, faces: Faces) -> tuple[Array, Array]:
-    """Centroid (3,) and covariance (3,3) of a surface seen as an evenly heavy skin (exact, not sampled)."""
+    """Centroid (3,) and covariance (3,3) of a surface of uniform density, exact."""
     areas = face_areas(vertices, faces)
     corners = vertices[faces]
     total = areas.sum()
@@ -107,13 +113,13 @@ def surface_moments(vertices: Array, faces: Faces) -> tuple[Array, Array]:
 
 
 def principal_axes(vertices: Array, faces: Faces) -> Array:
-    """(3,3) rows = principal axes of the surface, largest spread first."""
+    """(3,3) principal axes of the surface as rows, largest spread first."""
     _, vectors = np.linalg.eigh(surface_moments(vertices, faces)[1])
     return np.ascontiguousarray(vectors[:, ::-1].T)
 
 
 def _tight_extents(vertices: Array, faces: Faces) -> tuple[float, float, float]:
-    """Sides, largest first, of the smallest box that stands on a principal or a model axis."""
+    """Sides, largest first, of the smallest box along a principal axis or an axis of the model."""
     import cv2
 
     used = vertices[np.unique(faces)]
@@ -131,25 +137,25 @@ def _tight_extents(vertices: Array, faces: Faces) -> tuple[float, float, float]:
 
 
 def _merge_vertices(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
-    """One vertex for each cluster closer than MERGE_FRACTION of the diagonal; the first of it is kept."""
+    """Merge clusters of vertices closer than MERGE_FRACTION of the diagonal into their first vertex."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
-    distinct, faces = vertices[first], inverse.ravel()[faces]
-    tolerance = MERGE_FRACTION * float(np.linalg.norm(np.ptp(distinct, axis=0)))
-    pairs = cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
+    unique, faces = vertices[first], inverse.ravel()[faces]
+    tolerance = MERGE_FRACTION * float(np.linalg.norm(np.ptp(unique, axis=0)))
+    pairs = cKDTree(unique).query_pairs(tolerance, output_type="ndarray")
     if len(pairs) == 0:
-        return distinct, faces
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(distinct),) * 2)
+        return unique, faces
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(unique),) * 2)
     _, labels = connected_components(graph, directed=False)
     _, representative = np.unique(labels, return_index=True)
-    return distinct[representative], labels[faces].astype(np.int64)
+    return unique[representative], labels[faces].astype(np.int64)
 
 
 def _drop_degenerate(vertices: Array, faces: Faces) -> Faces:
-    """Faces without those of no area and without repetitions of the same three vertices."""
+    """The faces with an area, each triple of vertices once."""
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     if len(faces) == 0:
@@ -185,7 +191,7 @@ def _bodies(faces: Faces, vertex_count: int) -> NDArray[np.int64]:
 
 
 def _wind_outwards(vertices: Array, faces: Faces) -> Faces:
-    """Consistent winding, closed bodies outwards (the walls of a cavity towards the cavity)."""
+    """Make the winding consistent; closed bodies face outwards, the walls of a cavity into the cavity."""
     counts, balance, _ = _edges(faces, len(vertices))
     if np.any(balance[counts == 2] != 0):
         faces = _wind_alike(vertices, faces)
@@ -200,13 +206,13 @@ def _wind_outwards(vertices: Array, faces: Faces) -> Faces:
     outer = closed & (volumes > 0)
     flip = closed & (volumes < 0)
     for body in np.flatnonzero(flip):
-        # A body that is turned inwards is a cavity when it lies inside one that is not.
+        # A body that faces inwards is a cavity when it lies inside one that faces outwards.
         flip[body] = not np.any(outer & (low < low[body]).all(axis=1) & (high > high[body]).all(axis=1))
     return np.where(flip[bodies][:, None], faces[:, ::-1], faces)
 
 
 def _wind_alike(vertices: Array, faces: Faces) -> Faces:
-    """Neighbours over manifold edges wound the same way; each patch keeps the side most of its area has."""
+    """Give neighbours over manifold edges the same winding; each patch keeps that of most of its area."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import breadth_first_order, connected_components
 

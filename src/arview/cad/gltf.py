@@ -1,7 +1,7 @@
 """Reader of glTF 2.0 (.glb, .gltf): named nodes, nested transforms, instances, colours.
 
 Source: Khronos glTF 2.0 specification. Written for CAD, so that every node that carries a mesh stays one
-component under its own name; skins, morph targets and textures are left aside.
+component under its own name; skins, morph targets and textures are ignored.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ Color = tuple[float, float, float]
 def read_gltf(path: Path) -> RawModel:
     """Components of a .glb or .gltf file in the file's unit.
 
-    The unit is the metre, as the specification says. The one exception: trimesh writes raw numbers of any
-    unit and tags each mesh with ``extras.units``; such a tag is believed when trimesh is the generator.
+    The unit is the metre, as the specification says, with one exception: trimesh writes numbers in any unit and tags
+    each mesh with ``extras.units``; the tag is used when trimesh is the generator.
 
     Raises:
         InputError: not glTF 2.0, truncated, compressed, or inconsistent in itself.
@@ -62,7 +62,7 @@ def srgb_from_linear(linear: Array) -> Array:
 
 
 class _Gltf:
-    """One file while it is read."""
+    """Reader of one file."""
 
     def __init__(self, data: bytes, path: Path) -> None:
         self.path = path

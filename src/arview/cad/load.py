@@ -1,4 +1,4 @@
-"""load_model: a CAD file as a Model of named components in millimetres."""
+"""Loading of CAD files: a `Model` of named components in millimetres."""
 
 from __future__ import annotations
 
@@ -25,13 +25,15 @@ from arview.errors import InputError, MissingDependencyError
 from arview.geometry import Array
 
 SUFFIXES = (".step", ".stp", ".glb", ".gltf", ".obj", ".stl", ".ply", ".3mf")
-SMALLEST_MM, LARGEST_MM = 1.0, 100_000.0
+MIN_SIZE_MM, MAX_SIZE_MM = 1.0, 100_000.0
+"""Range of the diameter of a part, for files whose unit may be wrong."""
 DEFAULT_COLOR = (0.6, 0.6, 0.62)
+"""sRGB of components without a colour."""
 
 
 @dataclass(frozen=True)
 class LoadedCad:
-    """A model with what its file is worth telling: the unit in mm, and remarks (renamed or empty nodes)."""
+    """A model, the unit of its file in mm, and remarks on renamed or empty nodes."""
 
     model: Model
     unit_mm: float
@@ -41,7 +43,7 @@ class LoadedCad:
 def load_model(
     path: str | Path, unit: str | None = None, *, tol_linear_mm: float = 0.1, tol_angular_deg: float = 10.0
 ) -> Model:
-    """Model of a STEP, glTF, OBJ, STL, PLY or 3MF file; see load_cad, which also returns the remarks."""
+    """The model of a STEP, glTF, OBJ, STL, PLY or 3MF file, see `load_cad`, which also returns remarks."""
     check_type(path, PATH, "load_model: path")
     return load_cad(path, unit, tol_linear_mm, tol_angular_deg).model
 
@@ -120,8 +122,8 @@ def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float,
     return _read_mesh_file(path, suffix)
 
 
-# cascadio runs in a process of its own: OpenCASCADE writes to the terminal, and can abort on odd files.
-# Without trimesh, which it would only register a glTF extension with, it starts in 0.25 s instead of 1.2 s.
+# cascadio runs in a process of its own: OpenCASCADE writes to the terminal, and may abort on malformed files.
+# trimesh, for which it only registers a glTF extension, is left out, so that the process starts faster.
 _STEP_TO_GLB = """
 import sys
 sys.modules["trimesh"] = None
@@ -134,7 +136,7 @@ with open(target, "wb") as f: f.write(glb)
 
 
 def _read_step(path: Path, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
-    """STEP as triangles by OpenCASCADE (cascadio), whose linear tolerance is in mm for every file unit."""
+    """Triangles of a STEP file by OpenCASCADE (cascadio), whose tolerance is in mm whatever the unit of the file."""
     import importlib.util
 
     if importlib.util.find_spec("cascadio") is None:
@@ -151,8 +153,8 @@ def _read_step(path: Path, tol_linear_mm: float, tol_angular_deg: float, is_over
         )
         data = target.read_bytes() if target.is_file() else b""
     if not data:
-        said = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + "\n" + done.stderr).splitlines()
-        reason = next((line.strip(" *") for line in said if "ERR" in line), "")
+        printed = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + "\n" + done.stderr).splitlines()
+        reason = next((line.strip(" *") for line in printed if "ERR" in line), "")
         reason = reason or (f"OpenCASCADE crashed, code {done.returncode}" if done.returncode else "no shape in it")
         raise InputError(f"{path}: broken or truncated STEP ({reason}); export it again")
     raw = parse_gltf(data, path)
@@ -165,10 +167,10 @@ def _read_step(path: Path, tol_linear_mm: float, tol_angular_deg: float, is_over
 
 
 def _step_unit_mm(path: Path) -> float:
-    """Length unit that a STEP file declares, in mm; raises InputError when it declares none or several."""
+    """Length unit in mm that a STEP file declares; raises InputError when it declares none or several."""
     text = path.read_text(encoding="latin-1")
     prefixes = {"$": 1000.0, ".MILLI.": 1.0, ".CENTI.": 10.0, ".DECI.": 100.0, ".MICRO.": 0.001}
-    # An inch is defined by way of millimetres: of a conversion unit only the unit itself counts.
+    # An inch is defined in millimetres: of a conversion-based unit only the unit itself counts.
     names = re.findall(r"CONVERSION_BASED_UNIT\s*\(\s*'([^']*)'[^;]*?LENGTH_UNIT", text)
     units: set[float | None] = {unit_in_mm(name) for name in names}
     if not units:
@@ -180,7 +182,7 @@ def _step_unit_mm(path: Path) -> float:
 
 
 def _read_mesh_file(path: Path, suffix: str) -> RawModel:
-    """STL and PLY through trimesh: one mesh (ASCII STL: one per solid) without a unit."""
+    """An STL or PLY file read by trimesh: one mesh without a unit, for ASCII STL one for each solid."""
     import trimesh
 
     size = path.stat().st_size
@@ -194,9 +196,9 @@ def _read_mesh_file(path: Path, suffix: str) -> RawModel:
         with _quiet_trimesh(), path.open("rb") as file:
             scene = trimesh.load_scene(file, file_type=suffix[1:], process=False)
     except Exception as error:  # trimesh raises whatever its parsers stumble over
-        kind, said = suffix[1:].upper(), next(iter(str(error).splitlines()), "")
+        kind, printed = suffix[1:].upper(), next(iter(str(error).splitlines()), "")
         raise InputError(
-            f"{path}: broken or truncated {kind} ({type(error).__name__}: {said}); export it again"
+            f"{path}: broken or truncated {kind} ({type(error).__name__}: {printed}); export it again"
         ) from error
     raw = RawModel()
     several = len(scene.geometry) > 1
@@ -218,7 +220,7 @@ def _read_mesh_file(path: Path, suffix: str) -> RawModel:
 
 @contextmanager
 def _quiet_trimesh() -> Iterator[None]:
-    """Keep trimesh's and numpy's remarks about odd files off the terminal."""
+    """Suppress the warnings of trimesh and numpy about malformed files."""
     logger = logging.getLogger("trimesh")
     was_disabled = logger.disabled
     logger.disabled = True
@@ -243,7 +245,7 @@ def _bounding_size(raw: RawModel) -> Array:
 
 
 def _size_text(size_mm: Array) -> str:
-    """``120 × 80 × 8 mm``, in metres where millimetres get long."""
+    """A size such as ``120 × 80 × 8 mm``, in metres from 10 m on."""
     factor, name = (1000.0, "m") if size_mm.max() >= 10_000 else (1.0, "mm")
     return " × ".join(f"{value:.4g}" for value in size_mm / factor) + f" {name}"
 
@@ -261,7 +263,7 @@ def _unit_factor(raw: RawModel, path: Path, unit: str | None) -> float:
 
 def _check_size(model: Model, path: Path) -> None:
     size = model.diameter_mm
-    if SMALLEST_MM <= size <= LARGEST_MM:
+    if MIN_SIZE_MM <= size <= MAX_SIZE_MM:
         return
     extent = _size_text(model.bounds_in_model[1] - model.bounds_in_model[0])
     raise InputError(

@@ -14,13 +14,16 @@ from arview.geometry import Array
 
 @dataclass(frozen=True)
 class Component:
-    """One named part of the assembly at its nominal place.
+    """A named mesh of an assembly at its nominal place.
 
     Attributes:
         name: unique within its model.
         vertices_in_model: (V,3) float64, mm.
         faces: (F,3) int32, counter-clockwise seen from outside.
-        color: (3,) float64 sRGB in 0–1.
+        color: (3,) sRGB in 0–1.
+
+    Raises:
+        InputError: arrays of other shapes, NaN, or a face that refers to a missing vertex.
     """
 
     name: str
@@ -55,10 +58,16 @@ class Component:
 
 @dataclass(frozen=True)
 class Model:
-    """A named assembly of components.
+    """An assembly of named components.
 
-    ``source_hash`` identifies the geometry (SHA-256 of names, vertices to a micrometre and faces) and is
-    what guide views and inspections are checked against.
+    Attributes:
+        name: of the assembly.
+        components: with unique names.
+        source_hash: SHA-256 of names, vertices rounded to a micrometre and faces, by which guide views and inspections
+            are checked.
+
+    Raises:
+        InputError: no components, or a name that is not unique.
     """
 
     name: str
@@ -80,7 +89,7 @@ class Model:
 
     @cached_property
     def mesh(self) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
-        """All components in one mesh: vertices (V,3) mm, faces (F,3), component index per face (F,)."""
+        """The mesh of all components: vertices (V,3), mm, faces (F,3), and component index of each face (F,)."""
         vertices, faces, ids, offset = [], [], [], 0
         for index, component in enumerate(self.components):
             vertices.append(component.vertices_in_model)
@@ -101,7 +110,7 @@ class Model:
 
     @property
     def center_in_model(self) -> Array:
-        """(3,) middle of the bounding box, mm."""
+        """(3,) centre of the bounding box, mm."""
         return self.bounds_in_model.mean(axis=0)
 
     @property
@@ -127,7 +136,7 @@ class Model:
 
 
 def make_model(name: str, components: tuple[Component, ...]) -> Model:
-    """Model with its ``source_hash`` computed from the geometry."""
+    """A model with the ``source_hash`` of its geometry."""
     import hashlib
 
     digest = hashlib.sha256()

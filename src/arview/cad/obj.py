@@ -73,7 +73,7 @@ def _vertex_index(word: str, count: int) -> int:
 
 
 def _read_materials(path: Path) -> dict[str, Color]:
-    """Diffuse colours of an MTL file; an absent or odd file gives no colours (OBJ is usable without)."""
+    """Diffuse colours of an MTL file; none for a missing or malformed file, without which OBJ is still usable."""
     colors: dict[str, Color] = {}
     if not path.is_file():
         return colors

@@ -22,7 +22,7 @@ DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 @dataclass(frozen=True)
 class ComponentSettings:
-    """What the part file says about one component.
+    """Settings of one component in the part file.
 
     Attributes:
         name: of the component.
@@ -41,12 +41,16 @@ class ComponentSettings:
 
 @dataclass(frozen=True)
 class Datum:
-    """A feature that defines the frame of measurement.
+    """A feature that defines the datum frame.
 
-    ``direction_in_model`` is the unit normal of a plane or point, or the unit axis of a hole, pin, cylinder or edge;
-    ``point_in_model`` lies on it, mm; ``diameter_mm`` belongs to round ones only. Of a ``fit``, the best fit of
-    the whole component, they are the middle of its bounding box and +Z. ``locks`` are the degrees of freedom that
-    it may lock.
+    Attributes:
+        label: A, B, C, ….
+        feature: its kind.
+        component: name of the component that carries it.
+        point_in_model: a point on it, mm; for ``fit``, the best fit of a whole component, its centre.
+        direction_in_model: unit normal of a plane or point, unit axis of a hole, pin, cylinder or edge; for ``fit`` +Z.
+        diameter_mm: of round features only.
+        locks: degrees of freedom that it may lock.
     """
 
     label: str
@@ -60,7 +64,7 @@ class Datum:
 
 @dataclass(frozen=True)
 class Guide:
-    """A view with a name that the part can be brought into; None leaves the choice to the declared range."""
+    """A named view that the part can be brought into; None leaves a value to the declared range."""
 
     name: str
     azimuth_deg: float
@@ -71,7 +75,7 @@ class Guide:
 
 @dataclass(frozen=True)
 class Part:
-    """A model and the settings of a part file (or the defaults, for a bare CAD file).
+    """A model and the settings of a part file, or the defaults for a bare CAD file.
 
     Attributes:
         name: of the part.
@@ -79,12 +83,12 @@ class Part:
         cad_path: the CAD file.
         model: without the components whose role is ``ignore``, in the colours of the part file.
         settings: one per component of the CAD, ignored ones included, in the order of the CAD.
-        view_range: as declared, or None; see default_view_range.
+        view_range: the declared one, or None; see `default_view_range`.
         symmetries: declared rotations of the whole part.
         datums: in order of precedence.
         guides: views of the part file.
-        serial: of the specimen, or None.
-        notes: remarks of the loader (renamed or empty components).
+        serial: serial number of the specimen, or None.
+        notes: remarks of the loader on renamed or empty components.
     """
 
     name: str
@@ -104,7 +108,11 @@ class Part:
         return f"<Part {self.name}{serial}: {len(self.model.components)} components, {len(self.inspected)} inspected>"
 
     def component_settings(self, name: str) -> ComponentSettings:
-        """Settings of a component; raises InputError with the closest names when there is none."""
+        """Settings of a component by name.
+
+        Raises:
+            InputError: there is no such component; the message has the closest name.
+        """
         for settings in self.settings:
             if settings.name == name:
                 return settings
@@ -122,10 +130,10 @@ class Part:
 
 
 def default_view_range(model: Model) -> ViewRange:
-    """Range for a part that declares none: every direction, every roll, 1.5 to 6 diameters away.
+    """The range of a part that declares none: every direction and roll, 1.5 to 6 diameters away.
 
-    With a focal length of 1.2 times the picture's width the part is 0.8 of that width across at 1.5
-    diameters, and 0.2 of it (256 of 1280 px) at 6, where its components get too small to follow.
+    With a focal length of 1.2 times the width of the picture the part spans 0.8 of that width at 1.5 diameters, and 0.2
+    of it (256 of 1280 px) at 6, beyond which its components are too small to be tracked.
     """
     return ViewRange(distance_mm=(1.5 * model.diameter_mm, 6.0 * model.diameter_mm))
 

@@ -105,10 +105,10 @@ locks = ["tx", "ty"]           # default: all that it determines; of rx ry rz tx
 
 
 def find_part_file(path: str | Path) -> Path:
-    """The part file or CAD file that is meant: of a folder its part.toml.
+    """The part file or CAD file at a path; for a folder its part.toml.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such file.
     """
     path = Path(path)
     if path.is_dir():
@@ -119,13 +119,15 @@ def find_part_file(path: str | Path) -> Path:
 
 
 def load_part(path: str | Path, unit: str | None = None) -> Part:
-    """Part of a part file (TOML, see PART_FILE_EXAMPLE), of a folder with a part.toml, or of a bare CAD file.
+    """The part of a part file (TOML, see PART_FILE_EXAMPLE), of a folder with a part.toml, or of a bare CAD file.
 
-    ``unit`` (mm, cm, m, inch) overrides the unit of the part file and of the CAD.
+    Args:
+        path: of the file or folder.
+        unit: mm, cm, m or inch; overrides the unit in the part file and in the CAD file.
 
     Raises:
-        InputError: missing or broken file, unknown key, wrong type or value, a component that the CAD does
-            not have; and everything that load_cad raises.
+        InputError: a missing or broken file, an unknown key, a wrong type or value, or a component that the CAD
+            does not have; and all errors of `load_cad`.
     """
     check_type(path, PATH, "load_part: path")
     path = find_part_file(path)

@@ -1,4 +1,4 @@
-"""What the CAD readers hand over: triangles with name paths in the file's own numbers, and unit names."""
+"""Results of the readers of CAD files: triangles with name paths in the unit of the file, and names of units."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from arview.errors import InputError
 from arview.geometry import Array
 
 MAX_TRIANGLES = 5_000_000
+"""Largest number of triangles of a file."""
 
 UNIT_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
-"""Units a user may name, in mm."""
+"""Units that a user may name, in mm."""
 
 _ALIASES_MM = {
     "micron": 0.001,
@@ -38,10 +39,10 @@ class RawComponent:
     """One mesh of a file at its place.
 
     Attributes:
-        path: names from the root to the mesh, empty names left out.
-        vertices: (V,3) float64, in the file's unit, nested transforms applied.
-        faces: (F,3) int64, counter-clockwise from outside as far as the file is.
-        color: sRGB in 0-1, None when the file does not say.
+        path: names from the root to the mesh, without empty ones.
+        vertices: (V,3) float64 in the unit of the file, nested transforms applied.
+        faces: (F,3) int64, counter-clockwise seen from outside, if the file is right.
+        color: sRGB in 0–1; None when the file has none.
     """
 
     path: tuple[str, ...]
@@ -52,7 +53,7 @@ class RawComponent:
 
 @dataclass
 class RawModel:
-    """The content of a file: its meshes, its unit in mm (None: not said) and remarks for the user."""
+    """The content of a file: its meshes, its unit in mm (None when it has none) and remarks for the user."""
 
     components: list[RawComponent] = field(default_factory=list)
     unit_mm: float | None = None
@@ -60,7 +61,7 @@ class RawModel:
     triangle_count: int = 0
 
     def add(self, component: RawComponent, path: Path) -> None:
-        """Append a component; raises InputError when the file grows beyond MAX_TRIANGLES."""
+        """Append a component; raises InputError beyond MAX_TRIANGLES."""
         self.triangle_count += len(component.faces)
         check_triangle_count(self.triangle_count, path)
         self.components.append(component)
@@ -76,7 +77,7 @@ def check_triangle_count(count: int, path: Path) -> None:
 
 
 def unit_in_mm(name: str) -> float | None:
-    """Millimetres per unit of a unit's name as found in files, None when unknown."""
+    """Length in mm of a unit by its name in a file; None when the name is unknown."""
     key = name.strip().lower()
     singular = key[:-1] if key.endswith("s") else key
     for candidate in (key, singular):
@@ -88,7 +89,7 @@ def unit_in_mm(name: str) -> float | None:
 
 
 def place(parent_from_mesh: Array, vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (V,3) under an affine (4,4) transform; faces are turned over when it mirrors."""
+    """Apply an affine transform (4,4) to vertices (V,3); a reflection reverses the winding of the faces."""
     placed = vertices @ parent_from_mesh[:3, :3].T + parent_from_mesh[:3, 3]
     if np.linalg.det(parent_from_mesh[:3, :3]) < 0:
         faces = faces[:, ::-1]
@@ -98,8 +99,8 @@ def place(parent_from_mesh: Array, vertices: Array, faces: NDArray[np.int64]) ->
 def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str], list[str]]:
     """A unique name for every name path, and a note for each name that had to be changed.
 
-    The last name of a path is used when no other component has it; else as many parents are put before
-    it (``sub_1/post``) as tell all its namesakes apart; else they are numbered in the order of the file.
+    The last name of a path is used when no other component has it. Otherwise as many parents are prepended
+    (``sub_1/post``) as distinguish all components of that name, or they are numbered in the order of the file.
     """
     paths = [path or (fallback,) for path in paths]
     names = [path[-1] for path in paths]

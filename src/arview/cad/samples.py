@@ -1,4 +1,4 @@
-"""Samples of a component's surface."""
+"""Even samples of the surface of a component."""
 
 from __future__ import annotations
 
@@ -20,15 +20,22 @@ class Samples:
     normals: Array
 
     def of(self, which: NDArray[np.bool_]) -> Samples:
-        """Some of them."""
+        """The samples of a mask (N,)."""
         return Samples(self.points[which], self.normals[which])
 
 
-def sample_surface(component: Component, spacing_mm: float, most: int, seed: int = 0) -> Samples:
-    """Samples about ``spacing_mm`` apart, at most ``most``, evenly by area."""
+def sample_surface(component: Component, spacing_mm: float, max_count: int, seed: int = 0) -> Samples:
+    """Samples of a surface.
+
+    Args:
+        component: the surface.
+        spacing_mm: mean distance between neighbours, larger where ``max_count`` requires it.
+        max_count: largest number of samples.
+        seed: of the random numbers.
+    """
     corners = component.vertices_in_model[component.faces]
     areas = face_areas(component.vertices_in_model, component.faces.astype(np.int64))
-    spacing_mm = max(spacing_mm, float(np.sqrt(areas.sum() / most)))
+    spacing_mm = max(spacing_mm, float(np.sqrt(areas.sum() / max_count)))
     count = int(np.ceil(6.0 * areas.sum() / spacing_mm**2))
     rng = np.random.default_rng(seed)
     edges = np.cumsum(areas) / max(float(areas.sum()), 1e-300)
@@ -37,9 +44,9 @@ def sample_surface(component: Component, spacing_mm: float, most: int, seed: int
     points = np.einsum("nc,ncx->nx", np.stack([1 - u, u * (1 - v), u * v], axis=1), corners[owners])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[owners]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # One a cell of space and of direction is even enough.
+    # One sample in each cell of position and of normal is even enough.
     cells = np.concatenate([np.floor(points / spacing_mm), np.round(1.2 * normals)], axis=1).astype(np.int64)
     first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    if len(first) > most:
-        first = np.sort(rng.permutation(first)[:most])
+    if len(first) > max_count:
+        first = np.sort(rng.permutation(first)[:max_count])
     return Samples(points[first], normals[first])

@@ -1,4 +1,4 @@
-"""Rotations that leave a shape as it is, or nearly: declared in part files, and found in the geometry."""
+"""Rotational symmetries, exact and near ones: declared in part files, and found in the geometry."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from arview.errors import InputError
 from arview.geometry import Array, exp_so3
 
 ORDERS = (2, 3, 4, 5, 6, 8, 12)
-# Angles that no rotation group of a low order holds: a shape that takes all of them spins freely.
+# Angles outside the rotation groups of low order: a shape invariant under all of them is a body of revolution.
 _FREE_TURNS_RAD = np.deg2rad([7.3, 23.1, 41.9, 77.7, 131.3])
 
 _QUERY_COUNT = 600
@@ -65,8 +65,8 @@ class FoundSymmetry:
 
     Attributes:
         symmetry: the rotation.
-        is_exact: no surface is farther than the tolerance from where the rotation puts it.
-        unmatched_share: share of the surface's area that lies elsewhere after the rotation.
+        is_exact: the rotated surface lies within the tolerance of the surface.
+        unmatched_share: share of the surface's area that the rotation moves off the surface.
         unmatched_of_group: (G,) the same for each group of faces alone.
     """
 
@@ -79,8 +79,8 @@ class FoundSymmetry:
 class SurfaceSamples:
     """Even samples of a surface, and distances from any points to it.
 
-    A distance is exact to the triangles of the nearest samples (each triangle has one at its middle, more by
-    area), which is the distance to the surface for all practical purposes without a tree of triangles.
+    Distances are computed to the triangles of the nearest samples. Each triangle has one sample at its centroid, and
+    more by area, so that the result is the distance to the surface except in rare cases.
     """
 
     def __init__(self, vertices: Array, faces: NDArray[np.int64], groups: NDArray[np.int64]) -> None:
@@ -113,23 +113,22 @@ def find_symmetries(
 ) -> tuple[FoundSymmetry, ...]:
     """Proper rotations that map a surface onto itself, or all but a small part of it.
 
-    Candidate axes (principal axes, model axes, normals of the largest flat areas, and their bisectors) pass
-    through the centroid of the surface or the middle of its box; candidate angles are 360° over ORDERS and
-    some that only a body of revolution takes. A candidate must keep the covariance of the surface
-    (a cheap necessary condition), then sampled points are rotated and their distance to the surface taken.
+    Candidate axes (principal axes, axes of the model, normals of the largest flat areas, and bisectors of these) pass
+    through the centroid of the surface or the centre of its box. Candidate angles are 360° over ORDERS, and some that
+    only a body of revolution is invariant under. A candidate must preserve the covariance of the surface, a cheap
+    necessary condition; then sampled points are rotated, and their distances to the surface are computed.
 
     Args:
         vertices: (V,3), mm.
         faces: (F,3).
         groups: (F,) group of each face, 0 to G-1, for ``unmatched_of_group``.
-        exact_fraction: a symmetry is exact when 99.5 % of the points come to lie within this share of the
-            diameter (0.5 %: covers the chords of tessellated cylinders).
-        near_fraction: a point is unmatched beyond this share of the diameter (1 %: some pixels).
-        near_share: a near-symmetry leaves at most this share of the area unmatched; 0.0 looks for exact
-            ones only, which is quicker.
+        exact_fraction: a symmetry is exact when 99.5 % of the rotated points lie within this share of the diameter from
+            the surface (0.5 % covers the chords of tessellated cylinders).
+        near_fraction: a point is unmatched beyond this share of the diameter (1 % are some pixels).
+        near_share: largest unmatched share of a near-symmetry; 0 finds exact ones only, which is faster.
 
     Returns:
-        The highest order per axis, exact ones first, then by unmatched area.
+        the highest order for each axis, exact ones first, then by unmatched area.
     """
     groups = np.zeros(len(faces), dtype=np.int64) if groups is None else groups
     faces = faces.astype(np.int64)
@@ -143,7 +142,9 @@ def find_symmetries(
         centers.append(middle)
     counts = np.bincount(samples.query_groups, minlength=int(groups.max()) + 1)
 
-    def judge(axis: Array, center: Array, angles_rad: NDArray[np.float64], order: int | None) -> FoundSymmetry | None:
+    def evaluate(
+        axis: Array, center: Array, angles_rad: NDArray[np.float64], order: int | None
+    ) -> FoundSymmetry | None:
         unmatched = np.zeros(len(samples.queries), dtype=bool)
         is_exact = True
         for angle in angles_rad:
@@ -172,7 +173,7 @@ def find_symmetries(
             trials: list[tuple[int | None, NDArray[np.float64]]] = [(None, _FREE_TURNS_RAD)]
             trials += [(order, np.array([2.0 * np.pi / order])) for order in sorted(ORDERS, reverse=True)]
             for order, angles_rad in trials:
-                candidate = judge(axis, center, angles_rad, order)
+                candidate = evaluate(axis, center, angles_rad, order)
                 if candidate is not None and (best is None or (candidate.is_exact and not best.is_exact)):
                     best = candidate
                 if best is not None and best.is_exact:
@@ -188,7 +189,7 @@ def find_symmetries(
 def _without_copies(found: list[FoundSymmetry]) -> tuple[FoundSymmetry, ...]:
     """One entry per axis; of the half turns across an axis of order 3 or more only the best one.
 
-    (The others follow from the two.)
+    The others follow from these two.
     """
 
     def is_across(flip: Symmetry, main: Symmetry) -> bool:
@@ -205,7 +206,7 @@ def _without_copies(found: list[FoundSymmetry]) -> tuple[FoundSymmetry, ...]:
 
 
 def _candidate_axes(vertices: Array, faces: NDArray[np.int64], covariance: Array) -> list[Array]:
-    """Unit directions that a rotational symmetry of this surface could have, likely ones first."""
+    """Unit directions of possible axes of symmetry, likely ones first."""
     _, principal = np.linalg.eigh(covariance)
     candidates = [*principal.T[::-1], *np.eye(3)]
     a, b, c = vertices[faces].transpose(1, 0, 2)
@@ -218,7 +219,7 @@ def _candidate_axes(vertices: Array, faces: NDArray[np.int64], covariance: Array
     for largest in np.argsort(-weights)[:6]:
         mean = (normals * lengths[:, None])[group.ravel() == largest].sum(axis=0)
         candidates.append(mean / np.linalg.norm(mean))
-    base = _distinct(candidates)
+    base = _without_duplicates(candidates)
     bisectors = []
     for i, one in enumerate(base):
         for other in base[:i]:
@@ -228,13 +229,14 @@ def _candidate_axes(vertices: Array, faces: NDArray[np.int64], covariance: Array
                     (one - other) / np.linalg.norm(one - other),
                 ]
     diagonals = [np.array([1.0, y, z]) / np.sqrt(3.0) for y in (-1, 1) for z in (-1, 1)]
-    # A rotation of order 3 and more needs two equal moments; bisectors matter only then.
+    # A rotation of order 3 or more requires two equal moments; bisectors are needed only then.
     moments = np.linalg.eigvalsh(covariance)
     is_round = np.min(np.diff(moments)) < 0.15 * moments[-1]
-    return _distinct([*base, *bisectors[:30], *diagonals]) if is_round else base
+    return _without_duplicates([*base, *bisectors[:30], *diagonals]) if is_round else base
 
 
-def _distinct(axes: list[Array]) -> list[Array]:
+def _without_duplicates(axes: list[Array]) -> list[Array]:
+    """The axes without those within 1° of an earlier one."""
     kept: list[Array] = []
     for axis in axes:
         if all(abs(float(axis @ other)) < np.cos(np.deg2rad(1.0)) for other in kept):
@@ -245,7 +247,7 @@ def _distinct(axes: list[Array]) -> list[Array]:
 def _sample(
     vertices: Array, faces: NDArray[np.int64], areas: Array, count: int, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Points (N,3) spread by area and the face of each, stratified so that N samples cover evenly."""
+    """Points (N,3) spread evenly by area, stratified, and the face of each (N,)."""
     edges = np.cumsum(areas) / areas.sum()
     owners = np.searchsorted(edges, (np.arange(count) + rng.random(count)) / count)
     owners = np.minimum(owners, len(faces) - 1)
@@ -257,7 +259,7 @@ def _sample(
 def _closest_on_triangles(points: Array, triangles: Array) -> Array:
     """Closest points (...,3) of triangles (...,3,3) to points (...,3), by broadcasting.
 
-    The foot on the plane where it falls inside, else the closest of the three edges.
+    The foot of the perpendicular where it lies inside the triangle, else the closest point of the three edges.
     """
     a, b, c = triangles[..., 0, :], triangles[..., 1, :], triangles[..., 2, :]
     normal = np.cross(b - a, c - a)

@@ -38,7 +38,7 @@ class _Object:
 
 
 def read_3mf(path: Path) -> RawModel:
-    """Components of a 3MF file in the file's unit (millimetre when it does not say).
+    """Components of a 3MF file in the file's unit (millimetre when it declares none).
 
     Names are an item's ``partnumber``, else an object's ``name``, else ``partnumber``, else nothing.
 
@@ -57,7 +57,7 @@ def read_3mf(path: Path) -> RawModel:
 
 
 class _Archive:
-    """One file while it is read."""
+    """Reader of one file."""
 
     def __init__(self, archive: zipfile.ZipFile, path: Path) -> None:
         self.archive = archive
@@ -85,7 +85,7 @@ class _Archive:
         return self.model
 
     def _main_part(self, names: list[str]) -> str:
-        """Name of the 3D model part: as the package's relationships say, else the only likely one."""
+        """Name of the 3D model part: by the relationships of the package, else the only candidate."""
         if "_rels/.rels" in names:
             for relation in self._parse("_rels/.rels"):
                 if str(relation.get("Type", "")).endswith("/3dmodel"):
@@ -129,7 +129,7 @@ class _Archive:
         faces = [(int(t.attrib["v1"]), int(t.attrib["v2"]), int(t.attrib["v3"])) for t in triangles]
         if faces and not 0 <= min(map(min, faces)) <= max(map(max, faces)) < len(vertices):
             raise ValueError(f"a triangle of object {element.attrib['id']} refers to a vertex that does not exist")
-        # The property of most triangles; a triangle without one has its object's.
+        # The property of most triangles; a triangle without a property has that of its object.
         uses: dict[tuple[str | None, str | None], int] = {}
         for triangle in triangles:
             use = (triangle.get("pid", element.get("pid")), triangle.get("p1", element.get("pindex")))

@@ -1,4 +1,4 @@
-"""ViewRange: from where the camera may look at the part."""
+"""ViewRange: the viewpoints from which a camera may see the part."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ from arview.geometry import Array
 
 @dataclass(frozen=True)
 class ViewRange:
-    """Declared range of viewpoints around the centre of the model's bounding box.
+    """Range of viewpoints around the centre of a model's bounding box.
 
-    ``distance_mm`` is camera to centre. Azimuth runs from ``+X`` towards ``+Y``, elevation from the XY
-    plane towards ``+Z`` (model axes). Roll is about the viewing axis; 0 means that ``+Z`` points up in
-    the image. A range of 360° or more in azimuth or roll means "any".
+    A range of 360° or more in azimuth or roll means any angle.
+
+    Attributes:
+        distance_mm: from the camera to the centre.
+        elevation_deg: from the XY plane of the model towards ``+Z``.
+        azimuth_deg: from ``+X`` towards ``+Y``.
+        roll_deg: about the viewing axis; at 0, ``+Z`` points up in the image.
     """
 
     distance_mm: tuple[float, float]
@@ -37,7 +41,7 @@ class ViewRange:
 
     @property
     def is_full_sphere(self) -> bool:
-        """True when every viewing direction is allowed."""
+        """True when every viewing direction is in the range."""
         return (
             self.elevation_deg[0] <= -90
             and self.elevation_deg[1] >= 90
@@ -45,7 +49,7 @@ class ViewRange:
         )
 
     def contains_direction(self, directions: ArrayLike, margin_deg: float = 0.0) -> NDArray[np.bool_]:
-        """For unit vectors (N,3) from the centre to the camera: which are inside, with a margin in deg."""
+        """Which unit vectors (N,3) from the centre to the camera are in the range, widened by a margin in deg."""
         d = np.asarray(directions, dtype=np.float64)
         elevation = np.rad2deg(np.arcsin(np.clip(d[..., 2], -1.0, 1.0)))
         inside = (elevation >= self.elevation_deg[0] - margin_deg) & (elevation <= self.elevation_deg[1] + margin_deg)
@@ -53,13 +57,13 @@ class ViewRange:
         if high - low < 360:
             azimuth = np.rad2deg(np.arctan2(d[..., 1], d[..., 0]))
             away = np.abs((azimuth - 0.5 * (low + high) + 180.0) % 360.0 - 180.0)
-            # Near a pole azimuth means little: the margin grows with 1 / cos(elevation).
+            # Azimuths converge at the poles: the margin grows with 1 / cos(elevation).
             widened = margin_deg / np.maximum(np.cos(np.deg2rad(elevation)), 1e-3)
             inside &= away <= 0.5 * (high - low) + widened
         return np.asarray(inside)
 
     def rolls_deg(self, step_deg: float) -> Array:
-        """Rolls (R,) in deg that cover the range no coarser than the step, evenly spread."""
+        """Evenly spaced rolls (R,), deg, that cover the range with at most a given step."""
         low, high = self.roll_deg
         if high - low >= 360:
             return np.arange(0.0, 360.0, 360.0 / np.ceil(360.0 / step_deg))
@@ -67,7 +71,7 @@ class ViewRange:
         return np.asarray(low + (high - low) * (np.arange(count) + 0.5) / count)
 
     def distances_mm(self, ratio: float) -> Array:
-        """Distances (D,) in mm, a geometric series whose steps do not exceed ``ratio``."""
+        """Distances (D,), mm, in a geometric series whose steps do not exceed ``ratio``."""
         low, high = self.distance_mm
         count = max(1, int(np.ceil(np.log(high / low) / np.log(ratio) - 1e-9)))
         return np.asarray(low * (high / low) ** ((np.arange(count) + 0.5) / count))

@@ -1,4 +1,4 @@
-"""Viewpoint: where one camera stands around a part, and the pose that belongs to it."""
+"""Viewpoint: position and roll of a camera around a part, and the pose of the part for it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from arview.geometry import Array, exp_so3, rigid
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where a camera stands around a part, as `ViewRange` counts it."""
+    """Position and roll of a camera around a part, in the convention of `ViewRange`."""
 
     distance_mm: float
     elevation_deg: float
@@ -22,15 +22,15 @@ class Viewpoint:
 
 
 def viewpoint(cam_from_model: Array, center_in_model: ArrayLike) -> Viewpoint:
-    """Viewpoint of a pose.
+    """The viewpoint of a pose.
 
-    The part need not be in the middle of the picture: the camera is first turned, the shortest way, to look
-    at the centre. What then differs from a camera that has +Z up is a turn about the optical axis: the roll,
-    positive when the part appears turned clockwise in the picture.
+    The part need not be in the middle of the picture: the camera is first rotated, by the smallest angle, to look at
+    the centre. The remaining rotation, to a camera with +Z up, is the roll about the optical axis, positive when the
+    part appears rotated clockwise in the picture.
 
     Args:
         cam_from_model: (4,4), mm.
-        center_in_model: (3,) middle of the model's bounding box, mm.
+        center_in_model: (3,) centre of the model's bounding box, mm.
 
     Raises:
         InputError: the camera is at the centre.
@@ -57,14 +57,14 @@ def viewpoint(cam_from_model: Array, center_in_model: ArrayLike) -> Viewpoint:
 
 
 def pose_at(place: Viewpoint, center_in_model: ArrayLike, ray_in_cam: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """``cam_from_model`` (4,4) of a camera that stands there, the inverse of `viewpoint`.
+    """``cam_from_model`` (4,4) of a camera at a viewpoint, the inverse of `viewpoint`.
 
-    Straight above and below the azimuth still counts: it says which side of the part is down in the picture.
+    Straight above and below the part the azimuth still matters: it determines which side of the part is down.
 
     Args:
-        place: of the camera.
-        center_in_model: (3,) middle of the model's bounding box, mm.
-        ray_in_cam: (3,) direction in which the camera sees that middle.
+        place: viewpoint of the camera.
+        center_in_model: (3,) centre of the model's bounding box, mm.
+        ray_in_cam: (3,) direction from the camera to that centre.
     """
     ray = np.asarray(ray_in_cam, dtype=np.float64)
     ray = ray / np.linalg.norm(ray)
@@ -75,7 +75,7 @@ def pose_at(place: Viewpoint, center_in_model: ArrayLike, ray_in_cam: ArrayLike 
 
 
 def _upright(azimuth_rad: float, elevation_rad: float) -> Array:
-    """(3,3) rotation cam from model of a camera in that direction that looks at the middle with +Z up."""
+    """(3,3) rotation from the model to a camera in a direction that looks at the centre with +Z up."""
     c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
     forward = -np.array([np.cos(elevation_rad) * c, np.cos(elevation_rad) * s, np.sin(elevation_rad)])
     right = np.array([-s, c, 0.0])
@@ -83,7 +83,7 @@ def _upright(azimuth_rad: float, elevation_rad: float) -> Array:
 
 
 def _shortest_turn(start: Array, end: Array) -> Array:
-    """(3,3) rotation by the smallest angle that takes one unit vector to another."""
+    """(3,3) rotation by the smallest angle from one unit vector to another."""
     axis = np.cross(start, end)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-12:

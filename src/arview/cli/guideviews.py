@@ -33,7 +33,7 @@ def guideviews(
     """
     from arview.cad import load_part
     from arview.guideviews import GuideViewOptions, make_guide_views
-    from arview.guideviews.findings import most_confusable
+    from arview.guideviews.findings import confusable_pair
     from arview.guideviews.uniqueness import assess
 
     loaded = load_part(part, unit)
@@ -53,7 +53,7 @@ def guideviews(
     click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB")
     unique = assess(views)
     click.echo(f"{unique.reason} (score {unique.score:.2f})")
-    alike = most_confusable(views, unique)
+    alike = confusable_pair(views, unique)
     if alike:
         click.echo(alike)
     if preview_path is not None:

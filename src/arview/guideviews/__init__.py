@@ -1,4 +1,4 @@
-"""Guide views: what the part looks like from everywhere it may be seen from."""
+"""Guide views: features of a part in views from all directions of a range."""
 
 from arview.guideviews.extract import ViewFeatures
 from arview.guideviews.views import (

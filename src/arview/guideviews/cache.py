@@ -1,4 +1,4 @@
-"""Guide views made once per model and range, and kept in the user's cache folder."""
+"""Guide views, made once for each model and range, and kept in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from arview.version import __version__
 
 
 def cached_path(model: Model, view_range: ViewRange, options: GuideViewOptions) -> Path:
-    """Where the set of a model, range and options lies; another arview has another place."""
+    """The file of the set of a model, range and options; each version of the code has files of its own."""
     key = repr((model.source_hash, asdict(view_range), asdict(options), __version__, _code_hash()))
     name = f"{model.source_hash[:12]}-{hashlib.sha256(key.encode()).hexdigest()[:16]}.guideviews"
     return cache_folder() / "guideviews" / name
@@ -30,9 +30,9 @@ def cached_guide_views(
     *,
     progress: StepProgress | None = None,
 ) -> GuideViewSet:
-    """The set from the cache, or made now and put there; see `make_guide_views` for arguments and errors.
+    """The set from the cache, or made now and stored there; see `make_guide_views` for arguments and errors.
 
-    A damaged file is made anew, and a cache that cannot be written to is done without.
+    A damaged file is replaced; a cache that cannot be written is not used.
     """
     options = options or GuideViewOptions()
     path = cached_path(model, view_range, options)
@@ -51,7 +51,7 @@ def cached_guide_views(
 
 @cache
 def _code_hash() -> str:
-    """Hash of the code that makes guide views, so that a changed arview does not take old ones."""
+    """Hash of the code that makes guide views, so that sets made by other code are not used."""
     here = Path(__file__).parent
     files = [*sorted(here.glob("*.py")), *sorted((here.parent / "rendering").glob("*.py"))]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

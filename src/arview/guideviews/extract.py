@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EdgeSamples, MeshEdges, sample_visible_edges
+from arview.guideviews.mesh_edges import EDGE_CONTOUR, MeshEdges, ViewEdgeSamples, sample_visible_edges
 from arview.rendering.renderers import Rendering
 
 MAX_SHIFT_PX = 1.6
@@ -207,7 +207,7 @@ def extract_features(
 
 
 def _edge_tangents(
-    samples: EdgeSamples, cam_from_model: Array, camera: Camera, shape: tuple[int, ...]
+    samples: ViewEdgeSamples, cam_from_model: Array, camera: Camera, shape: tuple[int, ...]
 ) -> tuple[Array, NDArray[np.intp]]:
     """Unit tangents (N,3) of edge samples in the model frame, and the indices of the samples that are usable.
 
@@ -238,7 +238,9 @@ def _edge_tangents(
     return tangents, np.flatnonzero(~along_sight | is_short)
 
 
-def _contour(rendering: Rendering, cam_from_model: Array, camera: Camera, samples: EdgeSamples, count: int) -> _Contour:
+def _contour(
+    rendering: Rendering, cam_from_model: Array, camera: Camera, samples: ViewEdgeSamples, count: int
+) -> _Contour:
     """At most ``count`` points of the silhouette's outline; those near an edge sample of the contour lie on it."""
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     mask, depth = rendering.silhouette, rendering.depth_mm

@@ -1,10 +1,10 @@
-"""What guide views say about a part, in words: can it be told from its surroundings, and which views are alike."""
+"""Findings of guide views on a part, as text: is it distinctive, and which of its views look alike?"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from arview.cad.check import Finding
+from arview.cad.check import PartFinding
 from arview.cad.model import Model
 from arview.cad.view_range import ViewRange
 from arview.geometry import Array
@@ -12,29 +12,30 @@ from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, Uniqueness, assess
 from arview.guideviews.views import GuideViewOptions, GuideViewSet, make_guide_views
 
 COARSE_OPTIONS = GuideViewOptions(subdivisions=2, margin_deg=0.0, renderer="zbuffer")
-"""162 views on the full sphere, about 16° apart: enough to judge a part in a few seconds."""
+"""162 views on the full sphere, about 16° apart: enough to assess a part in a few seconds."""
 FINER_OPTIONS = GuideViewOptions(subdivisions=3, margin_deg=0.0, renderer="zbuffer")
-FEWEST_VIEWS = 40
-"""A narrow range that holds fewer coarse views is looked at more closely."""
+"""642 views on the full sphere, for narrow ranges."""
+MIN_VIEWS = 40
+"""Number of coarse views below which a narrow range is assessed by finer ones."""
 
 
 def azimuths_deg(views: GuideViewSet) -> Array:
-    """(N,) from +X towards +Y, -180 to 180."""
+    """(N,) azimuths of the views, deg, from +X towards +Y, -180 to 180."""
     return np.rad2deg(np.arctan2(views.directions[:, 1], views.directions[:, 0]))
 
 
 def elevations_deg(views: GuideViewSet) -> Array:
-    """(N,) from the XY plane towards +Z."""
+    """(N,) elevations of the views, deg, from the XY plane towards +Z."""
     return np.rad2deg(np.arcsin(np.clip(views.directions[:, 2], -1.0, 1.0)))
 
 
 def describe_view(views: GuideViewSet, index: int) -> str:
-    """Where a view looks from, in words."""
+    """Azimuth and elevation of a view, as text."""
     return f"azimuth {azimuths_deg(views)[index]:.0f}°, elevation {elevations_deg(views)[index]:.0f}°"
 
 
-def most_confusable(views: GuideViewSet, unique: Uniqueness) -> str:
-    """The two views that are most alike, in words; empty where no view is far enough from another."""
+def confusable_pair(views: GuideViewSet, unique: Uniqueness) -> str:
+    """The two views that are most alike, as text; empty where no two views are far enough apart."""
     if np.all(np.isnan(unique.likeness)):
         return ""
     index = int(np.nanargmax(unique.likeness))
@@ -45,12 +46,12 @@ def most_confusable(views: GuideViewSet, unique: Uniqueness) -> str:
     )
 
 
-def uniqueness_findings(model: Model, view_range: ViewRange) -> list[Finding]:
-    """Findings of a coarse set of guide views made now, for `PartCheck.with_findings`."""
+def uniqueness_findings(model: Model, view_range: ViewRange) -> list[PartFinding]:
+    """Findings of a coarse set of guide views, rendered now, for `PartCheck.with_findings`."""
     views = make_guide_views(model, view_range, COARSE_OPTIONS)
-    if len(views) < FEWEST_VIEWS:
+    if len(views) < MIN_VIEWS:
         views = make_guide_views(model, view_range, FINER_OPTIONS)
     unique = assess(views)
-    alike = most_confusable(views, unique)
+    alike = confusable_pair(views, unique)
     text = f"guide views {unique.reason} (score {unique.score:.2f}{f'; {alike}' if alike else ''})"
-    return [Finding("note" if unique.is_sufficient else "problem", text)]
+    return [PartFinding("note" if unique.is_sufficient else "problem", text)]

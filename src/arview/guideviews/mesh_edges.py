@@ -143,7 +143,7 @@ def _sample_visible(  # type: ignore[no-untyped-def]
     vertices, ends, faces, is_crease, is_sharp, normals, component, cam_from_model, fx, fy, cx, cy, depth,
     spacing_px, depth_tolerance
 ):  # fmt: skip
-    """The kernel of `sample_visible_edges`; returns the arrays of `EdgeSamples` in their order."""
+    """The kernel of `sample_visible_edges`; returns the arrays of `ViewEdgeSamples` in their order."""
     height, width = depth.shape
     rotation = cam_from_model[:3, :3]
     translation = cam_from_model[:3, 3]
@@ -220,7 +220,7 @@ def _sample_visible(  # type: ignore[no-untyped-def]
 
 
 @dataclass(frozen=True)
-class EdgeSamples:
+class ViewEdgeSamples:
     """Visible samples along the edges of a model in one view.
 
     Attributes:
@@ -246,7 +246,7 @@ def sample_visible_edges(
     intrinsics: tuple[float, float, float, float],
     depth_mm: NDArray[np.float32],
     spacing_px: float,
-) -> EdgeSamples:
+) -> ViewEdgeSamples:
     """Samples along the creases and silhouettes that are not hidden in a view.
 
     Args:
@@ -260,7 +260,7 @@ def sample_visible_edges(
     seen = depth_mm[depth_mm > 0]
     # Two pixels' worth of a surface seen at 45 degrees.
     tolerance = 3.0 * float(np.median(seen)) / fx if seen.size else 1.0
-    return EdgeSamples(
+    return ViewEdgeSamples(
         *_sample_visible(
             edges.vertices_in_model, edges.ends, edges.faces, edges.is_crease, edges.is_sharp, edges.face_normals,
             edges.component, cam_from_model, fx, fy, cx, cy, depth_mm, spacing_px, tolerance,

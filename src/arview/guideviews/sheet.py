@@ -1,4 +1,4 @@
-"""Contact sheet of a guide-view set: what detector and tracker see of each view, and which views are weak."""
+"""Contact sheet of a guide-view set: the features of its views, and which views are weak."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.errors import InputError
 from arview.geometry import apply
-from arview.guideviews.findings import azimuths_deg, elevations_deg, most_confusable
+from arview.guideviews.findings import azimuths_deg, confusable_pair, elevations_deg
 from arview.guideviews.mesh_edges import EDGE_SHARP
 from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, PLAIN_LINES, Uniqueness, assess
 from arview.guideviews.views import GuideViewSet
@@ -23,7 +23,7 @@ EDGE_COLOR = (60, 110, 235)
 PLAIN_COLOR = (190, 120, 0)
 CONFUSABLE_COLOR = (150, 30, 140)
 LIGHT_IN_CAM = np.array([-0.4, -0.6, -0.7]) / np.linalg.norm([0.4, 0.6, 0.7])
-"""Direction towards the light: over the viewer's left shoulder."""
+"""Direction towards the light, over the viewer's left shoulder."""
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -32,30 +32,31 @@ def contact_sheet(
     views: GuideViewSet,
     columns: int = 8,
     tile_px: int = 160,
-    most: int = 48,
+    max_views: int = 48,
     unique: Uniqueness | None = None,
 ) -> NDArray[np.uint8]:
-    """Picture (H,W,3) uint8 RGB of evenly chosen views.
+    """A picture (H,W,3) uint8 RGB of evenly chosen views.
 
-    Every tile shows the part shaded as a ghost, its contour points green, design edges red, other edges blue, and
-    below it azimuth and elevation, the distinct lines and the likeness to the most alike view from elsewhere. Plain
-    and confusable views are framed and named.
+    Each tile shows the shaded part with its contour points in green, design edges in red and other edges in blue, and
+    below it azimuth, elevation, the number of distinct lines and the likeness to the most similar view from another
+    side. Plain and confusable views have a frame and a label.
 
     Args:
         model: the model of the views.
+        views: the set.
         columns: tiles in a row.
         tile_px: side of the picture in a tile, at least 100.
-        most: at most so many views.
-        unique: of these views, where it was assessed already.
+        max_views: largest number of tiles.
+        unique: assessment of these views, if there is one already.
 
     Raises:
-        InputError: sizes without sense.
+        InputError: a size is too small.
     """
-    if columns < 1 or tile_px < 100 or most < 1:
-        raise InputError(f"contact sheet: columns {columns}, tile_px {tile_px}, most {most}: too small")
+    if columns < 1 or tile_px < 100 or max_views < 1:
+        raise InputError(f"contact sheet: columns {columns}, tile_px {tile_px}, max_views {max_views}: too small")
     unique = assess(views) if unique is None else unique
     order = np.lexsort((azimuths_deg(views), -np.round(elevations_deg(views) / 15.0)))
-    count = min(most, len(views))
+    count = min(max_views, len(views))
     chosen = order[((np.arange(count) + 0.5) * len(views) / count).astype(np.intp)]
     renderer = ZBufferRenderer(model, views.camera.scaled(2 * tile_px, 2 * tile_px))
     tiles = [_tile(renderer, views, int(index), unique, tile_px) for index in chosen]
@@ -76,7 +77,7 @@ def contact_sheet(
 def _tile(
     renderer: ZBufferRenderer, views: GuideViewSet, index: int, unique: Uniqueness, tile_px: int
 ) -> NDArray[np.uint8]:
-    """One view with its caption (tile_px + caption, tile_px, 3)."""
+    """A tile (tile_px + caption, tile_px, 3): one view and its caption."""
     view = views.view(index)
     camera = renderer.camera
     rendering = renderer.render(view.cam_from_model)
@@ -120,13 +121,13 @@ def _tile(
 
 
 def _head(views: GuideViewSet, unique: Uniqueness, shown: int, width: int) -> NDArray[np.uint8]:
-    """Title, verdict and legend; long lines are broken to the width."""
+    """Title, verdict and legend, with line breaks at the width."""
     scale = 0.42
     lines = [
         f"{views.model_name}: {shown} of {len(views)} guide views, "
         f"uniqueness {unique.score:.2f} (share of views neither plain nor alike)",
         unique.reason,
-        most_confusable(views, unique).replace("°", ""),
+        confusable_pair(views, unique).replace("°", ""),
     ]
     broken = [piece for line in lines for piece in _wrapped(line, width - 16, scale)]
     entries = [
@@ -154,7 +155,7 @@ def _head(views: GuideViewSet, unique: Uniqueness, shown: int, width: int) -> ND
 
 
 def _wrapped(text: str, width: int, scale: float) -> list[str]:
-    """Text broken between words into lines no wider than width px."""
+    """The text in lines no wider than width px."""
     lines: list[str] = []
     for word in text.split():
         longer = f"{lines[-1]} {word}" if lines else word
@@ -168,6 +169,6 @@ def _wrapped(text: str, width: int, scale: float) -> list[str]:
 def _write(
     image: NDArray[np.uint8], text: str, place: tuple[int, int], scale: float, color: tuple[int, int, int]
 ) -> None:
-    """Text without letters that OpenCV's font does not have."""
+    """Write text, without the characters that the fonts of OpenCV do not have."""
     plain = text.encode("ascii", "replace").decode()
     cv2.putText(image, plain, place, _FONT, scale, color, 1, cv2.LINE_AA)

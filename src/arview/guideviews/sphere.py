@@ -1,4 +1,4 @@
-"""Viewpoints: evenly spread directions on a sphere and the camera poses that look from them."""
+"""Evenly spread directions on a sphere, and poses of cameras that look from them."""
 
 from __future__ import annotations
 
@@ -44,10 +44,7 @@ def view_poses(directions: Array, distance_mm: float, center_in_model: Array) ->
 
 
 def directions_in_range(view_range: ViewRange, subdivisions: int, margin_deg: float) -> Array:
-    """The icosphere's directions that the declared range, widened by the margin, contains.
-
-    A range so narrow that no direction falls in still gets its middle.
-    """
+    """Directions (N,3) of the icosphere inside a range widened by a margin; its middle if there are none."""
     directions = icosphere_directions(subdivisions)
     inside = view_range.contains_direction(directions, margin_deg)
     if inside.any():

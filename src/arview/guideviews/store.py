@@ -1,4 +1,4 @@
-"""One file of named arrays with a JSON header, memory-mapped on load."""
+"""A file of named arrays with a JSON header, memory-mapped when read."""
 
 from __future__ import annotations
 

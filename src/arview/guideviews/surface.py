@@ -1,4 +1,4 @@
-"""The surface of a model as far as small pictures of it need it."""
+"""The surface of a model, reduced for small drawings of it."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.rendering.rasterizer import fill_buffers
 
-MOST_FACES = 20_000
-"""A mesh with more is reduced."""
+MAX_FACES = 20_000
+"""Largest number of faces; a mesh with more is reduced."""
 CELL = 1.0 / 150.0
-"""In diameters: what lies in one such cell becomes one point, while faces are too many in ever larger ones."""
+"""Size of the cells whose vertices are merged, in diameters; it grows until the faces are few enough."""
 
 
 NEAR_SHARE = 0.05
-"""Nearer to the camera than this share of the diameter no surface is drawn."""
+"""Depth of the near plane, as a share of the diameter."""
 
 
 class Surface(NamedTuple):
-    """A mesh as the kernels take it.
+    """A triangle mesh, as the kernels take it.
 
     Attributes:
-        points: (V,3) float32 mm.
-        faces: (F,3) int32.
+        points: (V,3) float32, mm.
+        faces: (F,3) int32 vertex indices.
         normals: (F,3) float32 unit normals of the faces.
-        component: (F,) int16 index of the component that each face is of.
+        component: (F,) int16 component index of each face.
     """
 
     points: NDArray[np.float32]
@@ -41,7 +41,7 @@ class Surface(NamedTuple):
 def surface_about(
     points: NDArray[np.float32], faces: NDArray[np.int32], component: NDArray[np.int16], center: Array
 ) -> Surface:
-    """A surface as `reduced_surface` gives it, about a point (3,) of the model's frame."""
+    """A surface from the arrays of `reduced_surface`, relative to a point (3,) of the model frame."""
     about = (points.astype(np.float64) - center).astype(np.float32)
     a, b, c = about[faces].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
@@ -51,17 +51,17 @@ def surface_about(
 
 @kernel
 def draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids):  # type: ignore[no-untyped-def]
-    """Draw a surface as an ideal camera sees it.
+    """Draw normals and depth of a surface in the view of an ideal camera.
 
     Args:
         surface: a `Surface`.
-        pose: (4,4) ``cam_from_body``, where the surface's origin is before the camera.
-        focal_px: (2,).
-        center_px: (2,) place of the surface's origin in what is drawn.
+        pose: (4,4) ``cam_from_body``; nothing is drawn unless the origin of the surface is in front of the camera.
+        focal_px: (2,) focal lengths.
+        center_px: (2,) projection of the surface's origin in the drawing.
         diameter_mm: of the part.
-        drawn: (4,H,W) float32, becomes the normal, right, down and towards the camera, and the depth beyond the
-            origin's in half diameters, -1 to 1; 0 beside the surface. The third is not 0 on it.
-        face_ids: (H,W) int32, becomes the face seen; -1 beside the surface.
+        drawn: (4,H,W) float32, becomes the normal, right, down and towards the camera, and the depth relative to the
+            origin in half diameters, -1 to 1; 0 off the surface. The third channel is never 0 on it.
+        face_ids: (H,W) int32, becomes the index of the visible face; -1 off the surface.
     """
     points, faces, normals, _ = surface
     height, width = face_ids.shape
@@ -98,8 +98,12 @@ def draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_id
 
 
 def differing(one: NDArray[np.float32], other: NDArray[np.float32], normal: float, depth: float) -> NDArray[np.bool_]:
-    """Which pixels of two drawings (4,H,W) by `draw_surface` show something else: one the surface and one none, parts
-    of normals that differ by more, or depths.
+    """Pixels (H,W) at which two drawings (4,H,W) of `draw_surface` differ.
+
+    Args:
+        one, other: the drawings.
+        normal: largest difference of a component of the normals that is no difference.
+        depth: the same of the depth.
     """
     off = np.abs(one - other)
     is_one, is_other = one[2] != 0.0, other[2] != 0.0
@@ -107,15 +111,17 @@ def differing(one: NDArray[np.float32], other: NDArray[np.float32], normal: floa
 
 
 def reduced_surface(model: Model) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int16]]:
-    """Points (V,3) in the model's frame, mm, faces (F,3) of its mesh, at most MOST_FACES, and their components (F,).
+    """The mesh of a model, reduced to at most MAX_FACES faces by merging the vertices of each cell into their mean.
 
-    Vertices of a cell become their mean (Rossignac and Borrel, "Multi-resolution 3D approximations for rendering
-    complex scenes", 1993).
+    Source: Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993.
+
+    Returns:
+        points (V,3) in the model frame, mm, faces (F,3), and component index of each face (F,).
     """
     points, faces, owners = model.mesh
     reduced, kept, component = points, faces.astype(np.int64), owners
     cell_mm = CELL * model.diameter_mm
-    while len(kept) > MOST_FACES:
+    while len(kept) > MAX_FACES:
         cells = np.floor((points - points.min(axis=0)) / cell_mm).astype(np.int64)
         _, cell_of, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         cell_of = cell_of.ravel()

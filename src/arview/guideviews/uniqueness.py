@@ -1,9 +1,9 @@
-"""Can the part be told from its surroundings and from itself by its guide views?
+"""Is a part distinctive? Measures of its guide views.
 
-Two measures per view. *Distinct lines*: the points of outline and design edges vote for the straight line they lie
-on; the perplexity (exponential of the entropy) of the votes counts the lines that matter. A plain block shows about
-nine, and any box-like thing in a workshop shows the same nine. *Confusability*: the likeness of the view to any view
-from elsewhere, at the roll that makes it greatest; a part that looks the same from two sides cannot say which it is.
+*Distinct lines* of a view: the points of outline and design edges vote for the straight line that they lie on; the
+perplexity (exponential of the entropy) of the votes is the number of lines that matter. A plain block has about nine,
+as has any other box in a workshop. *Confusability* of a view: its likeness to the most similar view from another side,
+at the roll that maximises it; a part that looks the same from two sides has an ambiguous pose.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.guideviews.views import GuideView, GuideViewSet
 
 PLAIN_LINES = 12.0
-"""Views with fewer distinct lines are plain: boxes, plates and cylinders by themselves."""
-MOST_PLAIN = 0.6
-"""A larger share of plain or of confusable views makes the set insufficient: many parts are plain from below."""
+"""Number of distinct lines below which a view is plain, as those of boxes, plates and cylinders are."""
+MAX_WEAK_SHARE = 0.6
+"""Largest share of plain or of confusable views of a sufficient set; many parts are plain from below."""
 CONFUSABLE_LIKENESS = 0.94
-"""Views at least this alike cannot be told apart in a picture with noise."""
+"""Likeness from which two views cannot be distinguished in a picture with noise."""
 APART_DEG = 30.0
-"""Views nearer than this are alike for a good reason."""
+"""Angle between two views below which their likeness does not count."""
 _RADII, _ANGLES, _ORIENTATIONS = 6, 36, 6
 
 
 @dataclass(frozen=True)
 class Uniqueness:
-    """Verdict on a set.
+    """Assessment of a set.
 
     Attributes:
-        distinct_lines: (N,) per view.
-        likeness: (N,) 0–1 to the most alike view from elsewhere; NaN where the set has no view far enough away.
-        confused_with: (N,) index of that view, -1 where there is none.
-        is_sufficient: the part can be detected without being taken for something else.
+        distinct_lines: (N,) of each view.
+        likeness: (N,) 0–1, to the most similar view from another side; NaN where no view is far enough away.
+        confused_with: (N,) index of that view; -1 where there is none.
+        is_sufficient: the part can be detected without being confused with something else.
         reason: one sentence.
     """
 
@@ -48,13 +48,13 @@ class Uniqueness:
 
     @property
     def score(self) -> float:
-        """0–1: share of views that are neither plain nor confusable."""
+        """Share of views that are neither plain nor confusable, 0–1."""
         fine = (self.distinct_lines >= PLAIN_LINES) & ~(self.likeness >= CONFUSABLE_LIKENESS)
         return float(np.mean(fine))
 
 
 def view_lines(view: GuideView, diameter_mm: float) -> float:
-    """Number of distinct lines that a view shows."""
+    """Number of distinct lines of a view."""
     pixels, normals = _edge_picture(view, diameter_mm)
     if len(pixels) == 0:
         return 0.0
@@ -66,25 +66,25 @@ def view_lines(view: GuideView, diameter_mm: float) -> float:
     return float(np.exp(-np.sum(share * np.log(share))))
 
 
-def assess(views: GuideViewSet, most_views: int = 642) -> Uniqueness:
-    """Uniqueness of a set; at most about ``most_views`` of its views are compared with each other."""
-    step = max(1, len(views) // most_views)
+def assess(views: GuideViewSet, max_views: int = 642) -> Uniqueness:
+    """Assess a set, of which about ``max_views`` views at most are compared with each other."""
+    step = max(1, len(views) // max_views)
     index = np.arange(0, len(views), step)
-    looked_at = [views.view(int(i)) for i in index]
-    lines = np.array([view_lines(view, views.diameter_mm) for view in looked_at])
+    some_views = [views.view(int(i)) for i in index]
+    lines = np.array([view_lines(view, views.diameter_mm) for view in some_views])
     likeness, partner = _likeness(
-        np.stack([_descriptor(v, views.diameter_mm) for v in looked_at]), views.directions[index]
+        np.stack([_descriptor(v, views.diameter_mm) for v in some_views]), views.directions[index]
     )
     nearest = np.argmax(views.directions @ views.directions[index].T, axis=1)
     confused = np.where(partner[nearest] >= 0, index[np.maximum(partner[nearest], 0)], -1)
     plain_share = float(np.mean(lines < PLAIN_LINES))
     confusable = float(np.mean(likeness >= CONFUSABLE_LIKENESS))
-    if plain_share > MOST_PLAIN:
+    if plain_share > MAX_WEAK_SHARE:
         reason = (
             f"insufficient: {plain_share:.0%} of the views show fewer than {PLAIN_LINES:.0f} distinct lines "
             f"(median {np.median(lines):.0f}), as any plain block or plate does; add components around it to the part"
         )
-    elif confusable > MOST_PLAIN:
+    elif confusable > MAX_WEAK_SHARE:
         reason = (
             f"insufficient: {confusable:.0%} of the views look like a view from another side; "
             "declare the symmetry or narrow the range of viewpoints"
@@ -98,13 +98,13 @@ def assess(views: GuideViewSet, most_views: int = 642) -> Uniqueness:
         distinct_lines=lines[nearest],
         likeness=likeness[nearest],
         confused_with=confused,
-        is_sufficient=plain_share <= MOST_PLAIN and confusable <= MOST_PLAIN,
+        is_sufficient=plain_share <= MAX_WEAK_SHARE and confusable <= MAX_WEAK_SHARE,
         reason=reason,
     )
 
 
 def _edge_picture(view: GuideView, diameter_mm: float) -> tuple[Array, Array]:
-    """Places (N,2) of outline and design edge points in half diameters, and their normals (N,2) in the picture."""
+    """Positions (N,2) of outline and design edge points, in half diameters, and their normals (N,2) in the picture."""
     f = view.features
     pose = view.cam_from_model
     kept = (f.edge_kinds & (EDGE_CONTOUR | EDGE_SHARP)) > 0
@@ -120,7 +120,7 @@ def _edge_picture(view: GuideView, diameter_mm: float) -> tuple[Array, Array]:
 
 
 def _descriptor(view: GuideView, diameter_mm: float) -> Array:
-    """(angles, radii · orientations) unit histogram of edges on a polar grid, orientation relative to the radius."""
+    """(angles, radii · orientations) normalised histogram of edges on a polar grid, oriented by the radius."""
     pixels, normals = _edge_picture(view, diameter_mm)
     histogram = np.zeros((_ANGLES, _RADII, _ORIENTATIONS))
     if len(pixels):
@@ -141,7 +141,7 @@ def _descriptor(view: GuideView, diameter_mm: float) -> Array:
 
 
 def _likeness(descriptors: Array, directions: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Largest correlation (N,) over all rolls with a view more than APART_DEG away, and its index (-1: none)."""
+    """Largest correlation (N,), over all rolls, with a view more than APART_DEG away, and its index, -1 without any."""
     spectra = np.moveaxis(np.fft.rfft(descriptors, axis=1), 1, 0)
     conjugates = spectra.conj().transpose(0, 2, 1)
     count = len(descriptors)
