@@ -103,6 +103,61 @@ class SurfaceSamples:
         return np.linalg.norm(closest - points[:, None, :], axis=2).min(axis=1)
 
 
+@dataclass(frozen=True)
+class _SymmetryTest:
+    """Tests of candidate symmetries of one surface.
+
+    Attributes:
+        samples: of the surface.
+        covariance: (3,3) of the surface.
+        counts: (G,) sampled points of each group of faces.
+        diameter: of the surface, mm.
+        exact_fraction, near_fraction, near_share: see `find_symmetries`.
+    """
+
+    samples: SurfaceSamples
+    covariance: Array
+    counts: NDArray[np.int64]
+    diameter: float
+    exact_fraction: float
+    near_fraction: float
+    near_share: float
+
+    def evaluate(
+        self, axis: Array, center: Array, angles_rad: NDArray[np.float64], order: int | None
+    ) -> FoundSymmetry | None:
+        """The symmetry about an axis through a centre; None when the surface does not have it.
+
+        Args:
+            axis: (3,) unit vector.
+            center: (3,) mm.
+            angles_rad: rotations that are tried.
+            order: of the symmetry; None for any angle.
+        """
+        samples, covariance, near_share = self.samples, self.covariance, self.near_share
+        reach = self.near_fraction * self.diameter
+        unmatched = np.zeros(len(samples.queries), dtype=bool)
+        is_exact = True
+        for angle in angles_rad:
+            rotation = exp_so3(axis * angle)
+            turned = rotation @ covariance @ rotation.T
+            if np.linalg.norm(turned - covariance) > (0.02 + near_share) * np.linalg.norm(covariance):
+                return None
+            few = (samples.queries[::10] - center) @ rotation.T + center
+            if np.mean(samples.distances(few) > reach) > 0.02 + 2.0 * near_share:
+                return None
+            distances = samples.distances((samples.queries - center) @ rotation.T + center)
+            unmatched |= distances > reach
+            is_exact &= bool(np.quantile(distances, 0.995) <= self.exact_fraction * self.diameter)
+            if unmatched.mean() > near_share:
+                return None
+        of_group = np.bincount(samples.query_groups[unmatched], minlength=len(self.counts))
+        x, y, z = axis.tolist()
+        cx, cy, cz = center.tolist()
+        symmetry = Symmetry((x, y, z), (cx, cy, cz), order)
+        return FoundSymmetry(symmetry, is_exact, float(unmatched.mean()), of_group / np.maximum(self.counts, 1))
+
+
 def find_symmetries(
     vertices: Array,
     faces: NDArray[np.int64],
@@ -141,30 +196,7 @@ def find_symmetries(
     if np.linalg.norm(middle - centroid) > 0.25 * exact_fraction * diameter:
         centers.append(middle)
     counts = np.bincount(samples.query_groups, minlength=int(groups.max()) + 1)
-
-    def evaluate(
-        axis: Array, center: Array, angles_rad: NDArray[np.float64], order: int | None
-    ) -> FoundSymmetry | None:
-        unmatched = np.zeros(len(samples.queries), dtype=bool)
-        is_exact = True
-        for angle in angles_rad:
-            rotation = exp_so3(axis * angle)
-            turned = rotation @ covariance @ rotation.T
-            if np.linalg.norm(turned - covariance) > (0.02 + near_share) * np.linalg.norm(covariance):
-                return None
-            few = (samples.queries[::10] - center) @ rotation.T + center
-            if np.mean(samples.distances(few) > near_fraction * diameter) > 0.02 + 2.0 * near_share:
-                return None
-            distances = samples.distances((samples.queries - center) @ rotation.T + center)
-            unmatched |= distances > near_fraction * diameter
-            is_exact &= bool(np.quantile(distances, 0.995) <= exact_fraction * diameter)
-            if unmatched.mean() > near_share:
-                return None
-        of_group = np.bincount(samples.query_groups[unmatched], minlength=len(counts)) / np.maximum(counts, 1)
-        x, y, z = axis.tolist()
-        cx, cy, cz = center.tolist()
-        symmetry = Symmetry((x, y, z), (cx, cy, cz), order)
-        return FoundSymmetry(symmetry, is_exact, float(unmatched.mean()), of_group)
+    test = _SymmetryTest(samples, covariance, counts, diameter, exact_fraction, near_fraction, near_share)
 
     found: list[FoundSymmetry] = []
     for axis in _candidate_axes(vertices, faces, covariance):
@@ -173,7 +205,7 @@ def find_symmetries(
             trials: list[tuple[int | None, NDArray[np.float64]]] = [(None, _FREE_TURNS_RAD)]
             trials += [(order, np.array([2.0 * np.pi / order])) for order in sorted(ORDERS, reverse=True)]
             for order, angles_rad in trials:
-                candidate = evaluate(axis, center, angles_rad, order)
+                candidate = test.evaluate(axis, center, angles_rad, order)
                 if candidate is not None and (best is None or (candidate.is_exact and not best.is_exact)):
                     best = candidate
                 if best is not None and best.is_exact:
