@@ -25,9 +25,7 @@ class ChoiceOptions:
     """Number of views, and which views are excluded from the choice."""
 
     max_views: int = 40  # more reduce the noise, but not the errors of the lens model
-    max_error_ratio: float = (
-        2.0  # views with a larger expected error, relative to the median (blur, motion), are excluded
-    )
+    max_error_ratio: float = 2.0  # largest expected error (blur, motion) of a view, relative to the median
     min_separation: float = 0.02  # of the diagonal; of views nearer to each other the better one is kept
     candidates: int = 160  # views from which the choice is made
     initial_views: int = 25  # for the first camera, with which the information of all views is computed

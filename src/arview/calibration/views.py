@@ -134,9 +134,8 @@ class BoardFinder:
         if is_legacy:
             drawn.setLegacyPattern(True)
         details = cv2.aruco.CharucoParameters()
-        details.minMarkers = (
-            1  # one of the two beside a corner suffices, to reach the border, where distortion is largest
-        )
+        # One of the two markers beside a corner suffices, to reach the border, where distortion is largest.
+        details.minMarkers = 1
         return cv2.aruco.CharucoDetector(drawn, details, self._parameters)
 
 

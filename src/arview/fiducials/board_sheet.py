@@ -156,9 +156,8 @@ def board_pdf(sheet: Sheet) -> bytes:
     stream = pydyf.Stream(compress=False)
     stream.set_matrix(_PT_PER_MM, 0, 0, _PT_PER_MM, 0, 0)
     stream.push_state()
-    stream.set_matrix(
-        1, 0, 0, -1, sheet.left_mm, sheet.height_mm - sheet.top_mm
-    )  # origin at the board's corner, y down
+    # Origin at the board's corner, y down.
+    stream.set_matrix(1, 0, 0, -1, sheet.left_mm, sheet.height_mm - sheet.top_mm)
     for gray, rectangles in zip((0, 1), rectangles_mm(sheet.board), strict=True):
         stream.set_color_rgb(gray, gray, gray)
         for rectangle in rectangles:  # one path, so that no hairlines appear between neighbours

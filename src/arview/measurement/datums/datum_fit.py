@@ -179,9 +179,8 @@ def check_fit_covered(one: DatumEquations, fit: DatumFit, options: AlignmentOpti
             f"{name}: only {used} of {one.of} points on it could be measured; photograph it from more sides, in better"
             " light, or name another feature in the part file"
         )
-    if (
-        one.feature in ("hole", "pin") and one.by_radius is not None
-    ):  # only its centre matters, which a short arc does not determine
+    if one.feature in ("hole", "pin") and one.by_radius is not None:
+        # Only its centre matters, which a short arc does not determine.
         local, watched = np.concatenate([one.rows[:, 3:6], one.by_radius[:, None]], axis=1), np.eye(3, 4)
     else:
         local = one.rows[:, :6] - one.rows[:, 3:6] @ shift_origin(one.points.mean(axis=0))[:, :6]

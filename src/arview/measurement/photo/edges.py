@@ -248,9 +248,8 @@ class ComponentEdges:
         found = edge_offsets(some, self.body.center, self.views, o.capture_mm / px_mm + 2.0, o, level)
         shifts = self.body.shifts(o.capture_mm)
         weight = np.abs(found.strengths) / (np.abs(found.strengths) + o.half_slope)
-        order = np.argsort(
-            -weight.max(axis=1), kind="stable"
-        )  # strongest first, so that poor shifts are given up early
+        # Strongest first, so that poor shifts are given up early.
+        order = np.argsort(-weight.max(axis=1), kind="stable")
         order = order[weight[order].max(axis=1) > 0.0]
         votes = _vote(
             found.hypotheses_mm[order], weight[order], found.directions[order], shifts, max(0.4, 1.2 * px_mm), 0.99
@@ -277,9 +276,8 @@ class ComponentEdges:
         )  # fmt: skip
         left = found.offsets_mm[ok] - rows @ fit.twist
         limit = o.max_dark_shift_px * self.body.px_mm
-        shift = float(
-            np.sum(fit.weights * dark * left) / (1.05 * np.sum(fit.weights) + 1.0)
-        )  # with a weak prior at zero
+        # The denominator holds a weak prior at zero.
+        shift = float(np.sum(fit.weights * dark * left) / (1.05 * np.sum(fit.weights) + 1.0))
         return fit, float(np.clip(shift, -limit, limit))
 
     def _support(self, edges: EdgePoints, place: Array) -> float:

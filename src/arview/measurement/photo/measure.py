@@ -92,8 +92,9 @@ def is_gone(body: MeasuredComponent) -> bool:
     # The surface below faces opposite to the component's own.
     below = Samples(contact.points, -contact.normals)
     found = sweep_offsets(below.points, below.normals, body.views, 3.0 * body.px_mm, o, removed=body.index)
-    looked = np.count_nonzero(found.views >= 0, axis=1) >= o.min_views
-    agree = looked & found.is_ok & (np.abs(found.offsets_mm) < 1.5 * body.px_mm)
+    visible = np.count_nonzero(found.views >= 0, axis=1) >= o.min_views
+    agree = visible & found.is_ok & (np.abs(found.offsets_mm) < 1.5 * body.px_mm)
     return bool(
-        np.count_nonzero(looked) >= 10 and np.count_nonzero(agree) > body.options.gone_share * np.count_nonzero(looked)
+        np.count_nonzero(visible) >= 10
+        and np.count_nonzero(agree) > body.options.gone_share * np.count_nonzero(visible)
     )

@@ -82,9 +82,8 @@ def glance(data: bytes) -> Glance:
         size = (max(1, width // factor), max(1, height // factor))
         picture.draft("L", size)
         gray = _pixels(picture, "L")
-        exif = replace(
-            exif_of(picture), width=width, height=height
-        )  # after decoding, because reading a PNG's EXIF decodes all
+        # After decoding, because reading the EXIF data of a PNG decodes all of it.
+        exif = replace(exif_of(picture), width=width, height=height)
         is_jpeg = picture.format in ("JPEG", "MPO")
     if is_jpeg and _is_damaged_jpeg(data):
         raise InputError("its data are damaged and part of the picture is lost; copy it again from the camera")

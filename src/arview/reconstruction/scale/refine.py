@@ -152,7 +152,7 @@ class EdgeResiduals:
         rows: (M,8) derivatives by the twist and d log(scale), and the sign of the step for a shift to the dark side.
         offsets: (M,) from the predicted edge to the step, px.
         component, feature: (M,) to which each belongs.
-        looked, found: (C,) number of points inside the picture, and of those with a step near them.
+        searched, found: (C,) number of points inside the picture, and of those with a step near them.
     """
 
     rows: Array
