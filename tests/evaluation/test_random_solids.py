@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,13 +15,21 @@ from arview.evaluation.semisynthetic.random_solids import random_near_symmetric,
 SEEDS = range(30)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("made", [random_solid, random_near_symmetric])
-def test_a_solid_consists_of_closed_bodies_of_a_parts_size(made: Callable[[int], Model], seed: int) -> None:
+@cache
+def near_symmetric(seed: int) -> Model | None:
+    """The solid of a seed; None where all tries fail, which takes seconds."""
     try:
-        solid = made(seed)
+        return random_near_symmetric(seed)
     except ValueError:
-        assert made is random_near_symmetric and seed in (21, 23)
+        return None
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("made", [random_solid, near_symmetric])
+def test_a_solid_consists_of_closed_bodies_of_a_parts_size(made: Callable[[int], Model | None], seed: int) -> None:
+    solid = made(seed)
+    if solid is None:
+        assert made is near_symmetric and seed in (21, 23)
         return
     assert 60.0 < solid.diameter_mm < 350.0
     for component in solid.components:
@@ -45,9 +54,8 @@ def test_solids_depend_only_on_their_seed() -> None:
 def test_a_near_symmetric_solid_is_symmetric_but_for_a_few_features() -> None:
     seen = 0
     for seed in SEEDS:
-        try:
-            solid = random_near_symmetric(seed)
-        except ValueError:
+        solid = near_symmetric(seed)
+        if solid is None:
             continue
         points = np.concatenate([c.vertices_in_model for c in solid.components])
         away_mm = []

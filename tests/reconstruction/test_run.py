@@ -197,7 +197,9 @@ def test_a_broken_photo_among_good_ones_is_named(folder: Path, tmp_path: Path) -
     assert "left out img_003.png" in result.stderr and "left out img_005.png" in result.stderr
 
 
-def test_photos_of_another_part_give_no_frame(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photos_of_another_part_give_no_frame(
+    found: Reconstruction, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The photos are good, but the CAD is another part's: no scale, no frame, and it is said."""
     monkeypatch.setattr("arview.guideviews.cache.cache_folder", lambda: tmp_path)
     write_obj(tmp_path / "other.obj", bracket())
