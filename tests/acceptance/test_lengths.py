@@ -88,6 +88,7 @@ def test_lengths_without_common_marks_are_binomial() -> None:
     assert test.expected == tuple(int(v) for v in binom.interval(0.95, 8, 0.9545))
 
 
+@pytest.mark.slow
 def test_a_correct_u_is_accepted_and_others_are_rejected() -> None:
     """25 tests of 120 lengths: a correct U is hardly ever rejected, half of it nearly always."""
     wrong = {"honest": 0, "half": 0, "scale": 0}

@@ -100,6 +100,7 @@ def walk(model: Model | None, count: int, seed: int = 0, noise: float = 4.0) -> 
     ]
 
 
+@pytest.mark.slow
 def test_one_picture_shows_missing_moved_and_swapped_components() -> None:
     hits, pictures, others = 0, 0, 0
     for number, (parts, model) in enumerate(LOOK_ALIKES.items()):
@@ -113,6 +114,7 @@ def test_one_picture_shows_missing_moved_and_swapped_components() -> None:
     assert others <= 0.04 * pictures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "gain"), [(2.0, 1.0), (8.0, 1.0), (4.0, 0.55)])
 def test_a_right_part_is_not_mismatched(noise: float, gain: float) -> None:
     for k, pose in enumerate(views_of(8, seed=50)):
@@ -137,6 +139,7 @@ def test_evidence_adds_up_over_frames_until_reset() -> None:
     assert seen.mismatches == () and seen.uncertain == ()
 
 
+@pytest.mark.slow
 def test_a_corrected_component_is_cleared() -> None:
     seen = watch(walk(changed(block_2=None), 4))
     assert mismatched(seen.mismatches) == {"block_2"}
@@ -224,6 +227,7 @@ def test_a_component_entering_the_view_is_observed_soon(
     assert waited == frames
 
 
+@pytest.mark.slow
 def test_an_occluded_component_is_no_mismatch() -> None:
     for name in ("post_1", "post_3", "block_1", "block_2"):
         for k, pose in enumerate(views_of(2, seed=70)):
@@ -231,6 +235,7 @@ def test_an_occluded_component_is_no_mismatch() -> None:
             assert name not in mismatched(monitor().mismatches_in(image, about(pose, k))), f"{name}, view {k}"
 
 
+@pytest.mark.slow
 def test_what_is_hidden_at_first_is_mismatched_later_even_at_a_fast_turn() -> None:
     model = changed(block_2=None)
     poses = [pose_from(-70 + 7 * k, 40, 520) for k in range(20)]
@@ -240,6 +245,7 @@ def test_what_is_hidden_at_first_is_mismatched_later_even_at_a_fast_turn() -> No
     assert mismatched(watch(frames).mismatches) == {"block_2"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_there", [True, False])
 def test_a_component_is_unverified_until_it_is_confirmed_at_its_place(is_there: bool) -> None:
     model = None if is_there else changed(block_2=None)
@@ -277,6 +283,7 @@ def test_a_part_of_one_component_has_nothing_to_mismatch() -> None:
     assert alone.mismatches == () and alone.uncertain == () and alone.unverified == ()
 
 
+@pytest.mark.slow
 def test_a_session_never_calls_a_similar_part_tracked() -> None:
     session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=path(1, 4)[0])
     for k, pose in enumerate(path(5, 4)):

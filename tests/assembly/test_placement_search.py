@@ -109,6 +109,7 @@ def test_swapped_components_share_their_foot() -> None:
     assert pairs["block_1", "block_2"] == pytest.approx([42.0, -27.0, 0.0], abs=0.5)
 
 
+@pytest.mark.slow
 def test_a_component_occluded_at_its_place_is_found_at_an_alternative_one() -> None:
     found = [against(changed(walled(), hidden=(26.0, 0.0)), seed) for seed in range(8)]
     assert np.median([said["hidden"] for said in found]) > 1.0

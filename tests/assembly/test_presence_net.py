@@ -54,6 +54,7 @@ def crops(image: NDArray[np.uint8], pose: Array, *names: str) -> list[ComponentC
     return component_crops(picture_of_part, PART.surface, PART.views.diameter_mm, only)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [2.0, 6.0])
 def test_a_missing_component_scores_above_one_that_is_there(noise: float) -> None:
     there, gone = [], []
@@ -70,6 +71,7 @@ def test_a_missing_component_scores_above_one_that_is_there(noise: float) -> Non
     assert np.median(gone) > 0.0 > np.median(there)
 
 
+@pytest.mark.slow
 def test_an_occluded_component_scores_below_a_missing_one() -> None:
     hidden, gone = [], []
     for name in ("post_1", "post_2", "post_3", "block_1", "block_2"):

@@ -226,6 +226,7 @@ def test_the_report_is_text(tmp_path):
     assert check.findings[0].text == "views 3 and 7 look alike"
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_real_parts():
     cube = check_part(load_part(DATA / "sequences" / "cube" / "models" / "assembly.glb"))

@@ -198,6 +198,7 @@ def assert_near_truth(solution: Solution, focal: float, centre_px: float, pixel_
     assert off[[0, 8, 54, 62]].max() < corner_px  # the corners of the picture
 
 
+@pytest.mark.slow
 def test_a_folder_of_photos(photos: Path) -> None:
     result = calibrate([photos], BOARD)
     solution, judged = result.solution, result.verdict
@@ -325,6 +326,7 @@ def test_too_few_views_are_refused() -> None:
 # --- what goes wrong -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spec", "expected"),
     [

@@ -110,6 +110,7 @@ def refused(result: Result, *words: str) -> None:
 # --- What works -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_annotate_writes_video_and_poses(room: Path) -> None:
     result = run("annotate", "clip.mp4", *ANNOTATE, "-o", "out.mp4", "--poses", "poses.jsonl")
     assert result.exit_code == 0, result.output
@@ -181,6 +182,7 @@ def test_annotate_aligns_with_a_guide_view(room: Path, monkeypatch: pytest.Monke
         refused(run("annotate", "clip.mp4", *ANNOTATE, "--init", f"guide:{name}", "--poses", "p.jsonl"), name, word)
 
 
+@pytest.mark.slow
 def test_guideviews_are_written_and_used(room: Path) -> None:
     options = ("--renderer", "zbuffer", "--component", "brick", "--preview", "sheet.png")
     result = run("guideviews", "part.toml", "-o", "set.bin", *options)
@@ -193,6 +195,7 @@ def test_guideviews_are_written_and_used(room: Path) -> None:
     assert result.exit_code == 0, result.output
 
 
+@pytest.mark.slow
 def test_guide_views_are_kept_and_damaged_ones_made_anew(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arview.guideviews.cache, "cache_folder", lambda: room / "cache")
     arguments = ("annotate", "clip.mp4", *ANNOTATE, "--poses", "poses.jsonl")
@@ -284,6 +287,7 @@ def test_cad_in_metres_read_as_mm_is_questioned(room: Path) -> None:
     refused(run("check", "tiny.glb"), "is it really", "--unit")
 
 
+@pytest.mark.slow
 def test_guide_views_of_another_model(room: Path) -> None:
     write_stl(room / "other.stl", scale=1.1)
     (room / "other.toml").write_text(PART.replace("brick.stl", "other.stl"))
@@ -398,6 +402,7 @@ def start(room: Path, *arguments: str, **environment: str) -> subprocess.Popen[s
     )
 
 
+@pytest.mark.slow
 def test_ctrl_c_finishes_the_files(room: Path) -> None:
     arguments = ("clip.mp4", *ANNOTATE, "-o", "out.mp4", "--poses", "poses.jsonl")
     process = start(room, "annotate", *arguments, FAKE_SESSION_S="0.3")

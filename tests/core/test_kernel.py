@@ -63,6 +63,7 @@ def run(folder: Path, **callee: object) -> tuple[float, int]:
     return float(result), int(hits)
 
 
+@pytest.mark.slow
 def test_a_changed_callee_or_constant_is_compiled_anew_and_words_are_not(tmp_path: Path) -> None:
     assert run(tmp_path) == (6.0, 0)
     assert run(tmp_path) == (6.0, 1)
@@ -75,6 +76,7 @@ def test_a_changed_callee_or_constant_is_compiled_anew_and_words_are_not(tmp_pat
     assert run(tmp_path, factor=3.0) == (9.0, 1)
 
 
+@pytest.mark.slow
 def test_flags_of_the_compiler_have_one_key_in_every_process(tmp_path: Path) -> None:
     options = '(fastmath={"reassoc", "contract", "arcp", "nsz"})'
     assert run(tmp_path, options=options) == (6.0, 0)

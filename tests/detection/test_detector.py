@@ -73,6 +73,7 @@ def anywhere(rng: np.random.Generator) -> np.ndarray:
     return pose
 
 
+@pytest.mark.slow
 def test_the_part_is_found_without_a_hint() -> None:
     rng = np.random.default_rng(11)
     found, exact = 0, 0
@@ -93,11 +94,13 @@ def test_the_part_is_found_without_a_hint() -> None:
     assert exact >= 16
 
 
+@pytest.mark.slow
 def test_nothing_is_found_where_there_is_no_part() -> None:
     for k in range(20):
         assert detector().detect(picture(None, seed=k, scene=20 + k)) == []
 
 
+@pytest.mark.slow
 def test_the_part_is_found_over_the_full_sphere_and_all_rolls() -> None:
     views = make_guide_views(assembly(), ViewRange((300.0, 1200.0)), GuideViewOptions(subdivisions=3))
     everywhere = Detector(views, CAMERA)
@@ -189,6 +192,7 @@ def test_of_views_that_symmetries_make_the_same_one_and_a_margin_is_looked_for()
     assert in_fundamental_domain(directions, turns[:0], full).all()
 
 
+@pytest.mark.slow
 def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
     sought = Detector(make_guide_views(block(), ViewRange((250.0, 500.0)), GuideViewOptions(subdivisions=3)), CAMERA)
     assert len(sought.disambiguator.exact_rotations) == 4
@@ -223,6 +227,7 @@ def knob(key_mm: float) -> Model:
     return make_model("knob", parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("key_mm", "is_told"), [(14.0, True), (1.8, False)])
 def test_a_key_decides_between_twins_and_where_it_cannot_be_seen_the_view_is_ambiguous(
     key_mm: float, is_told: bool
@@ -278,6 +283,7 @@ def lid() -> Model:
     return make_model("lid", tuple(parts))
 
 
+@pytest.mark.slow
 def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
     model = lid()
     views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
@@ -350,6 +356,7 @@ def test_a_small_part_a_plain_view_and_a_close_rival_are_doubted_and_a_pose_a_li
     assert quality(500.0, None, 0.0, 0.3) < 0.5 < alone < quality(500.0, None, 0.0, 2.0)
 
 
+@pytest.mark.slow
 def test_the_poses_of_an_ambiguous_view_say_which_others_fit() -> None:
     model = knob(1.8)
     views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
@@ -375,6 +382,7 @@ def test_rough_poses_are_tried_by_themselves() -> None:
     assert searched and error(searched[0].cam_from_model, truth)[2] < 1.5
 
 
+@pytest.mark.slow
 def test_what_hides_half_of_the_part_does_not_pull_the_pose_away() -> None:
     errors = []
     for k, truth in enumerate(path(40)[::4]):

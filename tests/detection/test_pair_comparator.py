@@ -49,6 +49,7 @@ def leads(key_mm: float, truth: Array, poses: list[Array], **drawn: object) -> A
     return PairComparator(part_of(key_mm)).log_odds(ImagePyramid(seen, CAMERA, 12, EdgeNet()), poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [2.0, 10.0])
 def test_the_right_twin_is_ahead_of_the_others(noise: float) -> None:
     right, steep = [], []

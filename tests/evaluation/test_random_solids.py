@@ -24,6 +24,7 @@ def near_symmetric(seed: int) -> Model | None:
         return None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("made", [random_solid, near_symmetric])
 def test_a_solid_consists_of_closed_bodies_of_a_parts_size(made: Callable[[int], Model | None], seed: int) -> None:

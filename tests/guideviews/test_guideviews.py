@@ -345,6 +345,7 @@ def test_options_without_sense_are_refused(change: dict[str, int]) -> None:
 # --- Uniqueness -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_lone_block_is_insufficient_and_says_why() -> None:
     found = make_guide_views(block(), SPHERE, GuideViewOptions(subdivisions=2, renderer="zbuffer"))
     unique = assess(found)
@@ -365,6 +366,7 @@ def test_the_assembly_is_sufficient() -> None:
     assert len(unique.distinct_lines) == len(unique.likeness) == len(found)
 
 
+@pytest.mark.slow
 def test_views_of_a_block_are_alike_from_opposite_sides() -> None:
     """Half a turn about Z brings a block back: every view is as good as equal to the one from the other side."""
     found = make_guide_views(block(), SPHERE, GuideViewOptions(subdivisions=2, renderer="zbuffer"))

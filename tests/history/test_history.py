@@ -244,10 +244,12 @@ def together(where: str, tmp_path: Path, count: int, shared: int) -> None:
         assert store.check() == (len(expected), [])
 
 
+@pytest.mark.slow
 def test_two_processes_write_a_thousand_results_each(tmp_path: Path) -> None:
     together(str(tmp_path / "results.sqlite"), tmp_path, 1000, 50)
 
 
+@pytest.mark.slow
 def test_a_writer_that_is_killed_leaves_a_whole_store(tmp_path: Path) -> None:
     folder, where = many(tmp_path, "a", 300), str(tmp_path / "results.sqlite")
     process = writer(where, "one", folder)
@@ -294,6 +296,7 @@ def test_a_writer_waits_for_another(tmp_path: Path) -> None:
 # ---- PostgreSQL
 
 
+@pytest.mark.slow
 def test_postgresql_two_writers(postgresql: str, tmp_path: Path) -> None:
     together(postgresql, tmp_path, 250, 20)
 

@@ -65,6 +65,7 @@ def bare(server: Running, path: str, **headers: str) -> tuple[int, dict[str, str
     return given
 
 
+@pytest.mark.slow
 def test_the_link_brings_the_page_and_the_cookie(server: Running) -> None:
     status, headers, _ = bare(server, f"/?token={server.token}")
     assert status == 200 and "text/html" in headers["content-type"]
@@ -157,6 +158,7 @@ def test_what_is_served_is_what_pages_need() -> None:
     assert all(str(here) not in name and ".." not in name for name in served)
 
 
+@pytest.mark.slow
 def test_bodies_too_large_are_refused_by_what_they_say_and_by_what_they_are(server: Running, page: Http) -> None:
     name, limits = page.join(), RequestLimits()
     for path, kind, most in (
@@ -205,6 +207,7 @@ def test_slow_headers_and_bodies_are_cut(server: Running, page: Http, monkeypatc
     assert time.monotonic() - began_s < 7
 
 
+@pytest.mark.slow
 def test_a_client_that_takes_no_answer_is_cut(server: Running, page: Http, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(TimeLimitedProtocol, "limits", ConnectionLimits(write_timeout_s=0.5))
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as line:
@@ -223,6 +226,7 @@ def test_a_client_that_takes_no_answer_is_cut(server: Running, page: Http, monke
         assert taken < 20 * 448_168
 
 
+@pytest.mark.slow
 def test_snapshots_are_rate_limited() -> None:
     # A low rate, so that a slow machine gets no new tokens while it draws.
     chosen = options(requests=RequestLimits(snapshots_per_s=0.1))
@@ -234,6 +238,7 @@ def test_snapshots_are_rate_limited() -> None:
     assert statuses[:6] == [200] * 6 and statuses.count(429) >= 8
 
 
+@pytest.mark.slow
 def test_too_many_requests_are_slowed_down() -> None:
     chosen = options(requests=RequestLimits(per_s=5.0, burst=10.0))
     with running(chosen, loader(chosen)) as slow:
@@ -265,6 +270,7 @@ def test_rate_limit_counts_by_address_and_forgets(monkeypatch: pytest.MonkeyPatc
     assert len(rate._buckets) <= MAX_ADDRESSES
 
 
+@pytest.mark.slow
 def test_a_fuzzing_client_does_not_affect_others(server: Running) -> None:
     """Random methods, paths, headers and bodies, by HTTP and as raw bytes, while another page is served."""
     rng = random.Random(7)
@@ -313,6 +319,7 @@ def test_a_fuzzing_client_does_not_affect_others(server: Running) -> None:
     good.ask("DELETE", f"/api/clients/{good_name}")
 
 
+@pytest.mark.slow
 def test_many_pages_at_once(server: Running) -> None:
     """Twenty pages join at the same time and four are admitted; the others are refused, and the four are served."""
     from concurrent.futures import ThreadPoolExecutor

@@ -106,6 +106,7 @@ def closing() -> Iterator[Callable[[Feed], Feed]]:
         feed.close()
 
 
+@pytest.mark.slow
 def test_a_slow_tracker_takes_the_newest_frame_and_counts_the_others(closing: Callable[[Feed], Feed]) -> None:
     """30 frames per second into a tracker that manages 5: no pose is older than one waiting and one tracking."""
     feed = closing(feed_of(Scripted(pause_s=0.2)))
@@ -126,6 +127,7 @@ def test_a_slow_tracker_takes_the_newest_frame_and_counts_the_others(closing: Ca
     assert ids == sorted(set(ids))
 
 
+@pytest.mark.slow
 def test_memory_of_a_feed_is_bounded(closing: Callable[[Feed], Feed]) -> None:
     feed = closing(feed_of(Scripted()))
     for number in range(200):
@@ -322,6 +324,7 @@ def model() -> Model:
     return load_part(PART).model
 
 
+@pytest.mark.slow
 def test_inspection_file_keeps_the_last_good_one(tmp_path: Path, model: Model) -> None:
     path = tmp_path / "inspection.json"
     shutil.copy(INSPECTION, path)

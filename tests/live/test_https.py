@@ -150,6 +150,7 @@ def test_apple_profile_holds_the_certificate(tmp_path: Path) -> None:
     assert bytes.fromhex(fingerprint(made.authority_der)) == digest
 
 
+@pytest.mark.slow
 def test_pages_come_by_https_and_the_way_to_trust_them_by_http(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ARVIEW_DATA", str(tmp_path))
     place = open_endpoint(LOOPBACK, 0)

@@ -62,6 +62,7 @@ def page(phones: Running) -> Iterator[Http]:
     page.close()
 
 
+@pytest.mark.slow
 def test_poses_by_jpeg_are_those_of_the_very_frame(page: Http) -> None:
     name = page.join()
     off_mm, off_deg = [], []
@@ -82,6 +83,7 @@ def test_poses_by_jpeg_are_those_of_the_very_frame(page: Http) -> None:
     assert (status["clients"], status["max_clients"], status["mode"]) == (1, 3, "poses")
 
 
+@pytest.mark.slow
 def test_annotated_picture_by_jpeg(page: Http) -> None:
     name = page.join(mode="video")
     status, headers, content = send(page, name, 0)
@@ -120,6 +122,7 @@ def test_control_changes_state_and_an_invalid_request_changes_nothing(page: Http
     assert (again["mode"], again["style"]) == ("video", answer["style"])
 
 
+@pytest.mark.slow
 def test_reset_searches_again(page: Http) -> None:
     name = page.join()
     assert json.loads(send(page, name, 0)[2])["track_ms"] > 0
@@ -239,6 +242,7 @@ def codes(page: Http) -> list[str]:
     return [notice["code"] for notice in page.json("GET", "/api/status")[1]["notices"]]
 
 
+@pytest.mark.slow
 def test_inspection_is_reloaded_and_garbage_keeps_the_last_good_one(page: Http, phones: Running) -> None:
     path = phones.server.options.inspection
     assert path is not None
@@ -263,6 +267,7 @@ def test_inspection_is_reloaded_and_garbage_keeps_the_last_good_one(page: Http, 
     assert json.loads(send(page, name, 0)[1]["x-arview-answer"])["revision"] == after["revision"]
 
 
+@pytest.mark.slow
 def test_part_is_aligned_with_a_guide_view_when_asked_for() -> None:
     """The response has the pose of the guide view; the part is accepted near it only."""
     chosen = options(guide="az-110_el50_d550", max_age_s=None)
@@ -311,6 +316,7 @@ def test_pages_wait_while_the_part_is_loaded() -> None:
         assert page.join()
 
 
+@pytest.mark.slow
 def test_silent_pages_leave_by_themselves() -> None:
     chosen = options(jpeg_silence_s=0.5)
     with running(chosen, loader(chosen)) as server:
@@ -319,6 +325,7 @@ def test_silent_pages_leave_by_themselves() -> None:
         wait(lambda: not server.hub.clients)
 
 
+@pytest.mark.slow
 def test_every_phone_is_recorded_from_its_first_picture(tmp_path: Path) -> None:
     (tmp_path / "out-2.mp4").write_bytes(b"of another day")
     chosen = options(record=tmp_path / "out.mp4", record_folder=tmp_path, max_age_s=None)

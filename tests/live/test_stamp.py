@@ -70,6 +70,7 @@ def test_stamp_survives_scaling(width: int, height: int, scale: float) -> None:
         assert read_stamp(small) == Stamp(frame_id, width, height, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("codec", ["libvpx", "libx264"])
 def test_stamp_survives_encoders_at_a_low_rate(codec: str) -> None:
     """300 kbit/s at 640×480 and 30 fps, as browsers send over the worst networks: no stamp is read wrongly."""

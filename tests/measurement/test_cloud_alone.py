@@ -55,6 +55,7 @@ def off_mm(found_from_scan: Array, scale: float = 1.0, true_scale: float = 1.0) 
     return float(np.abs(apply(found_from_scan, apply(PLACE, corners) / true_scale * scale) - corners).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_normals", [True, False])
 def test_the_part_is_found_and_not_half_a_turn_round(has_normals: bool) -> None:
     """The plate is symmetric, the blocks differ by millimetres, one is missing, and two stand elsewhere."""
@@ -65,6 +66,7 @@ def test_the_part_is_found_and_not_half_a_turn_round(has_normals: bool) -> None:
     assert off_mm(found.model_from_scan) < 0.3
 
 
+@pytest.mark.slow
 def test_the_scale_is_found_too() -> None:
     cloud = scan(as_built(), scale=37.0)
     found = find_model_in_cloud(cloud, nominal(), None, replace(QUICK, scale_range=(0.85, 1.2)))
@@ -72,6 +74,7 @@ def test_the_scale_is_found_too() -> None:
     assert off_mm(found.model_from_scan, found.scale, 37.0) < 0.4
 
 
+@pytest.mark.slow
 def test_clouds_of_nothing_that_is_known() -> None:
     cloud = scan(as_built())
     mirror = np.array([-1.0, 1.0, 1.0])
@@ -128,6 +131,7 @@ def inspected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Inspection, Pat
     return load_inspection(folder / "inspection.json", nominal()), folder, result.output, result.exit_code
 
 
+@pytest.mark.slow
 def test_a_scan_alone_against_truth(inspected: tuple[Inspection, Path, str, int]) -> None:
     inspection = inspected[0]
     for name, (shift, turn_deg) in TRUTH.items():
@@ -228,6 +232,7 @@ def test_cylinder_and_edge_in_a_cloud() -> None:
     assert np.abs(apply(found, [[80.0, 60.0, 0.0]]) - apply(moved, [[80.0, 60.0, 0.0]])).max() < 0.05
 
 
+@pytest.mark.slow
 def test_cylinder_and_edge_in_photos(tmp_path: Path) -> None:
     from arview.measurement.datums.in_photos import measure_datums_in_photos
     from arview.measurement.photo.views import views_of

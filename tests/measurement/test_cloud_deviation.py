@@ -130,6 +130,7 @@ def results(cloud, model, part, photos):
     return by_name(measure_components_in_cloud(cloud, model, part, photos))
 
 
+@pytest.mark.slow
 def test_moves_are_found(results, model, moved):
     for name, true in moved.items():
         found = results[name]
@@ -161,6 +162,7 @@ def test_spin_of_round_posts_is_undetermined_and_nothing_else(results):
         assert len(results[name].undetermined) == 0
 
 
+@pytest.mark.slow
 def test_nothing_moved_and_broken_points(model, part, photos):
     sound = make_cloud(model, photos)
     rng = np.random.default_rng(5)
@@ -186,6 +188,7 @@ def test_cloud_without_photos_or_normals(cloud, model, part, moved):
         assert np.abs(found.displacement_mm - (apply(moved[found.component], c) - c)).max() < 0.03
 
 
+@pytest.mark.slow
 def test_missing_fallen_and_swapped(model, part, photos):
     lying = move_about(centre(model, TALL), np.array([np.pi / 2, 0, 0, 0, 0, -15.0]))
     swap_tall = move_about(centre(model, NUT), np.array([0, 0, 0, *(centre(model, POST) - centre(model, NUT))]))
@@ -236,6 +239,7 @@ def test_clouds_that_do_not_belong(cloud, model, part, photos):
         measure_components_in_cloud(only(rng.uniform(box[0], box[1], (20_000, 3))), model, part, photos)
 
 
+@pytest.mark.slow
 def test_foreign_object_is_found_and_only_that(cloud, results, model, photos, moved):
     places = {name: move.measured_from_nominal for name, move in results.items()}
     assert find_foreign(cloud, model, places) == []

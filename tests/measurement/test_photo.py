@@ -80,6 +80,7 @@ def textured() -> tuple[PhotoViews, dict[str, dict[Method, Move | NotMeasured]]]
     return views, measure_components_in_photos(views, None, NOMINAL, names=(*BLOCKS, "post"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", BLOCKS[:3])
 def test_displaced_blocks(name: str, method: Method) -> None:
@@ -132,6 +133,7 @@ def painted() -> dict[str, dict[Method, Move | NotMeasured]]:
     return measure_components_in_photos(views, None, NOMINAL, names=BLOCKS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BLOCKS[:3])
 def test_without_texture_edges_still_measure(name: str) -> None:
     sweep, edges = painted()[name]["sweep"], painted()[name]["edges"]

@@ -150,6 +150,7 @@ def smooth_field(points, length_mm, rng, waves=150):
     return (np.cos(phase) @ rng.normal(size=(waves, 3)) + np.sin(phase) @ rng.normal(size=(waves, 3))) / np.sqrt(waves)
 
 
+@pytest.mark.slow
 def test_covariance_holds_for_noise_that_neighbours_share():
     """Over 20 clouds with errors of 0.05 mm shared over 6 mm: predicted against true scatter."""
     surface, center = post()
@@ -169,6 +170,7 @@ def test_covariance_holds_for_noise_that_neighbours_share():
         assert np.sqrt(np.mean(np.array(naive)[:, axes])) / true < 0.3
 
 
+@pytest.mark.slow
 def test_covariance_of_independent_noise():
     surface, center = post()
     rng = np.random.default_rng(3)

@@ -59,6 +59,7 @@ def inspection(reconstruction: MetricReconstruction) -> Inspection:
     return measure(reconstruction, part(), MeasureOptions(methods=("sweep", "edges")))
 
 
+@pytest.mark.slow
 def test_displacements_against_truth(inspection: Inspection) -> None:
     for name, (shift, turn_deg) in TRUTH.items():
         found = inspection.find(name)
@@ -113,6 +114,7 @@ def test_budget_and_datums(inspection: Inspection) -> None:
     assert inspection.provenance.photos == 12 and inspection.provenance.photos_hash
 
 
+@pytest.mark.slow
 def test_without_datums_the_base_is_the_frame(reconstruction: MetricReconstruction) -> None:
     options = MeasureOptions(methods=("edges",), uncertainty=UncertaintyOptions(monte_carlo=False))
     found = measure(reconstruction, part(datums=False), options)

@@ -24,6 +24,7 @@ def table(study, name=None):
     return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
+@pytest.mark.slow
 def test_displacement_study():
     study = displacement_study(is_quick=True)
     rows = table(study)
@@ -35,6 +36,7 @@ def test_displacement_study():
     assert study.picture.shape == (1800, 960, 3)
 
 
+@pytest.mark.slow
 def test_noise_study_is_unbiased_and_repeatable():
     study, again = noise_study(is_quick=True), noise_study(is_quick=True)
     assert study.tables == again.tables

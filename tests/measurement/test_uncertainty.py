@@ -168,6 +168,7 @@ def test_what_one_method_leaves_open_the_other_fills() -> None:
 # --- a component's number --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("monte_carlo", [True, False])
 def test_intervals_hold_the_truth_as_often_as_they_say(monte_carlo: bool) -> None:
     """500 components displaced by 0 to 2 mm, each with its own noise, measured in a frame that is measured too."""

@@ -410,6 +410,7 @@ def test_odd_size_is_warned_of(tmp_path: Path) -> None:
     assert [found.camera.height for found in intake.lenses] == [600, 500]
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_the_plate_photos_pass_without_a_word() -> None:
     start = time.process_time()
@@ -432,6 +433,7 @@ def clip(path: Path, places: list[tuple[int, int]], blurred: set[int] = frozense
     return path
 
 
+@pytest.mark.slow
 def test_video_frames_are_sharp_and_spread(tmp_path: Path) -> None:
     places = [(4 * k, 3 * k) for k in range(40)] + [(160, 120)] * 20 + [(160 + 5 * k, 120) for k in range(40)]
     blurred = {k for k in range(100) if k % 3 == 0}

@@ -91,6 +91,7 @@ def frame_error(found: Reconstruction) -> tuple[float, Array]:
     return fit.scale - 1.0, fit.model_from_scan
 
 
+@pytest.mark.slow
 def test_scale_and_frame_come_from_the_cad(found: Reconstruction) -> None:
     assert found.is_metric and found.sparse is not None and len(found.sparse.photos) == len(POSES)
     scale_error, true_from_found = frame_error(found)
@@ -197,6 +198,7 @@ def test_a_broken_photo_among_good_ones_is_named(folder: Path, tmp_path: Path) -
     assert "left out img_003.png" in result.stderr and "left out img_005.png" in result.stderr
 
 
+@pytest.mark.slow
 def test_photos_of_another_part_give_no_frame(
     found: Reconstruction, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

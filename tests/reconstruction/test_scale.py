@@ -264,6 +264,7 @@ def target_scene() -> tuple[list[Array], list[NDArray[np.uint8]]]:
     ]
 
 
+@pytest.mark.slow
 def test_boards_tags_and_bars_through_a_lens() -> None:
     poses, pictures = target_scene()
     sparse = sparse_of(poses, LENS)
@@ -283,6 +284,7 @@ def test_boards_tags_and_bars_through_a_lens() -> None:
     assert json.loads(json.dumps(result.provenance()))["evidence"][0]["kind"] == "board"
 
 
+@pytest.mark.slow
 def test_wrong_board_size_is_noticed_and_absent_targets_are_named() -> None:
     poses, pictures = target_scene()
     sources = ScaleSources(
@@ -401,6 +403,7 @@ def usual_result() -> tuple[SparseModel, ScaleResult]:
     return sparse, find(sparse, part_of(assembly(), "plate"), pictures=pictures)
 
 
+@pytest.mark.slow
 def test_cad_gives_scale_and_frame_though_components_are_displaced() -> None:
     poses, _ = assembly_photos()
     sparse, result = usual_result()
@@ -416,6 +419,7 @@ def test_cad_gives_scale_and_frame_though_components_are_displaced() -> None:
     np.testing.assert_allclose(moved.photos[3].cam_from_scan, poses[3], atol=0.4)
 
 
+@pytest.mark.slow
 def test_noise_of_the_poses_is_in_the_uncertainty() -> None:
     poses, pictures = assembly_photos()
     rng = np.random.default_rng(6)
@@ -429,6 +433,7 @@ def test_noise_of_the_poses_is_in_the_uncertainty() -> None:
     assert middle_mm < 4 * np.sqrt(np.trace(result.covariance[3:, 3:]))
 
 
+@pytest.mark.slow
 def test_scale_of_a_rig_moves_the_frame_with_it() -> None:
     poses, pictures = assembly_photos()
     sparse = sparse_of(poses, PLAIN)
@@ -444,6 +449,7 @@ def test_scale_of_a_rig_moves_the_frame_with_it() -> None:
     assert any("CAD edges" in w and "camera rig" in w for w in result.warnings)
 
 
+@pytest.mark.slow
 def test_absent_part_gives_no_frame_and_no_scale() -> None:
     poses, _ = assembly_photos()
     empty = [picture(None, assembly(), PLAIN, seed=i, scene=i) for i in range(len(poses))]
@@ -458,6 +464,7 @@ def test_one_photo_is_too_few() -> None:
     assert result.scale is None and "fewer than two photos" in result.why_no_frame
 
 
+@pytest.mark.slow
 def test_bent_reconstruction_is_noticed() -> None:
     poses, pictures = assembly_photos()
     about = rigid(np.eye(3), assembly().center_in_model)
@@ -469,6 +476,7 @@ def test_bent_reconstruction_is_noticed() -> None:
     assert set(result.consistency.misfits) == {"01.png", "02.png", "03.png"}
 
 
+@pytest.mark.slow
 def test_points_off_the_surface_are_noticed() -> None:
     poses, pictures = assembly_photos()
     points = surface_points(assembly()) - [0, 0, 6.0]
@@ -487,6 +495,7 @@ def nearly_symmetric() -> Model:
     return make_model("nearly symmetric", tuple(parts))
 
 
+@pytest.mark.slow
 def test_components_decide_between_twins() -> None:
     model = nearly_symmetric()
     poses = ring(model, 6)

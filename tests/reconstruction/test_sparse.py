@@ -53,6 +53,7 @@ def placed(paths: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple
     return reconstruct_sparse(photos_of(paths), folder, OPTIONS), folder
 
 
+@pytest.mark.slow
 def test_cameras_and_points_against_truth(placed: tuple[SparseModel, Path], paths: list[Path]) -> None:
     sparse, _ = placed
     truth = {path.name: pose for path, pose in zip(paths, ring(12), strict=True)}
@@ -85,11 +86,13 @@ def test_covariance_tells_the_size_of_the_errors(placed: tuple[SparseModel, Path
     assert 0.3 < np.sqrt(np.mean(errors_mm**2) / np.mean(variances)) < 3.0
 
 
+@pytest.mark.slow
 def test_same_seed_same_model(placed: tuple[SparseModel, Path], paths: list[Path], tmp_path: Path) -> None:
     again = reconstruct_sparse(photos_of(paths), tmp_path, OPTIONS)
     assert np.allclose(again.points_in_scan, placed[0].points_in_scan, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_calibrated_camera_is_left_as_it_is(paths: list[Path], tmp_path: Path) -> None:
     sparse = reconstruct_sparse(photos_of(paths, CAMERA, is_calibrated=True), tmp_path, OPTIONS)
     assert len(sparse.photos) == 12
@@ -97,6 +100,7 @@ def test_calibrated_camera_is_left_as_it_is(paths: list[Path], tmp_path: Path) -
     assert np.allclose(sparse.photos[0].camera.dist, CAMERA.dist)
 
 
+@pytest.mark.slow
 def test_photos_of_another_part_are_named(paths: list[Path], tmp_path: Path) -> None:
     others = [photograph(bench(9), pose, seed=77) for pose in ring(12)[:5]]
     mixed = photos_of([*paths, *write_photos(tmp_path / "other", others, "other")])
@@ -114,6 +118,7 @@ def test_no_texture_is_said(tmp_path: Path) -> None:
         reconstruct_sparse(photos_of(write_photos(tmp_path, walls)), tmp_path / "sparse", OPTIONS)
 
 
+@pytest.mark.slow
 def test_photos_with_nothing_in_common_are_refused(tmp_path: Path) -> None:
     strangers = [photograph(bench(i), ring(12)[3 * i], seed=i) for i in range(4)]
     with pytest.raises(CannotMeasureError, match="in common"):

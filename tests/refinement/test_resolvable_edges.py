@@ -50,6 +50,7 @@ def design_points(views: GuideViewSet) -> tuple[Array, NDArray[np.bool_]]:
     return np.asarray(raw["edge_points"], dtype=np.float64)[chosen], find_unresolvable(views)[chosen]
 
 
+@pytest.mark.slow
 def test_rims_of_small_holes_are_unresolvable_and_those_of_large_ones_are_not() -> None:
     points, unresolvable = design_points(perforated())
     on_small = np.any([np.linalg.norm(points[:, :2] - center, axis=1) < 1.2 * SMALL_MM for center in SMALL], axis=0)

@@ -120,6 +120,7 @@ def test_ray_caster_axis_parallel_rays_and_refusals():
         caster.cast([[0.0, 0, 1]], [[0.0, 1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 def test_matches_are_exact_under_motion_noise_and_exposure(camera):
     texture = modality(camera)
@@ -202,6 +203,7 @@ def test_corners_keep_off_edges_and_background(first):
     assert np.sort(to_faces, axis=1)[:, 1].min() > 1.5
 
 
+@pytest.mark.slow
 def test_keyframe_bank_is_bounded_and_returns_to_known_views():
     texture = modality(options=TextureOptions(max_keyframes=3, max_corners=40))
     poses = [START @ exp_se3([0.0, 0.0, 0.3 * k, 0.0, 0.0, 0.0]) for k in range(4)]

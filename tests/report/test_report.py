@@ -122,6 +122,7 @@ def test_undetermined_is_a_word_and_minus_a_minus() -> None:
 # ---- pictures
 
 
+@pytest.mark.slow
 def test_crops_show_the_ghost_at_the_design_place_and_the_arrow_where_it_points(
     model: Model, found: Inspection, reconstruction: MetricReconstruction
 ) -> None:
@@ -199,6 +200,7 @@ def test_photos_that_are_gone_are_named(
 # ---- the page
 
 
+@pytest.mark.slow
 def test_the_page_holds_all_and_needs_no_network(
     source: Path, part: Part, patched: None, tmp_path: Path, found: Inspection
 ) -> None:
@@ -303,6 +305,7 @@ def _decoded(pack: dict[str, Any]) -> Array:
     return np.asarray(whole * np.array(pack["step"]) + pack["low"])
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="there is no chromium")
 def test_the_view_works_from_a_file(source: Path, part: Part, patched: None, tmp_path: Path) -> None:
@@ -323,6 +326,7 @@ def test_the_view_works_from_a_file(source: Path, part: Part, patched: None, tmp
 # ---- paper
 
 
+@pytest.mark.slow
 def test_the_pdf(source: Path, part: Part, patched: None, tmp_path: Path) -> None:
     pypdf = pytest.importorskip("pypdf")
     paper = tmp_path / "report.pdf"

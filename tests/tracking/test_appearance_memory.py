@@ -61,6 +61,7 @@ def moved(azimuth: float, elevation: float, rng: np.random.Generator) -> Array:
     return pose
 
 
+@pytest.mark.slow
 def test_kept_sides_are_found_anywhere_in_other_scenes_and_light() -> None:
     memory, rng = six_sides(), np.random.default_rng(5)
     assert len(memory) == len(SIDES)
@@ -74,6 +75,7 @@ def test_kept_sides_are_found_anywhere_in_other_scenes_and_light() -> None:
     assert right >= 16
 
 
+@pytest.mark.slow
 def test_a_search_near_the_last_pose_is_fast() -> None:
     memory, rng = taught(SIDES), np.random.default_rng(6)
     for azimuth in range(-75, 76, 10):
@@ -150,6 +152,7 @@ def test_the_silhouette_is_that_of_the_part() -> None:
     assert cropper.crop(picture(None, scene=2), far) is None
 
 
+@pytest.mark.slow
 def test_no_pose_is_accepted_without_the_part() -> None:
     options = SessionOptions(eager_frames=0, search_every=1000)
     session = TrackingSession(assembly_views(), CAMERA, assembly(), options)
@@ -165,6 +168,7 @@ def test_no_pose_is_accepted_without_the_part() -> None:
         assert session.process(image, k, 0.0).cam_from_model is None
 
 
+@pytest.mark.slow
 def test_a_lost_part_is_found_by_its_appearance() -> None:
     found = {}
     for use_appearance_memory in (True, False):

@@ -210,6 +210,7 @@ def test_a_session_says_what_the_detector_rejected() -> None:
     assert result.reason == "too far: about 820 mm, declared up to 640 mm"
 
 
+@pytest.mark.slow
 def test_a_lost_part_keeps_the_reason_of_its_loss() -> None:
     session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=TRUTH)
     reasons: list[str] = []

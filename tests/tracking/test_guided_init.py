@@ -168,6 +168,7 @@ def test_guides_of_a_part_file(tmp_path: Path) -> None:
 # --- Guided initialisation ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_part_is_found_within_15_degrees_and_15_percent() -> None:
     rng = np.random.default_rng(21)
     found_count = 0
@@ -184,6 +185,7 @@ def test_the_part_is_found_within_15_degrees_and_15_percent() -> None:
     assert found_count >= 9
 
 
+@pytest.mark.slow
 def test_nothing_is_found_without_the_part_or_when_it_is_far_away() -> None:
     rng = np.random.default_rng(22)
     for k in range(20):
@@ -249,6 +251,7 @@ def aligning(count: int) -> list[Array]:
     return poses
 
 
+@pytest.mark.slow
 def test_the_session_waits_for_the_part_and_tracks_it() -> None:
     session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     poses = aligning(16)
@@ -269,6 +272,7 @@ def test_the_session_waits_for_the_part_and_tracks_it() -> None:
         assert mm < 3.0 and deg < 1.0
 
 
+@pytest.mark.slow
 def test_the_outline_comes_back_when_a_lost_part_is_not_found_for_long() -> None:
     options = SessionOptions(align_again_frames=4)
     session = TrackingSession(assembly_views(), CAMERA, assembly(), options, guide_cam_from_model=GUIDE)

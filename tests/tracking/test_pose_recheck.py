@@ -46,6 +46,7 @@ def stuck(image: NDArray[np.uint8], cam_from_model: Array) -> Array:
     return local().refiner.refine_fresh(image, gray, in_body(cam_from_model), LAST_STAGES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [3.0, 12.0])
 def test_a_wrong_pose_is_replaced(noise: float) -> None:
     rng = np.random.default_rng(4)
@@ -65,6 +66,7 @@ def test_a_wrong_pose_is_replaced(noise: float) -> None:
     assert mended >= 0.9 * tried
 
 
+@pytest.mark.slow
 def test_a_right_pose_is_kept() -> None:
     rng = np.random.default_rng(5)
     for k in range(10):
@@ -146,6 +148,7 @@ def follow(
     return errors
 
 
+@pytest.mark.slow
 def test_it_is_run_only_for_poses_far_from_the_prediction() -> None:
     watched = Watched(local())
     errors = follow(SLOW, watched, 4.0)
@@ -155,6 +158,7 @@ def test_it_is_run_only_for_poses_far_from_the_prediction() -> None:
     assert watched.asked == 1 and errors[-1][2] < 1.0
 
 
+@pytest.mark.slow
 def test_a_part_half_hidden_that_turns_in_jerks_is_followed_better_with_it() -> None:
     """The part turns by 8° to 14° and moves by 20 mm per frame in random directions, which no prediction follows."""
     rng = np.random.default_rng(11)

@@ -63,6 +63,7 @@ def follow(
 # --- Accuracy -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name,median,worst",
     [
@@ -81,6 +82,7 @@ def test_accuracy_of_each_modality(name: str, median: tuple[float, float], worst
     assert min(e.quality for e in estimates) > 0.9
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_exposure_is_followed() -> None:
     images = [picture(pose, seed=i, gain=0.6 if 15 <= i < 30 else 1.0) for i, pose in enumerate(PATH)]
     for name, worst_mm, worst_deg in (("all", 0.8, 0.2), ("edge", 0.9, 0.3), ("region", 10.0, 2.0)):
@@ -93,6 +95,7 @@ def test_a_jump_of_the_exposure_is_followed() -> None:
         assert min(e.quality for e in estimates) > 0.8
 
 
+@pytest.mark.slow
 def test_half_of_the_part_may_be_hidden() -> None:
     images = [picture(p, seed=i, card=half_hidden(p) if i >= 10 else None) for i, p in enumerate(PATH)]
     _, _, errors = follow(images, PATH)
@@ -102,6 +105,7 @@ def test_half_of_the_part_may_be_hidden() -> None:
     assert errors[:, 2].max() < 1.5
 
 
+@pytest.mark.slow
 def test_another_background_and_strong_noise() -> None:
     images = [picture(p, seed=i, scene=4, noise=12.0) for i, p in enumerate(PATH)]
     _, _, errors = follow(images, PATH)
@@ -122,6 +126,7 @@ def test_a_start_that_is_off_is_pulled_in() -> None:
     assert np.mean([mm < 2.0 and deg < 0.5 for mm, _, deg in ends]) >= 0.9
 
 
+@pytest.mark.slow
 def test_a_part_that_moved_far_between_frames_is_found() -> None:
     """20° to 35° and up to a quarter of the diameter sideways in one frame; the next frames need no search."""
     rng = np.random.default_rng(3)
@@ -139,6 +144,7 @@ def test_a_part_that_moved_far_between_frames_is_found() -> None:
     assert right >= 11
 
 
+@pytest.mark.slow
 def test_a_part_that_moved_a_tenth_of_its_size_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """6° to 10° and 16 to 30 mm in one frame, with noise: stages in which colours lead reach it (27 of 30, without
     them 1)."""
@@ -175,12 +181,14 @@ def squared_distances(tracker: Tracker, estimates: list[Estimate], truths: list[
     return np.array(values)
 
 
+@pytest.mark.slow
 def test_covariance_covers_the_errors_of_a_real_camera() -> None:
     images = [picture(p, camera=REAL_CAMERA, seed=i, noise=4.0, scene=2) for i, p in enumerate(PATH)]
     tracker, estimates, _ = follow(images, PATH)
     assert 0.2 < np.median(squared_distances(tracker, estimates, PATH[1:])) < 5.0
 
 
+@pytest.mark.slow
 def test_covariance_is_never_too_small_on_ideal_pictures_and_grows_with_hiding() -> None:
     tracker, estimates, _ = follow(clip(), PATH)
     distances = squared_distances(tracker, estimates, PATH[1:])
@@ -247,6 +255,7 @@ def hidden_run() -> tuple[list[Pose], list[Array]]:
     return results, poses
 
 
+@pytest.mark.slow
 def test_a_hidden_part_is_lost_and_found_again() -> None:
     results, poses = hidden_run()
     states = [result.state for result in results]
@@ -273,6 +282,7 @@ def test_no_wrong_pose_is_ever_called_tracked() -> None:
             assert deg < 5.0
 
 
+@pytest.mark.slow
 def test_there_is_no_pose_without_the_part() -> None:
     results, _ = hidden_run()
     assert sum(result.state == TrackingState.LOST for result in results) > 20
@@ -294,6 +304,7 @@ def test_there_is_no_pose_without_the_part() -> None:
     assert (white.cam_from_model, white.reason) == (None, "overexposed")
 
 
+@pytest.mark.slow
 def test_a_part_that_leaves_the_picture_is_lost() -> None:
     session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=PATH[0])
     states = []

@@ -69,6 +69,7 @@ def tries(folder: Path) -> dict[str, list[str]]:
     return {path.stem: path.read_text().split() for path in sorted(folder.glob("*.tries"))}
 
 
+@pytest.mark.slow
 def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
     serial = [run_job(one, LIGHT) for one in batch(tmp_path / "in", str(tmp_path / "serial"))]
     assert [one.verdict for one in serial] == ["pass"] * 5 + ["undecided"] + ["fail"] * 6
@@ -94,6 +95,7 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
     assert [(one.name, one.inspection_sha256) for one in again] == [(one.name, one.inspection_sha256) for one in found]
 
 
+@pytest.mark.slow
 def test_what_kills_every_worker_stops_only_itself(tmp_path: Path) -> None:
     def deadly(job: InspectJob, folder: Path) -> tuple[str, str]:
         if job.serial == "P-01":
