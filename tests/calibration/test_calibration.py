@@ -221,6 +221,7 @@ def test_a_folder_of_photos(photos: Path) -> None:
     assert draw(result)[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+@pytest.mark.slow
 def test_blur_and_noise(pictures: list[np.ndarray]) -> None:
     """Half the contrast, twice the noise, edges three times as soft: five times less exact, and U says so."""
     rng = np.random.default_rng(9)
@@ -342,6 +343,7 @@ def test_another_board_is_named(spec: str, expected: str, pictures: list[np.ndar
         calibrate([tmp_path], parse_board(spec))
 
 
+@pytest.mark.slow
 def test_another_size_of_squares_gives_the_same_camera(pictures: list[np.ndarray]) -> None:
     """Lengths on the board scale the distance and nothing else; a wrong share of the markers hardly matters."""
     cameras = []

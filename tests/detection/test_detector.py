@@ -119,6 +119,7 @@ def test_the_part_is_found_over_the_full_sphere_and_all_rolls() -> None:
     assert wrong_ones == 0
 
 
+@pytest.mark.slow
 def test_what_was_rejected_is_told() -> None:
     seen = detector()
     assert seen.detect(picture(None, seed=1, scene=21)) == []
@@ -137,6 +138,7 @@ def test_symmetries_are_discovered() -> None:
     assert len(find_rotational_symmetries(assembly_views()).near) == 0
 
 
+@pytest.mark.slow
 def test_fifths_are_discovered() -> None:
     angles = np.deg2rad(72.0 * np.arange(5) + 10.0)
     grey = (0.5, 0.5, 0.5)

@@ -52,6 +52,7 @@ def test_solids_depend_only_on_their_seed() -> None:
     assert one.diameter_mm != other.diameter_mm
 
 
+@pytest.mark.slow
 def test_a_near_symmetric_solid_is_symmetric_but_for_a_few_features() -> None:
     seen = 0
     for seed in SEEDS:

@@ -80,6 +80,7 @@ def test_the_link_brings_the_page_and_the_cookie(server: Running) -> None:
     assert "server" not in headers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path", ["/", "/watch", "/api/part", "/api/model.glb", "/static/index.html", "/watch.mjpg", "/x"]
 )

@@ -346,6 +346,7 @@ def test_inspection_file_keeps_the_last_good_one(tmp_path: Path, model: Model) -
     assert not file.reload() and file.notices() == []  # the same content: nothing new to show
 
 
+@pytest.mark.slow
 def test_inspection_that_is_old_or_of_another_part_is_told(tmp_path: Path, model: Model) -> None:
     path = tmp_path / "inspection.json"
     good = load_inspection(INSPECTION)

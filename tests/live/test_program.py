@@ -25,6 +25,8 @@ from arview.video import open_source
 from helpers.live_client import Http
 from helpers.live_sample import CAMERA, CLIP, INSPECTION, PART
 
+pytestmark = pytest.mark.slow  # each test starts the program
+
 LINK = re.compile(r"(https?)://127\.0\.0\.1:(\d+)/\?token=(\S+)")
 
 
@@ -68,7 +70,6 @@ def free_port() -> int:
         return port
 
 
-@pytest.mark.slow
 def test_it_serves_until_ctrl_c_and_finishes_the_recording(tmp_path: Path) -> None:
     arguments = ["--part", str(PART), "--inspection", str(INSPECTION), "--camera", str(CAMERA), "--source", str(CLIP)]
     with program(tmp_path, *arguments, "--http", "--port", str(free_port()), "--record", "out.mp4") as process:
@@ -92,7 +93,6 @@ def test_it_serves_until_ctrl_c_and_finishes_the_recording(tmp_path: Path) -> No
     assert len(shown) >= 1 and shown[0].image.shape == (720, 1280, 3)
 
 
-@pytest.mark.slow
 def test_https_is_the_default_and_sigterm_ends_it_too(tmp_path: Path) -> None:
     with program(tmp_path, "--part", str(PART), "--host", LOOPBACK, "--port", str(free_port())) as process:
         assert link(process)[0] == "https"
@@ -106,7 +106,6 @@ def test_https_is_the_default_and_sigterm_ends_it_too(tmp_path: Path) -> None:
     assert (tmp_path / "data" / "tls" / "authority.key").stat().st_mode & 0o777 == 0o600
 
 
-@pytest.mark.slow
 def test_a_part_that_cannot_be_read_ends_it_with_one_line(tmp_path: Path) -> None:
     (tmp_path / "part.toml").write_text("[part]\ncad = 'gone.step'\n")
     with program(tmp_path, "--part", "part.toml", "--http", "--port", str(free_port())) as process:
@@ -151,7 +150,6 @@ def test_wrong_options_give_one_line(arguments: list[str], word: str) -> None:
     assert result.exit_code == 64 and word in result.stderr and "Traceback" not in result.stderr
 
 
-@pytest.mark.slow
 def test_wrong_inspection_camera_or_guide_end_it_with_one_line(tmp_path: Path) -> None:
     (tmp_path / "inspection.json").write_text("{}")
     (tmp_path / "camera.json").write_text("{")

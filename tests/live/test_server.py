@@ -131,6 +131,7 @@ def test_reset_searches_again(page: Http) -> None:
     assert hub_feed == 200 and answer["state"] == "tracked" and errors(answer, truth()[COUNT - 1])[0] < 3.0
 
 
+@pytest.mark.slow
 def test_snapshot_of_a_held_frame_with_all_about_it(page: Http) -> None:
     name = page.join()
     send(page, name, 3)
@@ -151,6 +152,7 @@ def test_snapshot_of_a_held_frame_with_all_about_it(page: Http) -> None:
     assert newest["frame_id"] == 17
 
 
+@pytest.mark.slow
 def test_recording_from_the_page(page: Http) -> None:
     name = page.join()
     send(page, name, 0)
@@ -199,6 +201,7 @@ def test_model_glb_holds_the_cad_in_mm(page: Http, phones: Running) -> None:
         np.testing.assert_allclose(lines.bounds, component.bounds_in_model, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_too_many_pages_are_told_so_and_a_reload_is_not_one(page: Http, phones: Running) -> None:
     names = [page.join() for _ in range(3)]
     status, refused = page.json("POST", "/api/clients", {"transport": "jpeg"})
@@ -210,6 +213,7 @@ def test_too_many_pages_are_told_so_and_a_reload_is_not_one(page: Http, phones: 
     assert len(phones.hub.clients) == 2
 
 
+@pytest.mark.slow
 def test_one_picture_in_flight(phones: Running, page: Http) -> None:
     name = page.join()
     client = phones.hub.clients[name]
@@ -220,6 +224,7 @@ def test_one_picture_in_flight(phones: Running, page: Http) -> None:
     assert send(page, name, 0)[0] == 200
 
 
+@pytest.mark.slow
 def test_phone_of_another_shape_is_refused_in_words(page: Http) -> None:
     """The camera file is for 16:9, so 4:3 pictures are refused."""
     name = page.join()
@@ -290,12 +295,14 @@ def test_part_is_aligned_with_a_guide_view_when_asked_for() -> None:
             assert yellow > 500
 
 
+@pytest.mark.slow
 def test_old_inspection_and_guessed_camera_are_told() -> None:
     chosen = options(camera=None, max_age_s=60.0)
     with running(chosen, loader(chosen)) as server:
         assert codes(server.session()) == ["inspection_old", "camera_guessed"]
 
 
+@pytest.mark.slow
 def test_pages_wait_while_the_part_is_loaded() -> None:
     chosen = options()
 

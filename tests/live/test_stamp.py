@@ -60,6 +60,7 @@ def test_layout_is_as_the_page_draws_it() -> None:
     assert "".join(map(str, cells)) == bits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), SIZES)
 @pytest.mark.parametrize("scale", [1.0, 0.75, 2 / 3, 0.5, 1 / 3])
 def test_stamp_survives_scaling(width: int, height: int, scale: float) -> None:
@@ -83,6 +84,7 @@ def test_stamp_survives_encoders_at_a_low_rate(codec: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_noise_and_damage_give_no_number_rather_than_a_wrong_one() -> None:
     rng = np.random.default_rng(1)
     for _ in range(300):

@@ -23,6 +23,8 @@ from arview.video.sources import check_source
 from helpers.live_client import Http, Running, running, wait
 from helpers.live_sample import HEIGHT, WIDTH, errors, frames, loader, options, there_and_back, truth
 
+pytestmark = pytest.mark.slow  # a camera that plays in real time
+
 
 class Cable(FrameSource):
     """A live camera that can be unplugged, plugged in again, and can freeze."""
@@ -85,7 +87,6 @@ def newest(page: Http, name: str, after: int = -1) -> tuple[dict[str, Any], Imag
     return json.loads(headers["x-arview-answer"]), from_jpeg(content)
 
 
-@pytest.mark.slow
 def test_file_is_played_and_all_pages_see_its_poses(playing: Running) -> None:
     page, other = playing.session(), playing.session()
     name, other_name = page.join(), other.join(mode="video")
@@ -143,7 +144,6 @@ def test_screens_that_watch_get_motion_jpeg_and_only_so_many(playing: Running) -
     wait(lambda: playing.hub.watchers == 0)
 
 
-@pytest.mark.slow
 def test_twenty_pages_show_one_station(clip: Path) -> None:
     """Each page gets plain or annotated pictures; each picture is drawn and encoded once."""
     from concurrent.futures import ThreadPoolExecutor
@@ -168,7 +168,6 @@ def test_twenty_pages_show_one_station(clip: Path) -> None:
         assert server.session().json("POST", "/api/clients", {"transport": "jpeg"})[0] == 503
 
 
-@pytest.mark.slow
 def test_camera_that_breaks_is_told_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     cable = Cable()
     monkeypatch.setattr(station, "open_source", cable.open)
@@ -196,7 +195,6 @@ def test_camera_that_breaks_is_told_and_comes_back(monkeypatch: pytest.MonkeyPat
         wait(lambda: said() == ("live", []))
 
 
-@pytest.mark.slow
 def test_a_stream_over_http_is_killed_and_served_again(clip: Path) -> None:
     """A real connection: an MPEG-TS server on the loopback interface that is closed in the middle and restarted."""
     content = _mpegts(clip)
@@ -222,7 +220,6 @@ def test_a_stream_over_http_is_killed_and_served_again(clip: Path) -> None:
         stream.stop()
 
 
-@pytest.mark.slow
 def test_recording_of_a_station_from_the_start(clip: Path, tmp_path: Path) -> None:
     chosen = options(source=str(clip), max_age_s=None, record=tmp_path / "out.mp4", record_folder=tmp_path)
     with running(chosen, loader(chosen)) as server:

@@ -25,6 +25,8 @@ from arview.live.transport.webrtc import _checked_offer, _with_bitrates
 from helpers.live_client import Camera, Phone, Running, running
 from helpers.live_sample import HEIGHT, WIDTH, errors, frames, loader, nearest, options, there_and_back, truth
 
+pytestmark = pytest.mark.slow  # phones that connect and stream
+
 FPS = 15.0
 
 
@@ -45,7 +47,6 @@ def index_of(frame_id: int, first_id: int = 0) -> int:
     return order[(frame_id - first_id) % len(order)]
 
 
-@pytest.mark.slow
 def test_poses_are_those_of_the_very_frame_and_come_soon(phones: Running) -> None:
     async def go() -> Phone:
         async with Phone(phones.session(), camera()) as phone:
@@ -73,7 +74,6 @@ def test_poses_are_those_of_the_very_frame_and_come_soon(phones: Running) -> Non
     assert not phone.shown  # poses only: no picture comes back to a phone
 
 
-@pytest.mark.slow
 def test_annotated_video_comes_back_with_the_ids_of_its_frames(phones: Running) -> None:
     async def go() -> Phone:
         async with Phone(phones.session(), camera(), mode="video") as phone:
@@ -101,7 +101,6 @@ def test_annotated_video_comes_back_with_the_ids_of_its_frames(phones: Running) 
     assert np.median(waited_ms) < 2000
 
 
-@pytest.mark.slow
 def test_station_sends_its_plain_picture_with_ids_and_poses(tmp_path_factory: pytest.TempPathFactory) -> None:
     from arview.video import VideoSink
 
@@ -132,7 +131,6 @@ def test_station_sends_its_plain_picture_with_ids_and_poses(tmp_path_factory: py
     assert drawn.mean() > 0.04
 
 
-@pytest.mark.slow
 def test_frames_that_arrive_scaled_keep_their_poses_and_are_told(phones: Running) -> None:
     """A browser with little bandwidth sends smaller pictures of the same frames."""
 
@@ -174,7 +172,6 @@ def test_a_page_that_hides_its_addresses_is_reached_all_the_same(phones: Running
     assert asyncio.run(go()).answers
 
 
-@pytest.mark.slow
 def test_a_second_phone_has_its_own_session(phones: Running) -> None:
     async def go() -> tuple[Phone, Phone]:
         async with Phone(phones.session(), camera()) as one, Phone(phones.session(), camera(500)) as two:

@@ -150,6 +150,7 @@ def test_a_scan_alone_against_truth(inspected: tuple[Inspection, Path, str, int]
     assert any("a cloud without photos" in warning for warning in inspection.warnings)
 
 
+@pytest.mark.slow
 def test_foreign_object_and_distance_map(inspected: tuple[Inspection, Path, str, int]) -> None:
     inspection, folder, output, _ = inspected
     assert len(inspection.foreign_objects) == 1

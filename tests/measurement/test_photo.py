@@ -19,6 +19,8 @@ from helpers import photo_scene
 from helpers.photo_scene import CAMERA, bench, photograph, ring
 from helpers.synthetic import post
 
+pytestmark = pytest.mark.slow  # components measured in ten photos
+
 BLOCKS = ("block_1", "block_2", "block_3", "block_4")
 METHODS: tuple[Method, ...] = ("sweep", "edges")
 
@@ -80,7 +82,6 @@ def textured() -> tuple[PhotoViews, dict[str, dict[Method, Move | NotMeasured]]]
     return views, measure_components_in_photos(views, None, NOMINAL, names=(*BLOCKS, "post"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", BLOCKS[:3])
 def test_displaced_blocks(name: str, method: Method) -> None:
@@ -133,7 +134,6 @@ def painted() -> dict[str, dict[Method, Move | NotMeasured]]:
     return measure_components_in_photos(views, None, NOMINAL, names=BLOCKS)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", BLOCKS[:3])
 def test_without_texture_edges_still_measure(name: str) -> None:
     sweep, edges = painted()[name]["sweep"], painted()[name]["edges"]

@@ -19,6 +19,8 @@ from arview.reconstruction.dense import Cad, DenseOptions, read_map, read_ply, r
 from arview.reconstruction.types import DenseCloud, PosedPhoto, SparseModel
 from arview.rendering.rasterizer import rasterise
 
+pytestmark = pytest.mark.slow  # depth maps of all views
+
 CAMERA = Camera(400, 300, 520.0, 520.0, 199.5, 149.5, np.array([-0.06, 0.01, 0.0, 0.0, 0.0]))
 PLATE, BOX = (120.0, 90.0, 8.0), (36.0, 26.0, 22.0)
 MOVED_MM = np.array([1.2, -0.8, 0.0])
@@ -128,7 +130,6 @@ def _score(cloud: DenseCloud, scene: SparseModel, **limits: float) -> object:
     return score_cloud(cloud.points, vertices, faces, cameras, **limits)
 
 
-@pytest.mark.slow
 def test_cloud_lies_on_what_was_built(cloud: DenseCloud, scene: SparseModel) -> None:
     # A pixel is 0.5 mm wide there, one of the depth maps 1 mm.
     score = _score(cloud, scene, near_mm=1.0)
@@ -150,14 +151,12 @@ def test_normals_colors_and_deviations_are_right(cloud: DenseCloud) -> None:
     assert np.corrcoef(truth, cloud.colors[on_plate, 0])[0, 1] > 0.9
 
 
-@pytest.mark.slow
 def test_cad_does_not_pull_a_displaced_component(cloud: DenseCloud, scene: SparseModel, nominal: Cad) -> None:
     without = reconstruct_dense(scene, replace(TINY, cad_hypotheses=False), nominal)
     assert np.abs(_box_place(cloud) - MOVED_MM[:2]).max() < 0.05
     assert np.abs(_box_place(without) - _box_place(cloud)).max() < 0.02
 
 
-@pytest.mark.slow
 def test_without_cad_the_sparse_points_do(scene: SparseModel) -> None:
     cloud = reconstruct_dense(scene, TINY)
     score = _score(cloud, scene, near_mm=1.0)
@@ -166,7 +165,6 @@ def test_without_cad_the_sparse_points_do(scene: SparseModel) -> None:
     assert score.complete > 0.75
 
 
-@pytest.mark.slow
 def test_same_seed_same_cloud_whatever_the_threads(cloud: DenseCloud, scene: SparseModel, nominal: Cad) -> None:
     again = reconstruct_dense(scene, replace(TINY, threads=1), nominal)
     assert again.points.shape == cloud.points.shape
@@ -174,7 +172,6 @@ def test_same_seed_same_cloud_whatever_the_threads(cloud: DenseCloud, scene: Spa
     assert np.array_equal(again.views, cloud.views)
 
 
-@pytest.mark.slow
 def test_no_texture_no_points(tmp_path: Path, nominal: Cad, cloud: DenseCloud) -> None:
     blank = reconstruct_dense(_scene(tmp_path / "blank", has_texture=False), TINY, nominal)
     assert len(blank.points) < 0.001 * len(cloud.points)
@@ -262,7 +259,6 @@ def test_distances_to_mesh_are_exact() -> None:
     assert distances_to_mesh(corner, vertices, faces)[0] == pytest.approx(13.0, abs=1e-3)
 
 
-@pytest.mark.slow
 def test_score_counts_what_is_missing_and_what_is_off(scene: SparseModel) -> None:
     vertices, faces, _ = _model(MOVED_MM).mesh
     samples, _ = sample_mesh(vertices, faces, 0.3, seed=5)

@@ -301,6 +301,7 @@ def test_wrong_board_size_is_noticed_and_absent_targets_are_named() -> None:
     assert nothing.scale is None and nothing.evidence == () and len(nothing.warnings) == 1
 
 
+@pytest.mark.slow
 def test_an_outlying_photo_does_not_move_the_board() -> None:
     poses, pictures = target_scene()
     sparse = sparse_of(poses, LENS)
@@ -458,6 +459,7 @@ def test_absent_part_gives_no_frame_and_no_scale() -> None:
     assert result.evidence == () and result.why_no_frame and result.provenance()["mm_per_unit"] is None
 
 
+@pytest.mark.slow
 def test_one_photo_is_too_few() -> None:
     poses, pictures = assembly_photos()
     result = find(sparse_of(poses[:1], PLAIN), part_of(assembly(), "plate"), pictures=pictures)

@@ -19,6 +19,8 @@ from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
 from arview.reconstruction.types import Photo, SparseModel
 from helpers.photo_scene import CAMERA, Picture, bench, photograph, ring, write_photos
 
+pytestmark = pytest.mark.slow  # features and matches of all photos
+
 OPTIONS = SparseOptions(features=FeatureOptions(max_features=2500), first_features=1500, threads=2)
 GUESS = Camera(CAMERA.width, CAMERA.height, 768.0, 768.0, CAMERA.cx, CAMERA.cy)
 
@@ -53,7 +55,6 @@ def placed(paths: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple
     return reconstruct_sparse(photos_of(paths), folder, OPTIONS), folder
 
 
-@pytest.mark.slow
 def test_cameras_and_points_against_truth(placed: tuple[SparseModel, Path], paths: list[Path]) -> None:
     sparse, _ = placed
     truth = {path.name: pose for path, pose in zip(paths, ring(12), strict=True)}
@@ -86,13 +87,11 @@ def test_covariance_tells_the_size_of_the_errors(placed: tuple[SparseModel, Path
     assert 0.3 < np.sqrt(np.mean(errors_mm**2) / np.mean(variances)) < 3.0
 
 
-@pytest.mark.slow
 def test_same_seed_same_model(placed: tuple[SparseModel, Path], paths: list[Path], tmp_path: Path) -> None:
     again = reconstruct_sparse(photos_of(paths), tmp_path, OPTIONS)
     assert np.allclose(again.points_in_scan, placed[0].points_in_scan, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_calibrated_camera_is_left_as_it_is(paths: list[Path], tmp_path: Path) -> None:
     sparse = reconstruct_sparse(photos_of(paths, CAMERA, is_calibrated=True), tmp_path, OPTIONS)
     assert len(sparse.photos) == 12
@@ -100,7 +99,6 @@ def test_calibrated_camera_is_left_as_it_is(paths: list[Path], tmp_path: Path) -
     assert np.allclose(sparse.photos[0].camera.dist, CAMERA.dist)
 
 
-@pytest.mark.slow
 def test_photos_of_another_part_are_named(paths: list[Path], tmp_path: Path) -> None:
     others = [photograph(bench(9), pose, seed=77) for pose in ring(12)[:5]]
     mixed = photos_of([*paths, *write_photos(tmp_path / "other", others, "other")])
@@ -118,7 +116,6 @@ def test_no_texture_is_said(tmp_path: Path) -> None:
         reconstruct_sparse(photos_of(write_photos(tmp_path, walls)), tmp_path / "sparse", OPTIONS)
 
 
-@pytest.mark.slow
 def test_photos_with_nothing_in_common_are_refused(tmp_path: Path) -> None:
     strangers = [photograph(bench(i), ring(12)[3 * i], seed=i) for i in range(4)]
     with pytest.raises(CannotMeasureError, match="in common"):

@@ -271,6 +271,7 @@ def test_a_hidden_part_is_lost_and_found_again() -> None:
     assert deg.max() < 1.0
 
 
+@pytest.mark.slow
 def test_no_wrong_pose_is_ever_called_tracked() -> None:
     results, poses = hidden_run()
     assert sum(result.state == TrackingState.TRACKED for result in results) > 25

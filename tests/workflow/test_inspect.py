@@ -168,6 +168,7 @@ def test_bad_input_is_said_before_the_work(bench: Bench, monkeypatch: pytest.Mon
     assert "internal" not in found.stderr and found.stderr.strip()
 
 
+@pytest.mark.slow
 def test_what_is_finished_is_kept(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     assert bench.inspect().exit_code == 0 and bench.did == ["reconstruct", "measure"]
     out = bench.folder / "out"
@@ -200,6 +201,7 @@ def test_nothing_is_left_of_other_inputs(bench: Bench) -> None:
     assert bench.inspect().exit_code == 0 and bench.did == ["measure"]
 
 
+@pytest.mark.slow
 def test_the_film_goes_with_the_measurement(bench: Bench) -> None:
     clip = write_clip(bench.folder / "clip.mp4", [numbered(index) for index in range(5)])
     photos = ["--photos", str(bench.folder / "photos")]
