@@ -78,6 +78,7 @@ def test_displacements_against_truth(inspection: Inspection) -> None:
         assert place[:3, :3] @ center + place[:3, 3] - center == pytest.approx(found.displacement_mm, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_verdicts_and_findings(inspection: Inspection) -> None:
     verdicts = {component.name: component.verdict for component in inspection.components}
     assert verdicts["block_1"] is Verdict.FAIL  # 1.17 mm, 0.5 allowed
@@ -90,6 +91,7 @@ def test_verdicts_and_findings(inspection: Inspection) -> None:
     assert missing is not None and missing.finding is not None and missing.distance_mm is None
 
 
+@pytest.mark.slow
 def test_budget_and_datums(inspection: Inspection) -> None:
     measured = [c for c in inspection.components if c.distance_mm is not None and c.details is not None]
     assert {component.name for component in measured} == set(TRUTH)
@@ -125,6 +127,7 @@ def test_without_datums_the_base_is_the_frame(reconstruction: MetricReconstructi
     assert np.array(block.displacement_mm, dtype=float) == pytest.approx([1.0, -0.6, 0.0], abs=0.12)
 
 
+@pytest.mark.slow
 def test_a_datum_that_is_not_there(reconstruction: MetricReconstruction) -> None:
     filled = replace(part(), datums=(*part().datums[:2], replace(part().datums[2], point_in_model=(0.0, 40.0, 0.0))))
     with pytest.raises(InputError, match="datum C: 'plate' has no hole of ⌀16 mm about"):
@@ -138,6 +141,7 @@ def _views(reconstruction: MetricReconstruction) -> Any:
     return run.load_views(reconstruction.sparse, nominal())
 
 
+@pytest.mark.slow
 def test_an_inconsistent_reconstruction_is_refused(reconstruction: MetricReconstruction) -> None:
     bad = replace(reconstruction, scale=replace(reconstruction.scale, consistency=Consistency(False, "bent")))
     with pytest.raises(InputError, match="bent; take other photos"):
@@ -185,6 +189,7 @@ def test_datums_of_a_part_file(tmp_path: Path) -> None:
 # --- the command -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command(inspection: Inspection, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: list[MeasureOptions] = []
 

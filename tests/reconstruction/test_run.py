@@ -101,6 +101,7 @@ def test_scale_and_frame_come_from_the_cad(found: Reconstruction) -> None:
     assert found.scale is not None and found.scale.consistency.is_consistent
 
 
+@pytest.mark.slow
 def test_cloud_lies_on_the_part_as_built(found: Reconstruction) -> None:
     assert found.cloud is not None and len(found.cloud.points) > 3000
     scale_error, true_from_found = frame_error(found)
@@ -115,6 +116,7 @@ def test_cloud_lies_on_the_part_as_built(found: Reconstruction) -> None:
     assert abs(np.median(points[on_side, 0]) - high[0]) < 0.25
 
 
+@pytest.mark.slow
 def test_summary_holds_what_was_found(found: Reconstruction, folder: Path) -> None:
     content = json.loads((folder / "out" / "reconstruction.json").read_text())
     assert content["unit"] == "mm" and len(content["photos"]) == len(POSES)
@@ -134,6 +136,7 @@ def test_summary_holds_what_was_found(found: Reconstruction, folder: Path) -> No
         assert (folder / "out" / name).stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_finished_stages_are_read_not_repeated(
     found: Reconstruction, folder: Path, part: Part, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -377,6 +377,7 @@ def test_distances_are_read_back(model: Model, reconstruction: MetricReconstruct
         read_distance_ply(tmp_path / "cut.ply", 3.0, ())
 
 
+@pytest.mark.slow
 def test_evidence_is_in_the_datum_frame(source: Path, part: Part, patched: None, tmp_path: Path) -> None:
     evidence = gather(source, part, tmp_path)
     assert evidence.sparse is not None

@@ -205,6 +205,7 @@ def test_covariance_is_never_too_small_on_ideal_pictures_and_grows_with_hiding()
     assert np.linalg.det(unsure[3:, 3:]) > 2.0 * np.linalg.det(sure[3:, 3:])
 
 
+@pytest.mark.slow
 def test_quality_separates_right_from_wrong_poses() -> None:
     """Poses refined from wrong starts have a low quality, and the wide search finds the part from there."""
     rng = np.random.default_rng(5)
