@@ -206,7 +206,8 @@ def confidence_terms(
 
     Args:
         appearance: see `appearance_score`.
-        evidence: see `evidence_logit`; more reliable than ``appearance`` on parts unlike the training solids.
+        evidence: see `evidence_logit`; with the profile score more reliable than ``appearance`` on parts unlike the
+            training solids.
         profile: score of the profile rankers.
         contour: score of the contour verifier.
         margins: over other hypotheses; a right pose stands out, poses that fit by chance come in groups.

@@ -78,7 +78,7 @@ class GlobalSearchOptions:
         shift_px: range and step of the shifts tried with each change.
         distinct_px, distinct_rad, distinct_ratio: offset at the scale of the templates, rotation and distance ratio
             within which improved matches are duplicates.
-        response_weight: weight of the mean response beside the profile score, which sees neither all lines nor views.
+        response_weight: weight of the mean response beside the profile score when candidates are ranked.
     """
 
     radius_px: float = 20.0
@@ -130,7 +130,7 @@ class SearchBudget:
 
 
 QUICK = SearchBudget(matches=400, refined=200, ranked=100, starts=16, kept=(6, 4), scale_stride=2, is_trimmed=False)
-"""Enough for parts in plain sight before little clutter."""
+"""The first search of every image; half of the scales, few matches."""
 WIDE = SearchBudget(matches=2500, refined=1400, ranked=700, starts=160, kept=(60, 20), scale_stride=1, is_trimmed=True)
 """For clutter, in which thousands of wrong matches score higher than the right one, and for occluded parts."""
 GRADIENTS_ONLY = replace(WIDE, is_trimmed=False, use_edge_net=False)
