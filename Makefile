@@ -1,4 +1,4 @@
-# On a fresh machine: `make test`, `make demo`. Both make the environment in .venv first; the program is
+# On a fresh machine: `make test` or `make demo`. Every target first makes the environment in .venv, where the program is
 # .venv/bin/arview.
 SHELL := /bin/bash
 READY := .venv/.ready
@@ -9,20 +9,20 @@ PARALLEL := -n auto --dist loadgroup --no-loadscope-reorder
 .PHONY: help demo test test-fast check bench evaluate soak clean
 
 help:
-	@echo "make demo      inspect the sample plate by its photos: report and film in out/demo"
+	@echo "make demo      inspect the sample plate: report and annotated video in out/demo"
 	@echo "make test      formatting, linting, types, all tests: ten minutes on two cores"
 	@echo "make test-fast the quick tests of every room: a minute"
 	@echo "make check     formatting, linting, types"
 	@echo "make bench     measure speed: out/bench.json"
 	@echo "make evaluate  measure accuracy on the recorded sequences: out/evaluation.json, out/evaluation.md"
-	@echo "make soak      the live server for ten minutes: does its memory grow, do its frames get old?"
-	@echo "make clean     remove what these made, but for .venv"
+	@echo "make soak      run the live server for ten minutes, and check its memory and the age of frames"
+	@echo "make clean     remove what these targets made, except .venv"
 
 $(READY): pyproject.toml tools/setup
 	tools/setup
 	@touch $@
 
-# Four components of the sample stand wrong, so that arview's exit code is 1, fail: the demo is right only with that.
+# Four components of the sample are out of tolerance: arview must end with exit code 1, fail.
 demo: $(READY)
 	.venv/bin/arview inspect --part $(SAMPLE)/part.toml --photos $(SAMPLE)/photos --video $(SAMPLE)/clip.mp4 \
 	    -o out/demo; code=$$?; [ $$code -eq 1 ] || { echo "demo: exit code $$code, expected 1" >&2; exit 1; }

@@ -1,13 +1,13 @@
 """Makes the sample: the STEP file, the clip with its truth, and the example inspection.
 
     generate.py step                                   bracket_plate.step
-    generate.py clip --frames 0:300 --work DIR         PNG frames into DIR; skips those that are there
+    generate.py clip --frames 0:300 --work DIR         PNG frames into DIR; skips existing ones
     generate.py encode --work DIR                      clip.mp4 from the frames
     generate.py truth                                  truth.json
     generate.py inspection                             inspection.json (needs arview installed)
-    generate.py verify                                 how well the truth lies on the clip's edges, in px
+    generate.py verify                                 errors of the truth at the edges of the clip, px
 
-Everything is drawn from one seed. See README.md for the packages that each step needs.
+Everything is random by one seed. See README.md for the packages that each step needs.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def encode(work: Path, crf: int) -> None:
 
 
 def make_truth() -> None:
-    """Poses from the motion itself; visibility by rays against part, hand and card."""
+    """Truth of the clip: poses from the motion, and visibility by rays against part, hand and card."""
     import motion
     import scene
 
@@ -80,7 +80,7 @@ def make_truth() -> None:
         "out_of_picture": _spans(inside == 0),
         "partly_out_of_picture": _spans((inside < 0.999) & (inside > 0)),
     }
-    # One frame a line keeps the file short and a difference between two versions readable.
+    # One frame per line keeps the file short and differences between versions readable.
     head = {
         "part": "bracket_plate",
         "clip": "clip.mp4",
@@ -108,7 +108,7 @@ def _spans(flags: np.ndarray) -> list[list[int]]:
 
 
 def make_inspection() -> None:
-    """A hand-written example: the as-built truth with a measurement's noise put on, by a fixed seed."""
+    """An example inspection: the as-built truth with the noise of a measurement, by a fixed seed."""
     from datetime import UTC, datetime
 
     from arview.cad.part_file import load_part
@@ -129,7 +129,7 @@ def make_inspection() -> None:
         uncertainty = round(float(rng.uniform(0.10, 0.16)), 2)
         tolerance = part.component_settings(name).position_tolerance_mm
         assert tolerance is not None
-        # Accept within tolerance - U, reject beyond tolerance + U, undecided between.
+        # Pass up to tolerance - U, fail beyond tolerance + U, undecided between.
         verdict = Verdict.UNDECIDED
         if distance <= tolerance - uncertainty:
             verdict = Verdict.PASS

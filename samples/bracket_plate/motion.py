@@ -1,4 +1,4 @@
-"""The shot: where the hand-held camera, the hand and the card are at any time (frames, mid-exposure)."""
+"""Motion in the clip: poses of the hand-held camera, the hand and the card at any time (frames, mid-exposure)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from textures import smoothstep, turn_z
 
 FRAMES = 300
 FPS = 30
-# Frame spans of the shot's events; what is really visible is measured into truth.json.
+# Frame spans of the events in the clip; the visible share of each frame is measured and stored in truth.json.
 HAND = (52, 118)
 CARD = (132, 174)
 PAN = (198, 256)
@@ -25,7 +25,7 @@ def _tremor(t, seed: int, low_hz=0.4, high_hz=7.0):
 
 
 def _pulse(t, begin, end, ramp):
-    """0 outside the span, 1 inside, with smooth ramps of that many frames within it."""
+    """0 outside a span and 1 inside, with smooth ramps of some frames within it."""
     return smoothstep(t, begin, begin + ramp) * (1.0 - smoothstep(t, end - ramp, end))
 
 

@@ -24,13 +24,13 @@ APERTURE_MM = 1.1
 SAMPLES = 4  # path samples per pixel and frame, shared by the sub-frames (at least 1 each)
 EXPOSURE = 1.3
 
-# Measured-from-nominal of what is not at its place: translation (mm) and tilt about an own axis (deg).
+# As-built displacement of the displaced components: translation (mm) and tilt about an axis of their own (deg).
 AS_BUILT = {
     "post_1": {"translation_mm": [1.1, -0.7, 0.0], "tilt_deg": 0.0},
     "nut_1": {"translation_mm": [0.4, 0.3, 0.0], "tilt_deg": 0.0},
     "bracket_1": {"translation_mm": [0.0, 0.0, 0.0], "tilt_deg": 0.5},
 }
-# The bracket leans about the line of its wall on the plate: through this point, along this direction.
+# The bracket tilts about the line where its wall meets the plate: through this point, along this direction.
 BRACKET_PIVOT = np.array([-46.0, 26.0, 0.0])
 BRACKET_AXIS = np.array([np.cos(np.deg2rad(-20.0)), np.sin(np.deg2rad(-20.0)), 0.0])
 
@@ -94,7 +94,7 @@ def _part(shapes, rng):
 
 
 def _clutter(shapes, rng):
-    """Bench, walls and things that are not the part."""
+    """Bench, walls and clutter around the part."""
     floor = -10.0
     plain = component_meshes()
 
@@ -138,7 +138,7 @@ def _clutter(shapes, rng):
     add("bottle", tx.revolve(bottle, 64, (330, 205, floor)), paint((0.75, 0.50, 0.03)), crease=50)
     roll = [(26, 0), (44, 0), (44, 24), (26, 24), (26, 0)]
     add("tape_roll", tx.revolve(roll, 64, (170, 178, floor)), paint((0.60, 0.42, 0.20)))
-    # Size, place, turn and colour of boxes that lie about.
+    # Size, position, rotation and colour of boxes on the bench.
     things = [
         ((44, 22, 18), 212, 20, 35, (0.62, 0.04, 0.03)),
         ((52, 26, 22), -206, -40, 20, (0.04, 0.16, 0.55)),
@@ -221,7 +221,7 @@ class Shot:
         self.camera = camera
         self.scene = build(focal_px=camera["fx"])
         self.params = mi.traverse(self.scene)
-        # Two passes cost half of what one does in which the AOV integrator wraps the path tracer.
+        # Two passes take half the time of one in which the AOV integrator wraps the path tracer.
         self.light = mi.load_dict({"type": "path", "max_depth": 4, "rr_depth": 3})
         self.guides = mi.load_dict({"type": "aov", "aovs": "alb:albedo,nn:sh_normal"})
         self.rest = {}
@@ -231,7 +231,7 @@ class Shot:
         self.maps = undistortion_maps(camera, MARGIN_FILM)
 
     def pose_all(self, t: float) -> None:
-        """Place camera and occluders at time ``t`` (frames)."""
+        """Set the poses of camera and occluders at time ``t`` (frames)."""
         cam_from_model = motion.cam_from_model(t)
         place_occluders(self.params, self.rest, t)
         self.params["sensor.to_world"] = to_world(cam_from_model)
@@ -257,7 +257,7 @@ class Shot:
 
 
 def place_occluders(params, rest, t: float) -> None:
-    """Move hand and card to their place at time ``t``, or far below the floor."""
+    """Move hand and card to their poses at time ``t``, or far below the floor when they are away."""
     card = motion.card_in_cam(t)
     model_from_cam = np.linalg.inv(motion.cam_from_model(t))
     poses = {"hand": motion.hand_in_model(t), "card": None if card is None else model_from_cam @ card}
@@ -273,7 +273,7 @@ def place_occluders(params, rest, t: float) -> None:
 
 
 class Sight:
-    """Measures by rays how much of the part's silhouette a frame shows."""
+    """Measures the visible share of the part's silhouette in a frame by rays."""
 
     def __init__(self, camera: dict, rays: int = 240):
         self.camera = camera
@@ -291,7 +291,7 @@ class Sight:
         self.slopes = (np.arange(rays) + 0.5) / rays * 0.8 - 0.4
 
     def visible(self, index: int) -> dict[str, float]:
-        """Shares of the silhouette seen from the camera's place: ``in_picture``, and ``visible`` at that."""
+        """Shares of the silhouette inside the picture (``in_picture``), and also not occluded (``visible``)."""
         place_occluders(self.params, self.rest, index)
         self.params.update()
         cam_from_model = motion.cam_from_model(index)
@@ -319,7 +319,7 @@ class Sight:
 
 
 def subframes(camera: dict, index: int) -> int:
-    """How many sub-frames: enough that picture and card move at most about 3 px between two of them.
+    """Number of sub-frames, so that picture and card move by at most about 3 px between two of them.
 
     (The hand may move 7 px: it is soft enough for that.)
     """

@@ -1,9 +1,8 @@
-"""How well truth and camera lie on the clip: CAD edges projected, and the picture's edge sought beside them.
+"""Check of truth and camera against the clip: CAD edges are projected, and the nearest picture edges found.
 
-Per frame, points on the creases of the as-built components (those that no weld bead covers) are projected
-through pose, intrinsics and distortion; along each normal in the picture the position of the strongest
-gradient is found to a fraction of a pixel. The common shift says how far off the truth is, the median offset
-how crisp the picture is.
+In each frame, points on the creases of the as-built components, except those covered by weld beads, are projected by
+pose, intrinsics and distortion. Along the normal of each the strongest gradient of the picture is located to a fraction
+of a pixel. The common shift is the error of the truth, the median offset the sharpness of the picture.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ def verify(folder: Path, draw: Path | None, clip: Path | None = None) -> None:
     for index, picture in pictures.items():
         pose = np.array(truth[index]["cam_from_model"])
         start = points[:, 0]
-        # The depth test: a ray to a point pulled a little towards the camera must meet nothing.
+        # Depth test: the ray to a point slightly nearer to the camera must not hit anything.
         position = np.linalg.inv(pose)[:3, 3]
         toward = start - position
         reach = np.linalg.norm(toward, axis=1)

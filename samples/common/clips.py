@@ -1,4 +1,4 @@
-"""Clips: their frames as pictures in a folder, and these as MP4."""
+"""Clips: their frames as pictures in a folder, and the MP4 video of these."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def render(folder: Path, indices: Iterable[int], camera: Callable[[], Callable[[int], np.ndarray]]) -> None:
-    """Make the frames that a folder lacks. ``camera()`` gives what takes one, (H,W,3) BGR; called only if needed."""
+    """Render the missing frames of a folder; ``camera()``, called only if needed, returns the function of one frame."""
     import cv2
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -20,7 +20,7 @@ def render(folder: Path, indices: Iterable[int], camera: Callable[[], Callable[[
     take = camera()
     for index in missing:
         begin = time.process_time()
-        # Written under another name first, so that a cut-off run leaves no half picture behind.
+        # Written under another name first, so that an interrupted run leaves no incomplete picture.
         part = folder / f"{index:06d}.part.png"
         cv2.imwrite(str(part), take(index))
         part.replace(folder / f"{index:06d}.png")

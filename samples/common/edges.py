@@ -1,4 +1,4 @@
-"""How a sample's truth is checked: CAD edges projected into a picture, and its edges sought beside them."""
+"""Check of a sample's truth: CAD edges are projected into a picture, and the nearest edges of the picture found."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def gradient_offsets(picture, pixel, normal):
     at = pixel[:, None] + step[None, :, None] * normal[:, None]
     profile = cv2.remap(gray, at[..., 0].astype(np.float32), at[..., 1].astype(np.float32), cv2.INTER_CUBIC)
     slope = np.abs(np.gradient(profile, 0.25, axis=1))
-    # A peak far away counts less, or a neighbouring edge would win.
+    # A distant peak counts less, so that a neighbouring edge is not taken.
     score = slope * np.exp(-((step / 3.0) ** 2))
     best = np.clip(score.argmax(axis=1), 1, len(step) - 2)
     rows = np.arange(len(pixel))

@@ -17,7 +17,7 @@ def bitmap(array, raw: bool):
     data = np.ascontiguousarray(array, dtype=np.float32)
     if data.ndim == 2:
         data = data[..., None]
-    # Row 0 of a texture is its largest v here. Colours are given linear: nothing is decoded from sRGB.
+    # Row 0 of a texture is its largest v here. Colours are linear: nothing is decoded from sRGB.
     data = np.ascontiguousarray(data[::-1])
     return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": raw, "wrap_mode": "repeat"}
 
@@ -89,7 +89,7 @@ def mesh(name, vertices, faces, surface, tile_mm=(240.0, 240.0), offset_mm=(0.0,
 
 
 def page(name, surface, size, center, turn_deg):
-    """A flat sheet that shows its texture exactly once, turned with it."""
+    """A flat sheet that shows its texture exactly once, in its own orientation."""
     corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * (size[0] / 2, size[1] / 2, 0.0)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     sheet = mesh(name, corners @ tx.turn_z(turn_deg).T + np.asarray(center), faces, surface)
@@ -109,7 +109,7 @@ def lamp(origin, target, size, radiance):
 
 
 def sensor(film, focal_px, aperture_mm, focus_mm):
-    """A thin-lens camera without distortion on a film of (width, height) px; its place is set later."""
+    """A thin-lens camera without distortion on a film of (width, height) px; its pose is set later."""
     width, height = film
     return {
         "type": "thinlens",
@@ -128,12 +128,12 @@ def sensor(film, focal_px, aperture_mm, focus_mm):
 
 
 def to_world(cam_from_model):
-    """Mitsuba's place of an OpenCV camera: it looks along +Z too, but with +X to the left and +Y up."""
+    """The ``to_world`` matrix of Mitsuba for an OpenCV pose: both look along +Z, Mitsuba with +X left and +Y up."""
     return mi.Transform4f(np.linalg.inv(cam_from_model) @ np.diag([-1.0, -1.0, 1.0, 1.0]))
 
 
 def denoise(color, guide):
-    """Linear RGB (H,W,3) from a noisy one, with albedo and normals in the last six channels of ``guide``."""
+    """Denoise linear RGB (H,W,3), with albedo and normals in the last six channels of ``guide``."""
     import mitsuba_oidn
 
     color = np.minimum(np.nan_to_num(color), 30.0).astype(np.float32)
@@ -149,7 +149,7 @@ def denoise(color, guide):
 
 
 def undistortion_maps(camera: dict, film: tuple[int, int]):
-    """Where in the undistorted film each pixel of the distorted picture lies (cv2.remap maps)."""
+    """Position in the undistorted film of each pixel of the distorted picture, as maps for cv2.remap."""
     u, v = np.meshgrid(np.arange(camera["width"], dtype=np.float64), np.arange(camera["height"], dtype=np.float64))
     k1, k2, *others = camera["dist"]
     assert not any(others), "only radial distortion k1, k2 is rendered"

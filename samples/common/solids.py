@@ -1,4 +1,4 @@
-"""Simple solids and the STEP file: what the samples' CAD models share. Lengths in mm."""
+"""Simple solids and the STEP file of the samples' CAD models. Lengths in mm."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def ring(outer: float, inner: float, height: float) -> bd.Part:
 
 
 def write_step(path: Path, label: str, components) -> None:
-    """The (name, solid, colour) as STEP AP214 with product names, colours and millimetres."""
+    """Write (name, solid, colour) as STEP AP214 with product names, colours and millimetres."""
     children = []
     for name, shape, color in components:
         solid = shape.solid() if hasattr(shape, "solid") else shape
@@ -41,7 +41,7 @@ def write_step(path: Path, label: str, components) -> None:
 
 
 def tessellated(components, linear_mm: float = 0.02, angular_rad: float = 0.12) -> dict:
-    """Fine triangles of (name, solid, colour): name → vertices (V,3), faces (F,3)."""
+    """Finely tessellated (name, solid, colour): name → vertices (V,3), faces (F,3)."""
     meshes = {}
     for name, shape, _ in components:
         vertices, faces = shape.tessellate(linear_mm, angular_rad)

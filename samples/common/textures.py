@@ -1,4 +1,4 @@
-"""Procedural textures and meshes: everything the picture shows comes from numbers drawn here by seed.
+"""Procedural textures and meshes, from random numbers of a seed.
 
 Noise has a 1/f spectrum over the whole texture, so that nothing repeats on the bench or on the part:
 repeated structure is what leads reconstructions astray.
@@ -45,7 +45,7 @@ def scratches(height: int, width: int, count: int, rng, length=(20, 220), turn=n
 
 
 def specks(height: int, width: int, size_px: float, rng):
-    """Scattered spots of about that size (H, W) in 0–1, on some 5 % of the area."""
+    """Scattered spots (H, W) in 0–1 of about a given size, on some 5 % of the area."""
     noise = rng.normal(size=(height, width)).astype(np.float32)
     noise = cv2.GaussianBlur(noise, (0, 0), size_px)
     return smoothstep(noise / noise.std(), 1.5, 2.1)
@@ -98,7 +98,7 @@ def blued(height: int, width: int, rng):
 
 
 def zinc(height: int, width: int, rng):
-    """Yellow-passivated zinc: the colour of bought nuts."""
+    """Yellow-passivated zinc, the colour of standard nuts."""
     color, rough, bump = machined(height, width, rng)
     tint = fft_noise(height, width, 1.1, rng)
     color = color * _mix(np.ones((height, width, 3)) * (1.05, 0.92, 0.62), (0.95, 0.8, 0.75), tint)
@@ -139,7 +139,7 @@ def bench_top(width_mm: float, depth_mm: float, px_per_mm: float, rng, stamp: st
     bump = 0.4 * grain - 0.5 * lines
     if holes:
         color, rough = _drilled(color, rough, px_per_mm, rng)
-    # A felt-tip note and a strip of old tape, so that the bench has places one can tell apart.
+    # A felt-tip note and a strip of old tape, so that places of the bench can be distinguished.
     note = np.zeros((height, width), np.uint8)
     spots = [(0.36, 0.43), (0.62, 0.36), (0.70, 0.62), (0.27, 0.66)]
     for (u, v), text in zip(spots, (stamp, "do not move!", "M6x25", "CELL 3"), strict=True):
@@ -277,7 +277,7 @@ def hand(rng_seed: int = 5):
 
 
 def weld_bead(vertices, faces, rng):
-    """Weld beads round the footprint on z = 0 of a component (its as-built mesh): (vertices, faces)."""
+    """Weld beads around the footprint on z = 0 of an as-built component: (vertices, faces)."""
     vertices = np.asarray(vertices)
     merged, index = np.unique(np.round(vertices, 3), axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces]

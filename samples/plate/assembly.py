@@ -27,7 +27,7 @@ def _square_nut(side: float, height: float, hole: float) -> bd.Part:
 
 
 def _chamfered_block(x: float, y: float, z: float, chamfer: float) -> bd.Part:
-    """Block whose top edge along its +X side is cut."""
+    """Block with a chamfer along the top edge of its +X side."""
     block = box(x, y, z)
     edge = block.edges().filter_by(bd.Axis.Y).sort_by(lambda e: e.center().X + e.center().Z)[-1]
     return bd.chamfer(edge, chamfer)

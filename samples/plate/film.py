@@ -1,4 +1,4 @@
-"""The clip: a walk past the as-built plate of the photos, with the photos' lens in a smaller picture. Lengths in mm."""
+"""The clip: a walk past the as-built plate, with the lens of the photos at a smaller size. Lengths in mm."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from rendering import denoise, develop, sensor, to_world, undistortion_maps
 from scipy.spatial.transform import Rotation
 
 FRAMES, FPS = 96, 24
-ARC_FRAMES = 120  # that the whole of the path would take
+ARC_FRAMES = 120  # duration of the whole path
 WIDTH, HEIGHT = 960, 720
 FILM = (1008, 756)  # undistorted picture that the distorted one is sampled from
-SAMPLES = 3  # path samples per pixel; the denoiser does the rest. The picture moves by 3 px a frame: no motion blur
+SAMPLES = 3  # path samples per pixel; the result is denoised. The picture moves by 3 px per frame: no motion blur
 
 
 def camera(seed: int) -> dict:
-    """Intrinsics of the clip: the photos' lens, its picture scaled."""
+    """Intrinsics of the clip: those of the photos, scaled."""
     photo = shots.camera(seed)
     scale = WIDTH / photo["width"]
     cx, cy = ((photo[key] + 0.5) * scale - 0.5 for key in ("cx", "cy"))

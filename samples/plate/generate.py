@@ -2,14 +2,14 @@
 
     generate.py step                    plate.step
     generate.py truth                   truth.json and camera.json
-    generate.py photos [--first A --last B]   photos/img_000.jpg …; skips those that are there
-    generate.py clip --work DIR [--first A --last B]   frames of the clip into DIR; skips those that are there
+    generate.py photos [--first A --last B]   photos/img_000.jpg …; skips existing ones
+    generate.py clip --work DIR [--first A --last B]   frames of the clip into DIR; skips existing ones
     generate.py encode --work DIR       clip.mp4 of them, and clip_truth.json
-    generate.py as-built                as_built.ply: what was really rendered, weld beads included (not shipped)
-    generate.py verify [--draw DIR]     how well the truth lies on the photos' edges, in px
+    generate.py as-built                as_built.ply: the mesh that is rendered, weld beads included (not shipped)
+    generate.py verify [--draw DIR]     errors of the truth at the edges of the photos, px
     generate.py sfm                     pycolmap's defaults against the truth (in arview's environment)
 
---seed N makes another set: other displacements, camera, places, light, clutter and textures; -o its folder.
+--seed N makes another set, with other displacements, camera, poses, light, clutter and textures, in the folder -o.
 See README.md for the packages that each step needs.
 """
 
@@ -55,7 +55,7 @@ def make_truth(out: Path, seed: int) -> None:
         "cam_from_model_mm": {photo_name(i): pose.tolist() for i, pose in enumerate(shots.places(seed))},
         "truth": shots.as_built(seed, scene.nominal_meshes()),
     }
-    # A matrix a line keeps the file readable.
+    # One matrix per line keeps the file readable.
     head = {key: truth.pop(key) for key in ("part", "seed", "convention", "K", "dist_k1_k2")}
     lines = [f" {json.dumps(key)}: {json.dumps(value)}" for key, value in head.items()]
     for key, table in truth.items():
@@ -66,7 +66,7 @@ def make_truth(out: Path, seed: int) -> None:
 
 
 def exif(camera: dict, index: int, gain: float):
-    """What a phone would write: focal lengths as rounded as theirs."""
+    """EXIF data as a phone writes them, with rounded focal lengths."""
     import shots
     from PIL import Image
 
@@ -103,7 +103,7 @@ def make_photos(out: Path, seed: int, first: int, last: int, quality: int) -> No
     for index in missing:
         begin = time.process_time()
         picture, gain = studio.photo(index)
-        # Written under another name first, so that a cut-off run leaves no half picture behind.
+        # Written under another name first, so that an interrupted run leaves no incomplete picture.
         part = folder / f".{photo_name(index)}.part"
         Image.fromarray(picture[..., ::-1]).save(part, "JPEG", quality=quality, exif=exif(studio.camera, index, gain))
         part.replace(folder / photo_name(index))

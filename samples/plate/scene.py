@@ -24,7 +24,7 @@ def nominal_meshes():
 
 
 def as_built_meshes(seed: int):
-    """What is really there: the displaced components, and the weld beads that the CAD does not have."""
+    """The plate as built: the displaced components, and the weld beads that the CAD does not have."""
     nominal = nominal_meshes()
     truth = shots.as_built(seed, nominal)
     rng = np.random.default_rng((seed, 4))
@@ -34,7 +34,7 @@ def as_built_meshes(seed: int):
         meshes[name] = vertices @ pose[:3, :3].T + pose[:3, 3], faces
         if name == "base_plate":
             continue
-        # A bead lies on the plate: it follows its component's shift and twist, not its lift and tilt.
+        # A bead lies on the plate: it follows the shift and twist of its component, not lift and tilt.
         centroid = np.array(truth[name]["centroid_mm"]) * (1, 1, 0)
         bead, bead_faces = tx.weld_bead(vertices, faces, rng)
         shift = np.array(truth[name]["displacement_mm"]) * (1, 1, 0)
@@ -44,7 +44,7 @@ def as_built_meshes(seed: int):
 
 
 def _speckled(maps, size_px: float, rng):
-    """Pits and spatter on a surface (color, roughness, bump): specks of about that size."""
+    """Add pits and spatter of about a given size to a surface (color, roughness, bump)."""
     color, rough, bump = maps
     for scale, share, tint in ((1.0, 0.7, 0.3), (1.7, 0.6, 0.25), (1.3, 0.5, 2.2)):
         speck = tx.specks(*rough.shape, scale * size_px, rng) * share
@@ -73,14 +73,14 @@ def _part(shapes, seed: int, rng):
         elif name.endswith("_weld"):
             shapes[name] = mesh(name, *geometry, bead, (30.0, 30.0), rng.uniform(0, 30, 2), 60.0)
         else:
-            # Every component has a texture of its own: none repeats, on it or on another.
+            # Every component has a texture of its own, so that no pattern repeats.
             finish, metallic, bump_mm = finishes.get(name.split("_")[0], (tx.machined, 0.85, 0.012))
             surface = steel(_speckled(finish(800, 800, rng), 1.8, rng), metallic, bump_mm)
             shapes[name] = mesh(name, *geometry, surface, (170.0, 170.0), rng.uniform(0, 170, 2))
 
 
 def _clutter(shapes, rng):
-    """Bench, walls and things that are not the part."""
+    """Bench, walls and clutter around the part."""
 
     def add(name, geometry, surface, tile=(200.0, 200.0), crease=35.0):
         shapes[name] = mesh(name, *geometry, surface, tile, rng.uniform(0, 200, 2), crease)
@@ -88,8 +88,8 @@ def _clutter(shapes, rng):
     def paint(tint):
         return matte(tx.painted(256, 256, rng, tint), 0.45)
 
-    # Where nothing lies yet: centres and radii of the round places taken. What is tall stands farther off, so
-    # that it hides the part from no camera.
+    # Centres and radii of the occupied places. Tall things stand farther away, so that they occlude the part in no
+    # photo.
     taken = [((0.0, 0.0), 225.0)]
 
     def free(radius, height=0.0):
@@ -127,7 +127,7 @@ def _clutter(shapes, rng):
         size = rng.uniform((20, 12, 10), (90, 50, 45))
         center = (*free(np.hypot(*size[:2]) / 2, size[2]), FLOOR + size[2] / 2)
         add(f"thing_{k}", tx.box(size, center, rng.uniform(0, 360)), paint(rng.uniform(0.03, 0.6, 3)))
-    # Parts like those on the plate and screws lie about, each with its own surface.
+    # Screws and parts like those on the plate lie around it, each with a surface of its own.
     loose = {name: geometry for name, geometry in nominal_meshes().items() if name in ("nut_1", "post_2", "link_2")}
     for name, (vertices, faces) in loose.items():
         vertices = vertices - vertices.mean(axis=0) * (1, 1, 0)
@@ -150,13 +150,13 @@ def _clutter(shapes, rng):
 
 
 def build(seed: int, camera: dict, film: dict | None = None):
-    """The scene as a Mitsuba object with the photos' sensor, or another; it is placed by who renders."""
+    """The scene as a Mitsuba object with the sensor of the photos, or another; the caller sets its pose."""
     rng = np.random.default_rng((seed, 5))
     shapes: dict[str, object] = {}
     _part(shapes, seed, rng)
     _clutter(shapes, rng)
     x, y = rng.uniform(-250, 250, 2)
-    # Radiance of the lamps: each of its own brightness and tint.
+    # Radiance of the lamps, each with a brightness and tint of its own.
     strip_1, strip_2, window = np.array([(9.5, 9.3, 8.9), (8.5, 8.4, 8.1), (3.0, 3.4, 4.0)]) * (
         rng.uniform(0.85, 1.15, (3, 1)) * rng.uniform(0.97, 1.03, (3, 3))
     )

@@ -12,7 +12,7 @@ import pycolmap
 
 
 def against_truth(out: Path) -> None:
-    """Print what is registered, the focal length, and the camera centres' distance after a similarity fit."""
+    """Print the registered photos, the focal length, and the errors of the camera centres after a similarity fit."""
     truth = json.loads((out / "truth.json").read_text())
     pycolmap.set_random_seed(0)
     with tempfile.TemporaryDirectory() as work:
@@ -36,7 +36,7 @@ def against_truth(out: Path) -> None:
 
 
 def similar(source, target):
-    """``source`` (N,3) after the similarity that fits it to ``target`` best (Umeyama 1991)."""
+    """``source`` (N,3) after the best similarity to ``target`` (Umeyama 1991)."""
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     u, s, vt = np.linalg.svd(b.T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

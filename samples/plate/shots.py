@@ -1,4 +1,4 @@
-"""What a seed decides besides surfaces: the as-built displacements, the camera and its places."""
+"""Values that a seed determines: as-built displacements, camera and poses of the photos."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from scipy.spatial.transform import Rotation
 
 PHOTOS = 24
 WIDTH, HEIGHT = 1600, 1200
-SENSOR_WIDTH_MM = 6.4  # of the imagined phone, for the focal length that its EXIF states
+SENSOR_WIDTH_MM = 6.4  # of the simulated phone, for the focal length in the EXIF data
 
 # Shift in the plate's plane (mm), lift (mm), tilt about an axis in the plate's plane (deg) and twist about its
-# normal (deg) of the components that do not stand where the CAD says. Which component gets which, and the
-# directions, come from the seed.
+# normal (deg) of the displaced components. The seed determines which component gets which, and the directions.
 MOVES = (
     (0.3, 0.0, 0.0, 0.0),
     (1.0, 0.0, 0.0, 0.0),
@@ -78,7 +77,7 @@ def camera(seed: int) -> dict:
 
 
 def places(seed: int) -> list[np.ndarray]:
-    """``cam_from_model`` (4,4) of each photo: three uneven rings, as someone walks round the part."""
+    """``cam_from_model`` (4,4) of each photo: three uneven rings, as of someone walking around the part."""
     rng = np.random.default_rng((seed, 3))
     start, poses = rng.uniform(0, 360), []
     for k in range(PHOTOS):

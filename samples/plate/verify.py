@@ -1,4 +1,4 @@
-"""How well truth and camera lie on the photos: CAD edges projected, and the picture's edges sought beside them."""
+"""Check of truth and camera against the photos: CAD edges are projected, and the nearest picture edges found."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rendering import matte, mesh
 
 
 def edges_on_photos(out: Path, seed: int, draw: Path | None) -> None:
-    """Print per photo the common shift of its edges and the median offset of an edge point, px."""
+    """Print for each photo the common shift of its edges and the median offset of an edge point, px."""
     truth = json.loads((out / "truth.json").read_text())
     matrix, distortion = np.array(truth["K"]), np.array([*truth["dist_k1_k2"], 0.0, 0.0])
     meshes = scene.as_built_meshes(seed)
@@ -29,7 +29,7 @@ def edges_on_photos(out: Path, seed: int, draw: Path | None) -> None:
             print(f"{name}: missing")
             continue
         pose = np.array(pose)
-        # The depth test: a ray to the point, stopped a little before it, must meet nothing.
+        # Depth test: the ray to the point must not hit anything before it.
         position = -pose[:3, :3].T @ pose[:3, 3]
         toward = points[:, 0] - position
         reach = np.linalg.norm(toward, axis=1)
