@@ -85,7 +85,8 @@ class MeasuredComponent:
         if self.views.pose_covariance is not None:
             covariance = covariance + by_poses @ self.views.pose_covariance @ by_poses.T
         extra = len(fit.undetermined) - len(self.free)
-        notes = (f"undetermined in {extra} directions beyond those that its symmetry leaves free",) if extra > 0 else ()
+        noun = "direction" if extra == 1 else "directions"
+        notes = (f"undetermined in {extra} {noun} beyond those that its symmetry leaves free",) if extra > 0 else ()
         twist = np.concatenate([log_so3(place[:3, :3]), apply(place, self.center) - self.center])
         return Move(
             component=self.shape.name,
