@@ -1,4 +1,4 @@
-"""ContourVerifier: the edge is in the middle of each where the pose is right, and the network says where it strays."""
+"""Contour profiles: a right pose has the edge in the middle column, and the network scores deviations from it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MIDDLE = COLUMNS // 2
 
 
 @cache
-def strips() -> ContourVerifier:
+def verifier() -> ContourVerifier:
     return ContourVerifier(PART)
 
 
@@ -45,62 +45,62 @@ def picture(noise: float = 4.0, is_hidden: bool = False) -> ImagePyramid:
 
 
 def scores(seen: ImagePyramid, poses: list[Array]) -> Array:
-    return strips().scores(seen, np.stack(poses))
+    return verifier().scores(seen, np.stack(poses))
 
 
 def aside(right_px: float) -> Array:
-    """The true pose moved to the right in the picture."""
+    """The true pose moved to the right in the image."""
     return rigid(TRUTH[:3, :3], TRUTH[:3, 3] + [right_px * TRUTH[2, 3] / CAMERA.fx, 0.0, 0.0])
 
 
 def nearer(share: float) -> Array:
-    """The true pose at a share of its distance."""
+    """The true pose at a fraction of its distance."""
     return rigid(TRUTH[:3, :3], share * TRUTH[:3, 3])
 
 
 def edge_offsets_px(cut: NDArray[np.uint8]) -> Array:
-    """Where along each row of the outline that is all in the picture the colours change most."""
+    """Offset of the strongest colour step in each outline row that is fully inside the image."""
     steps = network_input(cut, 80.0)[0][RAW_CHANNELS, :OUTLINE_ROWS]
     return STEP_PX * (steps[(cut[3, :OUTLINE_ROWS] > 0).all(axis=1)].argmax(axis=1) - MIDDLE)
 
 
-def test_the_edge_is_in_the_middle_where_the_pose_is_right() -> None:
+def test_a_right_pose_has_the_edge_in_the_middle() -> None:
     offsets = edge_offsets_px(contour_profiles(picture(), PART, TRUTH))
     assert len(offsets) > 0.7 * OUTLINE_ROWS
     assert abs(np.median(offsets)) < 0.6
     assert np.percentile(np.abs(offsets), 70) < 1.2
 
 
-def test_the_edge_is_inside_where_the_pose_is_too_near_and_outside_where_it_is_too_far() -> None:
+def test_a_near_pose_has_the_edge_inside_and_a_far_one_outside() -> None:
     near, far = (edge_offsets_px(contour_profiles(picture(), PART, nearer(share))) for share in (0.97, 1.03))
-    # The outline is 60 to 110 px from the middle of the part: 3 % of that.
+    # The outline is 60 to 110 px from the centre of the part: 3 % of that.
     assert np.median(near) == pytest.approx(-2.7, abs=1.0)
     assert np.median(far) == pytest.approx(2.7, abs=1.0)
 
 
-def test_inside_is_where_the_part_is_to_be() -> None:
+def test_the_expected_part_is_on_the_inner_side() -> None:
     cut = contour_profiles(picture(), PART, TRUTH)
     seen = cut[3, :OUTLINE_ROWS] > 0
     inside, outside = cut[7, :OUTLINE_ROWS, : MIDDLE + 1], cut[7, :OUTLINE_ROWS, MIDDLE + 1 :]
     assert set(np.unique(inside[seen[:, : MIDDLE + 1]])) <= {128, 255}
     assert set(np.unique(outside[seen[:, MIDDLE + 1 :]])) <= {0, 128}
-    # The line network sees a solid on the one side and none on the other.
+    # The edge network predicts a solid on one side and none on the other.
     assert cut[6, :OUTLINE_ROWS, :4][inside[:, :4] == 255].mean() > 150.0
     assert cut[6, :OUTLINE_ROWS, -4:][outside[:, -4:] == 0].mean() < 100.0
 
 
-def test_nothing_is_cut_outside_the_picture() -> None:
+def test_profiles_outside_the_image_are_zero() -> None:
     half_out = contour_profiles(picture(), PART, aside(-310.0))
     seen = half_out[3] > 0
     assert 0.1 < seen[:OUTLINE_ROWS].mean() < 0.9
     assert not half_out[:, ~seen].any()
     behind = rigid(TRUTH[:3, :3], -TRUTH[:3, 3])
     assert not contour_profiles(picture(), PART, behind).any()
-    seen_behind, told = network_input(contour_profiles(picture(), PART, behind), 80.0)
-    assert np.isfinite(seen_behind).all() and np.isfinite(told).all()
+    seen_behind, scalars = network_input(contour_profiles(picture(), PART, behind), 80.0)
+    assert np.isfinite(seen_behind).all() and np.isfinite(scalars).all()
 
 
-def test_large_pictures_are_cut_as_the_line_network_sees_them() -> None:
+def test_large_images_are_sampled_at_the_scale_of_the_edge_network() -> None:
     large = cv2.resize(picture().image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
     twice = ImagePyramid(large, CAMERA.scaled(1280, 960), 12, EdgeNet())
     assert (profile_step(picture()), profile_step(twice)) == (0, -4)
@@ -108,19 +108,19 @@ def test_large_pictures_are_cut_as_the_line_network_sees_them() -> None:
     assert np.abs(one - other).mean() < 4.0
 
 
-def test_what_is_shown_knows_no_brightness() -> None:
+def test_the_network_input_is_invariant_to_brightness() -> None:
     cut = contour_profiles(picture(), PART, TRUTH)
     dark = cut.copy()
     dark[:3] = cut[:3] // 2
-    (seen, told), (seen_dark, told_dark) = network_input(cut, 80.0), network_input(dark, 80.0)
+    (seen, scalars), (seen_dark, scalars_dark) = network_input(cut, 80.0), network_input(dark, 80.0)
     assert seen.shape == (CHANNELS, ROWS, COLUMNS)
     assert np.abs(seen - seen_dark)[:3].mean() < 0.15
     assert np.abs(seen - seen_dark)[RAW_CHANNELS].mean() < 0.05
-    assert told_dark[1] < told[1] - 0.2
+    assert scalars_dark[1] < scalars[1] - 0.2
 
 
 @pytest.mark.parametrize("noise", [2.0, 8.0])
-def test_poses_off_by_a_few_pixels_say_less(noise: float) -> None:
+def test_poses_off_by_a_few_pixels_score_less(noise: float) -> None:
     seen = picture(noise)
     near = scores(seen, [TRUTH, *turned_about(TRUTH, 0.7, 6)])
     off = scores(seen, [aside(4.0), aside(-4.0), nearer(0.95), nearer(1.05)])
@@ -130,11 +130,11 @@ def test_poses_off_by_a_few_pixels_say_less(noise: float) -> None:
     assert near.mean() > turned.mean() + 6.0
 
 
-def test_the_true_pose_says_more_than_any_on_clutter() -> None:
+def test_the_true_pose_scores_more_than_any_on_clutter() -> None:
     clutter = [ImagePyramid(background(seed), CAMERA, 12, EdgeNet()) for seed in range(4)]
     highest = max(scores(seen, [*turned_about(TRUTH, 20.0, 20)]).max() for seen in clutter)
     assert scores(picture(), [TRUTH])[0] > highest + 5.0
-    # A card over half of the outline takes its share, not all.
+    # A card over half of the outline lowers the score, but not to that of clutter.
     assert scores(picture(is_hidden=True), [TRUTH])[0] > highest + 3.0
 
 

@@ -1,4 +1,4 @@
-"""The denoiser: it tells how noisy a picture is, takes most of the noise out, and moves no edge."""
+"""The denoiser: estimates the noise level, removes most of the noise, and moves no edge."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def noisy(image: NDArray[np.uint8], noise: float, seed: int = 0) -> NDArray[np.u
 
 
 @cache
-def seen_through_a_lens() -> NDArray[np.uint8]:
+def blurred_by_a_lens() -> NDArray[np.uint8]:
     return np.asarray(cv2.GaussianBlur(drawn(POSE, noise=0.0), (0, 0), 0.8), dtype=np.uint8)
 
 
@@ -38,13 +38,13 @@ def off(image: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
 
 
 @pytest.mark.parametrize("noise", [5.0, 10.0, 18.0])
-def test_the_level_of_noise_is_told(noise: float) -> None:
+def test_the_noise_level_is_estimated(noise: float) -> None:
     smooth = cv2.GaussianBlur(background(3), (0, 0), 1.5)
-    # Grain of its own adds to it.
+    # The noise of the background itself adds to it.
     assert noise_level(noisy(smooth, noise)) == pytest.approx(np.hypot(noise, noise_level(smooth)), rel=0.1)
 
 
-def test_burnt_and_black_places_do_not_hide_noise() -> None:
+def test_saturated_and_black_areas_do_not_hide_noise() -> None:
     image = np.full((240, 320, 3), 120, dtype=np.uint8)
     image[:, 100:] = 255
     image[:, 200:] = 0
@@ -54,15 +54,15 @@ def test_burnt_and_black_places_do_not_hide_noise() -> None:
 
 
 def slopes(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(H,W) size of the gradient, grey levels a pixel."""
+    """Gradient magnitude (H,W) in grey levels per pixel."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     across, down = (cv2.Sobel(gray, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
     return np.hypot(across, down)
 
 
 @pytest.mark.parametrize("noise", [8.0, 14.0])
-def test_most_of_the_noise_is_taken_out_and_edges_stay_steep(noise: float) -> None:
-    truth = seen_through_a_lens()
+def test_most_noise_is_removed_and_edges_stay_sharp(noise: float) -> None:
+    truth = blurred_by_a_lens()
     grainy = noisy(truth, noise)
     clean = network().denoise(grainy)
     assert clean.shape == truth.shape and clean.dtype == np.uint8
@@ -76,7 +76,7 @@ def test_most_of_the_noise_is_taken_out_and_edges_stay_steep(noise: float) -> No
     assert np.mean(slopes(smoothed)[at_edges]) < 0.7 * np.mean(slopes(truth)[at_edges])
 
 
-def test_edges_stay_where_they_are() -> None:
+def test_edges_do_not_move() -> None:
     ramp = np.clip((np.arange(320) - 160.3) + 0.5, 0.0, 1.0)
     truth = np.round(70.0 + 110.0 * np.tile(ramp, (240, 1)))[..., None].repeat(3, axis=2).astype(np.uint8)
     clean = network().denoise(noisy(truth, 12.0)).mean(axis=2)
@@ -90,7 +90,7 @@ def test_edges_stay_where_they_are() -> None:
     assert np.std(crossing) < 0.25
 
 
-def test_pictures_of_little_noise_stay_as_they_are() -> None:
+def test_images_with_little_noise_are_returned_unchanged() -> None:
     image = cv2.GaussianBlur(drawn(POSE, noise=0.0), (0, 0), 0.7)
     for noise in (0.0, 1.5):
         grainy = noisy(image, noise)
@@ -99,7 +99,7 @@ def test_pictures_of_little_noise_stay_as_they_are() -> None:
 
 
 @pytest.mark.parametrize("size", [(97, 131), (8, 8), (3, 5), (40, 600)])
-def test_any_size_is_cleaned(size: tuple[int, int]) -> None:
+def test_any_size_is_denoised(size: tuple[int, int]) -> None:
     clean = network().denoise(noisy(np.full((*size, 3), 128, dtype=np.uint8), 15.0))
     assert clean.shape == (*size, 3)
     assert np.std(clean.astype(float)) < 11.0
@@ -113,8 +113,8 @@ def test_bands_leave_no_seams() -> None:
     assert np.max(np.abs(banded.astype(int) - whole)) <= 1
 
 
-def test_the_searches_see_noisy_pictures_clean() -> None:
-    truth = seen_through_a_lens()
+def test_searches_use_denoised_images() -> None:
+    truth = blurred_by_a_lens()
     grainy = noisy(truth, 14.0)
     seen = LocalSearch(assembly_views(), CAMERA).pyramid(grainy).image
     assert off(seen, truth) < 0.5 * off(grainy, truth)

@@ -1,4 +1,4 @@
-"""The detector on rendered frames: found anywhere in the range, not found where it is not, never one of twins."""
+"""The detector on rendered frames: finds the part anywhere in the range, and never a wrong or ambiguous pose alone."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ from helpers.synthetic import (
 
 SIGNS = tuple(product((-1.0, 1.0), repeat=3))
 CLEAR = 1.25
-"""Deviations, see `edge_margin`."""
+"""Standard deviations, see `edge_margin`."""
 
 
 @cache
@@ -64,7 +64,7 @@ def detector() -> Detector:
 
 
 def anywhere(rng: np.random.Generator) -> np.ndarray:
-    """A pose of the declared range, the part wholly in the picture."""
+    """A pose of the declared range with the part fully in the image."""
     pose = pose_from(
         rng.uniform(*RANGE.azimuth_deg), rng.uniform(*RANGE.elevation_deg), rng.uniform(440, 620),
         roll_deg=rng.uniform(*RANGE.roll_deg),
@@ -120,7 +120,7 @@ def test_the_part_is_found_over_the_full_sphere_and_all_rolls() -> None:
 
 
 @pytest.mark.slow
-def test_what_was_rejected_is_told() -> None:
+def test_the_best_rejected_hypothesis_is_kept() -> None:
     seen = detector()
     assert seen.detect(picture(None, seed=1, scene=21)) == []
     rejected = seen.best_rejected
@@ -139,7 +139,7 @@ def test_symmetries_are_discovered() -> None:
 
 
 @pytest.mark.slow
-def test_fifths_are_discovered() -> None:
+def test_symmetries_by_fifths_are_discovered() -> None:
     angles = np.deg2rad(72.0 * np.arange(5) + 10.0)
     grey = (0.5, 0.5, 0.5)
     places = [(38 * np.cos(a), 38 * np.sin(a)) for a in angles]
@@ -155,20 +155,20 @@ def test_fifths_are_discovered() -> None:
         np.testing.assert_allclose(np.sort(angles_deg), [72.0, 144.0, 216.0, 288.0])
 
 
-def cube_turns() -> np.ndarray:
-    """The 24 turns of a cube onto itself."""
+def cube_rotations() -> np.ndarray:
+    """The 24 rotations of a cube onto itself."""
     signed = [np.diag(signs) @ np.eye(3)[list(order)] for order in permutations(range(3)) for signs in SIGNS]
     return np.array([turn for turn in signed if np.linalg.det(turn) > 0.0])
 
 
-def farthest_from_wanted_deg(directions: np.ndarray, wanted: np.ndarray, turns: np.ndarray) -> float:
-    """How far the farthest of some directions (N,3) is from all images of the wanted ones."""
+def max_angle_to_images_deg(directions: np.ndarray, wanted: np.ndarray, turns: np.ndarray) -> float:
+    """Largest angle from one of some directions (N,3) to the nearest image of the wanted ones."""
     images = np.concatenate([wanted @ turn for turn in turns])
     return float(np.rad2deg(np.arccos(np.clip((directions @ images.T).max(axis=1), -1.0, 1.0)).max()))
 
 
-def test_of_views_that_symmetries_make_the_same_one_and_a_margin_is_looked_for() -> None:
-    turns, directions = cube_turns(), icosphere_directions(2)
+def test_one_of_several_symmetric_views_and_a_margin_are_searched() -> None:
+    turns, directions = cube_rotations(), icosphere_directions(2)
     assert len(turns) == 24
     rng = np.random.default_rng(2)
     anywhere = rng.normal(size=(2000, 3))
@@ -176,18 +176,18 @@ def test_of_views_that_symmetries_make_the_same_one_and_a_margin_is_looked_for()
     full = ViewRange((200.0, 500.0))
     wanted = directions[in_fundamental_domain(directions, turns, full)]
     assert 162 / 24 < len(wanted) < 162 / 6
-    assert farthest_from_wanted_deg(anywhere, wanted, turns) < 11.0
+    assert max_angle_to_images_deg(anywhere, wanted, turns) < 11.0
     # A margin: by every direction there are templates on all sides that need no turn.
     inside = anywhere[np.all((turns @ DOMAIN_DIRECTION - DOMAIN_DIRECTION) @ anywhere.T <= 0.0, axis=0)]
     assert len(inside) > 40
-    assert farthest_from_wanted_deg(inside, wanted, np.eye(3)[None]) < 11.0
+    assert max_angle_to_images_deg(inside, wanted, np.eye(3)[None]) < 11.0
 
     above = ViewRange((200.0, 500.0), elevation_deg=(20.0, 90.0), azimuth_deg=(-100.0, 40.0))
     sought = directions[above.contains_direction(directions, 3.0)]
     wanted = sought[in_fundamental_domain(sought, turns, above)]
     assert len(wanted) < len(sought)
     declared = anywhere[above.contains_direction(anywhere)]
-    assert farthest_from_wanted_deg(declared, wanted, turns) < 13.0
+    assert max_angle_to_images_deg(declared, wanted, turns) < 13.0
 
     upright = ViewRange((200.0, 500.0), roll_deg=(-20.0, 20.0))
     assert in_fundamental_domain(directions, turns, upright).all()
@@ -195,7 +195,7 @@ def test_of_views_that_symmetries_make_the_same_one_and_a_margin_is_looked_for()
 
 
 @pytest.mark.slow
-def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
+def test_a_box_is_found_from_all_directions_up_to_its_symmetries() -> None:
     sought = Detector(make_guide_views(block(), ViewRange((250.0, 500.0)), GuideViewOptions(subdivisions=3)), CAMERA)
     assert len(sought.disambiguator.exact_rotations) == 4
     rng = np.random.default_rng(5)
@@ -214,13 +214,13 @@ def test_a_box_is_found_from_everywhere_up_to_its_own_turns() -> None:
             found += mm < 8.0 and deg < 2.0
             wrong_ones += mm > 50.0 or deg > 5.0
     assert found >= 14
-    # From some places a plain box looks much like a box seen from elsewhere, with and without this.
+    # From some directions a plain box is similar to a box seen from another one.
     assert wrong_ones <= 1
 
 
 @cache
 def knob(key_mm: float) -> Model:
-    """A six-sided knob with a small block on one of its six corners: it alone tells the six turns apart."""
+    """A six-sided knob with a small block on one of its corners, which alone breaks the symmetry."""
     parts = (
         component("head", post((0, 0), 50, 0, 30, 6), (0.6, 0.6, 0.65)),
         component("neck", post((0, 0), 26, 30, 55, 6), (0.5, 0.5, 0.55)),
@@ -230,10 +230,8 @@ def knob(key_mm: float) -> Model:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("key_mm", "is_told"), [(14.0, True), (1.8, False)])
-def test_a_key_decides_between_twins_and_where_it_cannot_be_seen_the_view_is_ambiguous(
-    key_mm: float, is_told: bool
-) -> None:
+@pytest.mark.parametrize(("key_mm", "is_visible"), [(14.0, True), (1.8, False)])
+def test_a_visible_key_disambiguates_and_an_invisible_one_leaves_alternatives(key_mm: float, is_visible: bool) -> None:
     model = knob(key_mm)
     views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
     sought = Detector(views, CAMERA)
@@ -244,11 +242,11 @@ def test_a_key_decides_between_twins_and_where_it_cannot_be_seen_the_view_is_amb
         for found in sought.detect(picture(truth, model, seed=k, scene=k), max_results=1):
             poses = [found.cam_from_model, *found.alternatives]
             wrong_by = [error(pose, truth, model)[2] for pose in poses]
-            right += wrong_by[0] < 3.0 and len(poses) == 1 if is_told else len(poses) > 1 and min(wrong_by) < 3.0
+            right += wrong_by[0] < 3.0 and len(poses) == 1 if is_visible else len(poses) > 1 and min(wrong_by) < 3.0
     assert right >= 4
 
 
-def test_a_pose_settled_a_little_aside_is_no_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_badly_refined_copy_is_no_alternative(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = pose_from(30, 40, 500.0)
     seen = detector().local.pyramid(picture(truth))
     right = detector().hypotheses(seen)[0]
@@ -259,11 +257,11 @@ def test_a_pose_settled_a_little_aside_is_no_twin(monkeypatch: pytest.MonkeyPatc
         detector().disambiguator, "evidence_margins", lambda of, rivals: against[: len(rivals), : len(rivals)]
     )
     monkeypatch.setattr(detector().local, "refine_fine", lambda of, starts: [])
-    best, twins = detector().disambiguator.choose(seen, right, [aside])
-    assert best is right and not twins
+    best, alternatives = detector().disambiguator.choose(seen, right, [aside])
+    assert best is right and not alternatives
 
 
-def test_a_search_by_gradients_alone_takes_no_heed_of_the_line_network() -> None:
+def test_a_search_by_gradients_ignores_the_edge_network() -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
     without = ImagePyramid(seen.image, CAMERA, seen.pad_px)
     for one, other in zip(
@@ -276,7 +274,7 @@ def test_a_search_by_gradients_alone_takes_no_heed_of_the_line_network() -> None
 
 
 def lid() -> Model:
-    """A round lid with six pins and a small block beside one: the outline is hardly another at any turn."""
+    """A round lid with six pins and a small block beside one: its outline is nearly the same at any angle."""
     parts = [component("disc", post((0, 0), 60, 0, 14, 60), (0.55, 0.55, 0.6))]
     for k in range(6):
         place = 42.0 * np.array([np.cos(np.pi * k / 3), np.sin(np.pi * k / 3)])
@@ -286,7 +284,7 @@ def lid() -> Model:
 
 
 @pytest.mark.slow
-def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
+def test_a_rotation_sweep_finds_the_angle_of_a_nearly_round_part() -> None:
     model = lid()
     views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
     sought = Detector(views, CAMERA)
@@ -295,15 +293,15 @@ def test_a_nearly_round_part_is_spun_to_where_its_edges_are_seen() -> None:
     for k in range(4):
         truth = pose_from(20.0 + 80.0 * k, 45.0, 380.0, model)
         seen = sought.local.pyramid(picture(truth, model, seed=k, scene=k))
-        (spun,) = turned(truth @ part.model_from_body, [exp_so3(np.deg2rad([0.0, 0.0, 23.0]))])
-        starts = sought.disambiguator.rotation_sweep(seen, spun)
+        (rotated,) = turned(truth @ part.model_from_body, [exp_so3(np.deg2rad([0.0, 0.0, 23.0]))])
+        starts = sought.disambiguator.rotation_sweep(seen, rotated)
         assert min(error(start @ part.body_from_model, truth, model)[2] for start in starts[:3]) < 6.0
-        best = sought.local.verify(seen, sought.local.refine_fine(seen, [spun]))[0]
+        best = sought.local.verify(seen, sought.local.refine_fine(seen, [rotated]))[0]
         found, _ = sought.disambiguator.choose(seen, best, [])
         assert error(found.cam_from_body @ part.body_from_model, truth, model)[2] < 2.0
 
 
-def test_a_part_with_few_near_turns_is_not_spun() -> None:
+def test_a_part_with_few_near_symmetries_is_not_swept() -> None:
     assert not len(detector().symmetries.axes)
     assert (
         detector().disambiguator.rotation_sweep(detector().local.pyramid(picture(pose_from(30, 40, 500.0))), np.eye(4))
@@ -311,7 +309,7 @@ def test_a_part_with_few_near_turns_is_not_spun() -> None:
     )
 
 
-def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
+def test_edges_of_only_one_pose_give_the_margin() -> None:
     rng = np.random.default_rng(4)
     shared, only_a, only_b = (
         np.array([x, 0.0]) + rng.uniform(0, 90, (n, 2)) for x, n in ((0, 200), (200, 30), (400, 30))
@@ -328,24 +326,24 @@ def test_the_edges_that_only_one_of_two_poses_has_tell_which_is_right() -> None:
     assert edge_margin(steps(only_a, 0.6), steps(only_b, 0.0)) > CLEAR
     assert edge_margin(steps(only_b, 0.0), steps(only_a, 0.6)) < -CLEAR
     assert abs(edge_margin(steps(only_a, 0.6), steps(only_b, 0.55))) < CLEAR
-    # Edges that are there although the other pose has none in their place tell, too.
+    # Edges that exist where the other pose has none count, too.
     assert edge_margin(steps(only_a, 0.6), steps(shared[:30], 0.6)) > CLEAR
     assert edge_margin(steps(only_a, 0.0), steps(shared[:30], 0.6)) < -CLEAR
-    # Nothing tells them apart where all edges are shared.
+    # Shared edges alone give no margin.
     assert edge_margin(steps(shared[:30], 0.6), steps(shared[:30], 0.0)) == 0.0
 
 
-def test_a_small_part_a_plain_view_and_a_close_rival_are_doubted_and_a_pose_a_little_aside_is_no_rival() -> None:
+def test_small_parts_plain_views_and_competitors_lower_the_quality() -> None:
     evidence = PoseEvidence(0.6, 0.6, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
     weaker = PoseEvidence(0.58, 0.58, 0.35, 0.6, 0.5, 0.15, 1.0, 0.4)
 
-    def quality(distance_mm: float, rival_aside_mm: float | None, turn_deg: float, share: float = 1.0) -> float:
+    def quality(distance_mm: float, competitor_offset_mm: float | None, turn_deg: float, share: float = 1.0) -> float:
         pose, lines = pose_from(30, 40, distance_mm), share * detector().local.mean_view_lines
         radius_px = detector().local.refiner.radius_px(pose)
         hypotheses = [Hypothesis(pose, evidence, 4.0, lines, radius_px, verifier_score=1.0, contour_score=1.0)]
-        if rival_aside_mm is not None:
+        if competitor_offset_mm is not None:
             other = pose_from(30 + turn_deg, 40, distance_mm)
-            other[0, 3] += rival_aside_mm
+            other[0, 3] += competitor_offset_mm
             hypotheses.append(Hypothesis(other, weaker, 4.0, lines, radius_px, verifier_score=1.0, contour_score=1.0))
         return detector().qualities(hypotheses)[0]
 
@@ -354,12 +352,12 @@ def test_a_small_part_a_plain_view_and_a_close_rival_are_doubted_and_a_pose_a_li
     assert quality(500.0, 5.0, 8.0) == alone
     assert quality(500.0, 5.0, 60.0) < 0.5 * alone and quality(500.0, 300.0, 8.0) < 0.5 * alone
     assert quality(2000.0, None, 0.0) < 0.5
-    # A view that shows less than others do fits by chance.
+    # A view with fewer lines than usual fits by chance.
     assert quality(500.0, None, 0.0, 0.3) < 0.5 < alone < quality(500.0, None, 0.0, 2.0)
 
 
 @pytest.mark.slow
-def test_the_poses_of_an_ambiguous_view_say_which_others_fit() -> None:
+def test_an_ambiguous_view_has_alternatives() -> None:
     model = knob(1.8)
     views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
     session = TrackingSession(views, CAMERA, model)
@@ -370,7 +368,7 @@ def test_the_poses_of_an_ambiguous_view_say_which_others_fit() -> None:
     assert min(error(p, truth, model)[2] for p in (pose.cam_from_model, *pose.alternatives)) < 3.0
 
 
-def test_rough_poses_are_tried_by_themselves() -> None:
+def test_rough_poses_are_tried_alone() -> None:
     truth = pose_from(30, 40, 520)
     image = picture(truth, seed=1)
     near = wrong(truth, np.random.default_rng(1), 8.0, 12.0)
@@ -385,7 +383,7 @@ def test_rough_poses_are_tried_by_themselves() -> None:
 
 
 @pytest.mark.slow
-def test_what_hides_half_of_the_part_does_not_pull_the_pose_away() -> None:
+def test_an_occluder_over_half_of_the_part_does_not_shift_the_pose() -> None:
     errors = []
     for k, truth in enumerate(path(40)[::4]):
         found = detector().detect_near(picture(truth, seed=4 * k, card=half_hidden(truth)), [truth])
@@ -396,29 +394,29 @@ def test_what_hides_half_of_the_part_does_not_pull_the_pose_away() -> None:
     assert np.median(errors, axis=0)[0] < 1.5
 
 
-def test_results_are_apart_and_no_more_than_asked_for() -> None:
+def test_no_more_results_than_requested() -> None:
     image = picture(pose_from(30, 40, 520), seed=1)
     assert len(detector().detect(image, max_results=1)) == 1
     assert detector().detect(image, max_results=0) == []
 
 
-def test_options_without_sense_are_refused() -> None:
+def test_options_out_of_range_are_refused() -> None:
     with pytest.raises(InputError, match="radius_px"):
         DetectorOptions(radius_px=2.0)
 
 
-def test_no_search_looks_beyond_the_declared_distances() -> None:
+def test_no_search_leaves_the_declared_distances() -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0), noise=12.0))
     nearest_mm, farthest_mm = search_distances_mm(detector().views.view_range)
-    likely = detector().global_search.candidates(seen, WIDE).poses
-    climbed = detector().local.pattern_search(seen, detector().global_search.starts(seen, WIDE), WIDE.kept)
-    poses = np.concatenate([likely, [candidate.cam_from_body for candidate in climbed]])
+    candidates = detector().global_search.candidates(seen, WIDE).poses
+    improved = detector().local.pattern_search(seen, detector().global_search.starts(seen, WIDE), WIDE.kept)
+    poses = np.concatenate([candidates, [candidate.cam_from_body for candidate in improved]])
     distances_mm = np.linalg.norm(poses[:, :3, 3], axis=1)
-    assert len(likely) > 100 and climbed
+    assert len(candidates) > 100 and improved
     assert distances_mm.min() >= nearest_mm and distances_mm.max() <= farthest_mm
 
 
-def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None:
+def test_responses_rank_poses_of_equal_profile_score() -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
     pose = pose_from(10, 20, 480.0) @ detector().local.refiner.part.model_from_body
     responses = np.array([0.2, 0.7, 0.4])
@@ -428,16 +426,16 @@ def test_of_poses_judged_alike_those_with_the_clearer_lines_come_first() -> None
     assert scores[0] - scores[1] == pytest.approx(0.3 * GlobalSearchOptions().response_weight) and scores[1] > scores[2]
 
 
-def test_matches_that_all_leave_the_declared_distances_are_no_detection(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_matches_outside_the_distances_give_no_detection(monkeypatch: pytest.MonkeyPatch) -> None:
     search = detector().global_search
     monkeypatch.setattr(search, "_distances_mm", (1.0, 2.0))
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
-    likely, lines, _ = search.candidates(seen, WIDE)
-    assert likely.shape == (0, 4, 4) and lines.shape == (0,)
+    candidates, lines, _ = search.candidates(seen, WIDE)
+    assert candidates.shape == (0, 4, 4) and lines.shape == (0,)
     assert detector().detect(seen.image) == []
 
 
-def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
+def test_hypotheses_are_sorted_and_distinct() -> None:
     rng = np.random.default_rng(5)
     for k in range(4):
         found = detector().hypotheses(detector().local.pyramid(picture(anywhere(rng), seed=k, scene=k, noise=12.0)))
@@ -450,7 +448,7 @@ def test_hypotheses_come_best_first_and_apart_from_each_other() -> None:
                 assert not are_near(a.cam_from_body, b.cam_from_body, 0.04 * detector().views.diameter_mm, 4.0)
 
 
-def test_a_quick_search_ends_the_matter_only_when_it_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_a_sure_quick_search_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
     candidates, budgets = detector().global_search.candidates, []
 
@@ -470,7 +468,7 @@ def test_a_quick_search_ends_the_matter_only_when_it_is_sure(monkeypatch: pytest
         assert budgets == expected
 
 
-def test_what_spoke_for_a_pose_at_one_level_counts_at_the_next() -> None:
+def test_the_score_of_one_level_counts_at_the_next() -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
     poses = [candidate.cam_from_body for candidate in detector().global_search.starts(seen, QUICK)]
     plain = detector().local.pattern_search(seen, [PoseCandidate(0.0, pose) for pose in poses])

@@ -1,4 +1,4 @@
-"""The line network: it answers to a solid's lines, in their direction, more than to noise and texture."""
+"""The edge network: responds to edges of solids, by orientation, more than to noise and texture."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def network() -> EdgeNet:
 
 
 def outline() -> tuple[Array, Array]:
-    """Pixels (N,2) of the outline in the picture and normals (N,2)."""
+    """Pixels (N,2) of the outline in the image, and their normals (N,2)."""
     view = PART.views.view(int(np.argmax(PART.views.directions @ (POSE[:3, :3].T @ -POSE[:3, 3]))))
     intrinsics = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, 0, 0, 0, 0, 0, 0], dtype=np.float64)
     points, normals = view.features.contour_points, view.features.contour_normals
@@ -49,7 +49,7 @@ def outline() -> tuple[Array, Array]:
 
 
 def standing_out(maps: NDArray[np.uint8], quarter_turns: int = 0) -> float:
-    """Mean answer along the outline, in its direction or turned, relative to that of all places and directions."""
+    """Mean response along the outline, in its orientation or rotated, relative to the mean of all responses."""
     pixels, normals = outline()
     columns, rows = np.round((pixels + 0.5) / 2.0 - 0.5).astype(int).T
     around = np.stack([cv2.dilate(plane, np.ones((3, 3), np.uint8)) for plane in maps])
@@ -58,7 +58,7 @@ def standing_out(maps: NDArray[np.uint8], quarter_turns: int = 0) -> float:
 
 
 @pytest.mark.parametrize("noise", [3.0, 9.0, 16.0])
-def test_the_outline_stands_out_before_clutter_and_noise_as_it_does_not_by_gradients(noise: float) -> None:
+def test_the_outline_stands_out_more_than_by_gradients(noise: float) -> None:
     image = drawn(POSE, noise=noise)
     seen = network().predict(image)[:ORIENTATIONS]
     assert standing_out(seen) > 6.0
@@ -66,7 +66,7 @@ def test_the_outline_stands_out_before_clutter_and_noise_as_it_does_not_by_gradi
     assert standing_out(seen, 1) < 0.3 * standing_out(seen)
 
 
-def test_it_hardly_answers_to_noise() -> None:
+def test_noise_gives_hardly_any_response() -> None:
     rng = np.random.default_rng(0)
     noise = np.clip(110 + 14 * rng.standard_normal((480, 640, 3)), 0, 255).astype(np.uint8)
     seen = network().predict(noise)
@@ -75,7 +75,7 @@ def test_it_hardly_answers_to_noise() -> None:
 
 
 @pytest.mark.parametrize("noise", [3.0, 9.0, 16.0])
-def test_it_sees_where_the_solid_is(noise: float) -> None:
+def test_the_solid_is_predicted(noise: float) -> None:
     seen = network().predict(drawn(POSE, noise=noise))[SOLID_CHANNEL]
     vertices, faces, _ = assembly().mesh
     c = CAMERA.scaled(seen.shape[1], seen.shape[0])
@@ -85,8 +85,8 @@ def test_it_sees_where_the_solid_is(noise: float) -> None:
     assert np.median(seen[cv2.dilate(is_inside, side) == 0]) < 64
 
 
-class Answers:
-    """Stands in for the network: these answers, whatever it is shown."""
+class FixedNetwork:
+    """Replaces the network: predicts the same maps for any input."""
 
     def __init__(self, seen: NDArray[np.float32]) -> None:
         self._seen = seen[None]
@@ -96,12 +96,12 @@ class Answers:
         return self._seen
 
 
-def test_answers_count_relative_to_the_clearest_nearby_but_hardly_any_stay_so() -> None:
+def test_responses_are_normalised_by_the_strongest_nearby() -> None:
     seen = np.zeros((ORIENTATIONS + 1, 160, 320), dtype=np.float32)
     seen[3, :, 20], seen[5, 40, 200:], seen[1, 120, 200:] = 0.9, 0.3, 0.02
     seen[0, :, 30] = 0.3  # beside a clear one
     lines = EdgeNet()
-    lines._network = Answers(seen)
+    lines._network = FixedNetwork(seen)
     found = lines.predict(np.zeros((320, 640, 3), dtype=np.uint8)).astype(float) / 255.0
     assert found[3, 60:100, 20].min() == 1.0
     assert found[5, 40, 240:280].min() == 1.0  # as clear as any around
@@ -109,7 +109,7 @@ def test_answers_count_relative_to_the_clearest_nearby_but_hardly_any_stay_so() 
     assert 0.3 < found[0, 60:100, 30].max() < 0.4
 
 
-def test_smaller_maps_keep_the_strongest_of_four() -> None:
+def test_halved_maps_keep_the_maximum_of_four_pixels() -> None:
     rng = np.random.default_rng(0)
     lines = rng.integers(0, 256, (ORIENTATIONS, 24, 40)).astype(np.uint8)
     levels = halve_responses(lines)
@@ -121,14 +121,14 @@ def test_smaller_maps_keep_the_strongest_of_four() -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(480, 640), (257, 331), (720, 1280), (40, 30)])
-def test_pictures_of_any_size_are_taken(height: int, width: int) -> None:
+def test_images_of_any_size_are_taken(height: int, width: int) -> None:
     seen = network().predict(background(1, width, height))
     share = min(1.0, MAX_SIDE_PX / max(height, width))
     assert abs(seen.shape[1] - share * height / 2) <= 1 and abs(seen.shape[2] - share * width / 2) <= 1
     assert resize_responses(seen, 50, 40, 1).shape == (8, 40, 50)
 
 
-def test_lines_of_a_large_picture_are_where_they_are_in_a_small_one() -> None:
+def test_edges_of_an_enlarged_image_keep_their_places() -> None:
     image = drawn(POSE, noise=2.0)
     large = np.asarray(cv2.resize(image, None, fx=1.5, fy=1.5, interpolation=cv2.INTER_CUBIC))
     small, again = (network().predict(of)[:ORIENTATIONS].max(axis=0) for of in (image, large))
@@ -136,7 +136,7 @@ def test_lines_of_a_large_picture_are_where_they_are_in_a_small_one() -> None:
     assert np.corrcoef(cv2.blur(small, (5, 5)).ravel(), cv2.blur(again, (5, 5)).ravel())[0, 1] > 0.8
 
 
-def test_a_picture_mixes_both_in_its_maps_and_without_a_network_has_gradients_only() -> None:
+def test_response_maps_combine_gradients_and_edge_responses() -> None:
     image = drawn(POSE, noise=6.0)
     plain, lined = ImagePyramid(image, CAMERA, 12), ImagePyramid(image, CAMERA, 12, network())
     (by_gradients, one), (mixed, other) = plain.maps(-4), lined.maps(-4)

@@ -1,4 +1,4 @@
-"""The network that tells twins apart: it is for the right one, and says little where it cannot know."""
+"""The pair comparator: prefers the right pose, and gives small log odds where the difference cannot be seen."""
 
 from __future__ import annotations
 
@@ -38,55 +38,55 @@ def part_of(key_mm: float) -> PartView:
     return PartView(views)
 
 
-def twins_of(truth: Array, key_mm: float) -> list[Array]:
-    """``cam_from_body`` of a true ``cam_from_model``, itself first, and what its sixths make of it."""
+def symmetric_poses(truth: Array, key_mm: float) -> list[Array]:
+    """``cam_from_body`` of a true ``cam_from_model``, and its rotations by sixths."""
     body = truth @ part_of(key_mm).model_from_body
     return [rigid(body[:3, :3] @ turn, body[:3, 3]) for turn in TURNS]
 
 
-def leads(key_mm: float, truth: Array, poses: list[Array], **drawn: object) -> Array:
+def log_odds(key_mm: float, truth: Array, poses: list[Array], **drawn: object) -> Array:
     seen = picture(truth, plate(key_mm), **drawn)  # type: ignore[arg-type]
     return PairComparator(part_of(key_mm)).log_odds(ImagePyramid(seen, CAMERA, 12, EdgeNet()), poses)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [2.0, 10.0])
-def test_the_right_twin_is_ahead_of_the_others(noise: float) -> None:
+def test_the_right_pose_leads(noise: float) -> None:
     right, steep = [], []
     for k in range(12):
         truth = pose_from(30.0 * k, 35.0 + 4.0 * k, 400.0, plate(10.0), 20.0 * k)
-        told = leads(10.0, truth, twins_of(truth, 10.0), seed=k, scene=k, noise=noise)
-        np.testing.assert_array_equal(told, -told.T)
+        odds = log_odds(10.0, truth, symmetric_poses(truth, 10.0), seed=k, scene=k, noise=noise)
+        np.testing.assert_array_equal(odds, -odds.T)
         # From straight above a block of the plate's colour is hardly to be seen.
-        (right if k < 10 else steep).extend(told[0, 1:].tolist())
+        (right if k < 10 else steep).extend(odds[0, 1:].tolist())
     assert np.mean(np.array(right) > 1.0) > 0.9 and min(right) > -6.0, np.round(right, 1)
     assert min(steep) > -4.0, np.round(steep, 1)
 
 
-def test_it_does_not_matter_which_pose_comes_first() -> None:
+def test_the_order_of_the_poses_does_not_matter() -> None:
     truth = pose_from(40.0, 50.0, 400.0, plate(10.0))
-    poses = twins_of(truth, 10.0)
-    forth, back = (leads(10.0, truth, some) for some in (poses, poses[::-1]))
-    # The window is around the first.
+    poses = symmetric_poses(truth, 10.0)
+    forth, back = (log_odds(10.0, truth, some) for some in (poses, poses[::-1]))
+    # The window is centred on the first pose.
     np.testing.assert_allclose(forth, back[::-1, ::-1], atol=0.5)
 
 
-def test_what_hides_the_difference_decides_nothing() -> None:
+def test_an_image_without_the_part_gives_no_decision() -> None:
     truth = pose_from(40.0, 80.0, 400.0, plate(10.0))
     flat = np.clip(np.random.default_rng(0).normal(120.0, 4.0, (CAMERA.height, CAMERA.width, 3)), 0, 255)
     seen = ImagePyramid(flat.astype(np.uint8), CAMERA, 12, EdgeNet())
-    told = PairComparator(part_of(10.0)).log_odds(seen, twins_of(truth, 10.0))
-    assert np.abs(told).max() < DisambiguationOptions().min_margin, np.round(told, 1)
+    odds = PairComparator(part_of(10.0)).log_odds(seen, symmetric_poses(truth, 10.0))
+    assert np.abs(odds).max() < DisambiguationOptions().min_margin, np.round(odds, 1)
 
 
-def test_twins_that_differ_nowhere_are_equal() -> None:
+def test_exactly_symmetric_poses_have_equal_odds() -> None:
     truth = pose_from(40.0, 50.0, 400.0, plate(0.0))
-    np.testing.assert_array_equal(leads(0.0, truth, twins_of(truth, 0.0)), 0.0)
+    np.testing.assert_array_equal(log_odds(0.0, truth, symmetric_poses(truth, 0.0)), 0.0)
 
 
-def test_a_part_that_is_mostly_outside_the_picture_is_looked_at_as_far_as_it_is_seen() -> None:
+def test_a_part_mostly_outside_the_image_is_compared() -> None:
     truth = pose_from(40.0, 50.0, 400.0, plate(10.0))
     for aside_mm in (150.0, 250.0, 2000.0):
         moved = truth.copy()
         moved[0, 3] += aside_mm
-        assert np.all(np.isfinite(leads(10.0, moved, twins_of(moved, 10.0))))
+        assert np.all(np.isfinite(log_odds(10.0, moved, symmetric_poses(moved, 10.0))))

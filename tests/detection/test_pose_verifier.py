@@ -1,4 +1,4 @@
-"""The verifier: right poses before wrong ones and before pictures without the part, and the lines it is shown."""
+"""The pose verifier: scores right poses above wrong ones and images without the part; its crops match the CAD."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from helpers.synthetic import picture as drawn
 PART = PartView(assembly_views())
 TRUTH = pose_from(30.0, 45.0, 520.0) @ PART.model_from_body
 KNOWN = np.array([3.0, 1.0, 0.5])
-"""What evidence, judge and scatter say: the same of every pose here, so that the picture alone decides."""
+"""Evidence logit, profile score and scatter: equal for all poses, so that the image alone decides."""
 
 
 @cache
@@ -44,11 +44,11 @@ def verifier() -> PoseVerifier:
 def picture(noise: float = 6.0, is_hidden: bool = False) -> ImagePyramid:
     pose = TRUTH @ PART.body_from_model
     card = half_hidden(pose) if is_hidden else None
-    return ImagePyramid(drawn(pose, noise=noise, card=card), CAMERA, 12, lines())
+    return ImagePyramid(drawn(pose, noise=noise, card=card), CAMERA, 12, edge_net())
 
 
 @cache
-def lines() -> EdgeNet:
+def edge_net() -> EdgeNet:
     return EdgeNet()
 
 
@@ -56,8 +56,8 @@ def scores(seen: ImagePyramid, poses: Array) -> Array:
     return verifier().scores(seen, poses, np.tile(KNOWN, (len(poses), 1)))
 
 
-def shown(pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The picture around a pose, and what is drawn there."""
+def raw_crop(pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Pixels and drawn channels of the crop around a pose."""
     return crop_at(picture(), pose)[:2]
 
 
@@ -70,27 +70,27 @@ def turned(angle_deg: float, count: int) -> Array:
 
 
 @pytest.mark.parametrize("noise", [3.0, 12.0])
-def test_the_true_pose_is_verified_and_poses_far_off_are_not(noise: float) -> None:
+def test_the_true_pose_scores_above_poses_far_off(noise: float) -> None:
     seen = picture(noise)
     true, others = scores(seen, TRUTH[None])[0], scores(seen, turned(30.0, 60))
     assert true > others.max() + 1.0
     assert true > 0.0 > np.median(others)
 
 
-def test_the_further_off_the_less_is_a_pose_verified() -> None:
+def test_scores_fall_with_the_rotation_error() -> None:
     seen = picture()
     by_angle = [float(np.mean(scores(seen, turned(angle, 40)))) for angle in (1.0, 6.0, 12.0, 25.0)]
     assert by_angle == sorted(by_angle, reverse=True)
 
 
-def test_a_picture_without_the_part_verifies_no_pose() -> None:
-    clutter = [ImagePyramid(background(seed), CAMERA, 12, lines()) for seed in range(6)]
+def test_an_image_without_the_part_scores_low() -> None:
+    clutter = [ImagePyramid(background(seed), CAMERA, 12, edge_net()) for seed in range(6)]
     true = scores(picture(), TRUTH[None])[0]
     assert max(scores(seen, turned(20.0, 20)).max() for seen in clutter) < true - 2.0
 
 
-def test_the_outline_that_is_shown_is_that_of_the_mesh() -> None:
-    pixels, drawn_part = shown(TRUTH)
+def test_the_drawn_outline_is_that_of_the_mesh() -> None:
+    pixels, drawn_part = raw_crop(TRUTH)
     is_inside = around_truth(rendered()[1] >= 0) > 0.5
     outside_px = cv2.distanceTransform((~is_inside).astype(np.uint8), cv2.DIST_L2, 5)
     inside_px = cv2.distanceTransform(is_inside.astype(np.uint8), cv2.DIST_L2, 5)
@@ -102,8 +102,8 @@ def test_the_outline_that_is_shown_is_that_of_the_mesh() -> None:
     assert (pixels[..., 3] == 255).all()
 
 
-def test_the_surface_that_is_shown_is_that_of_the_mesh() -> None:
-    _, drawn_part = shown(TRUTH)
+def test_the_drawn_surface_is_that_of_the_mesh() -> None:
+    _, drawn_part = raw_crop(TRUTH)
     normals, depth = drawn_part[2:5], drawn_part[5]
     inverse_depth, face_ids = rendered()
     is_inside = cv2.erode(around_truth(face_ids >= 0), np.ones((3, 3))) > 0.99
@@ -123,7 +123,7 @@ def test_the_surface_that_is_shown_is_that_of_the_mesh() -> None:
         assert np.median(np.abs(normals[axis] - true)[is_inside]) < 0.05
 
 
-def test_the_lines_that_are_shown_lie_where_the_outline_is_and_solids_where_the_part_is() -> None:
+def test_cropped_edge_responses_match_outline_and_solid() -> None:
     _, drawn_part, seen = crop_at(picture(), TRUTH)
     strongest, along, solids = seen.astype(float) / 255.0
     is_inside = around_truth(rendered()[1] >= 0) > 0.5
@@ -136,7 +136,7 @@ def test_the_lines_that_are_shown_lie_where_the_outline_is_and_solids_where_the_
     assert np.median(solids[is_inside & ~at_outline]) > 0.6 > 0.3 > np.median(solids[far_off])
 
 
-def test_without_a_line_network_no_lines_are_shown() -> None:
+def test_without_an_edge_network_responses_are_zero() -> None:
     assert not crop_at(ImagePyramid(picture().image, CAMERA, 12), TRUTH).responses.any()
 
 
@@ -149,7 +149,7 @@ def rendered() -> tuple[Array, NDArray[np.int32]]:
 
 
 def around_truth(values: Array) -> Array:
-    """What the picture (H,W) has around the true pose, (S,S)."""
+    """Values (H,W) of the image resampled to the crop (S,S) around the true pose."""
     zoom = CROP_RADIUS_PX / (
         0.5 * (CAMERA.fx + CAMERA.fy) * 0.5 * PART.views.diameter_mm / np.linalg.norm(TRUTH[:3, 3])
     )
@@ -160,8 +160,8 @@ def around_truth(values: Array) -> Array:
 
 
 def shaded(strength: float, noise: float) -> tuple[Array, float]:
-    """The shading found on the true pose's surface when it has some, (S,S), and the share that it explains."""
-    pixels, drawn_part = shown(TRUTH)
+    """Shading and residual (S,S) for a surface shaded with some strength, and the share explained."""
+    pixels, drawn_part = raw_crop(TRUTH)
     light = 0.3 + np.maximum(np.tensordot([0.4, -0.5, 0.77], drawn_part[2:5], axes=1), 0.0)
     rng = np.random.default_rng(4)
     grays = 60.0 + strength * light + rng.normal(0.0, noise, light.shape)
@@ -170,8 +170,8 @@ def shaded(strength: float, noise: float) -> tuple[Array, float]:
     return seen[SHADING:], float(explained)
 
 
-def test_the_brightness_that_a_light_gives_the_surface_is_explained_and_noise_is_not() -> None:
-    _, drawn_part = shown(TRUTH)
+def test_shading_is_explained_and_noise_is_not() -> None:
+    _, drawn_part = raw_crop(TRUTH)
     is_surface = drawn_part[4] != 0.0
     (shading, rest), explained = shaded(100.0, 2.0)
     assert explained > 0.9
@@ -180,15 +180,15 @@ def test_the_brightness_that_a_light_gives_the_surface_is_explained_and_noise_is
     assert abs(shaded(0.0, 20.0)[1]) < 0.1
 
 
-def test_what_hides_a_part_of_the_part_does_not_turn_a_right_pose_into_a_wrong_one() -> None:
+def test_an_occluded_true_pose_scores_above_wrong_ones() -> None:
     seen = picture(is_hidden=True)
     assert scores(seen, TRUTH[None])[0] > scores(seen, turned(30.0, 60)).max()
 
 
-def test_a_pose_outside_the_picture_is_scored_without_a_picture() -> None:
+def test_a_pose_outside_the_image_is_scored() -> None:
     aside = TRUTH.copy()
     aside[0, 3] += 2000.0
-    plain, contrast = normalise_colours(*shown(aside))
+    plain, contrast = normalise_colours(*raw_crop(aside))
     seen, explained = append_gradients(plain)
     assert seen.shape == (CROP_CHANNELS, CROP_SIDE_PX, CROP_SIDE_PX)
     assert not seen[:4].any() and not seen[PLAIN_CHANNELS:].any()
@@ -197,7 +197,7 @@ def test_a_pose_outside_the_picture_is_scored_without_a_picture() -> None:
     assert scores(picture(), aside[None])[0] < scores(picture(), TRUTH[None])[0]
 
 
-def test_many_poses_are_scored_as_each_alone() -> None:
+def test_batched_scores_equal_single_scores() -> None:
     seen, poses = picture(), np.concatenate([TRUTH[None], turned(10.0, 20)])
     together = scores(seen, poses)
     alone = [scores(seen, pose[None])[0] for pose in poses]

@@ -1,4 +1,4 @@
-"""The judge: right poses before wrong ones, whatever the part, and the kernel against plain numpy."""
+"""The profile ranker: ranks right poses first, and its kernel computes what NumPy does."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def turned(angle_deg: float, count: int) -> Array:
     return turned_about(TRUTH, angle_deg, count)
 
 
-def elsewhere(count: int) -> Array:
-    """Random poses in the picture."""
+def random_poses(count: int) -> Array:
+    """Random poses in the image."""
     rng = np.random.default_rng(3)
     poses = []
     for _ in range(count):
@@ -58,14 +58,14 @@ def scores(seen: ImagePyramid, poses: Array, networks: tuple[str, ...]) -> Array
 
 
 @NETWORKS
-def test_the_true_pose_comes_before_all_others_in_noise_and_clutter(networks: tuple[str, ...]) -> None:
+def test_the_true_pose_ranks_first_in_noise_and_clutter(networks: tuple[str, ...]) -> None:
     seen = picture()
     true = scores(seen, TRUTH[None], networks)[0]
-    others = scores(seen, np.concatenate([turned(25.0, 40), elsewhere(160)]), networks)
+    others = scores(seen, np.concatenate([turned(25.0, 40), random_poses(160)]), networks)
     assert true > others.max() + 1.0
 
 
-def test_refined_poses_are_told_to_a_few_degrees() -> None:
+def test_scores_of_refined_poses_fall_within_a_few_degrees() -> None:
     seen = picture()
     by_angle = [float(np.mean(scores(seen, turned(angle, 60), FINE))) for angle in (0.0, 3.0, 6.0, 12.0)]
     assert by_angle == sorted(by_angle, reverse=True)
@@ -74,7 +74,7 @@ def test_refined_poses_are_told_to_a_few_degrees() -> None:
 
 @NETWORKS
 def test_the_kernel_scores_as_numpy_does(networks: tuple[str, ...]) -> None:
-    seen, poses = picture(), np.concatenate([TRUTH[None], turned(8.0, 20), elsewhere(40)])
+    seen, poses = picture(), np.concatenate([TRUTH[None], turned(8.0, 20), random_poses(40)])
     expected = np.zeros(len(poses))
     for name in networks:
         lines, both = describe_poses(seen, PART, poses, np.full(len(poses), 12.0), RADII_PX[name])
@@ -92,7 +92,7 @@ def test_the_kernel_scores_as_numpy_does(networks: tuple[str, ...]) -> None:
     assert scores(seen, poses, networks) == pytest.approx(expected, abs=1e-4)
 
 
-def test_lines_outside_the_picture_are_empty_and_still_give_a_score() -> None:
+def test_profiles_outside_the_image_are_empty_and_scored() -> None:
     aside = TRUTH.copy()
     aside[0, 3] += 2000.0
     lines, both = describe_poses(picture(), PART, aside[None], np.array([12.0]), 48.0)
@@ -103,14 +103,14 @@ def test_lines_outside_the_picture_are_empty_and_still_give_a_score() -> None:
     assert scores(picture(), aside[None], FINE)[0] < scores(picture(), TRUTH[None], FINE)[0]
 
 
-def test_it_is_shown_the_lines_of_the_line_network_and_where_that_sees_solids() -> None:
+def test_profiles_hold_the_responses_to_edges_and_solids() -> None:
     seen = picture()
     lines, _ = describe_poses(seen, PART, TRUTH[None], np.full(1, 12.0), RADII_PX["rough"])
     outline = lines[0, :OUTLINE_LINES]
     assert (outline[:, IS_SEEN] == 1.0).all()
     alike, inside = np.split(outline[:, IS_SEEN + 2 :].mean(axis=0), 2)
     assert len(alike) == len(inside) == PLACES
-    # A line there, no other beside it; solid on the inner side only.
+    # One edge, none beside it; solid on the inner side only.
     assert alike[REACH_PX - 1 : REACH_PX + 2].max() > 0.6 > 4.0 * alike[-3:].mean()
     assert inside[:3].mean() > 0.6 and inside[-3:].mean() < 0.3
     without = ImagePyramid(seen.image, CAMERA, 12)
