@@ -199,7 +199,7 @@ def test_scale_file(tmp_path: Path) -> None:
     for text, says in (
         ("[[boards]]\n", "unknown key 'boards'"),
         ("[[tag]]\nside_mm = 3\n", "'dictionary' is missing"),
-        ("[[scale_bar]]\nids = [1]\nlength_mm = 3\n", "expected two numbers"),
+        ("[[scale_bar]]\nids = [1]\nlength_mm = 3\n", "expected the ids of two tags"),
         ("[rig]\n", "expected one of"),
         ("[[", "not valid TOML"),
     ):
@@ -446,7 +446,7 @@ def test_scale_of_a_rig_moves_the_frame_with_it() -> None:
     wrong = {name: 1.01 * centre for name, centre in centres.items()}
     result = find(sparse, part_of(assembly(), "plate"), ScaleSources(rig=Rig(wrong)), pictures=pictures)
     assert result.scale == pytest.approx(1.01 * TRUTH.scale, rel=1e-5)
-    assert not result.consistency.is_consistent and "another size" in result.consistency.reason
+    assert not result.consistency.is_consistent and "the size of the CAD contradicts" in result.consistency.reason
     assert any("CAD edges" in w and "camera rig" in w for w in result.warnings)
 
 
