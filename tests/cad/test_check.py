@@ -111,19 +111,19 @@ def test_near_symmetry_names_the_component_that_breaks_it():
     )
     said = texts(check, "warning")
     assert "nearly the same" in said
-    assert "turned by 180° about Z; told apart by key" in said
+    assert "rotated by 180° about Z; distinguished by key" in said
     assert "looks the same" not in texts(check, "problem")
 
 
 def test_an_exact_symmetry_is_a_problem_until_declared_or_out_of_view():
     block = component("block", box((0, 0, 0), (100, 60, 30)))
     free = check_part(part_of(block))
-    assert "looks the same when turned by 180° about" in texts(free, "problem")
+    assert "looks the same when rotated by 180° about" in texts(free, "problem")
     assert free.has_problems
     narrow = ViewRange((300, 600), elevation_deg=(20, 70), azimuth_deg=(-60, 60), roll_deg=(-20, 20))
     seen = check_part(part_of(block, view_range=narrow))
     assert not seen.has_problems
-    assert "the view range keeps apart" in texts(seen, "note")
+    assert "that the view range excludes" in texts(seen, "note")
     declared = tuple(Symmetry(axis, (50, 30, 15), 2) for axis in [(1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0)])
     told = check_part(replace(part_of(block), symmetries=declared))
     assert not told.has_problems
@@ -182,8 +182,8 @@ def test_sizes_in_pixels():
     )
     pin = check.components[1]
     assert pin.pixels_across == pytest.approx((3.0, 15.0), rel=1e-3)
-    assert "pin is small: 3.0 px across at 1000 mm; well seen up to 250 mm" in texts(check, "warning")
-    assert "dot is too small to see: 5.0 px across even at 200 mm" in texts(check, "problem")
+    assert "pin is small: 3.0 px across at 1000 mm; large enough up to 250 mm" in texts(check, "warning")
+    assert "dot is too small to be seen: 5.0 px across even at 200 mm" in texts(check, "problem")
     assert not check.is_camera_guessed
 
 

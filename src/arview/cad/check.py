@@ -114,7 +114,7 @@ class PartCheck:
         lines += ["", *self._table(), ""]
         lines += [f"{finding.severity}: {finding.text}" for finding in self.findings]
         if not self.findings:
-            lines.append("nothing that should be hard")
+            lines.append("no difficulties expected")
         return "\n".join(lines)
 
     def _table(self) -> list[str]:
@@ -221,7 +221,7 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Pa
         findings.append(
             PartFinding(
                 "warning",
-                f"at {near_mm:.0f} mm the part is {share:.1f} pictures wide: little contour is seen",
+                f"at {near_mm:.0f} mm the part is {share:.1f} pictures wide: little of its contour is visible",
             )
         )
     across_px = camera.fx * diameter_mm / far_mm
@@ -260,12 +260,12 @@ def _symmetry_findings(part: Part, view_range: ViewRange, symmetries: tuple[Foun
             findings.append(PartFinding("warning", _near_text(part, found)))
     if ambiguous:
         text = (
-            f"the part looks the same when turned by {_listed(ambiguous, 4)}: its pose is ambiguous; "
+            f"the part looks the same when rotated by {_listed(ambiguous, 4)}: its pose is ambiguous; "
             "restrict [view_range], declare it as [[symmetry]] if it does not matter, or rely on its texture"
         )
         findings.append(PartFinding("problem", text))
     if excluded:
-        text = f"looks (nearly) the same when turned, but the view range keeps apart: {_listed(excluded, 4)}"
+        text = f"symmetries and near-symmetries that the view range excludes: {_listed(excluded, 4)}"
         findings.append(PartFinding("note", text))
     return findings
 
@@ -274,10 +274,10 @@ def _near_text(part: Part, found: FoundSymmetry) -> str:
     names = [component.name for component in part.model.components]
     shares = zip(names, found.unmatched_of_group, strict=True)
     breaking = [name for name, share in shares if share > MOVING_SHARE]
-    told = f"; told apart by {_listed(breaking, 6)}" if len(names) > 1 and breaking else ""
+    told = f"; distinguished by {_listed(breaking, 6)}" if len(names) > 1 and breaking else ""
     same = 100.0 * (1.0 - found.unmatched_share)
     what = found.symmetry.describe()
-    return f"the part is nearly the same ({same:.0f} % of its surface) when turned by {what}{told}"
+    return f"the part is nearly the same ({same:.0f} % of its surface) when rotated by {what}{told}"
 
 
 def can_confuse(symmetry: Symmetry, view_range: ViewRange) -> bool:
@@ -324,11 +324,11 @@ def _size_findings(check: ComponentCheck, view_range: ViewRange) -> list[PartFin
     name = check.component.name
     is_judged = check.settings.role == "inspect"
     if near_px < SMALL_PX:
-        text = f"{name} is too small to see: {near_px:.1f} px across even at {near_mm:.0f} mm"
+        text = f"{name} is too small to be seen: {near_px:.1f} px across even at {near_mm:.0f} mm"
         return [PartFinding("problem" if is_judged else "warning", text)]
     if far_px < SMALL_PX:
         limit_mm = near_mm * near_px / SMALL_PX
-        text = f"{name} is small: {far_px:.1f} px across at {far_mm:.0f} mm; well seen up to {limit_mm:.0f} mm"
+        text = f"{name} is small: {far_px:.1f} px across at {far_mm:.0f} mm; large enough up to {limit_mm:.0f} mm"
         return [PartFinding("warning", text)]
     thin_px = far_px * check.fitness.extents_mm[2] / check.fitness.extents_mm[1]
     if thin_px < THIN_PX:
@@ -344,7 +344,7 @@ def _mesh_findings(check: ComponentCheck) -> list[PartFinding]:
         text = f"{name} is a sheet without thickness ({fitness.thickness_mm:.3g} mm): give it one in the CAD"
         findings.append(PartFinding("warning", text))
     elif fitness.open_edge_count:
-        text = f"{name} is not closed: {fitness.open_edge_count} open edges; they will show as contours"
+        text = f"{name} is not closed: {fitness.open_edge_count} open edges; they will appear as contours"
         findings.append(PartFinding("warning", text))
     if fitness.non_manifold_edge_count:
         count = fitness.non_manifold_edge_count
@@ -369,7 +369,7 @@ def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[PartFindi
         if check.settings.role == "inspect" and declared is None and spins:
             spinning.append(f"{check.component.name} ({spins[0].describe().removeprefix('any angle about ')})")
     if spinning:
-        text = f"bodies of revolution, whose turn about their axis cannot be measured: {_listed(spinning, 8)}"
+        text = f"bodies of revolution, whose rotation about their axis cannot be measured: {_listed(spinning, 8)}"
         findings.append(PartFinding("note", text))
     return findings
 

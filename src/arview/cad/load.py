@@ -177,7 +177,7 @@ def _step_unit_mm(path: Path) -> float:
         found = re.findall(r"LENGTH_UNIT\s*\(\s*\)[^;]*?SI_UNIT\s*\(\s*([^,\s]*)\s*,\s*\.METRE\.", text)
         units = {prefixes.get(prefix) for prefix in found}
     if len(units) != 1 or None in units:
-        raise InputError(f"{path}: its length unit cannot be told, so unit cannot be overridden; leave unit out")
+        raise InputError(f"{path}: its length unit is not known, so that unit cannot be overridden; leave unit out")
     return float(next(value for value in units if value is not None))
 
 

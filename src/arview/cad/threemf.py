@@ -78,7 +78,7 @@ class _Archive:
         unit = root.get("unit", "millimeter")
         self.model.unit_mm = unit_in_mm(unit)
         if self.model.unit_mm is None:
-            self.model.notes.append(f"its unit {unit!r} is not one that 3MF knows")
+            self.model.notes.append(f"its unit {unit!r} is not a unit of 3MF")
         for item in root.iterfind("{*}build/{*}item"):
             key = (self._part_of(item, main), item.attrib["objectid"])
             self._instantiate(key, _transform(item), (), item.get("partnumber"))
