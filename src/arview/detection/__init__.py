@@ -1,4 +1,4 @@
-"""Detection: the part found in one picture, without any earlier pose."""
+"""Detection of a part in a single image, without an earlier pose."""
 
 from arview.detection.detector import Detection, Detector, DetectorOptions
 

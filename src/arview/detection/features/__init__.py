@@ -1,1 +1,1 @@
-"""What searches make of a picture: response maps at all scales, edge responses, a picture without noise."""
+"""Image features for the searches: denoised images, response maps at many scales, edge responses."""

@@ -46,7 +46,7 @@ def noise_level(image: NDArray[np.uint8], stride: int = 3) -> float:
 
     Args:
         image: RGB.
-        stride: every so many rows and columns are sampled.
+        stride: spacing of the sampled rows and columns.
     """
     laplacian = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
     green = image[..., 1].copy()

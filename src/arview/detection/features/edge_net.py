@@ -30,7 +30,7 @@ SHRINK = 2
 CELL_PX = 32
 """The network takes images whose sides are multiples of this."""
 SOLID_CHANNEL = ORIENTATIONS
-"""Index of the predicted map that says where solids are; the maps before it are edge responses by orientation."""
+"""Index of the predicted map of solids; the maps before it are edge responses by orientation."""
 INPUT_SCALE = 64.0
 """Grey levels that the input is divided by after its mean is subtracted."""
 

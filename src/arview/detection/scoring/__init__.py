@@ -1,1 +1,1 @@
-"""Networks and rankers that score poses of a picture."""
+"""Networks and rankers that score the poses of an image."""

@@ -352,7 +352,7 @@ def _compare_sides(sides, mean_colour, step, profiles):  # type: ignore[no-untyp
 
 @kernel
 def sample_lines(part, pose, max_outline, max_inner):  # type: ignore[no-untyped-def]
-    """`SampledLines` of the view nearest to a pose, with at most so many rows of outline and of design edges."""
+    """`SampledLines` of the view nearest to a pose, with at most ``max_outline`` and ``max_inner`` rows."""
     view = nearest_view(part.directions, pose)
     points = np.empty((max_outline + max_inner, 3), dtype=np.float32)
     directions = np.empty((max_outline + max_inner, 3), dtype=np.float32)

@@ -114,7 +114,7 @@ class SearchBudget:
         ranked: improved matches that are ranked.
         starts: ranked poses from which the local search starts.
         kept: hypotheses kept after each level of the pattern search.
-        scale_stride: templates are matched at every so many scale steps.
+        scale_stride: spacing of the scale steps at which templates are matched.
         is_trimmed: leave out the quarter of each outline with the lowest responses, which may be occluded.
         use_edge_net: edge responses weigh as much as gradients until poses are ranked.
     """
