@@ -6,6 +6,7 @@ import http.client
 import json
 import random
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -218,8 +219,16 @@ def test_a_client_that_takes_no_answer_is_cut(server: Running, page: Http, monke
         head = (
             f"GET /api/model.glb HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nCookie: {page.headers['Cookie']}\r\n\r\n"
         )
+        address, is_cut, lost = line.getsockname(), threading.Event(), TimeLimitedProtocol.connection_lost
+
+        def connection_lost(self: TimeLimitedProtocol, error: Exception | None) -> None:
+            if self.client == address:
+                is_cut.set()
+            lost(self, error)
+
+        monkeypatch.setattr(TimeLimitedProtocol, "connection_lost", connection_lost)
         line.sendall(20 * head.encode())
-        time.sleep(2.0)
+        assert is_cut.wait(60)
         taken = 0
         with suppress(ConnectionError):
             while chunk := line.recv(1 << 20):
