@@ -58,7 +58,7 @@ def make_composites(seeds: range, photos: Sequence[Path], things: Path, folder: 
         raise InputError(f"{things}: {len(cutouts)} pictures with transparency, {MIN_CUTOUTS} are needed")
     for seed, path in missing_files(seeds, folder, "composite_{:04d}.jpg", "composite backgrounds"):
         rng = np.random.default_rng([seed, 6])
-        picture = composite(read_photo(photos[rng.integers(len(photos))]), cutouts, rng)
+        picture = composite(read_photo(photos[int(rng.integers(len(photos)))]), cutouts, rng)
         with replacing(path) as file:
             file.write(to_jpeg(picture, JPEG_QUALITY))
 
@@ -67,7 +67,7 @@ def composite(photo: Image, cutouts: Sequence[Cutout], rng: np.random.Generator)
     """A picture (HEIGHT,WIDTH,3) of some things on a part of a photo."""
     picture = _ground(photo, rng)
     for _ in range(rng.integers(*THINGS)):
-        thing, shadow = _placed(cutouts[rng.integers(len(cutouts))], rng)
+        thing, shadow = _placed(cutouts[int(rng.integers(len(cutouts)))], rng)
         opacity = thing[..., 3:] / np.float32(255.0)
         picture *= 1.0 - shadow[..., None]
         picture += opacity * (thing[..., :3] - picture)

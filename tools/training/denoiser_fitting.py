@@ -109,9 +109,11 @@ def _pair(image: NDArray[np.uint8], rng: np.random.Generator, noise: float | Non
     square = image[top : top + taken_px, left : left + taken_px]
     if rng.random() < 0.15:
         square = with_flat_shapes(square, rng)
-    square = square.astype(np.float32)
+    pixels = square.astype(np.float32)
     way = cv2.INTER_AREA if taken_px > CROP_PX else cv2.INTER_LINEAR
-    truth = cv2.resize(square, (CROP_PX, CROP_PX), interpolation=way) if taken_px != CROP_PX else square
+    truth: NDArray[Any] = pixels
+    if taken_px != CROP_PX:
+        truth = np.asarray(cv2.resize(pixels, (CROP_PX, CROP_PX), interpolation=way))
     if rng.random() < 0.5:
         if rng.random() < 0.6:
             # A random change of saturation.

@@ -114,7 +114,7 @@ def read_edge_pictures(folder: Path) -> list[EdgePicture]:
 
 
 def _edge_picture(solids: Sequence[Model], photos: Sequence[Path], rng: np.random.Generator) -> EdgePicture:
-    photo = read_photo(photos[rng.integers(len(photos))])
+    photo = read_photo(photos[int(rng.integers(len(photos)))])
     picture = _crop(photo, rng).astype(np.float32)
     is_cluttered = rng.random() < CLUTTERED_SHARE
     if is_cluttered and rng.random() < PATTERNED_SHARE:
@@ -146,7 +146,7 @@ def cluttered_picture(
         photos: for the background.
         rng: random numbers.
     """
-    photo = read_photo(photos[rng.integers(len(photos))])
+    photo = read_photo(photos[int(rng.integers(len(photos)))])
     picture = _crop(photo, rng).astype(np.float32)
     if rng.random() < PATTERNED_SHARE:
         picture = _patterned(picture, rng)
@@ -165,7 +165,7 @@ def cluttered_picture(
 
 def lone_picture(solid: Model, pose: Array, photos: Sequence[Path], rng: np.random.Generator) -> NDArray[np.float32]:
     """A picture (H,W,3), without noise, of one solid at a ``cam_from_model`` in front of a photo."""
-    photo = read_photo(photos[rng.integers(len(photos))])
+    photo = read_photo(photos[int(rng.integers(len(photos)))])
     return drawn_before(_crop(photo, rng).astype(np.float32), photo, [(solid, pose)], photos, rng)[0]
 
 
@@ -178,10 +178,10 @@ def occluded_picture(
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
     """A picture with one of some solids, perhaps in other colours, drawn over a place."""
-    solid = solids[rng.integers(len(solids))]
+    solid = solids[int(rng.integers(len(solids)))]
     if rng.random() < RECOLOURED_SHARE:
         solid = recoloured(solid, rng)
-    photo = read_photo(photos[rng.integers(len(photos))])
+    photo = read_photo(photos[int(rng.integers(len(photos)))])
     placed = [(solid, _pose_at(solid, place_px, radius_px, rng))]
     return drawn_before(picture, photo, placed, photos, rng)[0]
 
@@ -219,7 +219,7 @@ def drawn_before(
         paste(layer.coverage, layer, cover)
         if rng.random() < PRINTED_SHARE:
             share = rng.uniform(0.2, 1.0)
-            print_on = _crop(read_photo(photos[rng.integers(len(photos))]), rng).astype(np.float32) / 110.0
+            print_on = _crop(read_photo(photos[int(rng.integers(len(photos)))]), rng).astype(np.float32) / 110.0
             both[..., :3] *= 1.0 - share + share * print_on
         picture = picture * (1.0 - both[..., 3:]) + 255.0 * np.clip(both[..., :3], 0.0, 1.0)
     return picture, covers
@@ -231,7 +231,7 @@ def _placed(solids: Sequence[Model], rng: np.random.Generator) -> list[tuple[Mod
     placed: list[tuple[Model, Array]] = []
     first_px, first_radius_px = np.zeros(2), 0.0
     for number in range(rng.choice(COUNTS, p=COUNT_SHARES)):
-        solid = solids[rng.integers(len(solids))]
+        solid = solids[int(rng.integers(len(solids)))]
         if rng.random() < RECOLOURED_SHARE:
             solid = recoloured(solid, rng)
         radius_px = float(np.exp(rng.uniform(*np.log(OTHER_RADIUS_PX if number else RADIUS_PX))))
@@ -257,7 +257,7 @@ def _clutter(
     steel = rng.uniform(0.15, 0.8) if rng.random() < STEEL_SHARE else None
     placed = []
     for number in range(rng.integers(*CLUTTER_COUNT)):
-        solid = solids[rng.integers(len(solids))]
+        solid = solids[int(rng.integers(len(solids)))]
         if steel is not None and rng.random() < 0.7:
             colors = steel * rng.uniform(0.7, 1.3, (len(solid.components), 1)) + rng.normal(0.0, 0.03, 3)
             solid = coloured(solid, colors)
@@ -309,7 +309,9 @@ def _patterned(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArra
     corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
     inward = 1.0 - 2.0 * corners
     corners_px = corners * (CAMERA.width, CAMERA.height) + inward * rng.uniform(-240.0, -5.0, (4, 2))
-    homography = cv2.getPerspectiveTransform(corners * np.float32(PATTERN_SIZE), corners_px.astype(np.float32))
+    homography = cv2.getPerspectiveTransform(
+        corners * np.array(PATTERN_SIZE, np.float32), corners_px.astype(np.float32)
+    )
     size = CAMERA.width, CAMERA.height
     share = cv2.warpPerspective(np.ones((height, width), np.float32), homography, size)[..., None]
     return np.asarray(picture * (1.0 - share) + cv2.warpPerspective(surface, homography, size) * share)

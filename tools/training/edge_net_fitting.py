@@ -194,7 +194,7 @@ def with_flat_shapes(image: NDArray[np.uint8], rng: np.random.Generator) -> NDAr
     return drawn
 
 
-def _motion_blurred(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+def _motion_blurred(image: NDArray[Any], rng: np.random.Generator) -> NDArray[np.float32]:
     """The image blurred by a linear motion."""
     way, middle = rng.uniform(0.0, np.pi), 6
     half = 0.5 * rng.uniform(2.0, 9.0) * np.array([np.cos(way), np.sin(way)])
@@ -204,7 +204,7 @@ def _motion_blurred(image: NDArray[np.float32], rng: np.random.Generator) -> NDA
     return np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum()))
 
 
-def _degraded(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
+def _degraded(image: NDArray[Any], rng: np.random.Generator) -> NDArray[np.uint8]:
     """Random changes of saturation, tint, brightness and illumination, blur, noise and compression."""
     if rng.random() < 0.6:
         grey = rng.uniform(-1.5, 1.0) if rng.random() < 0.5 else rng.uniform()

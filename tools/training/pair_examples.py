@@ -99,7 +99,7 @@ def _rotated_starts(detector: Detector, truth: Array, rng: np.random.Generator) 
     for _ in range(ROTATED_POSES):
         axis = rng.normal(size=3)
         if len(near) and rng.random() < 0.7:
-            axis = log_so3(near[rng.integers(len(near))])
+            axis = log_so3(near[int(rng.integers(len(near)))])
         angle = np.deg2rad(rng.uniform(*ROTATED_DEG)) * rng.choice((-1.0, 1.0))
         turns.append(turns[rng.integers(1 + len(near))] @ exp_so3(angle * axis / np.linalg.norm(axis)))
     return turned(truth, turns)

@@ -52,7 +52,7 @@ def fit_pair_comparator(folder: Path, epochs: int) -> None:
         inputs, rights, wrongs, count = [], [], [], 0
         for example in (fitted[i] for i in some):
             index = _chosen(example, rng)
-            inputs.append(network_input(example, index, rng)[0])
+            inputs.append(network_input(example, index.tolist(), rng)[0])
             right = example.is_right[index]
             pairs = [(count + a, count + b) for a in np.flatnonzero(right) for b in np.flatnonzero(~right)]
             rights += [a for a, _ in pairs]
@@ -84,7 +84,7 @@ def make_pair_comparator(torch: Any) -> Any:
     """A network from inputs (N,C,S,S) of poses and pairs of their indices (P,) to log odds for the first of each."""
     nn = torch.nn
 
-    class _PairComparator(nn.Module):  # type: ignore[misc, name-defined]
+    class _PairComparator(nn.Module):  # type: ignore[name-defined]
         def __init__(self) -> None:
             super().__init__()
             self.alone = nn.Sequential(*strided_convolutions(PAIR_CHANNELS, WIDTHS, (), torch))

@@ -97,7 +97,7 @@ def _component_crops(seed: int, photos: Sequence[Path]) -> Iterator[ComponentCro
         is_right = rng.random() < RIGHT_SHARE
         number = -1 if is_right else int(rng.integers(len(variants)))
         built, changed = (model, ()) if is_right else variants[number]
-        variant = VARIANTS[rng.integers(len(VARIANTS))]
+        variant = VARIANTS[int(rng.integers(len(VARIANTS)))]
         options = SequenceOptions(variant, 1, int(rng.integers(1 << 30)), noise=rng.uniform(2.0, 14.0), motion=ANYWHERE)
         pose = trajectory(model, options)[0]
         shown = _displaced(built, model, rng)
@@ -145,7 +145,7 @@ def _picture(
     """
     is_cluttered, is_occluded = rng.random() < CLUTTERED_SHARE, rng.random() < OCCLUDED_SHARE
     if not (is_cluttered or is_occluded):
-        photo = read_photo(photos[rng.integers(len(photos))])
+        photo = read_photo(photos[int(rng.integers(len(photos)))])
         return next(iter(render_sequence(shown, pose[None], photo, options, CAMERA, others[0]))).image
     picture = (
         cluttered_picture(others, (shown, pose), photos, rng)[0]
@@ -168,7 +168,7 @@ def _occluded(
     small = [component for component in model.components if component is not base]
     # A component on the near side, if there is any: the base hides the others.
     before = [one for one in small if _depth_mm(one, pose) < _depth_mm(base, pose)] or small
-    chosen = before[rng.integers(len(before))]
+    chosen = before[int(rng.integers(len(before)))]
     corners_px = CAMERA.project(apply(pose, chosen.vertices_in_model))
     low_px, high_px = corners_px.min(axis=0), corners_px.max(axis=0)
     size_px = float(np.max(high_px - low_px))
@@ -178,7 +178,7 @@ def _occluded(
 
 
 def _depth_mm(component: Component, pose: Array) -> float:
-    return float(apply(pose, np.mean(np.stack(component.bounds_in_model), axis=0))[2])
+    return float(apply(pose, np.mean(component.bounds_in_model, axis=0))[2])
 
 
 def _perturbed(pose: Array, rng: np.random.Generator) -> Array:
@@ -198,11 +198,11 @@ def _resized(model: Model, rng: np.random.Generator) -> tuple[Model, tuple[str, 
     """An assembly with one component scaled about its foot on the base, and the name of that component."""
     base = _base(model)
     others = [component for component in model.components if component is not base]
-    chosen = others[rng.integers(len(others))]
+    chosen = others[int(rng.integers(len(others)))]
     upright = int(np.argmin(np.ptp(base.bounds_in_model, axis=0)))
     low, high = chosen.bounds_in_model
     foot = 0.5 * (low + high)
-    is_above = foot[upright] > np.mean(np.stack(base.bounds_in_model)[:, upright])
+    is_above = foot[upright] > np.mean(base.bounds_in_model[:, upright])
     foot[upright] = low[upright] if is_above else high[upright]
     scale = np.full(3, rng.uniform(*SIZES[rng.integers(2)]))
     if rng.random() < 0.5:

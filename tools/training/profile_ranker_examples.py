@@ -200,8 +200,8 @@ def _pictures_of(
         pose = trajectory(solid, options)[0] if k < CLUTTERED_EACH else None
         clean, visible = cluttered_picture(others, None if pose is None else (solid, pose), photos, rng)
         if pose is None or visible >= 0.5:
-            truth = None if pose is None else pose @ detector.local.refiner.part.model_from_body
-            yield detector, noisy(clean, rng), truth
+            placed = None if pose is None else pose @ detector.local.refiner.part.model_from_body
+            yield detector, noisy(clean, rng), placed
     for _, image in frames_without_part(photos, (), CAMERA.width, CAMERA.height, WITHOUT_EACH, seed):
         yield detector, image, None
 
@@ -244,7 +244,9 @@ def _blurred(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.u
     return np.clip(np.round(picture), 0, 255).astype(np.uint8)
 
 
-def is_near(detector: Detector, poses: Array, truth: Array, turns: Array, angle_deg: float, share: float) -> Array:
+def is_near(
+    detector: Detector, poses: Array, truth: Array, turns: Array, angle_deg: float, share: float
+) -> NDArray[np.bool_]:
     """Which poses (N,4,4) are near the true one, up to some rotations (K,3,3) of the part, (N,) bool."""
     turned = np.einsum("ij,kjl->kil", truth[:3, :3], turns)
     cosine = 0.5 * (np.einsum("nij,kij->nk", poses[:, :3, :3], turned).max(axis=1) - 1.0)
@@ -284,7 +286,7 @@ def _rendered(
     options = SequenceOptions(
         variant, count, seed, noise=rng.uniform(3.0, 14.0), blur_px=rng.uniform(0.4, 1.3), motion=ANYWHERE
     )
-    photo = read_photo(photos[rng.integers(len(photos))])
+    photo = read_photo(photos[int(rng.integers(len(photos)))])
     return list(render_sequence(solid, trajectory(solid, options), photo, options, CAMERA, occluder))
 
 
@@ -296,7 +298,7 @@ def _recoloured(solid: Model, rng: np.random.Generator) -> Model:
 
 
 def _printed_on(frame: SequenceFrame, photos: Sequence[Path], rng: np.random.Generator) -> NDArray[np.uint8]:
-    photo = cv2.resize(read_photo(photos[rng.integers(len(photos))]), frame.image.shape[1::-1])
+    photo = cv2.resize(read_photo(photos[int(rng.integers(len(photos)))]), frame.image.shape[1::-1])
     share = rng.uniform(0.3, 1.0) * frame.mask[..., None]
     printed = frame.image * (1.0 - share + share * photo / 110.0)
     return np.asarray(np.clip(printed, 0, 255).astype(np.uint8))

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from arview.core.atomic import replacing
 from arview.detection.scoring.profile_ranker import (
@@ -51,12 +50,12 @@ def fit_profile_ranker(folder: Path, epochs: int, from_scratch: bool = True) -> 
         raise InputError("fit.py: torch is not installed; pip install torch") from error
     fitted, left = read_examples(folder, "groups_*.pkl", HELD_OUT)
     torch.manual_seed(0)
-    stored: dict[str, NDArray[np.float32]] = {}
+    stored: dict[str, Any] = {}
     for stage, names in (("rough", ("rough",)), ("refined", ("fine", "close"))):
         networks = {name: _network(torch) if from_scratch else _from_package(name, torch) for name in names}
         rate = RATE if from_scratch else CONTINUED_RATE_SHARE * RATE
-        of_stage = ([g for g in groups if g.stage == stage] for groups in (fitted, left))
-        weight = _fit(networks, *of_stage, epochs, rate, torch)
+        fitted_groups, left_groups = ([g for g in groups if g.stage == stage] for groups in (fitted, left))
+        weight = _fit(networks, fitted_groups, left_groups, epochs, rate, torch)
         print(f"{stage}: weight of the evidence {weight:.2f}")
         for name, network in networks.items():
             for field, layer in zip(RankerLayers._fields[::2], network.layers(), strict=True):
@@ -139,7 +138,7 @@ def _network(torch: Any) -> Any:
     """The network of `arview.detection.scoring.profile_ranker` in torch."""
     nn = torch.nn
 
-    class _Network(nn.Module):  # type: ignore[misc, name-defined]
+    class _Network(nn.Module):  # type: ignore[name-defined]
         def __init__(self) -> None:
             super().__init__()
             self.first, self.second = nn.Linear(FEATURES, WIDTH), nn.Linear(WIDTH, WIDTH)

@@ -46,7 +46,7 @@ def residual_block(width: int, torch: Any) -> Any:
     """A residual block (He et al., "Deep residual learning", CVPR 2016), initialised to the identity."""
     nn = torch.nn
 
-    class _Residual(nn.Module):  # type: ignore[misc, name-defined]
+    class _Residual(nn.Module):  # type: ignore[name-defined]
         is_identity_at_first = True
 
         def __init__(self) -> None:

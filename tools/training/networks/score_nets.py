@@ -110,7 +110,7 @@ def make_score_net(
     """
     nn = torch.nn
 
-    class _Network(nn.Module):  # type: ignore[misc, name-defined]
+    class _Network(nn.Module):  # type: ignore[name-defined]
         def __init__(self) -> None:
             super().__init__()
             self.convolutions = nn.Sequential(*strided_convolutions(channels, widths, deepened, torch))

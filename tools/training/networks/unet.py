@@ -19,7 +19,7 @@ def unet(torch: Any, first: Any, down: Sequence[Any], narrow: Sequence[Any], up:
     """
     nn = torch.nn
 
-    class _UNet(nn.Module):  # type: ignore[misc, name-defined]
+    class _UNet(nn.Module):  # type: ignore[name-defined]
         def __init__(self) -> None:
             super().__init__()
             self.first, self.last = first, last
