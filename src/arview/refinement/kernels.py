@@ -13,7 +13,7 @@ from arview.refinement.evidence import edge_evidence, region_evidence
 from arview.refinement.gauss_newton import apply_twist, solve_step
 from arview.refinement.modalities.edge import HYPOTHESES, EdgeProfiles, add_edges, measure_edges
 from arview.refinement.modalities.region import RegionLines, add_histograms, add_region, measure_region
-from arview.refinement.modalities.texture import add_matches
+from arview.refinement.modalities.texture_matching import add_matches
 from arview.refinement.projection import project_lines
 
 STRENGTH_HALF = 15.0
