@@ -304,6 +304,7 @@ def test_step_tolerance_is_in_mm_whatever_the_files_unit(unit, tmp_path):
     assert len(angular.components[0].faces) >= 4 * 72 - 8
 
 
+@pytest.mark.slow
 def test_hash_is_stable_between_runs_and_tells_parts_apart(tmp_path):
     path = nested_step(tmp_path, "mm")
     first = load_model(path).source_hash

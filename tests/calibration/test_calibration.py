@@ -279,6 +279,7 @@ def test_boards_of_old_opencv_are_recognised() -> None:
     assert len(view.ids) == 35
 
 
+@pytest.mark.slow
 def test_photos_of_several_cameras_and_none_with_a_board(pictures: list[np.ndarray], tmp_path: Path) -> None:
     for k in range(2):
         write_photo(tmp_path / f"a{k}.jpg", pictures[k])
@@ -327,6 +328,7 @@ def test_every_format_is_read_back(kind: str, camera: Camera, tmp_path: Path) ->
     assert np.allclose(numbers(again), numbers(expected), rtol=1e-14, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_profiles_are_found_by_what_pictures_say(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ARVIEW_PROFILES", str(tmp_path / "kept"))
     with pytest.raises(InputError, match="there are none in"):
@@ -384,6 +386,7 @@ def invoke(*arguments: object) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
+@pytest.mark.slow
 def test_the_commands(photos: Path, tmp_path: Path) -> None:
     code, said = invoke("board", "-o", tmp_path / "board.pdf", "--paper", "A3")
     assert code == 0

@@ -83,11 +83,13 @@ def test_flags_of_the_compiler_have_one_key_in_every_process(tmp_path: Path) -> 
     assert [run(tmp_path, options=options) for _ in range(3)] == [(6.0, 1)] * 3
 
 
+@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_done_without(tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("a file where the folder should be")
     assert run(tmp_path) == (6.0, 0)
 
 
+@pytest.mark.slow
 def test_a_cached_signature_of_a_renamed_named_tuple_is_compiled_anew(tmp_path: Path) -> None:
     program = """
 from typing import NamedTuple

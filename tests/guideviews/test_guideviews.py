@@ -114,6 +114,7 @@ def test_a_camera_inside_the_part_is_refused() -> None:
 # --- Features -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_contour_points_lie_on_the_outline_and_on_the_mesh(views: GuideViewSet) -> None:
     renderer = ZBufferRenderer(assembly(), views.camera)
     apart_px, apart_mm, snapped = [], [], []

@@ -103,6 +103,7 @@ def test_annotated_picture_by_jpeg(page: Http) -> None:
     assert (np.abs(plain - frames()[1]).max(axis=2) > 60).mean() < 0.02
 
 
+@pytest.mark.slow
 def test_control_changes_state_and_an_invalid_request_changes_nothing(page: Http) -> None:
     name = page.join()
     path = f"/api/clients/{name}/control"
@@ -184,6 +185,7 @@ def test_part_document_tells_what_the_inspection_says(page: Http) -> None:
     assert str(INSPECTION.parent) not in json.dumps(part) and "/tmp" not in json.dumps(part)
 
 
+@pytest.mark.slow
 def test_model_glb_holds_the_cad_in_mm(page: Http, phones: Running) -> None:
     import trimesh
 

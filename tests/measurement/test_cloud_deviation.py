@@ -151,6 +151,7 @@ def test_moves_are_found(results, model, moved):
             assert np.rad2deg(abs(np.arctan2(turned[1, 0], turned[0, 0]))) < 0.15, name
 
 
+@pytest.mark.slow
 def test_spin_of_round_posts_is_undetermined_and_nothing_else(results):
     for name in (POST, TALL):
         assert results[name].undetermined.shape == (1, 6)

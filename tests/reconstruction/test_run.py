@@ -174,22 +174,26 @@ def test_missing_and_empty_folders(tmp_path: Path) -> None:
     assert says(command(tmp_path / "empty", "-o", tmp_path / "out"), "no photos")
 
 
+@pytest.mark.slow
 def test_two_photos_are_too_few(folder: Path, tmp_path: Path) -> None:
     for name in ("img_000.png", "img_001.png"):
         shutil.copy(folder / "photos" / name, tmp_path)
     assert says(command(tmp_path, "-o", tmp_path / "out"), "2")
 
 
+@pytest.mark.slow
 def test_output_cannot_be_a_file_or_the_photos(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     assert says(command(folder / "photos", "-o", tmp_path / "file"), "is a file")
     assert says(command(folder / "photos", "-o", folder / "photos"), "folder of the photos")
 
 
+@pytest.mark.slow
 def test_wrong_board_is_named(folder: Path, tmp_path: Path) -> None:
     assert says(command(folder / "photos", "-o", tmp_path / "o", "--board", "charuco:8"), "charuco:8")
 
 
+@pytest.mark.slow
 def test_a_broken_photo_among_good_ones_is_named(folder: Path, tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     shutil.copytree(folder / "photos", photos)

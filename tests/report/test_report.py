@@ -153,6 +153,7 @@ def test_crops_show_the_ghost_at_the_design_place_and_the_arrow_where_it_points(
     assert abs(ray @ SHIFT) / (np.linalg.norm(ray) * np.linalg.norm(SHIFT)) < 0.71
 
 
+@pytest.mark.slow
 def test_the_ghost_lies_on_the_block_in_the_photo(
     model: Model, found: Inspection, reconstruction: MetricReconstruction
 ) -> None:
@@ -270,6 +271,7 @@ def test_another_part_is_refused(source: Path, tmp_path: Path, part: Part) -> No
 # ---- the 3D view
 
 
+@pytest.mark.slow
 def test_the_scene_is_the_cad_and_the_cloud(
     model: Model, found: Inspection, reconstruction: MetricReconstruction
 ) -> None:

@@ -161,6 +161,7 @@ def test_a_part_that_moved_a_tenth_of_its_size_needs_no_search(monkeypatch: pyte
     assert right >= 10
 
 
+@pytest.mark.slow
 def test_tracking_before_a_start_is_an_error() -> None:
     with pytest.raises(RuntimeError, match=r"before Tracker\.start"):
         Tracker(assembly_views(), CAMERA).track(clip()[0])
@@ -321,6 +322,7 @@ def test_a_part_that_leaves_the_picture_is_lost() -> None:
     assert TrackingState.LOST in states[:19]
 
 
+@pytest.mark.slow
 def test_an_initial_pose_is_refined() -> None:
     start = wrong(PATH[0], np.random.default_rng(1), 4.0, 8.0)
     session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)

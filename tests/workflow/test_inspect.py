@@ -188,6 +188,7 @@ def test_what_is_finished_is_kept(bench: Bench, monkeypatch: pytest.MonkeyPatch)
     assert bench.inspect("--tolerance", "0.3", "--force").exit_code == 0 and bench.did == ["reconstruct", "measure"]
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_other_inputs(bench: Bench) -> None:
     assert bench.inspect().exit_code == 0
     (bench.folder / "photos" / "2.jpg").write_bytes(b"another photo")
