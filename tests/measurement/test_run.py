@@ -212,10 +212,10 @@ def test_the_command(inspection: Inspection, monkeypatch: pytest.MonkeyPatch, tm
     assert any(line.startswith("datum B (hole of plate) locks tx ty") for line in lines)
     assert any("missing: block_4" in line for line in lines)
     good = replace(inspection, components=tuple(c for c in inspection.components if c.name == "block_2"))
-    monkeypatch.setattr(run, "measure", lambda *args: good)
+    monkeypatch.setattr(run, "measure", lambda *args, **named: good)
     assert CliRunner().invoke(main, arguments).exit_code == 0
-    doubtful = replace(good, components=(replace(good.components[0], verdict=Verdict.UNDECIDED),))
-    monkeypatch.setattr(run, "measure", lambda *args: doubtful)
+    undecided = replace(good, components=(replace(good.components[0], verdict=Verdict.UNDECIDED),))
+    monkeypatch.setattr(run, "measure", lambda *args, **named: undecided)
     assert CliRunner().invoke(main, arguments).exit_code == ExitCode.UNDECIDED
 
 
@@ -235,7 +235,7 @@ def test_folders_that_hold_no_measurement(tmp_path: Path) -> None:
     (tmp_path / "scale.json").write_text(json.dumps(known.provenance()), encoding="utf-8")
     listed = {"photos": [{"name": "a.jpg", "lens": "x", "width": 640, "height": 480}]}
     (tmp_path / "photos.json").write_text(json.dumps(listed), encoding="utf-8")
-    with pytest.raises(InputError, match=r"a.jpg: photo not found; say with --photos"):
+    with pytest.raises(InputError, match=r"a.jpg: photo not found; give the folder of the photos"):
         read_folder(tmp_path)
     (tmp_path / "a.jpg").write_bytes(b"x")
     with pytest.raises(InputError, match="the sparse model is missing or damaged"):
