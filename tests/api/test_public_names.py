@@ -47,6 +47,7 @@ def test_every_public_name_exists() -> None:
         arview.load_everything  # noqa: B018
 
 
+@pytest.mark.slow
 def test_no_name_is_a_submodule() -> None:
     modules = {module.name for module in pkgutil.iter_modules(arview.__path__)}
     assert not modules & set(arview.__all__) and "annotation" in modules

@@ -122,12 +122,14 @@ def test_a_right_part_is_not_mismatched(noise: float, gain: float) -> None:
         assert monitor().mismatches_in(image, about(pose, k)) == (), f"view {k}"
 
 
+@pytest.mark.slow
 def test_a_component_a_little_off_nominal_is_not_mismatched() -> None:
     near = changed(post_1=(1.0, -0.7), block_1=(-0.8, 0.8))
     for k, pose in enumerate(views_of(6, seed=60)):
         assert monitor().mismatches_in(picture(pose, near, seed=k, scene=k % 9), about(pose, k)) == (), f"view {k}"
 
 
+@pytest.mark.slow
 def test_evidence_adds_up_over_frames_until_reset() -> None:
     seen = watch(walk(changed(post_3=None), 4))
     assert mismatched(seen.mismatches) == {"post_3"}

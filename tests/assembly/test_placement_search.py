@@ -117,6 +117,7 @@ def test_a_component_occluded_at_its_place_is_found_at_an_alternative_one() -> N
     assert all(ratio < 0.0 for said in found for name, ratio in said.items() if name != "hidden")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [3.0, 8.0])
 def test_an_occluded_right_component_is_not_found_elsewhere(noise: float) -> None:
     for seed in range(8):
@@ -125,6 +126,7 @@ def test_an_occluded_right_component_is_not_found_elsewhere(noise: float) -> Non
         assert max(said.values()) < 1.0, f"picture {seed}"
 
 
+@pytest.mark.slow
 def test_a_verified_component_is_not_searched_for(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 

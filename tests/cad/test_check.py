@@ -156,6 +156,7 @@ def test_a_turn_about_x_upside_down_needs_free_roll():
     assert not can_confuse(flip, ViewRange((1, 2), **ahead, roll_deg=(-30, 30)))
 
 
+@pytest.mark.slow
 def test_bodies_of_revolution_and_declared_component_symmetries():
     post = component("post", prism(48, 8, 40))
     plate = component("plate", box((-50, -30, -10), (70, 30, 0)))

@@ -287,6 +287,7 @@ def test_unknown_unit(tmp_path):
 # --- tessellation and hash ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", ["mm", "inch"])
 def test_step_tolerance_is_in_mm_whatever_the_files_unit(unit, tmp_path):
     per_mm = {"mm": 1.0, "inch": 1 / 25.4}[unit]

@@ -155,6 +155,7 @@ def test_blur_and_noise(pictures: list[np.ndarray]) -> None:
     assert np.mean(off <= pixel_uncertainty(solution, GRID)) >= 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("together_px", [0.0, 0.1])
 def test_u_holds_the_truth_as_often_as_it_says(together_px: float) -> None:
     """30 calibrations: of 270 numbers and 1,890 places, 95 % are within U, also when corners of a view err together."""
@@ -299,6 +300,7 @@ def test_photos_of_several_cameras_and_none_with_a_board(pictures: list[np.ndarr
         calibrate([empty], BOARD)
 
 
+@pytest.mark.slow
 def test_a_video_and_a_corrupt_one(pictures: list[np.ndarray], tmp_path: Path) -> None:
     images = [cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB) for gray in pictures]
     clip = write_clip(tmp_path / "clip.mp4", images, [0.5 * k for k in range(len(images))], faststart=True)

@@ -122,6 +122,7 @@ def test_annotate_writes_video_and_poses(room: Path) -> None:
     assert result.stderr == ""
 
 
+@pytest.mark.slow
 def test_annotate_names_the_output_and_the_guessed_camera(room: Path) -> None:
     result = run("annotate", "clip.mp4", "--part", "part.toml", "--renderer", "zbuffer")
     assert result.exit_code == 0, result.output
@@ -155,6 +156,7 @@ def test_annotate_takes_a_part_of_the_frames_and_a_first_pose(room: Path) -> Non
     assert [line["index"] for line in lines] == [4, 6, 8]
 
 
+@pytest.mark.slow
 def test_annotate_aligns_with_a_guide_view(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (room / "part.toml").read_text()
     (room / "part.toml").write_text(text + "[guides.start]\nazimuth_deg = 5.0\nelevation_deg = 40.0\n")
@@ -432,6 +434,7 @@ def small_disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     subprocess.run(["umount", str(folder)], check=True)
 
 
+@pytest.mark.slow
 def test_full_disk_is_one_line(room: Path, small_disk: Path) -> None:
     rng = np.random.default_rng(1)
     noise = [rng.integers(0, 255, (120, 160, 3), dtype=np.uint8) for _ in range(60)]
@@ -443,6 +446,7 @@ def test_full_disk_is_one_line(room: Path, small_disk: Path) -> None:
     assert list(small_disk.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_program_prints_one_line_and_no_traceback(room: Path) -> None:
     program = [sys.executable, "-m", "arview.cli"]
     done = subprocess.run([*program, "check", "none.step"], capture_output=True, text=True, cwd=room)

@@ -21,6 +21,7 @@ def environment(unbuffered: str) -> dict[str, str]:
     return {**os.environ, "PYTHONUNBUFFERED": unbuffered}
 
 
+@pytest.mark.slow
 @buffering
 @pytest.mark.parametrize("arguments", [["--help"], ["annotate", "--help"], ["study", "rice", "--quick"]])
 def test_a_closed_pipe_ends_quietly(tmp_path: Path, unbuffered: str, arguments: list[str]) -> None:
@@ -42,6 +43,7 @@ def test_a_closed_pipe_ends_quietly(tmp_path: Path, unbuffered: str, arguments: 
     assert done.stderr == ""
 
 
+@pytest.mark.slow
 @needs_full
 @buffering
 @pytest.mark.parametrize("arguments", [["--help"], ["study", "rice", "--quick"]])
@@ -60,6 +62,7 @@ def test_a_full_standard_output_is_one_line(tmp_path: Path, unbuffered: str, arg
     assert done.stderr == "arview: error: standard output: cannot be written (No space left on device)\n"
 
 
+@pytest.mark.slow
 @needs_full
 def test_a_full_standard_error_changes_nothing_else(tmp_path: Path) -> None:
     with FULL.open("w") as full:
@@ -70,6 +73,7 @@ def test_a_full_standard_error_changes_nothing_else(tmp_path: Path) -> None:
             assert done.returncode == ExitCode.BAD_INPUT and done.stdout == ""
 
 
+@pytest.mark.slow
 @needs_full
 def test_a_full_device_as_output_file_is_named(tmp_path: Path) -> None:
     board = [*PROGRAM, "calibrate", "board", "-o"]
@@ -82,6 +86,7 @@ def test_a_full_device_as_output_file_is_named(tmp_path: Path) -> None:
     assert not Path("/dev/null").is_file()
 
 
+@pytest.mark.slow
 def test_a_broken_pipe_of_something_else_is_a_bug(tmp_path: Path) -> None:
     code = (
         "import arview.cad\n"

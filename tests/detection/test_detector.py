@@ -129,6 +129,7 @@ def test_the_best_rejected_hypothesis_is_kept() -> None:
     assert seen.best_rejected is None
 
 
+@pytest.mark.slow
 def test_symmetries_are_discovered() -> None:
     block_views = make_guide_views(block(), ViewRange((200.0, 500.0)), GuideViewOptions(subdivisions=2))
     half_turns = find_rotational_symmetries(block_views).exact

@@ -195,6 +195,7 @@ def test_the_occluder_hides_what_the_mask_leaves_out() -> None:
         assert front.pixels == pytest.approx(free.pixels)
 
 
+@pytest.mark.slow
 def test_moving_light_changes_the_part_and_not_its_place() -> None:
     model = shape("block")
     pictures = {}

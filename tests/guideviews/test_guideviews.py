@@ -378,6 +378,7 @@ def test_views_of_a_block_are_alike_from_opposite_sides() -> None:
     assert "likeness 0.9" in words or "likeness 1.0" in words
 
 
+@pytest.mark.slow
 def test_findings_name_the_block_a_problem_and_the_assembly_none() -> None:
     (finding,) = uniqueness_findings(block(), SPHERE)
     assert finding.severity == "problem"

@@ -278,6 +278,7 @@ def _rows(where: str) -> int:
         reading.close()
 
 
+@pytest.mark.slow
 def test_a_writer_waits_for_another(tmp_path: Path) -> None:
     where = tmp_path / "results.sqlite"
     HistoryStore(where).close()
@@ -301,6 +302,7 @@ def test_postgresql_two_writers(postgresql: str, tmp_path: Path) -> None:
     together(postgresql, tmp_path, 250, 20)
 
 
+@pytest.mark.slow
 def test_postgresql_refuses_changes(postgresql: str, tmp_path: Path) -> None:
     with HistoryStore(postgresql) as store:
         added = store.add(saved(tmp_path, "pg", built(5, 0.3, serial="pg-1")), "cell")
@@ -488,6 +490,7 @@ def test_several_parts_must_be_told_apart(filled: HistoryStore, tmp_path: Path) 
     assert len(series_of(filled, "block_1", part="bench").values) == 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "magic"), [("svg", b"<?xml"), ("png", b"\x89PNG"), ("pdf", b"%PDF")])
 def test_the_picture(filled: HistoryStore, kind: str, magic: bytes) -> None:
     series = series_of(filled, "block_1", "dx")

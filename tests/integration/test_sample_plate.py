@@ -26,6 +26,7 @@ def part():
     return load_part(FOLDER)
 
 
+@pytest.mark.slow
 def test_cad_part_file_and_truth_name_the_same_components(part, truth):
     names = [component.name for component in part.model.components]
     assert sorted(names) == sorted(truth["truth"])
@@ -88,6 +89,7 @@ def test_size():
         assert 0 < sum(path.stat().st_size for path in files) <= limit
 
 
+@pytest.mark.slow
 def test_truth_lies_on_the_photos_edges(part, truth):
     """CAD edges at their true place, projected; the picture's edges must not be shifted against them."""
     spec = importlib.util.spec_from_file_location("sample_edges", FOLDER.parent / "common" / "edges.py")

@@ -106,6 +106,7 @@ def test_tokens_differ_in_each_run() -> None:
     assert tokens.isdisjoint(repr(Access.to(["127.0.0.1"], 1, True)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "[::1]:80", "", "localhost:80"])
 def test_other_names_for_the_server_are_refused(server: Running, host: str) -> None:
     status, _, content = bare(server, f"/?token={server.token}", Host=host)
@@ -193,6 +194,7 @@ def test_bodies_that_are_no_json_object(page: Http, content: bytes) -> None:
     assert status == 400 and json.loads(answer)["error"] == "bad_request"
 
 
+@pytest.mark.slow
 def test_slow_headers_and_bodies_are_cut(server: Running, page: Http, monkeypatch: pytest.MonkeyPatch) -> None:
     options = server.hub.options
     monkeypatch.setattr(server.hub, "options", replace(options, requests=replace(options.requests, body_timeout_s=0.5)))

@@ -315,6 +315,7 @@ def test_plate_as_built_with_weld_beads():
     assert find_foreign(cloud, part.model, {move.component: move.measured_from_nominal for move in found}) == []
 
 
+@pytest.mark.slow
 def test_a_cloud_too_large_for_one_piece_gives_the_same(cloud, model, monkeypatch):
     box = model.bounds_in_model
     whole = prepare_cloud(cloud, box, 0.5, 60)

@@ -70,6 +70,7 @@ def test_density_study():
     assert by_method["exact"] < by_method["plane"] < by_method["point"]
 
 
+@pytest.mark.slow
 def test_threshold_study():
     rows = table(threshold_study(is_quick=True))
     exact = [row for row in rows if row["method"] == "exact surface" and row["threshold"] <= 1e-3]

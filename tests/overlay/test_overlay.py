@@ -379,6 +379,7 @@ def largest_step_px(before: list[PlacedLabel], after: list[PlacedLabel]) -> floa
     return max(steps, default=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(640, 480), (1280, 720)])
 def test_labels_keep_apart_and_glide(plate: Model, record: Inspection, size: tuple[int, int]) -> None:
     width, height = size

@@ -55,6 +55,7 @@ def twists(found: SparseModel, truth: SparseModel) -> np.ndarray[Any, Any]:
     return np.concatenate([log_se3(one.cam_from_scan @ invert(other.cam_from_scan)) for one, other in pairs])
 
 
+@pytest.mark.slow
 def test_poses_scatter_as_the_covariance_says() -> None:
     truth_model = synthetic_model(3)
     photos = photos_of(truth_model)

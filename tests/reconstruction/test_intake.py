@@ -98,6 +98,7 @@ def test_all_orientations_come_out_upright(tmp_path: Path) -> None:
         assert np.abs(seen.astype(int) - np.asarray(Image.fromarray(truth).convert("L"))).max() <= 1
 
 
+@pytest.mark.slow
 def test_formats(tmp_path: Path) -> None:
     truth = view(100)
     picture = Image.fromarray(truth)
@@ -122,6 +123,7 @@ def test_formats(tmp_path: Path) -> None:
         read_photo(tmp_path / "float.tif")
 
 
+@pytest.mark.slow
 def test_heic(tmp_path: Path) -> None:
     pillow_heif = pytest.importorskip("pillow_heif")
     truth = cv2.resize(view(50), (320, 240), interpolation=cv2.INTER_AREA)

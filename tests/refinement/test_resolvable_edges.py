@@ -60,6 +60,7 @@ def test_rims_of_small_holes_are_unresolvable_and_those_of_large_ones_are_not() 
     assert unresolvable[on_large].mean() < 0.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("apart", "expected"), [(0.5 * MIN_SEPARATION, True), (3.0 * MIN_SEPARATION, False)])
 def test_edges_of_a_thin_rib_are_unresolvable(apart: float, expected: bool) -> None:
     half_mm = 0.5 * apart * 126.0
@@ -71,6 +72,7 @@ def test_edges_of_a_thin_rib_are_unresolvable(apart: float, expected: bool) -> N
     assert (unresolvable[along].mean() > 0.95) if expected else (unresolvable[along].mean() < 0.3)
 
 
+@pytest.mark.slow
 def test_a_part_has_all_its_edges_and_the_resolvable_ones() -> None:
     views = perforated()
     part = PartView(views)

@@ -139,6 +139,7 @@ def test_matches_are_exact_under_motion_noise_and_exposure(camera):
         assert np.linalg.norm(pose[:3, 3] - moved[:3, 3]) < 0.6
 
 
+@pytest.mark.slow
 def test_prediction_wrong_by_25_px(first):
     texture = modality()
     texture.add_keyframe(first, START)

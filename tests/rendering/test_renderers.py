@@ -134,6 +134,7 @@ def gl() -> Iterator[PyrenderRenderer]:
     renderer.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("azimuth,elevation,distance", [(20, 40, 420), (-130, 10, 600), (75, -35, 500), (0, 88, 380)])
 def test_both_renderers_draw_the_same(gl: PyrenderRenderer, azimuth: float, elevation: float, distance: float) -> None:
     pose = pose_from(azimuth, elevation, distance, roll_deg=13)

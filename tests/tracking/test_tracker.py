@@ -113,6 +113,7 @@ def test_another_background_and_strong_noise() -> None:
     assert errors[:, 2].max() < 0.5
 
 
+@pytest.mark.slow
 def test_a_start_that_is_off_is_pulled_in() -> None:
     rng = np.random.default_rng(8)
     ends = []

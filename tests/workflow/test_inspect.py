@@ -229,6 +229,7 @@ def test_two_do_not_work_in_one_folder(bench: Bench) -> None:
     assert bench.inspect().exit_code == 0
 
 
+@pytest.mark.slow
 def test_the_result_is_put_into_the_store(bench: Bench) -> None:
     store = bench.folder / "plates.sqlite"
     for count in (1, 1):
