@@ -247,6 +247,7 @@ def test_a_visible_key_disambiguates_and_an_invisible_one_leaves_alternatives(ke
     assert right >= 4
 
 
+@pytest.mark.slow
 def test_a_badly_refined_copy_is_no_alternative(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = pose_from(30, 40, 500.0)
     seen = detector().local.pyramid(picture(truth))
@@ -406,6 +407,7 @@ def test_options_out_of_range_are_refused() -> None:
         DetectorOptions(radius_px=2.0)
 
 
+@pytest.mark.slow
 def test_no_search_leaves_the_declared_distances() -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0), noise=12.0))
     nearest_mm, farthest_mm = search_distances_mm(detector().views.view_range)
@@ -436,6 +438,7 @@ def test_matches_outside_the_distances_give_no_detection(monkeypatch: pytest.Mon
     assert detector().detect(seen.image) == []
 
 
+@pytest.mark.slow
 def test_hypotheses_are_sorted_and_distinct() -> None:
     rng = np.random.default_rng(5)
     for k in range(4):
@@ -449,6 +452,7 @@ def test_hypotheses_are_sorted_and_distinct() -> None:
                 assert not are_near(a.cam_from_body, b.cam_from_body, 0.04 * detector().views.diameter_mm, 4.0)
 
 
+@pytest.mark.slow
 def test_only_a_sure_quick_search_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0)))
     candidates, budgets = detector().global_search.candidates, []
