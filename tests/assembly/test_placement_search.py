@@ -119,7 +119,7 @@ def test_a_component_occluded_at_its_place_is_found_at_an_alternative_one() -> N
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [3.0, 8.0])
-def test_an_occluded_right_component_is_not_found_elsewhere(noise: float) -> None:
+def test_an_occluded_right_component_is_found_at_no_other_place(noise: float) -> None:
     for seed in range(8):
         said = against(None, seed, noise)
         assert said["hidden"] <= 0.1, f"picture {seed}"

@@ -160,7 +160,7 @@ def test_instances_keep_their_own_names_and_places(tmp_path):
     assert any("post_2_2" in note for note in cad.notes)
 
 
-def test_step_instances_of_two_subassemblies_are_told_apart(tmp_path):
+def test_step_instances_of_two_subassemblies_have_names_of_their_own(tmp_path):
     post = StepPart("post", (1, 1, 40), radius=10, color=(0.5, 0.25, 1.0))
     sub = StepAssembly("sub", [("post", post, np.eye(4))])
     root = StepAssembly("root", [("sub_1", sub, np.eye(4)), ("sub_2", sub, scaled(SHIFT, 50.0))])

@@ -356,7 +356,7 @@ def test_profiles_are_found_by_what_pictures_say(photos: Path, tmp_path: Path, m
     assert "1 profile in" in CliRunner().invoke(main, ["calibrate", "profiles"]).output
 
 
-def test_lenses_are_told_apart() -> None:
+def test_lenses_are_distinguished() -> None:
     phone = PhotoExif(4032, 3024, make="Apple", model="iPhone 12", focal_length_mm=4.2, focal_length_35mm_mm=26.0)
     main_lens = lens_record(phone, 4032, 3024)
     wide = lens_record(replace(phone, focal_length_mm=1.55, focal_length_35mm_mm=13.0), 4032, 3024)

@@ -439,7 +439,7 @@ def test_matches_outside_the_distances_give_no_detection(monkeypatch: pytest.Mon
 
 
 @pytest.mark.slow
-def test_hypotheses_are_sorted_and_distinct() -> None:
+def test_hypotheses_are_sorted_and_apart() -> None:
     rng = np.random.default_rng(5)
     for k in range(4):
         found = detector().hypotheses(detector().local.pyramid(picture(anywhere(rng), seed=k, scene=k, noise=12.0)))

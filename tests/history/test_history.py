@@ -483,7 +483,7 @@ def test_a_series(filled: HistoryStore, tmp_path: Path) -> None:
         series_of(filled, "nut")
 
 
-def test_several_parts_must_be_told_apart(filled: HistoryStore, tmp_path: Path) -> None:
+def test_one_of_several_parts_must_be_chosen(filled: HistoryStore, tmp_path: Path) -> None:
     filled.add(saved(tmp_path, "p", built(50, 0.0, part="other")))
     with pytest.raises(InputError, match=r"several parts \(bench, other\)"):
         series_of(filled, "block_1")

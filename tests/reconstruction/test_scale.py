@@ -120,7 +120,7 @@ def test_moved_is_a_step_about_the_centre() -> None:
         np.testing.assert_allclose(TRUTH.moved(np.r_[twist, 0], center).cam_from_model(pose), wanted, atol=1e-9)
 
 
-def test_vote_rejects_wrong_detections_and_twins() -> None:
+def test_vote_rejects_wrong_and_near_symmetric_detections() -> None:
     rng = np.random.default_rng(2)
     center, diameter = np.array([80.0, 60.0, 33.0]), 211.0
     about = rigid(np.eye(3), center)
@@ -498,7 +498,7 @@ def nearly_symmetric() -> Model:
 
 
 @pytest.mark.slow
-def test_components_decide_between_twins() -> None:
+def test_components_decide_between_near_symmetric_frames() -> None:
     model = nearly_symmetric()
     poses = ring(model, 6)
     pictures = [picture(pose, model, PLAIN, seed=i, scene=i + 20) for i, pose in enumerate(poses)]

@@ -79,7 +79,7 @@ def test_files_hold_the_same_model(placed: tuple[SparseModel, Path], paths: list
     assert again.photos[3].camera.fx == pytest.approx(sparse.photos[3].camera.fx)
 
 
-def test_covariance_tells_the_size_of_the_errors(placed: tuple[SparseModel, Path], paths: list[Path]) -> None:
+def test_covariance_predicts_the_size_of_the_errors(placed: tuple[SparseModel, Path], paths: list[Path]) -> None:
     sparse, _ = placed
     moved, errors_mm = aligned(sparse, {path.name: pose for path, pose in zip(paths, ring(12), strict=True)})
     assert moved.pose_covariance is not None
@@ -109,7 +109,7 @@ def test_photos_of_another_part_are_named(paths: list[Path], tmp_path: Path) -> 
     assert all("common" in reason for reason in reasons.values())
 
 
-def test_no_texture_is_said(tmp_path: Path) -> None:
+def test_missing_texture_is_reported(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     walls = [np.clip(rng.normal(200, 1.0, (480, 640, 3)), 0, 255).astype(np.uint8) for _ in range(4)]
     with pytest.raises(CannotMeasureError, match="texture"):

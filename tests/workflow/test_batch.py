@@ -31,7 +31,7 @@ def key(job: InspectJob, folder: Path) -> str:
     return hashlib.sha256(Path(job.photos or "").read_bytes() + repr(job.tolerance_mm).encode()).hexdigest()
 
 
-def look(job: InspectJob, folder: Path) -> tuple[str, str]:
+def measure_mean(job: InspectJob, folder: Path) -> tuple[str, str]:
     """A small measurement: the mean of noisy points; each attempt adds a line beside the input."""
     path = Path(job.photos or "")
     with path.with_suffix(".tries").open("a") as file:
@@ -48,7 +48,7 @@ def look(job: InspectJob, folder: Path) -> tuple[str, str]:
     return component.verdict.value, f"{moved[0]:.3f}"
 
 
-LIGHT = Work(key, look, ("inspection.json",))
+LIGHT = Work(key, measure_mean, ("inspection.json",))
 TWO = BatchOptions(workers=2, memory_limit="2GB", retries=1)
 
 
@@ -100,7 +100,7 @@ def test_what_kills_every_worker_stops_only_itself(tmp_path: Path) -> None:
     def deadly(job: InspectJob, folder: Path) -> tuple[str, str]:
         if job.serial == "P-01":
             os.kill(os.getpid(), signal.SIGKILL)
-        return look(job, folder)
+        return measure_mean(job, folder)
 
     found = run_batch(batch(tmp_path / "in", str(tmp_path / "out"), 3), TWO, Work(key, deadly, LIGHT.files))
     assert [one.verdict for one in found] == ["pass", "error", "pass"]
