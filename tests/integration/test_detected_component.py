@@ -8,6 +8,7 @@ from arview.detection import Detector
 from helpers.synthetic import CAMERA, assembly, assembly_views, picture, pose_from
 
 
+@pytest.mark.slow
 def test_a_missing_component_is_reported_at_a_detected_pose() -> None:
     detector = Detector(assembly_views(), CAMERA)
     monitor = AssemblyMonitor(assembly_views(), CAMERA, assembly())

@@ -185,6 +185,7 @@ def test_the_ghost_lies_on_the_block_in_the_photo(
     assert (near & cut).sum() / (near | cut).sum() > 0.8  # the rest is due to rounding at the rim and the holes
 
 
+@pytest.mark.slow
 def test_photos_that_are_gone_are_named(
     model: Model, found: Inspection, reconstruction: MetricReconstruction, tmp_path: Path
 ) -> None:
@@ -366,6 +367,7 @@ def test_without_pango_the_page_is_made_all_the_same(
 # ---- files
 
 
+@pytest.mark.slow
 def test_distances_are_read_back(model: Model, reconstruction: MetricReconstruction, tmp_path: Path) -> None:
     cloud = reconstruction.cloud
     assert cloud is not None
