@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from arview.assembly.monitor import AssemblyMonitor
 from arview.cad.model import make_model
 from arview.detection import Detector
