@@ -54,9 +54,9 @@ def kernel(
     """
 
     def compiled(function: Kernel) -> Kernel:
-        options: dict[str, Any] = {"nogil": True, "fastmath": fastmath}
-        if numpy_errors:
-            options["error_model"] = "numpy"
+        # All flags are explicit: otherwise a kernel takes them over from whichever kernel calls it first.
+        error_model = "numpy" if numpy_errors else "python"
+        options: dict[str, Any] = {"nogil": True, "fastmath": fastmath, "error_model": error_model}
         if inline:
             options["inline"] = "always"
         dispatcher: Any = njit(**options)(function)

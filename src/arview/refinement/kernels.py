@@ -69,7 +69,7 @@ class ViewLines(NamedTuple):
     edge_lines: NamedTuple
 
 
-@kernel
+@kernel(fastmath=True)
 def nearest_view(directions, cam_from_body):  # type: ignore[no-untyped-def]
     """Index of the view whose direction (N,3) is nearest to that of the camera."""
     r = cam_from_body

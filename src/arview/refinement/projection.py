@@ -45,7 +45,7 @@ def project(x, y, z, intrinsics):  # type: ignore[no-untyped-def]
     return intrinsics[0] * xn + intrinsics[2], intrinsics[1] * yn + intrinsics[3]
 
 
-@kernel
+@kernel(fastmath=True)
 def project_lines(points, directions, across, cam_from_body, intrinsics, step_mm):  # type: ignore[no-untyped-def]
     """Project points with directions, see `ProjectedLines`.
 

@@ -350,7 +350,7 @@ def _compare_sides(sides, mean_colour, step, profiles):  # type: ignore[no-untyp
             line[COLOUR_DIFFERENCES + k] = np.sqrt(square) / (np.sqrt(square) + HALF_COLOUR)
 
 
-@kernel
+@kernel(fastmath=True)
 def sample_lines(part, pose, max_outline, max_inner):  # type: ignore[no-untyped-def]
     """`SampledLines` of the view nearest to a pose, with at most ``max_outline`` and ``max_inner`` rows."""
     view = nearest_view(part.directions, pose)

@@ -113,7 +113,7 @@ def take_window(grey, s, x, y):  # type: ignore[no-untyped-def]
     return variance
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, numpy_errors=True)
 def warp(m, k, x, y, w, du, dv):  # type: ignore[no-untyped-def]
     """The homography of the window into source k, as three linear forms of (dx, dy): value and two slopes each."""
     tx, ty, tz = m[k, 9], m[k, 10], m[k, 11]
@@ -126,7 +126,7 @@ def warp(m, k, x, y, w, du, dv):  # type: ignore[no-untyped-def]
     return x0, xu, xv, y0, yu, yv, z0, zu, zv
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, numpy_errors=True)
 def falls_inside(sizes, k, h):  # type: ignore[no-untyped-def]
     """Whether the whole warped window lies in source k."""
     x0, xu, xv, y0, yu, yv, z0, zu, zv = h
@@ -196,7 +196,7 @@ def disagreement_px(maps, sizes, warps, step, k, h, w):  # type: ignore[no-untyp
     return min(abs(there - w / h[6]) * warps[k, PARALLAX], MAX_ERROR_PX)
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, numpy_errors=True)
 def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
     """Whether the element is in front of the camera and seen at less than 81° from its normal."""
     if not w > _ZERO:
