@@ -1,9 +1,16 @@
-"""Signatures of kernels as plain values, and the file that says with which types each kernel is called."""
+"""Signatures of kernels as plain values, and the file that says with which types each kernel is called.
+
+The file is made from a run of the commands or tests that records what they call:
+
+    ARVIEW_RECORD_KERNELS=out/kernels make test
+    python -m arview.core.kernel_signatures out/kernels
+"""
 
 from __future__ import annotations
 
 import importlib
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -64,3 +71,30 @@ def decode_type(part: Any) -> Any:
     if "tuple" in part:
         return nb_types.BaseTuple.from_types([decode_type(item) for item in part["tuple"]])
     return nb_types.Omitted(part["omitted"])
+
+
+def merge_records(folder: Path) -> dict[str, list[Any]]:
+    """The signatures of arview's kernels in all files that `kernel.record_signatures` wrote, each once and in order."""
+    merged: dict[str, list[Any]] = {}
+    for path in sorted(folder.glob("*.json")):
+        for name, signatures in json.loads(path.read_text(encoding="utf-8")).items():
+            if name.startswith("arview."):
+                known = merged.setdefault(name, [])
+                known += [signature for signature in signatures if signature not in known]
+    return {name: sorted(merged[name], key=json.dumps) for name in sorted(merged)}
+
+
+def _main() -> None:
+    if len(sys.argv) != 2 or not Path(sys.argv[1]).is_dir():
+        raise SystemExit("usage: python -m arview.core.kernel_signatures FOLDER; see the docstring of the module")
+    merged = merge_records(Path(sys.argv[1]))
+    kernels = (
+        f'"{name}": [\n' + ",\n".join(f" {json.dumps(signature)}" for signature in signatures) + "\n]"
+        for name, signatures in merged.items()
+    )
+    SIGNATURES_FILE.write_text("{\n" + ",\n".join(kernels) + "\n}\n", encoding="utf-8")
+    print(f"{SIGNATURES_FILE}: {len(merged)} kernels, {sum(map(len, merged.values()))} signatures")
+
+
+if __name__ == "__main__":
+    _main()

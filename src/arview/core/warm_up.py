@@ -1,7 +1,7 @@
 """Compilation of all kernels in advance, on all cores, so that no command has to compile later.
 
 ``kernel_signatures.json`` lists the argument types with which arview's commands and tests call each kernel. It is
-written by ``tools/kernel_signatures.py``.
+made by `kernel_signatures` from a run that records them.
 """
 
 from __future__ import annotations
@@ -31,17 +31,12 @@ def warm_up(progress: StepProgress | None = None, processes: int | None = None) 
     prune_kernels()
     jobs = recorded_signatures()
     compiled = 0
-    # Kernels of one module stay together: they call each other. Large modules come first, so that no core waits long.
-    modules: dict[str, dict[str, list[Any]]] = {}
-    for name, signatures in jobs.items():
-        modules.setdefault(name.split(":")[0], {})[name] = signatures
-    ordered = sorted(modules.values(), key=lambda module: -sum(map(len, module.values())))
     done = 0
     with ProcessPoolExecutor(processes or os.cpu_count() or 1, get_context("spawn")) as pool:
-        futures = {pool.submit(compile_kernels, module): len(module) for module in ordered}
+        futures = [pool.submit(compile_kernels, {name: signatures}) for name, signatures in jobs.items()]
         for future in as_completed(futures):
             compiled += future.result()
-            done += futures[future]
+            done += 1
             if progress is not None:
                 progress(done, len(jobs))
     return compiled
