@@ -241,7 +241,7 @@ def test_a_client_that_takes_no_answer_is_cut(server: Running, page: Http, monke
 @pytest.mark.slow
 def test_snapshots_are_rate_limited() -> None:
     # A low rate, so that a slow machine gets no new tokens while it draws.
-    chosen = options(requests=RequestLimits(snapshots_per_s=0.1))
+    chosen = options(requests=RequestLimits(images_per_s=0.1))
     with running(chosen, loader(chosen)) as server:
         page = server.session()
         name = page.join()

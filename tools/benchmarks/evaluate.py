@@ -7,6 +7,7 @@ import argparse
 import json
 import subprocess
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,7 @@ def main() -> None:
     details: dict[str, Any] = {}
     sets, reconstructions = photo_sets(chosen.photo_set), chosen.folder / "photo_sets"
     more = DetectionSuite(found, details, chosen.sequences, chosen.shapes, chosen.frames, chosen.backgrounds)
-    makers = (
+    makers: tuple[Callable[[], list[ResultRow]], ...] = (
         lambda: tracking_rows(found, details),
         lambda: convergence_rows(found),
         lambda: guided_init_rows(found, chosen.frames),

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.image_edges import EdgePictures, find_thin_edges, mark_owners, strength_at
+from arview.assembly.image_edges import EdgePicture, EdgePictures, find_thin_edges, mark_owners, strength_at
 from arview.assembly.visible_edges import VisibleEdges
 from arview.core.kernel import kernel
 from arview.geometry import Array
@@ -194,7 +194,10 @@ def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:
 
 
 @kernel
-def _best_shift(picture, c, places, along, count, scores, shifts, costs, hit):  # type: ignore[no-untyped-def]
+def _best_shift(
+    picture: EdgePicture, c: int, places: NDArray[np.int64], along: NDArray[np.int64], count: int,
+    scores: NDArray[np.float64], shifts: NDArray[np.int64], costs: NDArray[np.float64], hit: NDArray[np.bool_]
+) -> float:  # fmt: skip
     """Share of ``count`` points on edges at the best shift (by the sum of scores less its cost); sets ``hit`` (count,).
 
     Args:
@@ -227,7 +230,7 @@ def _best_shift(picture, c, places, along, count, scores, shifts, costs, hit):  
 
 
 @kernel
-def _contrast(image, edges, projected, c, reach_px):  # type: ignore[no-untyped-def]
+def _contrast(image: NDArray[np.uint8], edges: VisibleEdges, projected: _Projected, c: int, reach_px: float) -> float:
     """Mean colour change across a component's outline in standard deviations, over runs of points; -1 without runs."""
     pixels, normals, depths = projected.pixels, projected.normals, projected.depths
     sides, is_own = edges.sides, edges.is_own
@@ -271,7 +274,7 @@ def _contrast(image, edges, projected, c, reach_px):  # type: ignore[no-untyped-
 
 
 @kernel
-def _surroundings(pixels, points, c, limits):  # type: ignore[no-untyped-def]
+def _surroundings(pixels: NDArray[np.float64], points: _MeasuredPoints, c: int, limits: PointLimits) -> float:
     """Share of other components' points on edges, of those nearest to a component's unsupported points; 1 if few."""
     chosen, sizes, hit = points.chosen, points.sizes, points.hit
     low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
@@ -306,7 +309,9 @@ def _surroundings(pixels, points, c, limits):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _usable_points(edges, projected, c, shape, usable):  # type: ignore[no-untyped-def]
+def _usable_points(
+    edges: VisibleEdges, projected: _Projected, c: int, shape: tuple[int, int], usable: NDArray[np.int64]
+) -> tuple[int, float]:  # fmt: skip
     """Own points of a component inside the picture: sets their indices in ``usable``.
 
     Returns:
@@ -334,7 +339,10 @@ def _usable_points(edges, projected, c, shape, usable):  # type: ignore[no-untyp
 
 
 @kernel
-def _place_points(projected, usable, chosen, places, along):  # type: ignore[no-untyped-def]
+def _place_points(
+    projected: _Projected, usable: NDArray[np.int64], chosen: NDArray[np.int64], places: NDArray[np.int64],
+    along: NDArray[np.int64]
+) -> int:  # fmt: skip
     """Choose evenly spread points of those usable: sets their indices, pixels and normals, see `_best_shift`.
 
     Returns:
@@ -355,7 +363,9 @@ def _place_points(projected, usable, chosen, places, along):  # type: ignore[no-
 
 
 @kernel
-def measure_edge_support(picture, edges, projection, shifts, limits):  # type: ignore[no-untyped-def]
+def measure_edge_support(
+    picture: EdgePicture, edges: VisibleEdges, projection: Projection, shifts: Shifts, limits: PointLimits
+) -> EdgeSupport:  # fmt: skip
     """`EdgeSupport` of all components.
 
     Args:

@@ -70,7 +70,7 @@ class EdgePictures:
 
 
 @kernel(fastmath=True)
-def find_thin_edges(picture, min_slope):  # type: ignore[no-untyped-def]
+def find_thin_edges(picture: EdgePicture, min_slope: float) -> None:
     """Fill the gradient, strength and directions of an `EdgePicture` with edges of at least a slope.
 
     The slope is that of the strongest channel; an edge is thin where it is largest along its own direction.
@@ -120,7 +120,9 @@ def find_thin_edges(picture, min_slope):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def mark_owners(pixels, depths, component, owners):  # type: ignore[no-untyped-def]
+def mark_owners(
+    pixels: NDArray[np.float64], depths: NDArray[np.float64], component: NDArray[np.int16], owners: NDArray[np.int16]
+) -> None:  # fmt: skip
     """Set ``owners`` (H,W) int16 to the component whose edges pass within two pixels; -1: none, -2: several."""
     height, width = owners.shape
     owners[:] = -1
@@ -137,7 +139,10 @@ def mark_owners(pixels, depths, component, owners):  # type: ignore[no-untyped-d
 
 
 @kernel
-def strength_at(directions, strength, owners, c, places, normal, dx, dy):  # type: ignore[no-untyped-def]
+def strength_at(
+    directions: NDArray[np.int8], strength: NDArray[np.uint8], owners: NDArray[np.int16], c: int,
+    places: NDArray[np.int64], normal: NDArray[np.int64], dx: int, dy: int
+) -> Any:  # fmt: skip
     """Strongest edge within 25° of a normal at three places (3,2), shifted; edges of other components do not count.
 
     ``normal`` (2,) is in 127ths. There are no branches on the edges, because they cannot be predicted.

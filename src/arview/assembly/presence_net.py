@@ -168,7 +168,9 @@ def _crop(
     center = 0.5 * (points_in_cam.min(axis=0) + points_in_cam.max(axis=0))
     ideal = focal_px * points_in_cam[:, :2] / points_in_cam[:, 2:] + principal_px
     # The lens is taken to displace all of the component as it does its centre.
-    displaced = project(*center, intrinsics) - (focal_px * center[:2] / center[2] + principal_px)
+    displaced = project(center[0], center[1], center[2], intrinsics) - (
+        focal_px * center[:2] / center[2] + principal_px
+    )
     low, high = ideal.min(axis=0) + displaced, ideal.max(axis=0) + displaced
     size_px = float(np.max(high - low))
     side = max(options.min_source_px, round(size_px * SIDE_PX / (2.0 * options.radius_px)))

@@ -7,7 +7,7 @@ few directions again and again. Points where another component could be mistaken
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,13 +153,13 @@ class VisibleEdgeCache:
 
 
 @kernel
-def _longer(array):  # type: ignore[no-untyped-def]
+def _longer(array: NDArray[Any]) -> NDArray[Any]:
     """A copy of twice the length."""
     return np.concatenate((array, np.empty_like(array)))
 
 
 @kernel
-def _is_visible(view, column, row, depth_mm, component, is_silhouette):  # type: ignore[no-untyped-def]
+def _is_visible(view: _Rendering, column: int, row: int, depth_mm: float, component: int, is_silhouette: bool) -> bool:
     """Whether an edge point of a component is visible, by the 3 × 3 pixels around it.
 
     Either the rendered surface is at its depth, or the point is on a silhouette beside its own surface, which curves
@@ -182,7 +182,7 @@ def _is_visible(view, column, row, depth_mm, component, is_silhouette):  # type:
 
 
 @kernel
-def _sample_edges(mesh, view):  # type: ignore[no-untyped-def]
+def _sample_edges(mesh: _Mesh, view: _Rendering) -> _Samples:
     """Samples (a `_Samples`), one per pixel, along the visible sharp edges and silhouettes of a `_Mesh`.
 
     As `mesh_edges.sample_visible_edges`, but with the visibility test of `_is_visible`.
@@ -250,7 +250,9 @@ def _sample_edges(mesh, view):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _own_samples(samples, view, shared_px, shared_cos, occluder_px):  # type: ignore[no-untyped-def]
+def _own_samples(
+    samples: _Samples, view: _Rendering, shared_px: float, shared_cos: float, occluder_px: int
+) -> NDArray[np.bool_]:  # fmt: skip
     """(N,) False for samples near a parallel edge of another component, or near a surface in front of them.
 
     See `VisibleEdgeOptions` for the limits.

@@ -263,6 +263,6 @@ def _triangles(corners: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
         return np.zeros((0, 3), dtype=np.int64)
     if mode == 6:
         return np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
-    strip = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
-    strip[1::2] = strip[1::2][:, [1, 0, 2]]
-    return strip
+    triangles = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    triangles[1::2] = triangles[1::2][:, [1, 0, 2]]
+    return triangles

@@ -12,14 +12,14 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, TypeVar, overload
 
 from numba import njit
 
 from arview.core.kernel_cache import KernelCache
 from arview.core.kernel_signatures import encode_signature
 
-Kernel = Callable[..., Any]
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 RECORD_VARIABLE = "ARVIEW_RECORD_KERNELS"
 """Environment variable: folder into which each process writes the signatures with which it called kernels."""
@@ -28,22 +28,22 @@ _kernels: dict[str, Any] = {}
 
 
 @overload
-def kernel(function: Kernel) -> Kernel: ...
+def kernel(function: Function) -> Function: ...
 
 
 @overload
 def kernel(
     *, fastmath: bool | set[str] = ..., numpy_errors: bool = ..., inline: bool = ...
-) -> Callable[[Kernel], Kernel]: ...
+) -> Callable[[Function], Function]: ...
 
 
 def kernel(
-    function: Kernel | None = None,
+    function: Function | None = None,
     *,
     fastmath: bool | set[str] = False,
     numpy_errors: bool = False,
     inline: bool = False,
-) -> Kernel | Callable[[Kernel], Kernel]:
+) -> Function | Callable[[Function], Function]:
     """Compile a function with numba when it is first called, and keep the code in the user's cache folder.
 
     Args:
@@ -53,7 +53,7 @@ def kernel(
         inline: copy the body into every kernel that calls it.
     """
 
-    def compiled(function: Kernel) -> Kernel:
+    def compiled(function: Function) -> Function:
         # All flags are explicit: otherwise a kernel takes them over from whichever kernel calls it first.
         error_model = "numpy" if numpy_errors else "python"
         options: dict[str, Any] = {"nogil": True, "fastmath": fastmath, "error_model": error_model}
@@ -62,7 +62,7 @@ def kernel(
         dispatcher: Any = njit(**options)(function)
         dispatcher._cache = KernelCache(function, options)
         _kernels[f"{function.__module__}:{function.__qualname__}"] = dispatcher
-        result: Kernel = dispatcher
+        result: Function = dispatcher
         return result
 
     return compiled if function is None else compiled(function)

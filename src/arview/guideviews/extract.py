@@ -57,7 +57,7 @@ class ViewFeatures:
 
 
 @kernel
-def _run_length(mask, u, v, du, dv, on_part, longest):  # type: ignore[no-untyped-def]
+def _run_length(mask: NDArray[np.uint8], u: float, v: float, du: float, dv: float, on_part: bool, longest: int) -> int:
     """Number of steps of one pixel from (u, v) along (du, dv) during which the mask stays ``on_part``."""
     height, width = mask.shape
     for step in range(1, longest + 1):
@@ -70,7 +70,12 @@ def _run_length(mask, u, v, du, dv, on_part, longest):  # type: ignore[no-untype
 
 
 @kernel
-def _describe_contour(mask, xs, ys, starts, ends_, half, longest):  # type: ignore[no-untyped-def]
+def _describe_contour(
+    mask: NDArray[np.uint8], xs: NDArray[np.float64], ys: NDArray[np.float64], starts: NDArray[np.int64],
+    ends_: NDArray[np.int64], half: int, longest: int
+) -> tuple[
+    NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]
+]:  # fmt: skip
     """Positions, outward normals and run lengths at the pixels of closed outlines.
 
     Args:
@@ -123,7 +128,10 @@ def _describe_contour(mask, xs, ys, starts, ends_, half, longest):  # type: igno
 
 
 @kernel
-def _nearest_sample(u, v, sample_pixels, width, height, reach):  # type: ignore[no-untyped-def]
+def _nearest_sample(
+    u: NDArray[np.float64], v: NDArray[np.float64], sample_pixels: NDArray[np.float64], width: int, height: int,
+    reach: float
+) -> NDArray[np.int32]:  # fmt: skip
     """Index of the nearest sample within ``reach`` px of each (u, v), or -1, found by a grid of pixels."""
     grid = np.full((height, width), -1, dtype=np.int32)
     following = np.full(sample_pixels.shape[0], -1, dtype=np.int32)

@@ -7,6 +7,7 @@ camera and the other does not (Appel 1967; Gooch et al. 1999). Hidden samples ar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +94,9 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
 
 
 @kernel
-def facing(eye, point, normals, first, second):  # type: ignore[no-untyped-def]
+def facing(
+    eye: NDArray[np.float64], point: NDArray[np.float64], normals: NDArray[np.float64], first: int, second: int
+) -> tuple[float, float]:  # fmt: skip
     """How far the two faces at an edge are turned to the eye.
 
     Args:
@@ -115,7 +118,9 @@ def facing(eye, point, normals, first, second):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _to_cam(rotation, translation, point):  # type: ignore[no-untyped-def]
+def _to_cam(
+    rotation: NDArray[np.float64], translation: NDArray[np.float64], point: NDArray[np.float64]
+) -> tuple[float, float, float]:  # fmt: skip
     """Coordinates of a point (3,) in the camera frame."""
     x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
     y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
@@ -124,7 +129,7 @@ def _to_cam(rotation, translation, point):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _depth_test(depth, column, row, z, tolerance):  # type: ignore[no-untyped-def]
+def _depth_test(depth: NDArray[np.float32], column: int, row: int, z: float, tolerance: float) -> tuple[bool, bool]:
     """Compare a depth with the 3×3 pixels around a place: is any of them as deep, is any of them background?"""
     is_visible = False
     is_contour = False
@@ -139,10 +144,12 @@ def _depth_test(depth, column, row, z, tolerance):  # type: ignore[no-untyped-de
 
 
 @kernel
-def _sample_visible(  # type: ignore[no-untyped-def]
-    vertices, ends, faces, is_crease, is_sharp, normals, component, cam_from_model, fx, fy, cx, cy, depth,
-    spacing_px, depth_tolerance
-):  # fmt: skip
+def _sample_visible(
+    vertices: NDArray[np.float64], ends: NDArray[np.int32], faces: NDArray[np.int32], is_crease: NDArray[np.bool_],
+    is_sharp: NDArray[np.bool_], normals: NDArray[np.float64], component: NDArray[np.int32],
+    cam_from_model: NDArray[np.float64], fx: float, fy: float, cx: float, cy: float, depth: NDArray[np.float32],
+    spacing_px: float, depth_tolerance: float
+) -> tuple[NDArray[Any], ...]:  # fmt: skip
     """The kernel of `sample_visible_edges`; returns the arrays of `ViewEdgeSamples` in their order."""
     height, width = depth.shape
     rotation = cam_from_model[:3, :3]

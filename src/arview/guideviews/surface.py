@@ -50,7 +50,10 @@ def surface_about(
 
 
 @kernel
-def draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids):  # type: ignore[no-untyped-def]
+def draw_surface(
+    surface: Surface, pose: NDArray[np.float64], focal_px: NDArray[np.float64], center_px: NDArray[np.float64],
+    diameter_mm: float, drawn: NDArray[np.float32], face_ids: NDArray[np.int32]
+) -> None:  # fmt: skip
     """Draw normals and depth of a surface in the view of an ideal camera.
 
     Args:

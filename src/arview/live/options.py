@@ -57,8 +57,8 @@ class RequestLimits:
     burst: float = 240.0
     joins_per_s: float = 1.0  # of one address; each join costs a tracker and a handshake
     joins_burst: float = 12.0
-    snapshots_per_s: float = 2.0  # of one page; drawing and packing a PNG takes 50 ms of a core
-    snapshots_burst: float = 6.0
+    images_per_s: float = 2.0  # of one page; drawing and packing a PNG takes 50 ms of a core
+    images_burst: float = 6.0
 
 
 @dataclass(frozen=True)

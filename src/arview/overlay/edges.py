@@ -91,7 +91,9 @@ class Edges:
 
 
 @kernel(fastmath=True)
-def _faces_camera(normals, face_points, eye, face):  # type: ignore[no-untyped-def]
+def _faces_camera(
+    normals: NDArray[np.float64], face_points: NDArray[np.float64], eye: NDArray[np.float64], face: int
+) -> bool:  # fmt: skip
     return (
         normals[face, 0] * (eye[0] - face_points[face, 0])
         + normals[face, 1] * (eye[1] - face_points[face, 1])
@@ -100,7 +102,7 @@ def _faces_camera(normals, face_points, eye, face):  # type: ignore[no-untyped-d
 
 
 @kernel(fastmath=True)
-def _is_visible(column, row, limit, inverse_depth):  # type: ignore[no-untyped-def]
+def _is_visible(column: int, row: int, limit: float, inverse_depth: NDArray[np.float64]) -> bool:
     """Whether some surface within one pixel is no nearer than the inverse depth ``limit``."""
     height, width = inverse_depth.shape
     if 0 <= row < height and 0 <= column < width and inverse_depth[row, column] <= limit:
@@ -113,10 +115,13 @@ def _is_visible(column, row, limit, inverse_depth):  # type: ignore[no-untyped-d
 
 
 @kernel(fastmath=True)
-def _draw_edges(  # type: ignore[no-untyped-def]
-    points, ends, faces, is_crease, is_closed, owners, normals, face_points, eye,
-    fx, fy, cx, cy, inverse_depth, width_px, with_hidden, cover, owner,
-):  # fmt: skip
+def _draw_edges(
+    points: NDArray[np.float64], ends: NDArray[np.int64], faces: NDArray[np.int64], is_crease: NDArray[np.bool_],
+    is_closed: NDArray[np.bool_], owners: NDArray[np.int16], normals: NDArray[np.float64],
+    face_points: NDArray[np.float64], eye: NDArray[np.float64], fx: float, fy: float, cx: float, cy: float,
+    inverse_depth: NDArray[np.float64], width_px: float, with_hidden: bool, cover: NDArray[np.uint8],
+    owner: NDArray[np.int16]
+) -> None:  # fmt: skip
     height, width = inverse_depth.shape
     # One pixel of tolerance, in the image and in depth, keeps edges complete on faces at a grazing angle.
     slack = 1.0 / (1.0 - 1.0 / fx - 5e-4)

@@ -160,7 +160,10 @@ def _ideal_pixels(camera: Camera) -> NDArray[np.int16]:
 
 
 @kernel
-def _look_up(ideal_pixels, window, origin, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
+def _look_up(
+    ideal_pixels: NDArray[np.int16], window: tuple[int, ...], origin: tuple[int, int],
+    inverse_depth: NDArray[np.float64], face_ids: NDArray[np.int32]
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:  # fmt: skip
     """Inverse depth and faces of a window of the real image, from those of the ideal image."""
     u0, v0, u1, v1 = window
     depth = np.zeros((v1 - v0, u1 - u0))
@@ -176,7 +179,10 @@ def _look_up(ideal_pixels, window, origin, inverse_depth, face_ids):  # type: ig
 
 
 @kernel(fastmath=True)
-def _faces_to_draw(points, faces, winding, component_of_face, shade):  # type: ignore[no-untyped-def]
+def _faces_to_draw(
+    points: NDArray[np.float64], faces: NDArray[np.int32], winding: NDArray[np.int8],
+    component_of_face: NDArray[np.int32], shade: NDArray[np.float32]
+) -> tuple[NDArray[np.int32], NDArray[np.int32], int]:  # fmt: skip
     """Faces that may be visible (first ``count`` rows), their components, and ``count``; fills ``shade``."""
     kept = np.empty_like(faces)
     components = np.empty_like(component_of_face)
@@ -199,7 +205,11 @@ def _faces_to_draw(points, faces, winding, component_of_face, shade):  # type: i
 
 
 @kernel(fastmath=True)
-def blend(image, u0, v0, face_ids, shade, components, ghost_style, edge_cover, edge_owner, edge_style):  # type: ignore[no-untyped-def]
+def blend(
+    image: NDArray[np.uint8], u0: int, v0: int, face_ids: NDArray[np.int32], shade: NDArray[np.float32],
+    components: NDArray[np.int32], ghost_style: NDArray[np.float32], edge_cover: NDArray[np.uint8],
+    edge_owner: NDArray[np.int16], edge_style: NDArray[np.float32]
+) -> None:  # fmt: skip
     """Blend ghost and edges over the image in place.
 
     ``ghost_style`` and ``edge_style`` are (C,4) float32: r, g, b in 0–255 and alpha in 0–1 of each component;
@@ -239,7 +249,10 @@ def blend(image, u0, v0, face_ids, shade, components, ghost_style, edge_cover, e
 
 
 @kernel
-def count_cells(u0, v0, face_ids, components, weight, cells, seen_px):  # type: ignore[no-untyped-def]
+def count_cells(
+    u0: int, v0: int, face_ids: NDArray[np.int32], components: NDArray[np.int32], weight: NDArray[np.float32],
+    cells: NDArray[np.float32], seen_px: NDArray[np.int64]
+) -> None:  # fmt: skip
     """Add the weighted area (``weight`` (C,) times pixels) to each cell, and the visible pixels to each component.
 
     Every second pixel of every second row is counted as four.

@@ -268,7 +268,11 @@ class LabelLayout:
 
 
 @kernel
-def _best_rows(rows, heights, gap, bottom, x0, widths, anchors, previous, integral, cover_cost):  # type: ignore[no-untyped-def]
+def _best_rows(
+    rows: NDArray[np.float64], heights: NDArray[np.float64], gap: int, bottom: int, x0: NDArray[np.float64],
+    widths: NDArray[np.float64], anchors: NDArray[np.float64], previous: NDArray[np.float64],
+    integral: NDArray[np.float64], cover_cost: float
+) -> NDArray[np.float64]:  # fmt: skip
     """Rows (N,) of the labels of a column, in order and without overlap, of least total cost (dynamic programming).
 
     ``heights`` include the gap below. The costs of a label are for the area that it covers, its squared distance from

@@ -149,7 +149,7 @@ def arrow(image: Image, tail_px: Array, tip_px: Array, rgb: Rgb, width_px: float
 
 
 @kernel(fastmath=True)
-def _blend_mask(image, mask, x, y, r, g, b):  # type: ignore[no-untyped-def]
+def _blend_mask(image: NDArray[np.uint8], mask: NDArray[np.uint8], x: int, y: int, r: int, g: int, b: int) -> None:
     height, width = image.shape[0], image.shape[1]
     for i in range(max(0, -y), min(mask.shape[0], height - y)):
         for j in range(max(0, -x), min(mask.shape[1], width - x)):
@@ -163,7 +163,10 @@ def _blend_mask(image, mask, x, y, r, g, b):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def _blend_sprite(image, rgb, alpha, x, y, opacity):  # type: ignore[no-untyped-def]
+def _blend_sprite(
+    image: NDArray[np.uint8], rgb: NDArray[np.uint8], alpha: NDArray[np.uint8], x: int, y: int,
+    opacity: float | np.float32
+) -> None:  # fmt: skip
     height, width = image.shape[0], image.shape[1]
     for i in range(max(0, -y), min(alpha.shape[0], height - y)):
         for j in range(max(0, -x), min(alpha.shape[1], width - x)):

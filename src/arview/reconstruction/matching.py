@@ -18,7 +18,10 @@ _BLOCK = 512  # rows of similarities computed at a time, which fit into the proc
 
 
 @kernel
-def _best(similarity, first_row, partner, best, second, column_best, column_row):  # type: ignore[no-untyped-def]
+def _best(
+    similarity: NDArray[np.float32], first_row: int, partner: NDArray[np.int32], best: NDArray[np.float32],
+    second: NDArray[np.float32], column_best: NDArray[np.float32], column_row: NDArray[np.int32]
+) -> None:  # fmt: skip
     """Best and second best column of each row, and best row of each column; rows start at ``first_row``."""
     for i in range(similarity.shape[0]):
         row = i + first_row
@@ -66,25 +69,13 @@ def epipolar_inliers(ones: Features, others: Features, matches: Matches, max_err
 
 
 @kernel(fastmath=True)
-def _match_along(  # type: ignore[no-untyped-def]
-    rays,
-    other_px,
-    descriptors,
-    others,
-    sizes,
-    other_sizes,
-    essential,
-    focal,
-    band_px,
-    cells,
-    starts,
-    cell_px,
-    columns,
-    rows,
-    partner,
-    best,
-    second,
-):
+def _match_along(
+    rays: NDArray[np.float64], other_px: NDArray[np.float64], descriptors: NDArray[np.float32],
+    others: NDArray[np.float32], sizes: NDArray[np.float32], other_sizes: NDArray[np.float32],
+    essential: NDArray[np.float64], focal: float, band_px: float, cells: NDArray[np.int32], starts: NDArray[np.int32],
+    cell_px: NDArray[np.float64], columns: int, rows: int, partner: NDArray[np.int32], best: NDArray[np.float32],
+    second: NDArray[np.float32]
+) -> None:  # fmt: skip
     """Best and second best of ``others`` within ``band_px`` of each ray's epipolar line.
 
     ``rays`` are ideal directions (N,2), ``other_px`` ideal pixels about the principal point; ``cells`` lists the

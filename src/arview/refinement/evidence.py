@@ -11,10 +11,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.refinement.modalities.edge import EdgeProfiles
+from arview.refinement.modalities.region import RegionLines
 
 DECISION_SCORE = 0.58
 """Score that separates right from wrong poses best on the recorded sequences; their quality is 0.5 there."""
@@ -108,7 +111,7 @@ class EdgeSteps:
 
 
 @kernel
-def edge_evidence(profiles, kinds, reach_px, tolerance_px):  # type: ignore[no-untyped-def]
+def edge_evidence(profiles: EdgeProfiles, kinds: NDArray[np.uint8], reach_px: float, tolerance_px: float) -> EdgeTerms:
     """Evidence of edges, `EdgeTerms`.
 
     Args:
@@ -168,7 +171,7 @@ def edge_evidence(profiles, kinds, reach_px, tolerance_px):  # type: ignore[no-u
 
 
 @kernel
-def region_evidence(lines, tolerance_px):  # type: ignore[no-untyped-def]
+def region_evidence(lines: RegionLines, tolerance_px: float) -> RegionTerms:
     """Evidence of colours, `RegionTerms`, of the lines across the outline, a `RegionLines`."""
     information = lines.information
     total = 0.0

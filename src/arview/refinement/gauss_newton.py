@@ -6,13 +6,19 @@ centre. For a residual along a unit image direction n, J = [p × a, a] with a = 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 
 
 @kernel(inline=True)
-def add_line(hessian, gradient, point, cam_from_body, x, y, z, nu, nv, intrinsics, residual, weight):  # type: ignore[no-untyped-def]
+def add_line(
+    hessian: Any, gradient: Any, point: Any, cam_from_body: Any, x: Any, y: Any, z: Any, nu: Any, nv: Any,
+    intrinsics: Any, residual: Any, weight: Any
+) -> Any:  # fmt: skip
     """Add weight · (Jᵀ J, Jᵀ r) of one residual along (nu, nv) to the system; only the lower triangle is filled.
 
     Args:
@@ -39,7 +45,9 @@ def add_line(hessian, gradient, point, cam_from_body, x, y, z, nu, nv, intrinsic
 
 
 @kernel
-def solve_step(hessian, gradient, damping):  # type: ignore[no-untyped-def]
+def solve_step(
+    hessian: NDArray[np.float64], gradient: NDArray[np.float64], damping: NDArray[np.float64]
+) -> NDArray[np.float64]:  # fmt: skip
     """Twist (6,) that solves (H + diag(damping)) x = -g by Cholesky decomposition; zeros for a singular system.
 
     ``hessian`` is given by its lower triangle.
@@ -73,7 +81,7 @@ def solve_step(hessian, gradient, damping):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def apply_twist(cam_from_body, twist):  # type: ignore[no-untyped-def]
+def apply_twist(cam_from_body: NDArray[np.float64], twist: NDArray[np.float64]) -> NDArray[np.float64]:
     """``cam_from_body`` (4,4) after a twist (rotation rad, translation mm) on the right.
 
     The rotation follows Rodrigues' formula; the translation is applied along the axes of the body before the rotation.
@@ -112,7 +120,7 @@ def apply_twist(cam_from_body, twist):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def relative_twist(cam_from_before, cam_from_after):  # type: ignore[no-untyped-def]
+def relative_twist(cam_from_before: NDArray[np.float64], cam_from_after: NDArray[np.float64]) -> NDArray[np.float64]:
     """Twist (6,) with ``apply_twist(cam_from_before, twist) = cam_from_after``, for rotations below 180°."""
     a, b = cam_from_before, cam_from_after
     turn = np.zeros((3, 3))

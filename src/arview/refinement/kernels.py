@@ -5,16 +5,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
-from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.evidence import edge_evidence, region_evidence
 from arview.refinement.gauss_newton import apply_twist, solve_step
 from arview.refinement.modalities.edge import HYPOTHESES, EdgeProfiles, add_edges, measure_edges
-from arview.refinement.modalities.region import RegionLines, add_histograms, add_region, measure_region
+from arview.refinement.modalities.region import ColorModel, RegionLines, add_histograms, add_region, measure_region
+from arview.refinement.modalities.texture import TextureMatches
 from arview.refinement.modalities.texture_matching import add_matches
-from arview.refinement.projection import project_lines
+from arview.refinement.projection import ProjectedLines, ViewArrays, project_lines
+from arview.refinement.schedules import StageTable
 
 STRENGTH_HALF = 15.0
 """Strength of an edge step, in grey levels over two pixels, that has half the weight of a very strong one."""
@@ -61,16 +63,16 @@ class ViewLines(NamedTuple):
         edge_lines: `ProjectedLines` of the edge points and the normals of their edges.
     """
 
-    contour: Array
-    contour_runs_mm: Array
-    contour_lines: NamedTuple
-    edges: Array
-    edge_kinds: Array
-    edge_lines: NamedTuple
+    contour: NDArray[np.float32]
+    contour_runs_mm: NDArray[np.float32]
+    contour_lines: ProjectedLines
+    edges: NDArray[np.float32]
+    edge_kinds: NDArray[np.uint8]
+    edge_lines: ProjectedLines
 
 
 @kernel(fastmath=True)
-def nearest_view(directions, cam_from_body):  # type: ignore[no-untyped-def]
+def nearest_view(directions: NDArray[np.float64], cam_from_body: NDArray[np.float64]) -> int:
     """Index of the view whose direction (N,3) is nearest to that of the camera."""
     r = cam_from_body
     x = -(r[0, 0] * r[0, 3] + r[1, 0] * r[1, 3] + r[2, 0] * r[2, 3])
@@ -87,9 +89,11 @@ def nearest_view(directions, cam_from_body):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def run_stages(  # type: ignore[no-untyped-def]
-    image, gray, colors, part, cam_from_body, intrinsics, step_mm, stages, damping, weights, matches
-):
+def run_stages(
+    image: NDArray[np.uint8], gray: NDArray[np.uint8], colors: ColorModel, part: ViewArrays,
+    cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float, stages: StageTable,
+    damping: NDArray[np.float64], weights: ModalityWeights, matches: TextureMatches
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Refine a pose through some stages.
 
     Args:
@@ -146,7 +150,9 @@ def run_stages(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _project_view(part, pose, intrinsics, step_mm, stride):  # type: ignore[no-untyped-def]
+def _project_view(
+    part: ViewArrays, pose: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float, stride: int
+) -> ViewLines:  # fmt: skip
     """`ViewLines` of every ``stride``-th point of the nearest view at a pose."""
     view = nearest_view(part.directions, pose)
     first, last = part.contour_starts[view], part.contour_starts[view + 1]
@@ -163,7 +169,9 @@ def _project_view(part, pose, intrinsics, step_mm, stride):  # type: ignore[no-u
 
 
 @kernel
-def _measure_contour(image, colors, view, focal, scale, is_used):  # type: ignore[no-untyped-def]
+def _measure_contour(
+    image: NDArray[np.uint8], colors: ColorModel, view: ViewLines, focal: float, scale: int, is_used: bool
+) -> RegionLines:  # fmt: skip
     """`RegionLines` of the contour; empty without the region modality."""
     if is_used:
         return measure_region(image, colors, view.contour_lines, view.contour_runs_mm, focal, scale)
@@ -171,7 +179,9 @@ def _measure_contour(image, colors, view, focal, scale, is_used):  # type: ignor
 
 
 @kernel
-def _measure_profiles(gray, view, reach, step_px, threshold, is_used):  # type: ignore[no-untyped-def]
+def _measure_profiles(
+    gray: NDArray[np.uint8], view: ViewLines, reach: int, step_px: float, threshold: float, is_used: bool
+) -> EdgeProfiles:  # fmt: skip
     """`EdgeProfiles` of the edges; empty without the edge modality."""
     if is_used:
         return measure_edges(gray, view.edge_lines, reach, step_px, threshold)
@@ -179,7 +189,7 @@ def _measure_profiles(gray, view, reach, step_px, threshold, is_used):  # type: 
 
 
 @kernel
-def _fill_upper(matrix):  # type: ignore[no-untyped-def]
+def _fill_upper(matrix: NDArray[np.float64]) -> None:
     """Mirror the lower triangle of a matrix (6,6)."""
     for i in range(6):
         for j in range(i):
@@ -187,7 +197,7 @@ def _fill_upper(matrix):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _orthonormalize(pose):  # type: ignore[no-untyped-def]
+def _orthonormalize(pose: NDArray[np.float64]) -> None:
     """Make the rotation of a pose (4,4) orthonormal again: Gram-Schmidt over its rows."""
     for i in range(3):
         for j in range(i):
@@ -200,9 +210,11 @@ def _orthonormalize(pose):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def run_evidence(  # type: ignore[no-untyped-def]
-    image, gray, colors, has_colors, part, cam_from_body, intrinsics, step_mm, edge_threshold, tolerance_px
-):
+def run_evidence(
+    image: NDArray[np.uint8], gray: NDArray[np.uint8], colors: ColorModel, has_colors: bool, part: ViewArrays,
+    cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float, edge_threshold: float,
+    tolerance_px: float
+) -> EvidenceTerms:  # fmt: skip
     """`EvidenceTerms` of the picture for a pose; arguments as of `run_stages`.
 
     Args:
@@ -233,7 +245,10 @@ def run_evidence(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def run_edge_steps(gray, part, cam_from_body, intrinsics, step_mm, edge_threshold, tolerance_px):  # type: ignore[no-untyped-def]
+def run_edge_steps(
+    gray: NDArray[np.uint8], part: ViewArrays, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
+    step_mm: float, edge_threshold: float, tolerance_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Outline and design edges at a pose, see `EdgeSteps`; arguments as of `run_evidence`."""
     view = nearest_view(part.directions, cam_from_body)
     first, last = part.edge_starts[view], part.edge_starts[view + 1]
@@ -257,7 +272,10 @@ def run_edge_steps(gray, part, cam_from_body, intrinsics, step_mm, edge_threshol
 
 
 @kernel
-def count_colors(image, bin_of, part, cam_from_body, intrinsics, step_mm, fore, back):  # type: ignore[no-untyped-def]
+def count_colors(
+    image: NDArray[np.uint8], bin_of: NDArray[np.int64], part: ViewArrays, cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64], step_mm: float, fore: NDArray[np.float64], back: NDArray[np.float64]
+) -> None:  # fmt: skip
     """Add the colours inside and outside the contour at a pose to histograms of part and background (BINS³,)."""
     view = nearest_view(part.directions, cam_from_body)
     first, last = part.contour_starts[view], part.contour_starts[view + 1]
@@ -271,7 +289,7 @@ def count_colors(image, bin_of, part, cam_from_body, intrinsics, step_mm, fore, 
 
 
 @kernel
-def median_brightness_ratio(gray, before, step):  # type: ignore[no-untyped-def]
+def median_brightness_ratio(gray: NDArray[np.uint8], before: NDArray[np.float64], step: int) -> float:
     """Median ratio of the brightness to that of the last frame on a grid; 1 where too few pixels are usable.
 
     The median is that of a histogram of logarithms. Saturated and black pixels do not count.

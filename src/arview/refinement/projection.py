@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.kernel import kernel
@@ -26,13 +27,39 @@ class ProjectedLines(NamedTuple):
     depths: Array
 
 
+class ViewArrays(NamedTuple):
+    """All guide views of a part as flat arrays. Points are in the body frame, whose origin is the part's centre.
+
+    Attributes:
+        directions: (N,3) unit directions from the part's centre to the camera of each view.
+        contour_starts: (N+1,) first contour point of each view.
+        contour_points: (C,3) float32 mm.
+        contour_normals: (C,3) float32, outward unit normals of the contour.
+        contour_runs_mm: (C,2) how far the picture stays part inwards and background outwards of the contour.
+        edge_starts: (N+1,) first edge point of each view.
+        edge_points: (E,3) float32 mm.
+        edge_tangents: (E,3) float32, unit tangents of the edges.
+        edge_kinds: (E,) EDGE_* bits.
+    """
+
+    directions: NDArray[np.float64]
+    contour_starts: NDArray[np.int64]
+    contour_points: NDArray[np.float32]
+    contour_normals: NDArray[np.float32]
+    contour_runs_mm: NDArray[np.float32]
+    edge_starts: NDArray[np.int64]
+    edge_points: NDArray[np.float32]
+    edge_tangents: NDArray[np.float32]
+    edge_kinds: NDArray[np.uint8]
+
+
 def intrinsics_of(camera: Camera) -> Array:
     """Intrinsics in the form of the kernels: (10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0])
 
 
 @kernel(inline=True)
-def project(x, y, z, intrinsics):  # type: ignore[no-untyped-def]
+def project(x: float, y: float, z: float, intrinsics: NDArray[np.float64]) -> tuple[float, float]:
     """Pixel (u, v) of a point in the camera's frame; ``intrinsics`` as of `intrinsics_of`."""
     xn = x / z
     yn = y / z
@@ -46,7 +73,10 @@ def project(x, y, z, intrinsics):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def project_lines(points, directions, across, cam_from_body, intrinsics, step_mm):  # type: ignore[no-untyped-def]
+def project_lines(
+    points: NDArray[np.float64] | NDArray[np.float32], directions: NDArray[np.float64] | NDArray[np.float32],
+    across: bool, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float
+) -> ProjectedLines:  # fmt: skip
     """Project points with directions, see `ProjectedLines`.
 
     Args:

@@ -8,7 +8,6 @@ missed or confused with each other, and a test that expects them rejects right p
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from arview.geometry import invert, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.modalities.shading import ShadingOptions, corner_normals, curved_share
+from arview.refinement.projection import ViewArrays
 
 MIN_SEPARATION = 0.035
 """Edges closer to each other than this, in diameters of the part, are unresolvable: 3.4 px where the diameter is 96 px,
@@ -32,32 +32,6 @@ END_ON = 0.02
 """Edges whose projected tangent is shorter than this are seen end-on and left out."""
 UNIT_16 = np.float32(1.0 / 32767.0)
 """Scale of the unit vectors that guide views store as 16-bit integers."""
-
-
-class ViewArrays(NamedTuple):
-    """All guide views of a part as flat arrays. Points are in the body frame, whose origin is the part's centre.
-
-    Attributes:
-        directions: (N,3) unit directions from the part's centre to the camera of each view.
-        contour_starts: (N+1,) first contour point of each view.
-        contour_points: (C,3) float32 mm.
-        contour_normals: (C,3) float32, outward unit normals of the contour.
-        contour_runs_mm: (C,2) how far the picture stays part inwards and background outwards of the contour.
-        edge_starts: (N+1,) first edge point of each view.
-        edge_points: (E,3) float32 mm.
-        edge_tangents: (E,3) float32, unit tangents of the edges.
-        edge_kinds: (E,) EDGE_* bits.
-    """
-
-    directions: NDArray[Any]
-    contour_starts: NDArray[Any]
-    contour_points: NDArray[Any]
-    contour_normals: NDArray[Any]
-    contour_runs_mm: NDArray[Any]
-    edge_starts: NDArray[Any]
-    edge_points: NDArray[Any]
-    edge_tangents: NDArray[Any]
-    edge_kinds: NDArray[Any]
 
 
 class PartView:
@@ -120,7 +94,11 @@ def find_unresolvable(views: GuideViewSet) -> NDArray[np.bool_]:
 
 
 @kernel(fastmath=True)
-def _mark_unresolvable(directions, starts, points, tangents, is_design, diameter_mm, unresolvable):  # type: ignore[no-untyped-def]
+def _mark_unresolvable(
+    directions: NDArray[np.float64], starts: NDArray[np.int64], points: NDArray[np.float32],
+    tangents: NDArray[np.float32], is_design: NDArray[np.bool_], diameter_mm: float | np.float32,
+    unresolvable: NDArray[np.bool_]
+) -> None:  # fmt: skip
     """Mark edge points, see `find_unresolvable`. Edges are compared in the image plane of each view."""
     nearest, furthest = np.float32(SAME_LINE) * diameter_mm, np.float32(MIN_SEPARATION) * diameter_mm
     along = np.float32(MAX_ALONG) * diameter_mm

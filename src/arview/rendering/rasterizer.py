@@ -7,6 +7,8 @@ inside; triangles that cross the near plane are clipped (Sutherland & Hodgman 19
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +17,10 @@ from arview.geometry import Array
 
 
 @kernel(inline=True)
-def _fill(u0, v0, w0, u1, v1, w1, u2, v2, w2, face, x_low, y_low, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
+def _fill(
+    u0: Any, v0: Any, w0: Any, u1: Any, v1: Any, w1: Any, u2: Any, v2: Any, w2: Any, face: Any, x_low: Any,
+    y_low: Any, inverse_depth: Any, face_ids: Any
+) -> Any:  # fmt: skip
     """Draw one projected triangle into the buffers; w is 1/z at the corners, (x_low, y_low) the first pixel."""
     height, width = inverse_depth.shape
     area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
@@ -53,7 +58,10 @@ def _fill(u0, v0, w0, u1, v1, w1, u2, v2, w2, face, x_low, y_low, inverse_depth,
 
 
 @kernel
-def fill_buffers(points, faces, fx, fy, cx, cy, near, x_low, y_low, inverse_depth, face_ids):  # type: ignore[no-untyped-def]
+def fill_buffers(
+    points: NDArray[np.float64], faces: NDArray[np.int32] | NDArray[np.int64], fx: float, fy: float, cx: float,
+    cy: float, near: float, x_low: int, y_low: int, inverse_depth: NDArray[np.float64], face_ids: NDArray[np.int32]
+) -> None:  # fmt: skip
     """The kernel of `rasterise`: draws into buffers (H,W) that hold 0 and -1 at first."""
     height, width = inverse_depth.shape
     count = points.shape[0]

@@ -6,7 +6,7 @@ and the ray-triangle test of Möller & Trumbore (1997). Both sides of a triangle
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,7 +38,10 @@ BINS = 12
 
 
 @kernel
-def _bound_node(low, high, order, first, last, bounds):  # type: ignore[no-untyped-def]
+def _bound_node(
+    low: NDArray[np.float64], high: NDArray[np.float64], order: NDArray[np.int32], first: int, last: int,
+    bounds: NDArray[np.float64]
+) -> tuple[int, float, float]:  # fmt: skip
     """Write the box of some triangles into ``bounds`` (6,).
 
     Returns:
@@ -62,7 +65,10 @@ def _bound_node(low, high, order, first, last, bounds):  # type: ignore[no-untyp
 
 
 @kernel
-def _best_plane(low, high, order, first, last, axis, origin, to_bin, box, sizes, cost):  # type: ignore[no-untyped-def]
+def _best_plane(
+    low: NDArray[np.float64], high: NDArray[np.float64], order: NDArray[np.int32], first: int, last: int, axis: int,
+    origin: float, to_bin: float, box: NDArray[np.float64], sizes: NDArray[np.int64], cost: NDArray[np.float64]
+) -> int:  # fmt: skip
     """The last bin left of the plane of least cost; ``box`` (B,6), ``sizes`` (B,) and ``cost`` (B,) are scratch."""
     bins = box.shape[0]
     sizes[:] = 0
@@ -100,7 +106,10 @@ def _best_plane(low, high, order, first, last, axis, origin, to_bin, box, sizes,
 
 
 @kernel
-def _partition(low, high, order, first, last, axis, origin, to_bin, plane, swap):  # type: ignore[no-untyped-def]
+def _partition(
+    low: NDArray[np.float64], high: NDArray[np.float64], order: NDArray[np.int32], first: int, last: int, axis: int,
+    origin: float, to_bin: float, plane: int, swap: NDArray[np.int32]
+) -> int:  # fmt: skip
     """Move the triangles left of a plane before the others, in stable order; returns the first index of the right."""
     left, right = first, 0
     for k in range(first, last):
@@ -116,7 +125,9 @@ def _partition(low, high, order, first, last, axis, origin, to_bin, plane, swap)
 
 
 @kernel
-def _build(low, high, leaf_size):  # type: ignore[no-untyped-def]
+def _build(
+    low: NDArray[np.float64], high: NDArray[np.float64], leaf_size: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:  # fmt: skip
     """The hierarchy over the boxes of triangles.
 
     Args:
@@ -161,7 +172,7 @@ def _build(low, high, leaf_size):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _enter(bounds, node, ox, oy, oz, ix, iy, iz, limit):  # type: ignore[no-untyped-def]
+def _enter(bounds: Any, node: Any, ox: Any, oy: Any, oz: Any, ix: Any, iy: Any, iz: Any, limit: Any) -> Any:
     """Distance at which a ray enters a node's box; 1e300 when it misses the box or enters beyond ``limit``."""
     a, b = (bounds[node, 0] - ox) * ix, (bounds[node, 3] - ox) * ix
     near, far = min(a, b), max(a, b)
@@ -177,7 +188,10 @@ def _enter(bounds, node, ox, oy, oz, ix, iy, iz, limit):  # type: ignore[no-unty
 
 
 @kernel
-def cast_ray(hierarchy, ox, oy, oz, dx, dy, dz, limit, any_hit):  # type: ignore[no-untyped-def]
+def cast_ray(
+    hierarchy: Hierarchy, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, limit: float,
+    any_hit: bool
+) -> tuple[float, int]:  # fmt: skip
     """The nearest hit of one ray.
 
     Args:
@@ -242,7 +256,10 @@ def cast_ray(hierarchy, ox, oy, oz, dx, dy, dz, limit, any_hit):  # type: ignore
 
 
 @kernel
-def _cast_rays(hierarchy, origins, directions, distances, faces):  # type: ignore[no-untyped-def]
+def _cast_rays(
+    hierarchy: Hierarchy, origins: NDArray[np.float64], directions: NDArray[np.float64],
+    distances: NDArray[np.float64], faces: NDArray[np.int32]
+) -> None:  # fmt: skip
     """Write the nearest hit of each ray (N,3) into ``distances`` (N,) and ``faces`` (N,)."""
     for i in range(origins.shape[0]):
         distance, face = cast_ray(

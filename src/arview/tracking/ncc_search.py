@@ -307,7 +307,10 @@ class NccSearch:
 
 
 @kernel(fastmath=True)
-def _correlation(image, picture, mask, u, v, roll, ratio):  # type: ignore[no-untyped-def]
+def _correlation(
+    image: NDArray[np.float32], picture: NDArray[np.uint8], mask: NDArray[np.uint8], u: float, v: float, roll: float,
+    ratio: float
+) -> float:  # fmt: skip
     """Masked normalised correlation of a view with an image, all channels together; -1 mostly outside the image.
 
     The view is placed with its centre at (u, v) px, turned by ``roll`` rad and scaled by ``ratio``. Pixels outside the
@@ -351,7 +354,10 @@ def _correlation(image, picture, mask, u, v, roll, ratio):  # type: ignore[no-un
 
 
 @kernel
-def pattern_search(image, picture, mask, start, steps, halvings):  # type: ignore[no-untyped-def]
+def pattern_search(
+    image: NDArray[np.float32], picture: NDArray[np.uint8], mask: NDArray[np.uint8], start: NDArray[np.float64],
+    steps: NDArray[np.float64], halvings: int
+) -> tuple[float, NDArray[np.float64]]:  # fmt: skip
     """Pattern search (Hooke & Jeeves, 1961) for the best correlation of a view.
 
     Args:

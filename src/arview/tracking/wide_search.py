@@ -22,7 +22,7 @@ from arview.detection.search.nms import select_distinct
 from arview.detection.search.pattern_search import search_poses
 from arview.geometry import Array, turn_ball
 from arview.refinement.modalities.region import BINS, ColorModel
-from arview.refinement.view_model import ViewArrays
+from arview.refinement.projection import ViewArrays
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class WideSearch:
 
 
 @kernel
-def _with_odds(image, bin_of, odds):  # type: ignore[no-untyped-def]
+def _with_odds(image: NDArray[np.uint8], bin_of: NDArray[np.int64], odds: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Picture (H,W,4) with the probability that a pixel shows the part, 0–255, as its fourth channel."""
     height, width = image.shape[0], image.shape[1]
     out = np.empty((height, width, 4), dtype=np.uint8)

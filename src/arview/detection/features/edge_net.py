@@ -20,7 +20,7 @@ from arview.core.onnx_session import padded_to_multiple
 from arview.detection.features.response_maps import ORIENTATIONS
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
-from arview.refinement.projection import project_lines
+from arview.refinement.projection import ViewArrays, project_lines
 from arview.weights import load_network
 
 MAX_SIDE_PX = 640
@@ -111,7 +111,10 @@ def resize_responses(maps: NDArray[np.uint8], width: int, height: int, spread_px
 
 
 @kernel
-def mean_edge_response(maps, part, pose, intrinsics, step_mm):  # type: ignore[no-untyped-def]
+def mean_edge_response(
+    maps: NDArray[np.uint8], part: ViewArrays, pose: NDArray[np.float64], intrinsics: NDArray[np.float64],
+    step_mm: float
+) -> float:  # fmt: skip
     """Mean edge response 0–1 under the outline and the design edges of a part, which weigh at most half.
 
     Args:

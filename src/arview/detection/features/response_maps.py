@@ -16,7 +16,7 @@ from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
-from arview.refinement.projection import project_lines
+from arview.refinement.projection import ViewArrays, project_lines
 
 Plane = NDArray[np.float32]
 
@@ -62,7 +62,9 @@ def colour_gradients(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Plane
 
 
 @kernel
-def _strongest(gx, gy):  # type: ignore[no-untyped-def]
+def _strongest(
+    gx: NDArray[np.int16], gy: NDArray[np.int16]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
     """Gradient (H,W) of each pixel's strongest channel (Dalal & Triggs, CVPR 2005), and its size in grey levels."""
     channels, height, width = gx.shape
     x = np.empty((height, width), dtype=np.float32)
@@ -87,7 +89,10 @@ def _strongest(gx, gy):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _oriented(phase, magnitude, around, peak, pool):  # type: ignore[no-untyped-def]
+def _oriented(
+    phase: NDArray[np.float32], magnitude: NDArray[np.float32], around: NDArray[np.float32],
+    peak: NDArray[np.float32], pool: int
+) -> NDArray[np.uint8]:  # fmt: skip
     """Strength of thin edges by orientation (8, H / pool, W / pool), relative to the contrast around them.
 
     An edge between two orientations counts for both.
@@ -128,7 +133,7 @@ def _oriented(phase, magnitude, around, peak, pool):  # type: ignore[no-untyped-
 
 
 @kernel
-def _subtract_mean(spread, pad):  # type: ignore[no-untyped-def]
+def _subtract_mean(spread: NDArray[np.uint8], pad: int) -> NDArray[np.uint8]:
     """Responses beyond a share of their mean over all orientations, rescaled and padded with zeros."""
     count, height, width = spread.shape
     maps = np.zeros((count, height + 2 * pad, width + 2 * pad), dtype=np.uint8)
@@ -160,7 +165,10 @@ def orientation_bins(normals_px: Array) -> NDArray[np.uint8]:
 
 
 @kernel
-def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, points):  # type: ignore[no-untyped-def]
+def collect_points(
+    part: ViewArrays, view: int, pose: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float,
+    contour_count: int, edge_count: int, points: NDArray[np.int64]
+) -> int:  # fmt: skip
     """Project a guide view's outline and design edges, and return the number of points.
 
     ``points`` (3,N) int64 receives their columns, rows and orientation bins; see `score_around` for the rest.
@@ -199,9 +207,11 @@ def collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_co
 
 
 @kernel
-def score_around(  # type: ignore[no-untyped-def]
-    maps, part, cam_from_body, intrinsics, step_mm, turns, stretches, shift_px, shift_step, contour_count, edge_count
-):
+def score_around(
+    maps: NDArray[np.uint8], part: ViewArrays, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
+    step_mm: float, turns: NDArray[np.float64], stretches: NDArray[np.float64], shift_px: int, shift_step: int,
+    contour_count: int, edge_count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Score poses around one pose by the responses under their projected outline and design edges.
 
     Args:
@@ -250,7 +260,10 @@ def score_around(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def best_shift(maps, points, count, shift_px, shift_step, sums):  # type: ignore[no-untyped-def]
+def best_shift(
+    maps: NDArray[np.uint8], points: NDArray[np.int64], count: int, shift_px: int, shift_step: int,
+    sums: NDArray[np.int32]
+) -> tuple[int, int, int]:  # fmt: skip
     """Highest sum of responses under the first ``count`` points over all shifts, and that shift dx, dy in px.
 
     ``points`` is as `collect_points` fills it; ``sums`` (S,S) int32 is a work buffer. Points that a shift moves outside

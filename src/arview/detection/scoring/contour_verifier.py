@@ -21,7 +21,7 @@ from arview.detection.scoring.crops import MASK, write_relative_colours
 from arview.detection.scoring.profile_ranker import sample_lines
 from arview.detection.scoring.score_net import REFERENCE_RADIUS_PX, NetworkInput, ScoreNet, size_and_contrast
 from arview.geometry import Array
-from arview.refinement.projection import project_lines
+from arview.refinement.projection import ViewArrays, project_lines
 from arview.refinement.view_model import PartView
 
 OUTLINE_ROWS, INNER_ROWS = 96, 48
@@ -83,7 +83,10 @@ def contour_profiles(pyramid: ImagePyramid, part: PartView, pose: Array) -> NDAr
 
 
 @kernel(fastmath=True)
-def _sample_profiles(colours, responses, part, pose, intrinsics, step_mm, profiles):  # type: ignore[no-untyped-def]
+def _sample_profiles(
+    colours: NDArray[np.uint8], responses: NDArray[np.uint8], part: ViewArrays, pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64], step_mm: float, profiles: NDArray[np.uint8]
+) -> None:  # fmt: skip
     """Write the samples of `contour_profiles`."""
     height, width = colours.shape[:2]
     rows, columns = responses.shape[1:]
@@ -129,7 +132,7 @@ def _sample_profiles(colours, responses, part, pose, intrinsics, step_mm, profil
 
 
 @kernel(fastmath=True)
-def _channels(profiles):  # type: ignore[no-untyped-def]
+def _channels(profiles: NDArray[np.uint8]) -> tuple[NDArray[np.float32], float, float]:
     """Channels (CHANNELS, ROWS, COLUMNS) float32 of raw profiles, contrast, and share of rows in the image."""
     out = np.zeros((CHANNELS, ROWS, COLUMNS), dtype=np.float32)
     contrast = write_relative_colours(profiles[:4].transpose(1, 2, 0), out)

@@ -21,7 +21,7 @@ from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.guideviews.surface import draw_surface
 from arview.refinement.kernels import nearest_view
-from arview.refinement.projection import project_lines
+from arview.refinement.projection import ViewArrays, project_lines
 from arview.refinement.view_model import PartView
 
 CROP_SIDE_PX, CROP_RADIUS_PX = 80, 35.0
@@ -145,7 +145,10 @@ def append_edge_responses(channels: NDArray[np.float32], responses: NDArray[np.u
 
 
 @kernel
-def crop_edge_responses(responses, shrunk, zoom, shift, outline):  # type: ignore[no-untyped-def]
+def crop_edge_responses(
+    responses: NDArray[np.uint8], shrunk: float, zoom: float, shift: NDArray[np.float64],
+    outline: NDArray[np.float32]
+) -> NDArray[np.uint8]:  # fmt: skip
     """Edge responses around a pose (RESPONSE_CHANNELS,S,S) uint8.
 
     Args:
@@ -175,7 +178,7 @@ def crop_edge_responses(responses, shrunk, zoom, shift, outline):  # type: ignor
 
 
 @kernel(fastmath=True)
-def normalise_colours(pixels, drawn):  # type: ignore[no-untyped-def]
+def normalise_colours(pixels: NDArray[np.uint8], drawn: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
     """Plain channels (PLAIN_CHANNELS,S,S) of a raw crop with normalised colours, and the contrast in grey levels."""
     plain = np.zeros((PLAIN_CHANNELS, *pixels.shape[:2]), dtype=np.float32)
     plain[4:] = drawn
@@ -183,7 +186,7 @@ def normalise_colours(pixels, drawn):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def write_relative_colours(pixels, plain):  # type: ignore[no-untyped-def]
+def write_relative_colours(pixels: NDArray[np.uint8], plain: NDArray[np.float32]) -> float:
     """Write colours less their mean, divided by their standard deviation, and return that deviation in grey levels.
 
     Args:
@@ -214,7 +217,7 @@ def write_relative_colours(pixels, plain):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def append_gradients(plain):  # type: ignore[no-untyped-def]
+def append_gradients(plain: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
     """Plain and derived channels (CROP_CHANNELS,S,S) of plain ones, and the share of brightness that shading explains.
 
     Gradients are relative to their mean.
@@ -253,7 +256,7 @@ def append_gradients(plain):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def _explain_shading(plain, shading, residual):  # type: ignore[no-untyped-def]
+def _explain_shading(plain: NDArray[np.float32], shading: NDArray[np.float32], residual: NDArray[np.float32]) -> float:
     """Write the brightness (S,S) that the normals explain and its residual, and return the explained share.
 
     Two rounds of iteratively reweighted least squares: pixels that the first fit leaves far off may be occluded,
@@ -305,7 +308,7 @@ def _explain_shading(plain, shading, residual):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def _slope_at(plane, v, u, slope):  # type: ignore[no-untyped-def]
+def _slope_at(plane: NDArray[np.float32], v: int, u: int, slope: NDArray[np.float32]) -> None:
     """Write the gradient x, y of a plane at a pixel by Sobel's weights; the border is replicated."""
     up, low = max(v - 1, 0), min(v + 1, plane.shape[0] - 1)
     left, right = max(u - 1, 0), min(u + 1, plane.shape[1] - 1)
@@ -315,7 +318,10 @@ def _slope_at(plane, v, u, slope):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def draw_edges(part, pose, intrinsics, step_mm, zoom, shift, drawn):  # type: ignore[no-untyped-def]
+def draw_edges(
+    part: ViewArrays, pose: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float, zoom: float,
+    shift: NDArray[np.float64], drawn: NDArray[np.float32]
+) -> None:  # fmt: skip
     """Draw the outline and the design edges of the part at a pose.
 
     Args:

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.detection.features.edge_net import SOLID_CHANNEL
-from arview.detection.features.image_pyramid import ImagePyramid, steps_to
+from arview.detection.features.image_pyramid import ImagePyramid, PyramidLevel, steps_to
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
-from arview.refinement.projection import project_lines
+from arview.refinement.projection import ViewArrays, project_lines
 from arview.refinement.view_model import PartView
 from arview.weights import load_arrays
 
@@ -177,7 +177,10 @@ def _batches(
 
 
 @kernel(fastmath=True)
-def score_profiles(level, part, poses, log_lines, diameter_mm, layers):  # type: ignore[no-untyped-def]
+def score_profiles(
+    level: PyramidLevel, part: ViewArrays, poses: NDArray[np.float64], log_lines: NDArray[np.float64],
+    diameter_mm: float, layers: RankerLayers
+) -> NDArray[np.float64]:  # fmt: skip
     """Scores (N,) of poses; see `ProfileRanker.scores`.
 
     Args:
@@ -224,7 +227,10 @@ def score_profiles(level, part, poses, log_lines, diameter_mm, layers):  # type:
 
 
 @kernel(fastmath=True)
-def describe_profiles(level, part, pose, log_lines, diameter_mm, profiles, scalars):  # type: ignore[no-untyped-def]
+def describe_profiles(
+    level: PyramidLevel, part: ViewArrays, pose: NDArray[np.float64], log_lines: float, diameter_mm: float,
+    profiles: NDArray[np.float32], scalars: NDArray[np.float32]
+) -> None:  # fmt: skip
     """Write the features of a pose to ``profiles`` (L, FEATURES) and ``scalars`` (RANKER_SCALARS,), float32.
 
     Profiles outside the image are all zero.
@@ -245,7 +251,10 @@ def describe_profiles(level, part, pose, log_lines, diameter_mm, profiles, scala
 
 
 @kernel(fastmath=True)
-def _sample_profiles(level, lines, pose, step_mm, profiles, sides, mean_colour):  # type: ignore[no-untyped-def]
+def _sample_profiles(
+    level: PyramidLevel, lines: SampledLines, pose: NDArray[np.float64], step_mm: float,
+    profiles: NDArray[np.float32], sides: NDArray[np.float64], mean_colour: NDArray[np.float64]
+) -> tuple[float, int]:  # fmt: skip
     """Sample gradients and responses across all lines, and the colours of their sides.
 
     Args:
@@ -325,7 +334,9 @@ def _sample_profiles(level, lines, pose, step_mm, profiles, sides, mean_colour):
 
 
 @kernel(fastmath=True)
-def _compare_sides(sides, mean_colour, step, profiles):  # type: ignore[no-untyped-def]
+def _compare_sides(
+    sides: NDArray[np.float64], mean_colour: NDArray[np.float64], step: float, profiles: NDArray[np.float32]
+) -> None:  # fmt: skip
     """Make gradients relative to their mean ``step``, and write the colour differences; see `_sample_profiles`."""
     for slot in range(profiles.shape[0]):
         line = profiles[slot]
@@ -351,7 +362,7 @@ def _compare_sides(sides, mean_colour, step, profiles):  # type: ignore[no-untyp
 
 
 @kernel(fastmath=True)
-def sample_lines(part, pose, max_outline, max_inner):  # type: ignore[no-untyped-def]
+def sample_lines(part: ViewArrays, pose: NDArray[np.float64], max_outline: int, max_inner: int) -> SampledLines:
     """`SampledLines` of the view nearest to a pose, with at most ``max_outline`` and ``max_inner`` rows."""
     view = nearest_view(part.directions, pose)
     points = np.empty((max_outline + max_inner, 3), dtype=np.float32)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 
 
 @kernel
-def select_distinct(rotations, positions, reach, cosine, distance_ratio, most):  # type: ignore[no-untyped-def]
+def select_distinct(
+    rotations: NDArray[np.float64], positions: NDArray[np.float64], reach: NDArray[np.float64], cosine: float,
+    distance_ratio: float, most: int
+) -> NDArray[np.int64]:  # fmt: skip
     """Indices of at most ``most`` poses, best first as given, none close to a better one.
 
     Args:

@@ -9,6 +9,7 @@ print or clutter that attracts single edge points.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.detection.features.response_maps import best_shift, collect_points
@@ -19,10 +20,15 @@ from arview.detection.search.template_bank import (
     sector_of,
 )
 from arview.refinement.kernels import nearest_view
+from arview.refinement.projection import ViewArrays
 
 
 @kernel
-def pose_score(maps, part, pose, intrinsics, step_mm, contour_count, edge_count, shift_px, shift_step, buffer, sums):  # type: ignore[no-untyped-def]
+def pose_score(
+    maps: NDArray[np.uint8], part: ViewArrays, pose: NDArray[np.float64], intrinsics: NDArray[np.float64],
+    step_mm: float, contour_count: int, edge_count: int, shift_px: int, shift_step: int, buffer: NDArray[np.int64],
+    sums: NDArray[np.int32]
+) -> tuple[float, int, int]:  # fmt: skip
     """Mean response 0–1 at a pose, and the best shift dx, dy in px; 0 with too few points.
 
     Args:
@@ -44,7 +50,7 @@ def pose_score(maps, part, pose, intrinsics, step_mm, contour_count, edge_count,
 
 
 @kernel
-def _stepped(pose, axis, amount):  # type: ignore[no-untyped-def]
+def _stepped(pose: NDArray[np.float64], axis: int, amount: float) -> NDArray[np.float64]:
     """A pose rotated about camera axis 0–2 through the part's centre, or moved in distance (axis 3)."""
     moved = pose.copy()
     if axis == 3:
@@ -60,10 +66,11 @@ def _stepped(pose, axis, amount):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def search_poses(  # type: ignore[no-untyped-def]
-    maps, part, poses, intrinsics, step_mm, turn_step_rad, stretch_step, rounds, halvings, shift_px, shift_step,
-    contour_count, edge_count
-):  # fmt: skip
+def search_poses(
+    maps: NDArray[np.uint8], part: ViewArrays, poses: NDArray[np.float64], intrinsics: NDArray[np.float64],
+    step_mm: float, turn_step_rad: float, stretch_step: float, rounds: int, halvings: int, shift_px: int,
+    shift_step: int, contour_count: int, edge_count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Improve poses independently of each other.
 
     Args:
@@ -116,9 +123,11 @@ def search_poses(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def outline_score(  # type: ignore[no-untyped-def]
-    maps, points, angles, roll, radius_px, nearness, x0, y0, shift_px, shift_step, is_trimmed, buffer, sums, sectors
-):  # fmt: skip
+def outline_score(
+    maps: NDArray[np.uint8], points: NDArray[np.float32], angles: NDArray[np.uint8], roll: float, radius_px: float,
+    nearness: float, x0: float, y0: float, shift_px: int, shift_step: int, is_trimmed: bool,
+    buffer: NDArray[np.int64], sums: NDArray[np.int32], sectors: NDArray[np.int64]
+) -> tuple[float, int, int]:  # fmt: skip
     """Mean response 0–1 of an outline at a roll, size and place, and the best shift dx, dy in px.
 
     Args:
@@ -149,7 +158,9 @@ def outline_score(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _trimmed_sum(maps, buffer, count, dx, dy, sums):  # type: ignore[no-untyped-def]
+def _trimmed_sum(
+    maps: NDArray[np.uint8], buffer: NDArray[np.int64], count: int, dx: int, dy: int, sums: NDArray[np.int64]
+) -> int | np.int64:  # fmt: skip
     """Sum of the responses under the points of an outline at a shift, without the lowest adjacent pair of sectors."""
     height, width = maps.shape[1], maps.shape[2]
     sums[:] = 0
@@ -161,10 +172,14 @@ def _trimmed_sum(maps, buffer, count, dx, dy, sums):  # type: ignore[no-untyped-
 
 
 @kernel
-def search_outlines(  # type: ignore[no-untyped-def]
-    maps, points, angles, neighbours, turns, views, rolls, radii_px, places, focal_px, roll_step_rad, stretch_step,
-    rounds, shift_px, shift_step, is_trimmed
-):  # fmt: skip
+def search_outlines(
+    maps: NDArray[np.uint8], points: NDArray[np.float32], angles: NDArray[np.uint8], neighbours: NDArray[np.int32],
+    turns: NDArray[np.float64], views: NDArray[np.int32], rolls: NDArray[np.float64], radii_px: NDArray[np.float64],
+    places: NDArray[np.float64], focal_px: float, roll_step_rad: float, stretch_step: float, rounds: int,
+    shift_px: int, shift_step: int, is_trimmed: bool
+) -> tuple[
+    NDArray[np.float64], NDArray[np.int32], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
+]:  # fmt: skip
     """Improve matches of outlines in view, roll, size and place, independently of each other.
 
     Faster than `search_poses`, because nothing is projected; accurate enough for rough matches.

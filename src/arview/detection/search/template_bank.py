@@ -173,13 +173,13 @@ def sector_order(points: Array) -> NDArray[np.intp]:
 
 
 @kernel
-def sector_of(place):  # type: ignore[no-untyped-def]
+def sector_of(place: int) -> int:
     """Sector of a point by its place in the order of `sector_order`."""
     return place // (FIRST_POINTS // SECTORS) % SECTORS
 
 
 @kernel
-def min_adjacent_pair(sums):  # type: ignore[no-untyped-def]
+def min_adjacent_pair(sums: NDArray[np.int64]) -> int:
     """Smallest sum of two adjacent sectors, from the sums (SECTORS,) of all."""
     smallest = sums[SECTORS - 1] + sums[0]
     for sector in range(1, SECTORS):

@@ -9,6 +9,8 @@ displace the others. The threshold of a group rises as better matches are found,
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,7 +55,10 @@ def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
 
 
 @kernel
-def _add_points(total, flat, source, shift, start, size, first, last):  # type: ignore[no-untyped-def]
+def _add_points(
+    total: NDArray[np.uint16], flat: NDArray[np.uint8], source: NDArray[np.int64], shift: NDArray[np.int64],
+    start: int, size: int, first: int, last: int
+) -> None:  # fmt: skip
     """Add the responses under points ``first`` to ``last`` to the sums of a tile, four points at a time in 8 bits."""
     for i in range(first, last, 4):
         a = flat[source[i], shift[i] + start : shift[i] + start + size]
@@ -65,7 +70,10 @@ def _add_points(total, flat, source, shift, start, size, first, last):  # type: 
 
 
 @kernel
-def _add_trimmed(total, own, lowest, flat, source, shift, start, size):  # type: ignore[no-untyped-def]
+def _add_trimmed(
+    total: NDArray[np.uint16], own: NDArray[np.uint16], lowest: NDArray[np.uint16], flat: NDArray[np.uint8],
+    source: NDArray[np.int64], shift: NDArray[np.int64], start: int, size: int
+) -> None:  # fmt: skip
     """Add the responses under the first points, without the adjacent pair of sectors that has the lowest sum."""
     each = FIRST_POINTS // SECTORS
     for sector in range(SECTORS):
@@ -84,7 +92,7 @@ def _add_trimmed(total, own, lowest, flat, source, shift, start, size):  # type:
 
 
 @kernel
-def _threshold(votes, kept):  # type: ignore[no-untyped-def]
+def _threshold(votes: NDArray[np.int64], kept: int) -> float:
     """Key that about ``kept`` of the matches counted in ``votes`` (1024,) reach."""
     above = 0
     for level in range(len(votes) - 1, 0, -1):
@@ -95,14 +103,16 @@ def _threshold(votes, kept):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _surviving(keys, groups, found, votes, kept):  # type: ignore[no-untyped-def]
+def _surviving(
+    keys: NDArray[np.float64], groups: NDArray[np.int32], found: int, votes: NDArray[np.int64], kept: int
+) -> NDArray[np.int64]:  # fmt: skip
     """Indices of those of the first ``found`` matches that still reach the thresholds of their groups."""
     thresholds = np.array([_threshold(votes[g], kept) for g in range(len(votes))])
     return np.array([i for i in range(found) if keys[i] >= thresholds[groups[i]]], dtype=np.int64)
 
 
 @kernel(inline=True)
-def _place_points(offsets, bins, step, columns, source, shift):  # type: ignore[no-untyped-def]
+def _place_points(offsets: Any, bins: Any, step: Any, columns: Any, source: Any, shift: Any) -> Any:
     """Write plane and offset of each point of a template in the decimated maps, and return its largest dx and dy."""
     reach_x = 0
     reach_y = 0
@@ -116,7 +126,9 @@ def _place_points(offsets, bins, step, columns, source, shift):  # type: ignore[
 
 
 @kernel(inline=True)
-def _sum_first_points(total, own, lowest, flat, source, shift, span, is_trimmed):  # type: ignore[no-untyped-def]
+def _sum_first_points(
+    total: Any, own: Any, lowest: Any, flat: Any, source: Any, shift: Any, span: Any, is_trimmed: Any
+) -> Any:  # fmt: skip
     """Write the sums of the first points at ``span`` places to ``total``, tile by tile."""
     for start in range(0, span, TILE):
         size = min(TILE, span - start)
@@ -128,7 +140,7 @@ def _sum_first_points(total, own, lowest, flat, source, shift, span, is_trimmed)
 
 
 @kernel(inline=True)
-def _typical_score(total, span, full):  # type: ignore[no-untyped-def]
+def _typical_score(total: Any, span: Any, full: Any) -> Any:
     """Mean score of the first points over sampled places, times `TYPICAL_SHARE`; ``full`` is the largest sum."""
     count = 0
     sampled = np.uint64(0)
@@ -141,7 +153,7 @@ def _typical_score(total, span, full):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _is_peak(total, k, span, columns):  # type: ignore[no-untyped-def]
+def _is_peak(total: Any, k: Any, span: Any, columns: Any) -> Any:
     """Whether place ``k`` is the maximum among its four neighbours; of equal neighbours the last one is."""
     value = total[k]
     if (k > 0 and total[k - 1] > value) or (k + 1 < span and total[k + 1] >= value):
@@ -150,7 +162,10 @@ def _is_peak(total, k, span, columns):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _compact(keys, templates, cells, groups, found, votes, kept):  # type: ignore[no-untyped-def]
+def _compact(
+    keys: NDArray[np.float64], templates: NDArray[np.int32], cells: NDArray[np.int32], groups: NDArray[np.int32],
+    found: int, votes: NDArray[np.int64], kept: int
+) -> int:  # fmt: skip
     """Move the surviving matches to the front of full buffers, and return their number.
 
     More than half of the buffer survives only if thousands have the same key; any of these will do.
@@ -164,7 +179,7 @@ def _compact(keys, templates, cells, groups, found, votes, kept):  # type: ignor
 
 
 @kernel
-def _places(cells, columns, step):  # type: ignore[no-untyped-def]
+def _places(cells: NDArray[np.int32], columns: int, step: int) -> NDArray[np.int32]:
     """Places (M,2) int32 in full pixels of cells (M,) of the grid."""
     places = np.empty((len(cells), 2), dtype=np.int32)
     for n in range(len(cells)):
@@ -174,9 +189,11 @@ def _places(cells, columns, step):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def match_templates(  # type: ignore[no-untyped-def]
-    phases, offsets, bins, gains, groups, first_template, last_template, kept, min_score, votes, is_trimmed
-):
+def match_templates(
+    phases: NDArray[np.uint8], offsets: NDArray[np.int32], bins: NDArray[np.uint8], gains: NDArray[np.float64],
+    groups: NDArray[np.int32], first_template: int, last_template: int, kept: int, min_score: float,
+    votes: NDArray[np.int64], is_trimmed: bool
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:  # fmt: skip
     """Matches that stand out most, of each group of templates.
 
     Args:

@@ -142,7 +142,10 @@ def corner_normals(vertices: Array, faces: NDArray[np.int32], smooth_below_deg: 
 
 
 @kernel
-def _corner_normals(faces, normals, doubled, owners, starts, smooth_cosine):  # type: ignore[no-untyped-def]
+def _corner_normals(
+    faces: NDArray[np.int32], normals: NDArray[np.float64], doubled: NDArray[np.float64], owners: NDArray[np.int64],
+    starts: NDArray[np.int64], smooth_cosine: float
+) -> NDArray[np.float64]:  # fmt: skip
     corners = np.empty((faces.shape[0], 3, 3))
     for face in range(faces.shape[0]):
         for k in range(3):
@@ -165,10 +168,12 @@ def _corner_normals(faces, normals, doubled, owners, starts, smooth_cosine):  # 
 
 
 @kernel
-def _shade(  # type: ignore[no-untyped-def]
-    inverse_depth, face_ids, points, faces, normals, colors, lens, toward, strength, ambient, surroundings,
-    diffuse, specular, mirror, gloss,
-):  # fmt: skip
+def _shade(
+    inverse_depth: NDArray[np.float64], face_ids: NDArray[np.int32], points: NDArray[np.float64],
+    faces: NDArray[np.int32], normals: NDArray[np.float64], colors: NDArray[np.float64], lens: NDArray[np.float64],
+    toward: NDArray[np.float64], strength: NDArray[np.float64], ambient: float, surroundings: NDArray[np.float32],
+    diffuse: float, specular: float, mirror: float, gloss: float
+) -> NDArray[np.float32]:  # fmt: skip
     height, width = face_ids.shape
     fx, fy, cx, cy = lens
     map_height, map_width = surroundings.shape[:2]

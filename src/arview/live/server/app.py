@@ -72,7 +72,7 @@ class Handlers:
         self._hub = hub
         limits = hub.options.requests
         self._joins = RateLimit(limits.joins_per_s, limits.joins_burst)
-        self._snapshots = RateLimit(limits.snapshots_per_s, limits.snapshots_burst)
+        self._snapshots = RateLimit(limits.images_per_s, limits.images_burst)
         self._files = page_files()
 
     async def index(self, request: Request) -> Response:

@@ -11,6 +11,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,7 +181,10 @@ def _pool() -> ThreadPoolExecutor:
 
 
 @kernel
-def _smooth(corner, normals, angles, faces_around, ends, min_cosine):  # type: ignore[no-untyped-def]
+def _smooth(
+    corner: NDArray[np.int64], normals: NDArray[np.float64], angles: NDArray[np.float64],
+    faces_around: NDArray[np.int64], ends: NDArray[np.int64], min_cosine: float
+) -> NDArray[np.float64]:  # fmt: skip
     """(F,3,3) normals at the corners of faces, averaged over adjacent faces that meet the face at a small angle."""
     out = np.zeros((len(corner), 3, 3))
     for face in range(len(corner)):
@@ -198,7 +202,11 @@ def _smooth(corner, normals, angles, faces_around, ends, min_cosine):  # type: i
 
 
 @kernel
-def _build(middles, lows, highs, order, low, high, right, start, count):  # type: ignore[no-untyped-def]
+def _build(
+    middles: NDArray[np.float64], lows: NDArray[np.float64], highs: NDArray[np.float64], order: NDArray[np.int64],
+    low: NDArray[np.float64], high: NDArray[np.float64], right: NDArray[np.int64], start: NDArray[np.int64],
+    count: NDArray[np.int64]
+) -> int:  # fmt: skip
     """Boxes of a tree in depth-first order, the left child right after its parent; returns their number."""
     stack = np.empty((128, 3), dtype=np.int64)
     stack[0] = 0, len(order), -1
@@ -256,7 +264,7 @@ def _tree(triangles: Array, used: NDArray[np.int64]) -> tuple[NDArray, ...]:  # 
 
 
 @kernel(inline=True)
-def _to_box(x, y, z, low, high):  # type: ignore[no-untyped-def]
+def _to_box(x: Any, y: Any, z: Any, low: Any, high: Any) -> Any:
     """Squared distance of a point to a box."""
     dx = max(low[0] - x, 0.0, x - high[0])
     dy = max(low[1] - y, 0.0, y - high[1])
@@ -265,7 +273,7 @@ def _to_box(x, y, z, low, high):  # type: ignore[no-untyped-def]
 
 
 @kernel(numpy_errors=True)
-def _on_triangle(px, py, pz, t):  # type: ignore[no-untyped-def]
+def _on_triangle(px: float, py: float, pz: float, t: NDArray[np.float64]) -> tuple[float, float, int]:
     """Weights of corners 1 and 2 at the closest point of a triangle, and its region: 0 inside, 1–3 side, 4–6 corner."""
     abx, aby, abz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     acx, acy, acz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
@@ -299,10 +307,13 @@ def _on_triangle(px, py, pz, t):  # type: ignore[no-untyped-def]
 
 
 @kernel(numpy_errors=True)
-def _query(  # type: ignore[no-untyped-def]
-    points, hints, reach2, triangles, sides, edges, corner_normals, low, high, right, start, count, order,
-    out_points, out_faces, out_distances, out_normals, out_edges,
-):  # fmt: skip
+def _query(
+    points: NDArray[np.float64], hints: NDArray[np.int64], reach2: float, triangles: NDArray[np.float64],
+    sides: NDArray[np.float64], edges: NDArray[np.bool_], corner_normals: NDArray[np.float64],
+    low: NDArray[np.float64], high: NDArray[np.float64], right: NDArray[np.int64], start: NDArray[np.int64],
+    count: NDArray[np.int64], order: NDArray[np.int64], out_points: NDArray[np.float64], out_faces: NDArray[np.int64],
+    out_distances: NDArray[np.float64], out_normals: NDArray[np.float64], out_edges: NDArray[np.bool_]
+) -> None:  # fmt: skip
     """Closest points of a chunk of points, written into the arrays ``out_…``; see `ClosestPoints`."""
     stack, near = np.empty(128, dtype=np.int64), np.empty(128)
     for i in range(len(points)):

@@ -304,7 +304,10 @@ _SIGMA_PX = 0.3
 
 
 @kernel(numpy_errors=True)
-def _vote(hypotheses, weights, directions, shifts, width, share):  # type: ignore[no-untyped-def]
+def _vote(
+    hypotheses: NDArray[np.float64], weights: NDArray[np.float64], directions: NDArray[np.float64],
+    shifts: NDArray[np.float64], width: float, share: float
+) -> NDArray[np.float64]:  # fmt: skip
     """Sum over edge points of the best step near the place to which each shift moves the edge.
 
     Args:

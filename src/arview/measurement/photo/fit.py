@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
@@ -186,7 +187,7 @@ def _correlated(rows: Array, residuals: Array, places: Array, stride: int = 1) -
 
 
 @kernel
-def _distance_bins(places, edges):  # type: ignore[no-untyped-def]
+def _distance_bins(places: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.uint8]:
     """(N,N) index of the distance bin of each pair; the last bin is for distances beyond all edges."""
     n, d = places.shape
     bins = np.empty((n, n), dtype=np.uint8)
@@ -204,7 +205,9 @@ def _distance_bins(places, edges):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _binned_products(bins, residuals, size):  # type: ignore[no-untyped-def]
+def _binned_products(
+    bins: NDArray[np.uint8], residuals: NDArray[np.float64], size: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Sum of the products of pairs of residuals, and number of pairs, in each bin."""
     products, counts = np.zeros(size), np.zeros(size)
     for i in range(bins.shape[0]):
@@ -215,7 +218,9 @@ def _binned_products(bins, residuals, size):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _correlated_sum(bins, correlation, rows):  # type: ignore[no-untyped-def]
+def _correlated_sum(
+    bins: NDArray[np.uint8], correlation: NDArray[np.float64], rows: NDArray[np.float64]
+) -> NDArray[np.float64]:  # fmt: skip
     """(B,B) sum over pairs i ≠ j of ``correlation`` times the outer product of rows i and j."""
     n, b = rows.shape
     result = np.zeros((b, b))

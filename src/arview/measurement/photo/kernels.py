@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
+from arview.measurement.photo.views import PhotoStack
 
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
 """LLVM flags that let sums be vectorised."""
@@ -13,7 +17,10 @@ _MIN_POINTS = 9
 
 
 @kernel(fastmath=_FAST, numpy_errors=True)
-def sweep_scores(patches, is_on, shades, normals, steps, views, stack, min_contrast):  # type: ignore[no-untyped-def]
+def sweep_scores(
+    patches: NDArray[np.float64], is_on: NDArray[np.bool_], shades: NDArray[np.float64], normals: NDArray[np.float64],
+    steps: NDArray[np.float64], views: NDArray[np.int64], stack: PhotoStack, min_contrast: float
+) -> tuple[NDArray[np.float32], NDArray[np.int8], NDArray[np.float32]]:  # fmt: skip
     """Mean correlation (ZNCC) over all pairs of views of patches moved along their normals.
 
     Args:
@@ -70,7 +77,11 @@ def sweep_scores(patches, is_on, shades, normals, steps, views, stack, min_contr
 
 
 @kernel(fastmath=_FAST, numpy_errors=True)
-def _to_cameras(patch, is_on, shades, normal, views, poses, in_cam, direction, shade):  # type: ignore[no-untyped-def]
+def _to_cameras(
+    patch: NDArray[np.float64], is_on: NDArray[np.bool_], shades: NDArray[np.float64], normal: NDArray[np.float64],
+    views: NDArray[np.int64], poses: NDArray[np.float64], in_cam: NDArray[np.float64], direction: NDArray[np.float64],
+    shade: NDArray[np.float64]
+) -> int:  # fmt: skip
     """Points in use, packed, and the normal in the frames of the cameras; shades packed alike. Returns their number."""
     used = 0
     for p in range(len(is_on)):
@@ -96,7 +107,7 @@ def _to_cameras(patch, is_on, shades, normal, views, poses, in_cam, direction, s
 
 
 @kernel(fastmath=_FAST, numpy_errors=True, inline=True)
-def _project(in_cam, direction, step, lens, used, u, v):  # type: ignore[no-untyped-def]
+def _project(in_cam: Any, direction: Any, step: Any, lens: Any, used: Any, u: Any, v: Any) -> Any:
     """Pixels (u, v) of the points moved by ``step`` along the normal, through a lens fx fy cx cy k1 k2 p1 p2 k3."""
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
@@ -112,7 +123,7 @@ def _project(in_cam, direction, step, lens, used, u, v):  # type: ignore[no-unty
 
 
 @kernel(fastmath=_FAST, numpy_errors=True, inline=True)
-def _is_inside(u, v, used, width, height):  # type: ignore[no-untyped-def]
+def _is_inside(u: Any, v: Any, used: Any, width: Any, height: Any) -> Any:
     """Whether all pixels lie inside the picture."""
     for p in range(used):
         a, b = u[p], v[p]
@@ -122,7 +133,7 @@ def _is_inside(u, v, used, width, height):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=_FAST, numpy_errors=True, inline=True)
-def _sample(pixels, start, width, u, v, used, values):  # type: ignore[no-untyped-def]
+def _sample(pixels: Any, start: Any, width: Any, u: Any, v: Any, used: Any, values: Any) -> Any:
     """Bilinear grey levels of the picture that begins at ``start`` in the stack."""
     for p in range(used):
         a, b = u[p], v[p]
@@ -135,7 +146,7 @@ def _sample(pixels, start, width, u, v, used, values):  # type: ignore[no-untype
 
 
 @kernel(fastmath=_FAST, numpy_errors=True, inline=True)
-def _normalise(values, shade, used, min_contrast, total):  # type: ignore[no-untyped-def]
+def _normalise(values: Any, shade: Any, used: Any, min_contrast: Any, total: Any) -> Any:
     """Remove the shades from the values, scale them to length 1 and add them to ``total``; False without contrast."""
     mean, slope_a, slope_b = 0.0, 0.0, 0.0
     for p in range(used):
@@ -156,7 +167,10 @@ def _normalise(values, shade, used, min_contrast, total):  # type: ignore[no-unt
 
 
 @kernel(fastmath=_FAST, numpy_errors=True)
-def _compare(values, total, used, contributing, similarity):  # type: ignore[no-untyped-def]
+def _compare(
+    values: NDArray[np.float64], total: NDArray[np.float64], used: int, contributing: int,
+    similarity: NDArray[np.float32]
+) -> float:  # fmt: skip
     """Mean correlation of all pairs of views, and into ``similarity`` that of each with the mean of the others."""
     square = 0.0
     for p in range(used):
@@ -174,7 +188,9 @@ def _compare(values, total, used, contributing, similarity):  # type: ignore[no-
 
 
 @kernel
-def choose_views(visible, cosines, directions, max_views):  # type: ignore[no-untyped-def]
+def choose_views(
+    visible: NDArray[np.bool_], cosines: NDArray[np.float64], directions: NDArray[np.float64], max_views: int
+) -> NDArray[np.int64]:  # fmt: skip
     """Choose the views of each sample greedily: seen at a steep angle, and from directions 20° apart where possible.
 
     Args:
@@ -209,7 +225,10 @@ def choose_views(visible, cosines, directions, max_views):  # type: ignore[no-un
 
 
 @kernel
-def vote_shifts(scores, steps, normals, shifts, floor):  # type: ignore[no-untyped-def]
+def vote_shifts(
+    scores: NDArray[np.float32], steps: NDArray[np.float64], normals: NDArray[np.float64],
+    shifts: NDArray[np.float64], floor: float
+) -> NDArray[np.float64]:  # fmt: skip
     """Sum over samples of how far their score exceeds ``floor`` where each shift puts them along their normals.
 
     Args:

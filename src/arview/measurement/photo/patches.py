@@ -142,7 +142,7 @@ def _symmetries(vertices: bytes, faces: bytes) -> tuple[Symmetry, ...]:
 
 
 @kernel
-def _nearer_than(points, corners, reach):  # type: ignore[no-untyped-def]
+def _nearer_than(points: NDArray[np.float64], corners: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
     """Whether each point is nearer than ``reach`` to any triangle (T,3,3), measured to its plane or to its edges."""
     count = corners.shape[0]
     boxes = np.empty((count, 6))

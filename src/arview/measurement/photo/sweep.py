@@ -140,7 +140,10 @@ _MIN_SIMILARITY = 0.35
 
 
 def without_outliers(
-    chosen: Indices, scores: Array, similarity: Array, min_similarity: float = _MIN_SIMILARITY
+    chosen: Indices,
+    scores: NDArray[np.float32],
+    similarity: NDArray[np.float32],
+    min_similarity: float = _MIN_SIMILARITY,
 ) -> Indices:
     """Drop views that differ from the others at the peak (highlights, occlusion), where three views remain.
 
@@ -160,7 +163,7 @@ def without_outliers(
 def agreeing_scores(
     patches: Array, is_on: NDArray[np.bool_], shades: Array, normals: Array, steps: Array, chosen: Indices,
     views: PhotoViews, min_contrast: float,
-) -> tuple[Array, Array, Indices]:  # fmt: skip
+) -> tuple[NDArray[np.float32], NDArray[np.int8], Indices]:  # fmt: skip
     """Sweep, drop the views that differ from the others, and sweep those samples again.
 
     Args:
@@ -187,7 +190,9 @@ def _steps(reach_mm: float, step_mm: float) -> Array:
     return np.asarray(np.arange(-count, count + 1) * step_mm, dtype=np.float64)
 
 
-def _peaks(scores: Array, count: Array, steps: Array, on: Array, chosen: Indices, o: SweepOptions) -> SweepOffsets:
+def _peaks(
+    scores: NDArray[np.float32], count: NDArray[np.int8], steps: Array, on: Array, chosen: Indices, o: SweepOptions
+) -> SweepOffsets:
     """Sub-pixel position of the best score by a parabola, with its variance.
 
     The sum of squared differences of m views from their mean is (m - 1)(1 - score). Its second derivative, and the

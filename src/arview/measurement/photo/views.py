@@ -200,7 +200,11 @@ def apply_all(cam_from_model: Array, point: Array) -> Array:
 
 
 @kernel
-def _all_visible(groups, pose, lens, size, ideal, origin, inverse_depth, ids, component):  # type: ignore[no-untyped-def]
+def _all_visible(
+    groups: NDArray[np.float64], pose: NDArray[np.float64], lens: NDArray[np.float64], size: NDArray[np.int64],
+    ideal: NDArray[np.float64], origin: NDArray[np.int64], inverse_depth: NDArray[np.float64], ids: NDArray[np.int32],
+    component: int
+) -> NDArray[np.bool_]:  # fmt: skip
     """(N,) whether all points of each group are inside the picture and not behind the rendered surface."""
     margin = 2.0
     height, width = inverse_depth.shape

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -171,7 +172,7 @@ def _neighbour_views(maps: Sequence[DepthMap], index: int) -> NDArray[np.int64]:
 
 
 @kernel(inline=True)
-def _seen_at(j, p0, p1, p2, layout, cameras, poses):  # type: ignore[no-untyped-def]
+def _seen_at(j: Any, p0: Any, p1: Any, p2: Any, layout: Any, cameras: Any, poses: Any) -> Any:
     """Index of the pixel of map j onto which a point projects (-1: none), and the point in that camera."""
     m = poses
     x = m[j, 0, 0] * p0 + m[j, 0, 1] * p1 + m[j, 0, 2] * p2 + m[j, 0, 3]
@@ -186,7 +187,11 @@ def _seen_at(j, p0, p1, p2, layout, cameras, poses):  # type: ignore[no-untyped-
 
 
 @kernel(numpy_errors=True)
-def _merge(i, neighbours, elements, layout, cameras, poses, limits, merged):  # type: ignore[no-untyped-def]
+def _merge(
+    i: int, neighbours: NDArray[np.int64], elements: NDArray[np.float32], layout: NDArray[np.int64],
+    cameras: NDArray[np.float64], poses: NDArray[np.float64], limits: NDArray[np.float64],
+    merged: NDArray[np.float32]
+) -> None:  # fmt: skip
     """Write merged depth, its standard deviation and the number of views of each pixel of view i that enough confirm.
 
     ``limits``: agreement in px, relative depth, cosine of the normals' angle, number of views, spread in px.
@@ -248,7 +253,10 @@ def _merge(i, neighbours, elements, layout, cameras, poses, limits, merged):  # 
 
 
 @kernel(numpy_errors=True, inline=True)
-def _confirmed_depth(elements, q, poses, i, j, seen, ray, normal, centre, pixel, limits):  # type: ignore[no-untyped-def]
+def _confirmed_depth(
+    elements: Any, q: Any, poses: Any, i: Any, j: Any, seen: Any, ray: Any, normal: Any, centre: Any, pixel: Any,
+    limits: Any
+) -> Any:  # fmt: skip
     """Depth along a pixel's ray at which the element of another view lies, or -1 where the two disagree.
 
     Args:
@@ -291,7 +299,7 @@ def _confirmed_depth(elements, q, poses, i, j, seen, ray, normal, centre, pixel,
 
 
 @kernel(numpy_errors=True)
-def _weighted_mean(depths, weights, count):  # type: ignore[no-untyped-def]
+def _weighted_mean(depths: NDArray[np.float64], weights: NDArray[np.float64], count: int) -> tuple[float, float]:
     """Weighted mean of the first depths, and its variance.
 
     Two maps share one photo on average, so they count as half as many independent ones.
@@ -308,7 +316,7 @@ def _weighted_mean(depths, weights, count):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _drop_crumbs(merged):  # type: ignore[no-untyped-def]
+def _drop_crumbs(merged: NDArray[np.float32]) -> None:
     """Clear pixels that share a surface with hardly any of their neighbours."""
     height, width = merged.shape[:2]
     depth = merged[..., 0].copy()

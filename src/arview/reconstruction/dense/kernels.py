@@ -84,7 +84,9 @@ def make_scratch(shift: float = 0.0, is_dense: bool = False) -> tuple[NDArray[np
 
 
 @kernel(fastmath=True, numpy_errors=True)
-def take_window(grey, s, x, y):  # type: ignore[no-untyped-def]
+def take_window(
+    grey: NDArray[np.float32], s: NDArray[np.float32], x: float | np.float32, y: float | np.float32
+) -> float | np.float32:  # fmt: skip
     """Write weights (sum 1) and weighted, centred grey levels of the view's window to the scratch; return its variance.
 
     Pixels unlike the centre have less weight (bilateral). (x, y) lies such that samples are pixels.
@@ -114,7 +116,10 @@ def take_window(grey, s, x, y):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True, numpy_errors=True)
-def warp(m, k, x, y, w, du, dv):  # type: ignore[no-untyped-def]
+def warp(
+    m: NDArray[np.float32], k: int, x: float | np.float32, y: float | np.float32, w: float | np.float32,
+    du: float | np.float32, dv: float | np.float32
+) -> tuple[float | np.float32, ...]:  # fmt: skip
     """The homography of the window into source k, as three linear forms of (dx, dy): value and two slopes each."""
     tx, ty, tz = m[k, 9], m[k, 10], m[k, 11]
     x0 = m[k, 0] * x + m[k, 1] * y + m[k, 2] + w * tx
@@ -127,7 +132,7 @@ def warp(m, k, x, y, w, du, dv):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True, numpy_errors=True)
-def falls_inside(sizes, k, h):  # type: ignore[no-untyped-def]
+def falls_inside(sizes: NDArray[np.int32], k: int, h: tuple[float | np.float32, ...]) -> bool:
     """Whether the whole warped window lies in source k."""
     x0, xu, xv, y0, yu, yv, z0, zu, zv = h
     reach = float32(RADIUS + 1)
@@ -143,7 +148,10 @@ def falls_inside(sizes, k, h):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True, numpy_errors=True)
-def sample(pixels, sizes, s, index, k, h):  # type: ignore[no-untyped-def]
+def sample(
+    pixels: NDArray[np.float32], sizes: NDArray[np.int32], s: NDArray[np.float32], index: NDArray[np.int32], k: int,
+    h: tuple[float | np.float32, ...]
+) -> None:  # fmt: skip
     """Write four neighbours (A to D) and fractions (FU, FV) of each sample of the window in source k to the scratch."""
     x0, xu, xv, y0, yu, yv, z0, zu, zv = h
     first, width = sizes[k, FIRST], sizes[k, WIDTH]
@@ -166,7 +174,10 @@ def sample(pixels, sizes, s, index, k, h):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True, numpy_errors=True)
-def zncc(pixels, sizes, s, index, k, h, variance, noise):  # type: ignore[no-untyped-def]
+def zncc(
+    pixels: NDArray[np.float32], sizes: NDArray[np.int32], s: NDArray[np.float32], index: NDArray[np.int32], k: int,
+    h: tuple[float | np.float32, ...], variance: float | np.float32, noise: float | np.float32
+) -> float | np.float32:  # fmt: skip
     """Correlation of the window with source k; noise adds to the contrast and so lowers it."""
     sample(pixels, sizes, s, index, k, h)
     first, second, both = _ZERO, _ZERO, _ZERO
@@ -183,7 +194,10 @@ def zncc(pixels, sizes, s, index, k, h, variance, noise):  # type: ignore[no-unt
 
 
 @kernel(fastmath=True, numpy_errors=True)
-def disagreement_px(maps, sizes, warps, step, k, h, w):  # type: ignore[no-untyped-def]
+def disagreement_px(
+    maps: NDArray[np.float32], sizes: NDArray[np.int32], warps: NDArray[np.float32], step: float | np.float32, k: int,
+    h: tuple[float | np.float32, ...], w: float | np.float32
+) -> float | np.float32:  # fmt: skip
     """Distance of the element from the depth map of source k in px of parallax, at most 3."""
     u, v = (h[0] / h[6] + _HALF) / step, (h[3] / h[6] + _HALF) / step
     column, row = int(u), int(v)
@@ -197,7 +211,10 @@ def disagreement_px(maps, sizes, warps, step, k, h, w):  # type: ignore[no-untyp
 
 
 @kernel(fastmath=True, numpy_errors=True)
-def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
+def is_facing(
+    numbers: NDArray[np.float32], x: float | np.float32, y: float | np.float32, w: float | np.float32,
+    du: float | np.float32, dv: float | np.float32
+) -> bool:  # fmt: skip
     """Whether the element is in front of the camera and seen at less than 81° from its normal."""
     if not w > _ZERO:
         return False
@@ -208,7 +225,12 @@ def is_facing(numbers, x, y, w, du, dv):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True, numpy_errors=True)
-def element_cost(pixels, maps, sizes, warps, numbers, s, index, x, y, w, du, dv, variance, limit):  # type: ignore[no-untyped-def]
+def element_cost(
+    pixels: NDArray[np.float32], maps: NDArray[np.float32], sizes: NDArray[np.int32], warps: NDArray[np.float32],
+    numbers: NDArray[np.float32], s: NDArray[np.float32], index: NDArray[np.int32], x: float | np.float32,
+    y: float | np.float32, w: float | np.float32, du: float | np.float32, dv: float | np.float32,
+    variance: float | np.float32, limit: float | np.float32
+) -> float | np.float32:  # fmt: skip
     """Mean of the best sources' 1 - ZNCC plus disagreement with their depth maps: 0 (best) to 2.
 
     It returns 2 without the remaining sources as soon as the mean cannot fall below ``limit``.

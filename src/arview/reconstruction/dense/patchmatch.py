@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import float32, uint32
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
-from arview.reconstruction.dense.kernels import FX, FY, element_cost, take_window
+from arview.reconstruction.dense.kernels import FX, FY, Problem, element_cost, take_window
 
 _ZERO = float32(0.0)
 NEIGHBOURS = np.array(
@@ -31,7 +32,7 @@ NEIGHBOURS = np.array(
 
 
 @kernel
-def draw(seed, x, y, turn):  # type: ignore[no-untyped-def]
+def draw(seed: int, x: int, y: int, turn: int) -> float | np.float32:
     """A number in [-1, 1) hashed from the arguments (mixing step of MurmurHash3)."""
     h = uint32(seed) ^ (uint32(x) * uint32(0x9E3779B1)) ^ (uint32(y) * uint32(0x85EBCA77))
     h = uint32(h ^ (uint32(turn) * uint32(0xC2B2AE3D)))
@@ -44,7 +45,11 @@ def draw(seed, x, y, turn):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def try_hypotheses(p, s, index, planes, costs, hypotheses, spread, randoms, lowest, highest, seed):  # type: ignore[no-untyped-def]
+def try_hypotheses(
+    p: Problem, s: NDArray[np.float32], index: NDArray[np.int32], planes: NDArray[np.float32],
+    costs: NDArray[np.float32], hypotheses: NDArray[np.float32], spread: float | np.float32, randoms: int,
+    lowest: float | np.float32, highest: float | np.float32, seed: int
+) -> None:  # fmt: skip
     """Set each pixel to the best of given hypotheses (C,H,W,3) and of random ones.
 
     Random hypotheses are drawn within ``spread`` (in w) of the first given one, and between ``lowest`` and ``highest``.
@@ -86,7 +91,11 @@ def try_hypotheses(p, s, index, planes, costs, hypotheses, spread, randoms, lowe
 
 
 @kernel(fastmath=True)
-def sweep(p, s, index, planes, costs, regions, color, step_w, step_tilt, seed):  # type: ignore[no-untyped-def]
+def sweep(
+    p: Problem, s: NDArray[np.float32], index: NDArray[np.int32], planes: NDArray[np.float32],
+    costs: NDArray[np.float32], regions: NDArray[np.int64], color: int, step_w: float | np.float32,
+    step_tilt: float | np.float32, seed: int
+) -> None:  # fmt: skip
     """Half a checkerboard iteration: planes of the best neighbours, then a perturbation.
 
     ``step_w`` is the perturbation of w, ``step_tilt`` that of the slope (tangent).

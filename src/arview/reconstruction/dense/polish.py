@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import float32
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.reconstruction.dense.kernels import (
@@ -26,6 +27,7 @@ from arview.reconstruction.dense.kernels import (
     B,
     C,
     D,
+    Problem,
     falls_inside,
     is_facing,
     sample,
@@ -43,7 +45,11 @@ _SLOPE_PRIOR = 0.05
 
 
 @kernel(fastmath=True, numpy_errors=True)
-def _normal_equations(pixels, sizes, warps, s, index, k, h, variance, noise, system):  # type: ignore[no-untyped-def]
+def _normal_equations(
+    pixels: NDArray[np.float32], sizes: NDArray[np.int32], warps: NDArray[np.float32], s: NDArray[np.float32],
+    index: NDArray[np.int32], k: int, h: tuple[float | np.float32, ...], variance: float | np.float32,
+    noise: float | np.float32, system: NDArray[np.float64]
+) -> float | np.float32:  # fmt: skip
     """Add source k, with gain and offset eliminated, to the system (upper H, gradient, squares); return its
     correlation.
     """
@@ -117,7 +123,7 @@ def _normal_equations(pixels, sizes, warps, s, index, k, h, variance, noise, sys
 
 
 @kernel(numpy_errors=True)
-def _solve(q):  # type: ignore[no-untyped-def]
+def _solve(q: NDArray[np.float64]) -> tuple[float, ...]:
     """Step (3,) of the damped system, and the variance of its first unknown for unit noise."""
     a, b, c = q[0], q[1], q[2]
     d, e, f = q[3] + _SLOPE_PRIOR * q[0], q[4], q[5] + _SLOPE_PRIOR * q[0]
@@ -136,7 +142,10 @@ def _solve(q):  # type: ignore[no-untyped-def]
 
 
 @kernel(numpy_errors=True)
-def polish(p, s, index, planes, scores, sigmas, step_px, iterations, unit_w):  # type: ignore[no-untyped-def]
+def polish(
+    p: Problem, s: NDArray[np.float32], index: NDArray[np.int32], planes: NDArray[np.float32],
+    scores: NDArray[np.float32], sigmas: NDArray[np.float32], step_px: int, iterations: int, unit_w: float
+) -> None:  # fmt: skip
     """Refine the planes (H,W,3) in place; write mean correlation (H,W) and standard deviation of w (H,W).
 
     The problem is ``step_px`` (1 or 2) times as fine as the planes, and ``unit_w`` is the change of w that moves a

@@ -17,7 +17,7 @@ from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.gauss_newton import add_line
-from arview.refinement.projection import project
+from arview.refinement.projection import ProjectedLines, project
 
 SOFT_EDGE_WEIGHT = 0.2
 """Weight of folds of a curved surface relative to outline and design edges. They may be invisible, and texture is often
@@ -48,7 +48,9 @@ def smoothed(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 @kernel
-def measure_edges(gray, lines, reach, step_px, threshold):  # type: ignore[no-untyped-def]
+def measure_edges(
+    gray: NDArray[np.uint8], lines: ProjectedLines, reach: int, step_px: float, threshold: float
+) -> EdgeProfiles:  # fmt: skip
     """Grey-level steps along the normal of each point, see `EdgeProfiles`.
 
     Args:
@@ -122,10 +124,12 @@ def measure_edges(gray, lines, reach, step_px, threshold):  # type: ignore[no-un
 
 
 @kernel
-def add_edges(  # type: ignore[no-untyped-def]
-    hessian, gradient, points, kinds, cam_from_body, intrinsics, lines, profiles, strength_half, sigma_px, spread_px,
-    weight
-):  # fmt: skip
+def add_edges(
+    hessian: NDArray[np.float64], gradient: NDArray[np.float64], points: NDArray[np.float32],
+    kinds: NDArray[np.uint8], cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
+    lines: ProjectedLines, profiles: EdgeProfiles, strength_half: float, sigma_px: float, spread_px: float,
+    weight: float
+) -> None:  # fmt: skip
     """Add the best hypothesis of each point to the 6×6 system.
 
     Args:

@@ -7,17 +7,18 @@ normals come from rays cast at the CAD, so that a keyframe needs a single pictur
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.errors import InputError
 from arview.geometry import Array, invert
 from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.projection import project
-from arview.rendering.raycast import RayCaster, cast_ray
+from arview.rendering.raycast import Hierarchy, RayCaster, cast_ray
 
 _RESPONSE = (8.0 / (4 * 255)) ** 2
 """Response of cornerMinEigenVal (3×3 Sobel, uint8) to a mean squared gradient of one (grey level/px)²."""
@@ -120,7 +121,7 @@ class Keyframe:
 
 
 @kernel(inline=True)
-def to_camera(m, x, y, z):  # type: ignore[no-untyped-def]
+def to_camera(m: Any, x: Any, y: Any, z: Any) -> Any:
     """Point (x, y, z) transformed by a rigid transform (4,4)."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
@@ -130,7 +131,10 @@ def to_camera(m, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def tangent_jacobian(point, tangents, cam_from_body, intrinsics, out):  # type: ignore[no-untyped-def]
+def tangent_jacobian(
+    point: NDArray[np.float64], tangents: NDArray[np.float64], cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64], out: NDArray[np.float64]
+) -> tuple[float, float, float]:  # fmt: skip
     """Pixel u, v and depth of a point; depth -1 behind the camera.
 
     Fills ``out`` (2,2) with px per mm along the two tangents, by central differences over about 4 px.
@@ -154,7 +158,7 @@ def tangent_jacobian(point, tangents, cam_from_body, intrinsics, out):  # type: 
 
 
 @kernel
-def _best_corners(response, threshold, cell):  # type: ignore[no-untyped-def]
+def _best_corners(response: NDArray[np.float32], threshold: float, cell: int) -> NDArray[np.float64]:
     """Strongest pixel of each square of ``cell`` × ``cell`` pixels that is a local maximum: (N,3) u, v, response."""
     height, width = response.shape
     rows, columns = (height + cell - 1) // cell, (width + cell - 1) // cell
@@ -178,7 +182,7 @@ def _best_corners(response, threshold, cell):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _unproject(u, v, intrinsics):  # type: ignore[no-untyped-def]
+def _unproject(u: float, v: float, intrinsics: NDArray[np.float64]) -> tuple[float, float]:
     """Undistorted x, y at z = 1 of a pixel, by fixed-point iteration."""
     x = xd = (u - intrinsics[2]) / intrinsics[0]
     y = yd = (v - intrinsics[3]) / intrinsics[1]
@@ -191,8 +195,11 @@ def _unproject(u, v, intrinsics):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _place_corners(hierarchy, body_from_cam, corners, intrinsics, margin_px,  # type: ignore[no-untyped-def]
-                   distance_px, flatness_px, min_facing, max_count):  # fmt: skip
+def _place_corners(
+    hierarchy: Hierarchy, body_from_cam: NDArray[np.float64], corners: NDArray[np.float64],
+    intrinsics: NDArray[np.float64], margin_px: float, distance_px: float, flatness_px: float, min_facing: float,
+    max_count: int
+) -> tuple[int, NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Corners that lie on a smooth piece of the part's surface, strongest first.
 
     Rays are cast through the corner and ``margin_px`` left, right, above and below it. The surface normal is taken
@@ -268,7 +275,10 @@ def _place_corners(hierarchy, body_from_cam, corners, intrinsics, margin_px,  # 
 
 
 @kernel
-def _all_jacobians(points, tangents, cam_from_body, intrinsics):  # type: ignore[no-untyped-def]
+def _all_jacobians(
+    points: NDArray[np.float64], tangents: NDArray[np.float64], cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64]
+) -> NDArray[np.float64]:  # fmt: skip
     """Jacobians (N,2,2) of all points, see `tangent_jacobian`."""
     jacobians = np.empty((points.shape[0], 2, 2))
     for i in range(points.shape[0]):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 
+Scalar = float | np.float32
 Pyramid = tuple[NDArray[np.uint8], ...]
 
 
@@ -24,7 +25,9 @@ def build_pyramid(gray: NDArray[np.uint8], levels: int) -> Pyramid:
 
 
 @kernel(fastmath=True)
-def sample_patch(image, u, v, warp, half, out):  # type: ignore[no-untyped-def]
+def sample_patch(
+    image: NDArray[np.uint8], u: float, v: float, warp: NDArray[np.float64], half: int, out: NDArray[np.float32]
+) -> bool:  # fmt: skip
     """Fill ``out`` (2·half+1)² with the image at (u, v) + warp · offset; False when the patch leaves the image."""
     height, width = image.shape
     reach_u = half * (abs(warp[0, 0]) + abs(warp[0, 1]))
@@ -47,7 +50,10 @@ def sample_patch(image, u, v, warp, half, out):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def prepare_template(patch, side, template, across, down):  # type: ignore[no-untyped-def]
+def prepare_template(
+    patch: NDArray[np.float32], side: int, template: NDArray[np.float32], across: NDArray[np.float32],
+    down: NDArray[np.float32]
+) -> tuple[tuple[Scalar, Scalar, Scalar], Scalar]:  # fmt: skip
     """Fill ``template`` with zero mean and unit norm, and its gradients orthogonal to it and to a constant.
 
     Args:
@@ -103,7 +109,11 @@ def prepare_template(patch, side, template, across, down):  # type: ignore[no-un
 
 
 @kernel(fastmath=True)
-def align_template(image, u, v, side, template, across, down, normal, norm, steps, stop_px):  # type: ignore[no-untyped-def]
+def align_template(
+    image: NDArray[np.uint8], u: Scalar, v: Scalar, side: int, template: NDArray[np.float32],
+    across: NDArray[np.float32], down: NDArray[np.float32], normal: tuple[Scalar, Scalar, Scalar], norm: Scalar,
+    steps: int, stop_px: float
+) -> tuple[Scalar, Scalar, Scalar]:  # fmt: skip
     """Align a prepared template with the image, starting at (u, v).
 
     The gradients are orthogonal to the template and to a constant, so that gain and offset do not enter the residual;
@@ -168,7 +178,10 @@ def align_template(image, u, v, side, template, across, down, normal, norm, step
 
 
 @kernel(fastmath=True)
-def common_shift(key_image, image, scale, key_pixels, pixels, warps, chosen, reach):  # type: ignore[no-untyped-def]
+def common_shift(
+    key_image: NDArray[np.uint8], image: NDArray[np.uint8], scale: int, key_pixels: NDArray[np.float64],
+    pixels: NDArray[np.float64], warps: NDArray[np.float64], chosen: NDArray[np.int64], reach: int
+) -> tuple[float, float]:  # fmt: skip
     """Shift (du, dv), px of the finest level, that aligns the chosen patches best with a coarse image.
 
     The search is exhaustive over ±``reach`` px of the coarse level and refined by parabolas. A shift is scored by the

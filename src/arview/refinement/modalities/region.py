@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.refinement.gauss_newton import add_line
-from arview.refinement.projection import project
+from arview.refinement.projection import ProjectedLines, project
 
 BINS = 16
 """Histogram bins per colour channel: 16³ log odds fit into the first-level cache."""
@@ -71,7 +71,10 @@ def value_bins(gain: float) -> NDArray[np.int64]:
 
 
 @kernel
-def add_histograms(image, bin_of, lines, runs_mm, focal, fore, back, reach_px, gap_px):  # type: ignore[no-untyped-def]
+def add_histograms(
+    image: NDArray[np.uint8], bin_of: NDArray[np.int64], lines: ProjectedLines, runs_mm: NDArray[np.float32],
+    focal: float, fore: NDArray[np.float64], back: NDArray[np.float64], reach_px: float, gap_px: float
+) -> None:  # fmt: skip
     """Count the colours inside and outside the contour into ``fore`` and ``back`` (BINS³,).
 
     Args:
@@ -107,7 +110,7 @@ def add_histograms(image, bin_of, lines, runs_mm, focal, fore, back, reach_px, g
 
 
 @kernel
-def log_odds(fore, back, out):  # type: ignore[no-untyped-def]
+def log_odds(fore: NDArray[np.float64], back: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     """Fill ``out`` (BINS³,) with the log odds of part against background per colour; 0 for colours never observed."""
     total_fore = fore.sum() + 1e-9
     total_back = back.sum() + 1e-9
@@ -119,7 +122,10 @@ def log_odds(fore, back, out):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=True)
-def measure_region(image, colors, lines, runs_mm, focal, scale):  # type: ignore[no-untyped-def]
+def measure_region(
+    image: NDArray[np.uint8], colors: ColorModel, lines: ProjectedLines, runs_mm: NDArray[np.float32], focal: float,
+    scale: int
+) -> RegionLines:  # fmt: skip
     """Displacement of the contour along each line, see `RegionLines`.
 
     Args:
@@ -134,9 +140,7 @@ def measure_region(image, colors, lines, runs_mm, focal, scale):  # type: ignore
     pixels, normals, depths = lines.pixels, lines.normals, lines.depths
     height, width = image.shape[0], image.shape[1]
     count = pixels.shape[0]
-    mean = np.zeros(count)
-    information = np.zeros(count)
-    agreement = np.full(count, -1.0)
+    mean, information, agreement = np.zeros(count), np.zeros(count), np.full(count, -1.0)
     posterior = np.empty(12)
     flat = 1.0 / 12.0
     half = 0.5 * 19 * scale
@@ -201,7 +205,11 @@ def measure_region(image, colors, lines, runs_mm, focal, scale):  # type: ignore
 
 
 @kernel
-def add_region(hessian, gradient, points, cam_from_body, intrinsics, lines, region, weight, robust_px):  # type: ignore[no-untyped-def]
+def add_region(
+    hessian: NDArray[np.float64], gradient: NDArray[np.float64], points: NDArray[np.float32],
+    cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], lines: ProjectedLines, region: RegionLines,
+    weight: float, robust_px: float
+) -> None:  # fmt: skip
     """Add the Gaussians of the lines to the 6×6 system.
 
     Args:

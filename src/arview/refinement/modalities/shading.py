@@ -116,7 +116,7 @@ def curved_share(surface: Surface, flat_deg: float = 0.5) -> float:
 
 
 @kernel
-def corner_normals(surface):  # type: ignore[no-untyped-def]
+def corner_normals(surface: Surface) -> NDArray[np.float32]:
     """Unit normals (F,3,3) float32 at the corners of the faces of a `Surface`.
 
     Each is the mean, weighted by area, of the normals of the faces around the corner that differ from the own one by
@@ -185,7 +185,10 @@ def crop_for_shading(
 
 
 @kernel
-def refine_by_shading(crop, surface, corners, diameter_mm, cam_from_body, information, gain):  # type: ignore[no-untyped-def]
+def refine_by_shading(
+    crop: ShadingCrop, surface: Surface, corners: NDArray[np.float32], diameter_mm: float,
+    cam_from_body: NDArray[np.float64], information: NDArray[np.float64], gain: float
+) -> ShadedPose:  # fmt: skip
     """Refine a pose by the shading of the part's surface, see `ShadedPose`.
 
     Args:
@@ -241,7 +244,7 @@ def refine_by_shading(crop, surface, corners, diameter_mm, cam_from_body, inform
 
 
 @kernel
-def _is_determined(information):  # type: ignore[no-untyped-def]
+def _is_determined(information: NDArray[np.float64]) -> bool:
     """Whether information (6,6), normalised to a unit diagonal, determines all six directions."""
     sizes = np.sqrt(np.maximum(np.diag(information), 0.0))
     if not np.all(np.isfinite(information)) or sizes.min() == 0.0:
@@ -250,7 +253,10 @@ def _is_determined(information):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _smooth_normals(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm):  # type: ignore[no-untyped-def]
+def _smooth_normals(
+    drawn: NDArray[np.float32], face_ids: NDArray[np.int32], surface: Surface, corners: NDArray[np.float32],
+    pose: NDArray[np.float64], focal_px: NDArray[np.float64], middle_px: NDArray[np.float64], diameter_mm: float
+) -> None:  # fmt: skip
     """Replace the normals of the faces by interpolated normals of their corners (Phong, CACM 1975), in place."""
     points, faces = surface[0], surface[1]
     place, normal = np.empty(3), np.empty(3)
@@ -292,7 +298,7 @@ def _smooth_normals(drawn, face_ids, surface, corners, pose, focal_px, middle_px
 
 
 @kernel
-def _inner_pixels(drawn, face_ids):  # type: ignore[no-untyped-def]
+def _inner_pixels(drawn: NDArray[np.float32], face_ids: NDArray[np.int32]) -> NDArray[np.int64]:
     """Rows and columns (N,2) of the pixels inside the surface, away from its border, jumps in depth and edges."""
     height, width = face_ids.shape
     places = np.empty((height * width, 2), dtype=np.int64)
@@ -317,14 +323,16 @@ def _inner_pixels(drawn, face_ids):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _harmonics(x, y, z, out):  # type: ignore[no-untyped-def]
+def _harmonics(x: float | np.float32, y: float | np.float32, z: float | np.float32, out: NDArray[np.float64]) -> None:
     """Write the spherical harmonics of a normal (x right, y down, z towards the camera) to ``out`` (9,)."""
     out[0], out[1], out[2], out[3] = 1.0, x, y, z
     out[4], out[5], out[6], out[7], out[8] = x * y, x * z, y * z, x * x - y * y, 3.0 * z * z - 1.0
 
 
 @kernel
-def _fit_light(values, functions, light, is_known):  # type: ignore[no-untyped-def]
+def _fit_light(
+    values: NDArray[np.float64], functions: NDArray[np.float64], light: NDArray[np.float64], is_known: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Light (9,) that explains grey levels (N,) best, and their robust weights (N,) (Geman & McClure).
 
     Args:
@@ -347,7 +355,7 @@ def _fit_light(values, functions, light, is_known):  # type: ignore[no-untyped-d
 
 
 @kernel
-def _weigh(residuals, weights):  # type: ignore[no-untyped-def]
+def _weigh(residuals: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
     """Fill the robust weights (N,) of residuals (N,)."""
     scale = MIN_DEVIATION + OUTLIER_SCALE * np.median(np.abs(residuals))
     for i in range(len(residuals)):
@@ -355,7 +363,10 @@ def _weigh(residuals, weights):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _jacobian(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_mm):  # type: ignore[no-untyped-def]
+def _jacobian(
+    places: NDArray[np.int64], light: NDArray[np.float64], drawn: NDArray[np.float32], face_ids: NDArray[np.int32],
+    pose: NDArray[np.float64], focal_px: NDArray[np.float64], middle_px: NDArray[np.float64], diameter_mm: float
+) -> NDArray[np.float64]:  # fmt: skip
     """Derivative (N,6) of the brightness at each pixel with respect to the twist, see `gauss_newton`.
 
     A moved surface shows another of its points at a pixel, and the normal of that point is turned.
@@ -400,7 +411,10 @@ def _jacobian(places, light, drawn, face_ids, pose, focal_px, middle_px, diamete
 
 
 @kernel
-def _reduce_system(motion, functions, values, weights, light):  # type: ignore[no-untyped-def]
+def _reduce_system(
+    motion: NDArray[np.float64], functions: NDArray[np.float64], values: NDArray[np.float64],
+    weights: NDArray[np.float64], light: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:  # fmt: skip
     """System (6,6), (6,) of the pose with the light eliminated, and the share of the variance that is explained.
 
     The system is divided by the residual variance of the brightness.

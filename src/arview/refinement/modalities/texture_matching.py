@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.refinement.gauss_newton import add_line, apply_twist, solve_step
-from arview.refinement.modalities.keyframes import tangent_jacobian, to_camera
+from arview.refinement.modalities.keyframes import Anchors, tangent_jacobian, to_camera
 from arview.refinement.modalities.patch_alignment import align_template, common_shift, prepare_template, sample_patch
 from arview.refinement.projection import project
-from arview.rendering.raycast import cast_ray
+from arview.rendering.raycast import Hierarchy, cast_ray
 
 
 class MatchSettings(NamedTuple):
@@ -50,7 +50,9 @@ COARSE_NCC = 0.6
 
 
 @kernel
-def _agree_with_neighbours(predicted, pixels, weights, limit_px):  # type: ignore[no-untyped-def]
+def _agree_with_neighbours(
+    predicted: NDArray[np.float64], pixels: NDArray[np.float64], weights: NDArray[np.float64], limit_px: float
+) -> None:  # fmt: skip
     """Clear the weights of points whose displacement differs from the median of their nearest neighbours."""
     count = predicted.shape[0]
     near = NEIGHBOURS
@@ -91,7 +93,11 @@ def _agree_with_neighbours(predicted, pixels, weights, limit_px):  # type: ignor
 
 
 @kernel
-def add_matches(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px):  # type: ignore[no-untyped-def]
+def add_matches(
+    hessian: NDArray[np.float64], gradient: NDArray[np.float64], points: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], pixels: NDArray[np.float64],
+    weights: NDArray[np.float64], sigma_px: float, robust_px: float
+) -> tuple[float, float, int]:  # fmt: skip
     """Add the reprojection residuals of matched points to the 6×6 system.
 
     Args:
@@ -131,7 +137,10 @@ def add_matches(hessian, gradient, points, cam_from_body, intrinsics, pixels, we
 
 
 @kernel
-def align_pose(points, cam_from_body, intrinsics, pixels, weights, damping, sigma_px):  # type: ignore[no-untyped-def]
+def align_pose(
+    points: NDArray[np.float64], cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
+    pixels: NDArray[np.float64], weights: NDArray[np.float64], damping: NDArray[np.float64], sigma_px: float
+) -> NDArray[np.float64]:  # fmt: skip
     """Pose (4,4) that projects points on their pixels; the robust limit shrinks from 40 to 3 px."""
     hessian = np.zeros((6, 6))
     gradient = np.zeros(6)
@@ -146,7 +155,10 @@ def align_pose(points, cam_from_body, intrinsics, pixels, weights, damping, sigm
 
 
 @kernel
-def _count_near(points, cam_from_body, intrinsics, pixels, weights, limit_px):  # type: ignore[no-untyped-def]
+def _count_near(
+    points: NDArray[np.float64], cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
+    pixels: NDArray[np.float64], weights: NDArray[np.float64], limit_px: float
+) -> int:  # fmt: skip
     """Number of points of positive weight that project to within ``limit_px`` of their pixels."""
     count = 0
     for i in range(points.shape[0]):
@@ -159,7 +171,9 @@ def _count_near(points, cam_from_body, intrinsics, pixels, weights, limit_px):  
 
 
 @kernel
-def _find_visible(anchors, hierarchy, cam_from_body, settings):  # type: ignore[no-untyped-def]
+def _find_visible(
+    anchors: Anchors, hierarchy: Hierarchy, cam_from_body: NDArray[np.float64], settings: MatchSettings
+) -> NDArray[np.bool_]:  # fmt: skip
     """Whether each trusted anchor (N,) faces the camera and is not hidden behind the part itself."""
     r = cam_from_body
     eye = np.empty(3)
@@ -188,7 +202,10 @@ def _find_visible(anchors, hierarchy, cam_from_body, settings):  # type: ignore[
 
 
 @kernel
-def _predict(anchors, cam_from_body, intrinsics, width, height, wanted, predicted, warps):  # type: ignore[no-untyped-def]
+def _predict(
+    anchors: Anchors, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], width: int, height: int,
+    wanted: NDArray[np.bool_], predicted: NDArray[np.float64], warps: NDArray[np.float64]
+) -> None:  # fmt: skip
     """Fill the predicted pixels (N,2) and the warps (N,2,2) of the tangent planes from frame to keyframe px.
 
     Clears ``wanted`` (N,) where the patch is outside the picture or much larger or smaller than in the keyframe.
@@ -217,7 +234,11 @@ def _predict(anchors, cam_from_body, intrinsics, width, height, wanted, predicte
 
 
 @kernel
-def _align_level(level, key_pyramid, pyramid, key_pixels, warps, wanted, min_ncc, pixels, scores):  # type: ignore[no-untyped-def]
+def _align_level(
+    level: int, key_pyramid: tuple[NDArray[np.uint8], ...], pyramid: tuple[NDArray[np.uint8], ...],
+    key_pixels: NDArray[np.float64], warps: NDArray[np.float64], wanted: NDArray[np.bool_], min_ncc: float,
+    pixels: NDArray[np.float64], scores: NDArray[np.float64]
+) -> None:  # fmt: skip
     """Align the wanted patches on one level, starting at ``pixels`` (N,2) in place; fills scores (N,), 0 = failed."""
     side = PATCH_SIDE
     patch = np.empty((side + 2, side + 2), dtype=np.float32)
@@ -244,7 +265,11 @@ def _align_level(level, key_pyramid, pyramid, key_pixels, warps, wanted, min_ncc
 
 
 @kernel
-def match_texture(key_pyramid, pyramid, anchors, hierarchy, cam_from_body, intrinsics, damping, settings):  # type: ignore[no-untyped-def]
+def match_texture(
+    key_pyramid: tuple[NDArray[np.uint8], ...], pyramid: tuple[NDArray[np.uint8], ...], anchors: Anchors,
+    hierarchy: Hierarchy, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
+    damping: NDArray[np.float64], settings: MatchSettings
+) -> PatchMatches:  # fmt: skip
     """Find the corners of a keyframe in a new frame, see `PatchMatches`.
 
     All patches are first shifted together on the coarsest level, then aligned one by one on level 2. If these agree on
