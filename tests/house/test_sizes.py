@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 
-from helpers.open_entries import open_entries
 from helpers.source_tree import functions, label, source_files
 
 MAX_FILE_LINES = 500
@@ -30,7 +29,7 @@ def too_large() -> set[str]:
 
 def test_sizes() -> None:
     assert len(source_files()) > 250
-    assert too_large() == set(EXCEPTIONS) | open_entries("sizes")
+    assert too_large() == set(EXCEPTIONS)
 
 
 def test_exceptions_are_few_and_have_reasons() -> None:

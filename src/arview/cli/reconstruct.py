@@ -112,7 +112,7 @@ def reconstruct(
         sparse=SparseOptions(seed=seed, threads=threads),
         sources=_sources(boards, tags, bars, scale_file, rig),
         dense=DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
-        last_stage=get_args(run.Stage)[STAGES.index(until)],
+        last_stage=get_args(run.StageName)[STAGES.index(until)],
         starts_over=force,
     )
     with stage_bar() as progress:

@@ -41,8 +41,8 @@ from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
 from arview.reconstruction.types import DenseCloud, Photo, SparseModel
 from arview.version import __version__
 
-Stage = Literal["photos", "sparse", "scale", "dense"]
-STAGES: tuple[Stage, ...] = ("photos", "sparse", "scale", "dense")
+StageName = Literal["photos", "sparse", "scale", "dense"]
+STAGES: tuple[StageName, ...] = ("photos", "sparse", "scale", "dense")
 """Stages in their order."""
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mts", ".3gp"})
@@ -58,7 +58,7 @@ class ReconstructOptions:
     scale: CadOptions = field(default_factory=CadOptions)
     sources: ScaleSources = field(default_factory=ScaleSources)
     dense: DenseOptions = field(default_factory=DenseOptions)
-    last_stage: Stage = "dense"
+    last_stage: StageName = "dense"
     starts_over: bool = False  # discard what an earlier run left in the folder
 
 

@@ -10,7 +10,7 @@ from arview.geometry import Array
 
 
 @dataclass(frozen=True)
-class DisambiguationOptions:
+class HypothesisSetOptions:
     """Options of the disambiguation.
 
     Attributes:
@@ -25,11 +25,11 @@ class HypothesisSet:
 
     Args:
         model_from_other: (4,4) transforms on the model's side that lead from the tracked pose to each alternative.
-        options: see `DisambiguationOptions`.
+        options: see `HypothesisSetOptions`.
     """
 
-    def __init__(self, model_from_other: list[Array], options: DisambiguationOptions | None = None) -> None:
-        self.options = options or DisambiguationOptions()
+    def __init__(self, model_from_other: list[Array], options: HypothesisSetOptions | None = None) -> None:
+        self.options = options or HypothesisSetOptions()
         self.model_from_other = model_from_other
         self._margins = [0.0] * len(model_from_other)
 

@@ -18,7 +18,7 @@ from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
 from arview.refinement.projection import ViewArrays, project_lines
 
-Plane = NDArray[np.float32]
+Channel = NDArray[np.float32]
 
 ORIENTATIONS = 8
 """Orientation bins over 180°."""
@@ -51,7 +51,7 @@ def response_maps(image: NDArray[np.uint8], spread_px: int, pad_px: int, pool: i
     return np.asarray(_subtract_mean(own, pad_px))
 
 
-def colour_gradients(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Plane, Plane, Plane]:
+def colour_gradients(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Channel, Channel, Channel]:
     """The smoothed image, and x, y and magnitude of each pixel's strongest gradient; see `_strongest`."""
     smooth = cv2.GaussianBlur(image, (3, 3), 0)
     planes = cv2.split(smooth)

@@ -16,7 +16,7 @@ from arview.camera import Camera
 from arview.fiducials.targets import CornerKey
 from arview.geometry import Array
 
-ScaleView = tuple[Camera, Array, NDArray[np.intp], Array]
+CornerSightings = tuple[Camera, Array, NDArray[np.intp], Array]
 """One photo: camera, ``cam_from_scan``, index of each corner that it shows, and their pixels (N,2)."""
 
 
@@ -70,7 +70,7 @@ def triangulate_corners(
     o = options or TriangulationOptions()
     keys = sorted({key for corners in corners_by_photo for key in corners})
     index = {key: i for i, key in enumerate(keys)}
-    views: list[ScaleView] = [
+    views: list[CornerSightings] = [
         (camera, pose, np.array([index[k] for k in corners], dtype=np.intp), np.array(list(corners.values())))
         for camera, pose, corners in zip(cameras, cams_from_scan, corners_by_photo, strict=True) if corners
     ]  # fmt: skip
@@ -91,7 +91,9 @@ def triangulate_corners(
     return TriangulatedCorners({keys[i]: points[i] for i in chosen}, covariances, sigma_px)
 
 
-def _linear_points(views: Sequence[ScaleView], count: int, min_angle_deg: float) -> tuple[Array, NDArray[np.bool_]]:
+def _linear_points(
+    views: Sequence[CornerSightings], count: int, min_angle_deg: float
+) -> tuple[Array, NDArray[np.bool_]]:
     """The points (count,3) nearest to all of their rays, and for which of them the parallax suffices."""
     normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
     directions: list[list[Array]] = [[] for _ in range(count)]
@@ -110,7 +112,7 @@ def _linear_points(views: Sequence[ScaleView], count: int, min_angle_deg: float)
 
 
 def _normal_equations(
-    views: Sequence[ScaleView], points: Array, good: NDArray[np.bool_], sigma_px: float, o: TriangulationOptions
+    views: Sequence[CornerSightings], points: Array, good: NDArray[np.bool_], sigma_px: float, o: TriangulationOptions
 ) -> tuple[Array, Array, NDArray[np.int_], list[Array]]:
     """Normal matrix (N,3,3), right side (N,3), observations used (N,), and the residual lengths of each photo."""
     normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
