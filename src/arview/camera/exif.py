@@ -69,8 +69,10 @@ def open_picture(data: bytes) -> Image:
         InputError: the data are not a readable picture, or one of far too many pixels.
         MissingDependencyError: a HEIC photo, without pillow-heif.
     """
-    from PIL import Image
+    from PIL import Image, ImageFile
 
+    # Importing WeasyPrint, for a report in the same process, turns this on: half a photo would pass as a whole one.
+    ImageFile.LOAD_TRUNCATED_IMAGES = False
     if not data:
         raise InputError("is empty (0 bytes); copy it again from the camera")
     if data[4:8] == b"ftyp" and data[8:12] in _HEIF_BRANDS:
