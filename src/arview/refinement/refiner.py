@@ -122,7 +122,15 @@ class PoseRefiner:
         inner_share = inner / max(outline + inner, 1)
         # Colours count more for a part with few design edges inside its outline.
         plainness = max(0.0, 1.0 - inner_share / o.min_inner_share)
-        self._region_weight = o.region_weight * (1.0 + o.plain_region_gain * plainness)
+        region_weight = o.region_weight * (1.0 + o.plain_region_gain * plainness)
+        self._weights = ModalityWeights(
+            region=region_weight if o.use_region else 0.0,
+            edge=o.edge_weight if o.use_edge else 0.0,
+            edge_sigma_px=o.edge_sigma_px,
+            edge_threshold=o.edge_threshold,
+            texture_sigma_px=o.texture_sigma_px,
+        )
+        self._weights_without_color = self._weights._replace(region=0.0)
         self._damping = np.concatenate(
             [
                 np.full(3, 1.0 / o.rotation_sigma_rad**2),
@@ -181,14 +189,7 @@ class PoseRefiner:
         Returns:
             ``cam_from_body`` (4,4) and information (6,6) of the twist (rad, mm) on its right.
         """
-        o = self.options
-        weights = ModalityWeights(
-            region=self._region_weight if o.use_region and appearance.is_known else 0.0,
-            edge=o.edge_weight if o.use_edge else 0.0,
-            edge_sigma_px=o.edge_sigma_px,
-            edge_threshold=o.edge_threshold,
-            texture_sigma_px=o.texture_sigma_px,
-        )
+        weights = self._weights if appearance.is_known else self._weights_without_color
         pose, information = run_stages(
             image, gray, appearance.colors, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm,
             stage_table(stages), self._damping, weights, matches,
