@@ -71,7 +71,7 @@ class ViewLines(NamedTuple):
     edge_lines: ProjectedLines
 
 
-@kernel(fastmath=True)
+@kernel
 def nearest_view(directions: NDArray[np.float64], cam_from_body: NDArray[np.float64]) -> int:
     """Index of the view whose direction (N,3) is nearest to that of the camera."""
     r = cam_from_body

@@ -72,7 +72,7 @@ def project(x: float, y: float, z: float, intrinsics: NDArray[np.float64]) -> tu
     return intrinsics[0] * xn + intrinsics[2], intrinsics[1] * yn + intrinsics[3]
 
 
-@kernel(fastmath=True)
+@kernel
 def project_lines(
     points: NDArray[np.float64] | NDArray[np.float32], directions: NDArray[np.float64] | NDArray[np.float32],
     across: bool, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float

@@ -361,7 +361,7 @@ def _compare_sides(
             line[COLOUR_DIFFERENCES + k] = np.sqrt(square) / (np.sqrt(square) + HALF_COLOUR)
 
 
-@kernel(fastmath=True)
+@kernel
 def sample_lines(part: ViewArrays, pose: NDArray[np.float64], max_outline: int, max_inner: int) -> SampledLines:
     """`SampledLines` of the view nearest to a pose, with at most ``max_outline`` and ``max_inner`` rows."""
     view = nearest_view(part.directions, pose)
