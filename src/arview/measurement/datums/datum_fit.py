@@ -155,8 +155,8 @@ def block_factor(points: Array, residuals: Array, rank: int, blocks: int = 12) -
     if np.std(np.hypot(x, y)) < 0.1 * np.mean(np.hypot(x, y)):
         order = np.argsort(np.arctan2(y, x))
     else:
-        strip = np.digitize(x, np.quantile(x, [0.25, 0.5, 0.75]))
-        order = np.lexsort((y, strip))
+        interval = np.digitize(x, np.quantile(x, [0.25, 0.5, 0.75]))
+        order = np.lexsort((y, interval))
     parts = np.array_split(residuals[order], blocks)
     means = np.array([part.mean() for part in parts])
     between = float(np.sum(means**2)) / (blocks - rank)
