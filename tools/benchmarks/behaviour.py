@@ -24,7 +24,7 @@ from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose
 from arview.tracking import TrackingSession
 from photos import background_photos
-from recordings import ROOT, SEQUENCES, scenes, skip, table
+from recordings import ROOT, VIDEOS, scenes, skip, table
 from rows import watched
 
 DESCRIPTION = """\
@@ -41,7 +41,7 @@ change with the differences between two runs of the code before it."""
 
 RECORDED = f"""\
 OUT holds a line of JSON for each frame in
-  {", ".join(f"{name}.jsonl" for name in SEQUENCES)}    recorded sequences, from detection, by TrackingSession
+  {", ".join(f"{name}.jsonl" for name in VIDEOS)}    recorded sequences, from detection, by TrackingSession
   clip_bracket.jsonl, clip_plate.jsonl    sample clips, by `arview annotate`
   detect.jsonl         detections in 60 frames of semi-synthetic sequences
 and inspection.json, of the sample plate, by `arview inspect`.
@@ -56,7 +56,7 @@ Of inspection.json: numbers that differ, with the relative difference; times and
 
 exit code: 0 within the tolerances, 1 not, 2 bad input"""
 
-PARTS = (*SEQUENCES, "detect", "clips")
+PARTS = (*VIDEOS, "detect", "clips")
 DETECTED_VARIANTS: tuple[Variant, ...] = ("regular", "noise")
 DETECTED_LENGTH, DETECTED_STRIDE, DETECTED_SEED = 10, 2, 1
 """Of the semi-synthetic sequences: frames, every which of them is searched, and the seed."""
@@ -121,7 +121,7 @@ def names_of_parts(text: str) -> tuple[str, ...]:
 def record(chosen: argparse.Namespace) -> int:
     out = chosen.out
     out.mkdir(parents=True, exist_ok=True)
-    wanted = tuple(name for name in SEQUENCES if name in chosen.only)
+    wanted = tuple(name for name in VIDEOS if name in chosen.only)
     for name, scene in scenes(wanted).items():
         write(out / f"{name}.jsonl", tracked_records(scene, name))
     if "detect" in chosen.only:

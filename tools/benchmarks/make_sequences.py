@@ -11,13 +11,16 @@ from pathlib import Path
 
 from arview.cad import Part, load_part
 from arview.core.progress import StepProgress
-from arview.errors import ArviewError
+from arview.errors import ArviewError, InputError
 from arview.evaluation import Scene, find_scenes, load_scene
 from arview.evaluation.semisynthetic import (
+    CONDITIONS,
+    CURVED_SHAPES,
     SHAPES,
     VARIANTS,
     Job,
     SequenceOptions,
+    curved_shape,
     look_alike_job,
     look_alikes,
     make_sequence,
@@ -35,6 +38,8 @@ Render CAD models along trajectories over real photos, with exact truth, as BOP 
   make_sequences.py --cad samples/bracket_plate/part.toml --variant occlusion -o out/sequences
   make_sequences.py --cad my.glb --trajectory ../shared/data/sequences/plate -o out/sequences
   make_sequences.py --shape assembly --lookalike -o out/look_alikes
+  make_sequences.py --shape curved --variant curved --frames 60 -o out/sequences
+  make_sequences.py --shape block --variant real --frames 60 -o out/sequences     under all real conditions
 
 Pictures are 640×512 px with f = 650 px; the part rotates by about 7° and moves by about 15 mm
 from frame to frame, seen from all sides, 450 to 1000 mm away. The same seed and backgrounds give the same pictures;
@@ -46,6 +51,15 @@ variants:
   light      a light that circles and changes its brightness
   noise      the same, with noise of 12 grey levels and a slight blur
   occlusion  the moving light, and another part circling in front; scene_gt_info.json has the visible share
+real conditions, which the CAD knows nothing of (light as above; all by --variant real):
+  printed    photographs, labels, logos and tags on the part
+  worn       labels, tape, scratches, rust and dirt, stronger highlights, soft shadows
+  large      the part fills the picture; scratched, soft
+  border     the same, cut by the picture's border: 40 to 90 % of it in view
+  hd         1920×1080 px, hand-held, H.264 at 12 Mbit/s; labels, dirt, shadows
+  phone      1280×720 px, rolling shutter, automatic exposure, white balance, focus, H.264 at 6 Mbit/s; the same
+  phone-hard the same with more of each and 1.5 Mbit/s; a worn part
+  curved     glossy and vivid, shadows, slight blur; meant for --shape curved
 
 Each OUT/NAME_VARIANT holds models/assembly.glb (the CAD to be detected), test/000001/ (rgb/, mask_visib/,
 scene_camera.json, scene_gt.json, scene_gt_info.json) and sequence.json (how it was made). Look-alikes hold the
@@ -78,8 +92,14 @@ def parser() -> argparse.ArgumentParser:
     )
     what = made.add_mutually_exclusive_group(required=True)
     what.add_argument("--cad", type=Path, metavar="PATH", help="a CAD file or part file (mm for STL, PLY and OBJ)")
-    what.add_argument("--shape", choices=(*SHAPES, "all"), help="one of the shapes made in code")
-    made.add_argument("--variant", choices=(*VARIANTS, "all"), default="regular", help="default: regular")
+    what.add_argument(
+        "--shape", choices=(*SHAPES, "all", *CURVED_SHAPES, "curved"),
+        help="one of the shapes made in code; all: the first six; curved: all curved ones",
+    )  # fmt: skip
+    made.add_argument(
+        "--variant", choices=(*VARIANTS, "all", *CONDITIONS, "real"), default="regular",
+        help="all: the first four; real: all others; default: regular",
+    )  # fmt: skip
     made.add_argument("--frames", type=positive, default=100, metavar="N", help="of each sequence; default: 100")
     made.add_argument(
         "--seed", type=seed, default=0, metavar="N", help="of trajectory, background, light and noise; default: 0"
@@ -97,7 +117,9 @@ def parser() -> argparse.ArgumentParser:
 def jobs(chosen: argparse.Namespace) -> Iterator[Job]:
     """The sequences that the command line asks for."""
     follow = scene_to_follow(chosen.trajectory)
-    variants = VARIANTS if chosen.variant == "all" else (chosen.variant,)
+    variants = {"all": VARIANTS, "real": tuple(CONDITIONS)}.get(chosen.variant, (chosen.variant,))
+    if set(variants) & set(CONDITIONS) and (chosen.lookalike or follow is not None or chosen.shutter):
+        raise InputError(f"--variant {chosen.variant} takes no --lookalike, --trajectory or --shutter; leave them out")
     recorded = recorded_name(chosen.cad)
     photos = background_photos(chosen.backgrounds, recorded)
     if chosen.cad:
@@ -105,10 +127,15 @@ def jobs(chosen: argparse.Namespace) -> Iterator[Job]:
         models, symmetries = {recorded or part.name: part.model}, part.symmetries
     else:
         models, symmetries = {name: shape(name) for name in SHAPES if chosen.shape in (name, "all")}, ()
+        models |= {name: curved_shape(name) for name in CURVED_SHAPES if chosen.shape in (name, "curved")}
     for name, model in models.items():
         if chosen.lookalike and chosen.shape == "all" and len(model.components) < 2:
             continue
         for variant in variants:
+            if variant in CONDITIONS:
+                plain = SequenceOptions(frames=chosen.frames, seed=chosen.seed)
+                yield Job(f"{name}_{variant}", model, plain, photos, None, None, symmetries, CONDITIONS[variant])
+                continue
             options = SequenceOptions(variant, chosen.frames, chosen.seed, shutter=chosen.shutter)
             if not chosen.lookalike:
                 yield Job(f"{name}_{variant}", model, options, photos, None, follow, symmetries)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from arview.errors import InputError
 from arview.evaluation.semisynthetic import photos_in
-from recordings import DATA, SEQUENCES
+from recordings import DATA, VIDEOS
 
 PHOTOS_PER_RECORDING = 8
 """Frames of each recording that serve as backgrounds."""
@@ -74,7 +74,7 @@ def fitting_photos(folder: Path | None) -> tuple[Path, ...]:
 def recorded_frames(*without: str) -> list[list[Path]]:
     """Frames of each recording and the photos of the plate, in order, without those that show certain parts."""
     left_out = {other for name in without for other in (name, *ALSO_SHOWN_BY.get(name, ()))}
-    folders = [DATA / name / "test" / "000001" for name in SEQUENCES if name not in left_out]
+    folders = [DATA / name / "test" / "000001" for name in VIDEOS if name not in left_out]
     if "plate" not in left_out:
         folders.append(DATA.parent / "plate" / "photos")
     return [photos_in(folder) for folder in folders if folder.is_dir()]

@@ -14,7 +14,11 @@ ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "samples" / "bracket_plate"
 SHARED = Path(os.environ.get("ARVIEW_DATA", ROOT.parent / "shared" / "data"))
 DATA = SHARED / "sequences"
-SEQUENCES = ("castle", "cube", "teabox", "dragon", "plate")
+VIDEOS = ("castle", "cube", "teabox", "dragon", "plate")
+"""Recorded videos; their frames also serve as backgrounds."""
+PHOTO_SEQUENCES = ("crate",)
+"""Recorded sequences of single photos, from one of which to the next nothing can be followed."""
+SEQUENCES = (*VIDEOS, *PHOTO_SEQUENCES)
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,8 @@ def photo_sets(more: Sequence[Path] = ()) -> list[PhotoSet]:
     return found
 
 
-def scenes(names: tuple[str, ...] = SEQUENCES) -> dict[str, Scene]:
-    """The available sequences by name; missing ones are named on stderr."""
+def scenes(names: tuple[str, ...] = VIDEOS) -> dict[str, Scene]:
+    """The available sequences by name, by default the videos; missing ones are named on stderr."""
     found = {}
     for name in names:
         folder = DATA / name / "test" / "000001"

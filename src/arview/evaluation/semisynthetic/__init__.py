@@ -2,16 +2,20 @@
 
 from arview.evaluation.semisynthetic.ambiguity import indistinguishable_poses, nearest_error
 from arview.evaluation.semisynthetic.backgrounds import photos_in
+from arview.evaluation.semisynthetic.conditions import CONDITIONS, Conditions
+from arview.evaluation.semisynthetic.curved_shapes import CURVED_SHAPES, curved_shape
 from arview.evaluation.semisynthetic.look_alikes import LookAlike, look_alikes
 from arview.evaluation.semisynthetic.make import (
     WALK_ROUND,
     Job,
+    conditions_job,
     look_alike_job,
     make_sequence,
     read_record,
     shape_job,
 )
 from arview.evaluation.semisynthetic.negatives import frames_without_part
+from arview.evaluation.semisynthetic.real_sequence import real_trajectory, render_real
 from arview.evaluation.semisynthetic.sequence import (
     CAMERA,
     VARIANTS,
@@ -26,15 +30,20 @@ from arview.evaluation.semisynthetic.trajectory import TrajectoryOptions
 
 __all__ = [
     "CAMERA",
+    "CONDITIONS",
+    "CURVED_SHAPES",
     "SHAPES",
     "VARIANTS",
     "WALK_ROUND",
+    "Conditions",
     "Job",
     "LookAlike",
     "SequenceFrame",
     "SequenceOptions",
     "TrajectoryOptions",
     "Variant",
+    "conditions_job",
+    "curved_shape",
     "frames_without_part",
     "indistinguishable_poses",
     "look_alike_job",
@@ -44,6 +53,8 @@ __all__ = [
     "nearest_error",
     "photos_in",
     "read_record",
+    "real_trajectory",
+    "render_real",
     "render_sequence",
     "shape",
     "shape_job",

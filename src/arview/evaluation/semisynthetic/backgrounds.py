@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 from arview.errors import InputError
 from arview.evaluation.bop import PICTURE_SUFFIXES
 from arview.evaluation.semisynthetic.trajectory import smooth_noise
+from arview.geometry import Array
 from arview.video import Image
 
 MIN_SIDE_PX = 200
 """Smallest side of a background; smaller pictures are too coarse."""
 _CROP_SHARE = (0.72, 0.92)
 """Range of the crop's width, as a share of the widest that fits."""
+_MAX_MAGNIFIED = 1.7
+"""A photo is repeated rather than magnified more than this."""
 _TILT_DEG = 4.0
 """Range of the crop's rotation."""
 
@@ -56,13 +59,48 @@ def moving_crops(
     photo: Image, width: int, height: int, count: int, rng: np.random.Generator, smooth_frames: float = 14.0
 ) -> Iterator[Image]:
     """Crops (height,width,3) of a photo that move, rotate and zoom smoothly, like a hand-held camera."""
-    photo = _shrunk(photo, width, height)
-    noise = np.tanh(smooth_noise(count, 4, smooth_frames, rng))
-    rows, columns = photo.shape[:2]
-    widest = min(columns, rows * width / height)
-    low, high = _CROP_SHARE
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    for across, down, zoom, tilt in noise:
+    path = CropPath(photo, width, height, count, rng, smooth_frames)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    for number in range(count):
+        crop = cv2.warpAffine(
+            path.photo, path.photo_from_crop(number), (width, height), flags=flags, borderMode=cv2.BORDER_REFLECT_101
+        )
+        yield np.asarray(crop)
+
+
+class CropPath:
+    """A crop that moves, rotates and zooms smoothly over a photo, at any time.
+
+    Attributes:
+        photo: (H,W,3), shrunk to about the crop's resolution.
+    """
+
+    def __init__(
+        self, photo: Image, width: int, height: int, count: int, rng: np.random.Generator, smooth_frames: float = 14.0
+    ) -> None:
+        self.photo = _shrunk(photo, width, height)
+        self._size = (width, height)
+        self._noise = np.tanh(smooth_noise(count, 4, smooth_frames, rng))
+
+    def photo_from_crop(self, number: int) -> Array:
+        """(2,3) affine map from the crop of a frame to the photo, px."""
+        return self._map(self._noise[number])
+
+    def photo_from_crop_at(self, time: float) -> Array:
+        """The same at a time between frames, in frames."""
+        place = min(max(time, 0.0), len(self._noise) - 1.0)
+        before = min(int(place), max(len(self._noise) - 2, 0))
+        after = min(before + 1, len(self._noise) - 1)
+        share = place - before
+        return self._map((1.0 - share) * self._noise[before] + share * self._noise[after])
+
+    def _map(self, noise: Array) -> Array:
+        across, down, zoom, tilt = noise
+        rows, columns = self.photo.shape[:2]
+        width, height = self._size
+        widest = min(columns, rows * width / height)
+        low, high = _CROP_SHARE
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
         scale = widest * (middle + half * zoom) / width
         angle = np.deg2rad(_TILT_DEG * tilt)
         linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -71,10 +109,15 @@ def moving_crops(
         free = np.maximum(0.5 * np.array([columns, rows]) - reach - 1.0, 0.0)
         center = 0.5 * np.array([columns - 1, rows - 1]) + free * [across, down]
         shift = center - linear @ [0.5 * (width - 1), 0.5 * (height - 1)]
-        photo_from_crop = np.column_stack([linear, shift])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        crop = cv2.warpAffine(photo, photo_from_crop, (width, height), flags=flags, borderMode=cv2.BORDER_REFLECT_101)
-        yield np.asarray(crop)
+        return np.column_stack([linear, shift])
+
+
+def mosaic(photo: Image, width: int, height: int) -> Image:
+    """The photo, repeated and mirrored at its borders until a crop of a size has as many pixels as the photo."""
+    rows = -(-height // max(1, round(_MAX_MAGNIFIED * _CROP_SHARE[0] * photo.shape[0])))
+    columns = -(-width // max(1, round(_MAX_MAGNIFIED * _CROP_SHARE[0] * photo.shape[1])))
+    line = np.concatenate([photo if k % 2 == 0 else photo[:, ::-1] for k in range(columns)], axis=1)
+    return np.concatenate([line if k % 2 == 0 else line[::-1] for k in range(rows)])
 
 
 def surroundings(photo: Image) -> NDArray[np.float32]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -17,11 +18,15 @@ from arview.errors import InputError
 from arview.evaluation.bop import Scene
 from arview.evaluation.metrics import symmetry_group
 from arview.evaluation.semisynthetic.backgrounds import read_photo
+from arview.evaluation.semisynthetic.conditions import CONDITIONS, Conditions
+from arview.evaluation.semisynthetic.curved_shapes import CURVED_SHAPES, curved_shape
 from arview.evaluation.semisynthetic.look_alikes import LookAlike, different_share
+from arview.evaluation.semisynthetic.real_sequence import real_trajectory, render_real
 from arview.evaluation.semisynthetic.scene_files import RECORD_FILE, write_dataset
 from arview.evaluation.semisynthetic.sequence import (
     CAMERA,
     VARIANTS,
+    SequenceFrame,
     SequenceOptions,
     generator,
     render_sequence,
@@ -33,6 +38,8 @@ from arview.geometry import Array
 
 WALK_ROUND = TrajectoryOptions(turn_deg=4.0, step_mm=8.0, distance_mm=(450.0, 800.0))
 """Motion of a camera that is moved around an assembly, for look-alikes."""
+PRINTED_PHOTOS = 8
+"""Photographs to choose from for a part's prints."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,7 @@ class Job:
         look_alike: rendered instead of the model, or None.
         follow: scene whose camera and trajectory are used, or None.
         symmetries: rotations of the model that change nothing.
+        conditions: real ones instead of the options' variant, of which then only frames and seed are used; or None.
     """
 
     name: str
@@ -56,24 +64,44 @@ class Job:
     look_alike: LookAlike | None = None
     follow: Scene | None = None
     symmetries: tuple[Symmetry, ...] = ()
+    conditions: Conditions | None = None
 
     @property
     def camera(self) -> Camera:
-        """The camera of RBOT, or of the followed scene."""
+        """The camera of RBOT, of the conditions, or of the followed scene."""
+        if self.conditions is not None:
+            return self.conditions.pinhole
         return self.follow.camera.without_distortion() if self.follow else CAMERA
 
     @property
     def photo(self) -> Path:
         """The background: a different one for each variant, and for each shape if there are enough."""
         order = generator(self.options.seed, "photos").permutation(len(self.photos))
+        if self.conditions is not None:
+            return self.photos[order[self._place_of_conditions() % len(order)]]
         known = SHAPES.index(self.model.name) if self.model.name in SHAPES else len(SHAPES)
         place = len(VARIANTS) * known + VARIANTS.index(self.options.variant)
         if self.look_alike:
             place += int(generator(self.options.seed, self.look_alike.name).integers(len(order)))
         return self.photos[order[place % len(order)]]
 
+    def _place_of_conditions(self) -> int:
+        names = (*SHAPES, *CURVED_SHAPES, self.model.name)
+        assert self.conditions is not None
+        known = list(CONDITIONS)
+        number = known.index(self.conditions.name) if self.conditions.name in known else len(known)
+        return len(names) * number + names.index(self.model.name)
+
+    def printed_photos(self) -> list[Path]:
+        """Photos to print on the part: never its background."""
+        others = [photo for photo in self.photos if photo != self.photo] or list(self.photos)
+        order = generator(self.options.seed, self.name, "printed").permutation(len(others))
+        return [others[k] for k in order[:PRINTED_PHOTOS]]
+
     def poses(self) -> Array:
         """``cam_from_model`` (frames,4,4)."""
+        if self.conditions is not None:
+            return real_trajectory(self.model, self.conditions, self.options.frames, self.options.seed)
         if self.follow is None:
             return trajectory(self.model, self.options, name=self.look_alike.name if self.look_alike else "")
         center = self.follow.part.model.center_in_model
@@ -83,6 +111,14 @@ class Job:
 def shape_job(name: str, options: SequenceOptions, photos: tuple[Path, ...]) -> Job:
     """A sequence of one of the test shapes."""
     return Job(f"{name}_{options.variant}", shape(name), options, photos)
+
+
+def conditions_job(name: str, conditions: Conditions, frames: int, seed: int, photos: tuple[Path, ...]) -> Job:
+    """A sequence of one of the test shapes, plain or curved, under real conditions."""
+    model = curved_shape(name) if name in CURVED_SHAPES else shape(name)
+    return Job(
+        f"{name}_{conditions.name}", model, SequenceOptions(frames=frames, seed=seed), photos, conditions=conditions
+    )
 
 
 def look_alike_job(
@@ -115,9 +151,8 @@ def make_sequence(job: Job, folder: Path, progress: StepProgress | None = None) 
     if _has_record(target, record):
         return target
     poses, camera = job.poses(), job.camera
-    blocker = shape(_other_shape(job.model.name))
     drawn = job.look_alike.model if job.look_alike else job.model
-    frames = render_sequence(drawn, poses, read_photo(job.photo), job.options, camera, blocker, job.name)
+    frames = _frames(job, drawn, poses, camera)
     shares = None
     if job.look_alike:
         shares = [different_share(job.model, drawn, camera, pose) for pose in poses]
@@ -125,6 +160,15 @@ def make_sequence(job: Job, folder: Path, progress: StepProgress | None = None) 
     report = None if progress is None else (lambda done: progress(done, len(poses)))
     write_dataset(target, job.model, camera, frames, record, turns, shares, report)
     return target
+
+
+def _frames(job: Job, drawn: Model, poses: Array, camera: Camera) -> Iterator[SequenceFrame]:
+    photo = read_photo(job.photo)
+    if job.conditions is not None:
+        printed = [read_photo(path) for path in job.printed_photos()]
+        return render_real(drawn, poses, photo, printed, job.conditions, job.options.seed, job.name)
+    blocker = shape(_other_shape(job.model.name))
+    return render_sequence(drawn, poses, photo, job.options, camera, blocker, job.name)
 
 
 def read_record(dataset: Path) -> dict[str, Any]:
@@ -145,7 +189,7 @@ def _record(job: Job) -> dict[str, Any]:
     look_alike = None
     if job.look_alike:
         look_alike = {"fault": job.look_alike.fault, "components": list(job.look_alike.components)}
-    return {
+    record = {
         "made_by": "arview semisynthetic",
         "name": job.name,
         "model": job.model.source_hash,
@@ -155,6 +199,9 @@ def _record(job: Job) -> dict[str, Any]:
         "trajectory": job.follow.name if job.follow else None,
         "code": _code_hash(),
     }
+    if job.conditions is not None:
+        record["conditions"] = asdict(job.conditions)
+    return record
 
 
 def _has_record(dataset: Path, record: dict[str, Any]) -> bool:

@@ -124,7 +124,7 @@ def render_sequence(
     """
     rng = generator(options.seed, name or model.name, options.variant)
     crops = moving_crops(photo, camera.width, camera.height, len(poses), rng)
-    lights = _lights(options.variant, len(poses), surroundings(photo), rng)
+    lights = scene_lights(options.variant, len(poses), surroundings(photo), rng)
     part = ShadedModel(model)
     blocker = None
     if occluder is not None and options.variant == "occlusion":
@@ -202,7 +202,9 @@ def _exposure(poses: Array, number: int, shutter: float) -> list[Array]:
     return [poses[number] @ exp_se3(shutter * t * twist) for t in np.linspace(-0.5, 0.5, EXPOSURES)]
 
 
-def _lights(variant: Variant, count: int, around: NDArray[np.float32], rng: np.random.Generator) -> Iterator[Light]:
+def scene_lights(
+    variant: Variant, count: int, around: NDArray[np.float32], rng: np.random.Generator
+) -> Iterator[Light]:
     """Light of each frame: fixed, or a key light that circles and varies in strength."""
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     key = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)

@@ -7,6 +7,7 @@ pixel. Colours are linear in the picture's grey levels, as in RBOT: no tone curv
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -70,22 +71,71 @@ class Layer:
     coverage: NDArray[np.float32]
 
 
-class ShadedModel:
-    """A model prepared for rendering: normals at the corners of its faces, and colours."""
+@dataclass(frozen=True)
+class UnlitSamples:
+    """The rendered samples of a part before they are lit, for a `SurfaceAppearance`.
 
-    def __init__(self, model: Model, reflectance: Reflectance | None = None) -> None:
+    Attributes:
+        inverse_depth: (H,W) in 1/mm, 0 where there is nothing.
+        face_ids: (H,W), -1 where there is nothing.
+        points: (V,3) vertices in the camera frame, mm.
+        faces: (F,3) vertex indices.
+        colors: (F,3) of the plain part.
+        lens: (fx, fy, cx, cy) of the samples, px.
+    """
+
+    inverse_depth: Array
+    face_ids: NDArray[np.int32]
+    points: Array
+    faces: NDArray[np.int32]
+    colors: Array
+    lens: Array
+
+
+class SurfaceAppearance(Protocol):
+    """What a part's surface is like from sample to sample, where it is not plain."""
+
+    def __call__(self, samples: UnlitSamples, light: Light) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Albedo and factor of highlights (H,W,4), and share of the first light that arrives (H,W)."""
+
+
+class ShadedModel:
+    """A model prepared for rendering: normals at the corners of its faces, and colours.
+
+    Args:
+        model: rendered.
+        reflectance: of its surface.
+        vivid: keep the CAD's colours as they are, instead of muting them.
+    """
+
+    def __init__(self, model: Model, reflectance: Reflectance | None = None, vivid: bool = False) -> None:
         self.model = model
         self.reflectance = reflectance or Reflectance()
-        self._vertices, self._faces, owners = model.mesh
-        self._normals = corner_normals(self._vertices, self._faces, SMOOTH_BELOW_DEG)
-        self._colors = muted(np.array([component.color for component in model.components]))[owners]
+        self.vertices, self.faces, owners = model.mesh
+        self._normals = corner_normals(self.vertices, self.faces, SMOOTH_BELOW_DEG)
+        colors = np.array([component.color for component in model.components])
+        self._colors = (colors if vivid else muted(colors))[owners]
 
-    def draw(self, cam_from_model: Array, camera: Camera, light: Light) -> Layer | None:
+    def draw(
+        self,
+        cam_from_model: Array,
+        camera: Camera,
+        light: Light,
+        surface: SurfaceAppearance | None = None,
+        points: Array | None = None,
+        supersampling: int = SUPERSAMPLING,
+    ) -> Layer | None:
         """Render the part at a pose (4,4), also beyond the picture's borders; None if it cannot be seen.
 
-        The camera must be free of distortion.
+        Args:
+            cam_from_model: (4,4); orients the normals.
+            camera: free of distortion.
+            light: of the scene.
+            surface: None for a plain one.
+            points: (V,3) vertices in the camera frame, where they are not at one pose; None: at ``cam_from_model``.
+            supersampling: samples per pixel in each direction.
         """
-        points = apply(cam_from_model, self._vertices)
+        points = apply(cam_from_model, self.vertices) if points is None else points
         if points[:, 2].min() < 1.0:
             return None
         pixels = camera.project(points)
@@ -95,18 +145,21 @@ class ShadedModel:
         right, bottom = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 3, 2 * size).tolist()
         if right <= left or bottom <= top:
             return None
-        n = SUPERSAMPLING
+        n = supersampling
         fine = camera.scaled(n * camera.width, n * camera.height)
         inverse_depth, face_ids = rasterise(
-            points, self._faces, fine.fx, fine.fy, fine.cx, fine.cy, n * (right - left), n * (bottom - top),
+            points, self.faces, fine.fx, fine.fy, fine.cx, fine.cy, n * (right - left), n * (bottom - top),
             origin=(n * left, n * top),
         )  # fmt: skip
         s = self.reflectance
+        lens = np.array([fine.fx, fine.fy, fine.cx - n * left, fine.cy - n * top])
+        own, reach = np.zeros((0, 0, 4), np.float32), np.zeros((0, 0), np.float32)
+        if surface is not None:
+            own, reach = surface(UnlitSamples(inverse_depth, face_ids, points, self.faces, self._colors, lens), light)
         color = _shade(
-            inverse_depth, face_ids, points, self._faces, self._normals @ cam_from_model[:3, :3].T, self._colors,
-            np.array([fine.fx, fine.fy, fine.cx - n * left, fine.cy - n * top]),
+            inverse_depth, face_ids, points, self.faces, self._normals @ cam_from_model[:3, :3].T, self._colors, lens,
             light.toward_in_cam, light.strength, light.ambient, light.surroundings,
-            s.diffuse, s.specular, s.mirror, s.gloss,
+            s.diffuse, s.specular, s.mirror, s.gloss, own, reach,
         )  # fmt: skip
         seen = (face_ids >= 0).astype(np.float32)
         color *= _openness(inverse_depth, seen, fine, self.model.diameter_mm)[..., None]
@@ -172,9 +225,11 @@ def _shade(
     inverse_depth: NDArray[np.float64], face_ids: NDArray[np.int32], points: NDArray[np.float64],
     faces: NDArray[np.int32], normals: NDArray[np.float64], colors: NDArray[np.float64], lens: NDArray[np.float64],
     toward: NDArray[np.float64], strength: NDArray[np.float64], ambient: float, surroundings: NDArray[np.float32],
-    diffuse: float, specular: float, mirror: float, gloss: float
+    diffuse: float, specular: float, mirror: float, gloss: float, own: NDArray[np.float32],
+    reach: NDArray[np.float32]
 ) -> NDArray[np.float32]:  # fmt: skip
     height, width = face_ids.shape
+    is_plain, is_all_lit = own.shape[0] == 0, reach.shape[0] == 0
     fx, fy, cx, cy = lens
     map_height, map_width = surroundings.shape[:2]
     out = np.zeros((height, width, 3), dtype=np.float32)
@@ -216,10 +271,13 @@ def _shade(
             for s in range(toward.shape[0]):
                 cosine = nx * toward[s, 0] + ny * toward[s, 1] + nz * toward[s, 2]
                 if cosine > 0.0:
-                    matt += diffuse * strength[s] * cosine
+                    arriving = strength[s]
+                    if s == 0 and not is_all_lit:
+                        arriving *= reach[r, col]
+                    matt += diffuse * arriving * cosine
                     along = rx * toward[s, 0] + ry * toward[s, 1] + rz * toward[s, 2]
                     if along > 0.0:
-                        shine += specular * strength[s] * along**gloss
+                        shine += specular * arriving * along**gloss
             # Reflected surroundings, stronger at grazing angles (Schlick's approximation).
             share = mirror * (0.4 + 0.6 * (1.0 - facing) ** 3)
             column = (np.arctan2(rx, rz) / (2.0 * np.pi) + 0.5) * map_width
@@ -231,7 +289,10 @@ def _shade(
                 upper = (1.0 - fc) * surroundings[r0, c0, c] + fc * surroundings[r0, c1, c]
                 lower = (1.0 - fc) * surroundings[r1, c0, c] + fc * surroundings[r1, c1, c]
                 mirrored = (1.0 - fr) * upper + fr * lower
-                value = colors[face, c] * matt + share * mirrored + shine
+                if is_plain:
+                    value = colors[face, c] * matt + share * mirrored + shine
+                else:
+                    value = own[r, col, c] * matt + own[r, col, 3] * (share * mirrored + shine)
                 # Highlights roll off towards white, as in a camera.
                 out[r, col, c] = value if value < 0.8 else 1.0 - 0.2 * np.exp(-(value - 0.8) / 0.2)
     return out
