@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.refinement.edge_spread import edge_spread
 from arview.refinement.evidence import EdgeSteps, PoseEvidence
 from arview.refinement.kernels import ModalityWeights, count_colors, run_edge_steps, run_evidence, run_stages
 from arview.refinement.modalities.region import BINS, EDGE_FUNCTION, ColorModel, log_odds, value_bins
@@ -241,6 +242,11 @@ class PoseRefiner:
             self._step_mm, self.options.edge_threshold, tolerance_px,
         )  # fmt: skip
         return PoseEvidence(**terms._asdict())
+
+    def edge_spread_px(self, gray: NDArray[np.uint8], cam_from_body: Array) -> float | None:
+        """Standard deviation of the blur of the part's edges at a pose (4,4); None where too few are seen."""
+        spread_px = edge_spread(gray, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm)
+        return None if spread_px < 0 else spread_px
 
     def edge_steps(self, gray: NDArray[np.uint8], cam_from_body: Array, tolerance_px: float = 1.5) -> EdgeSteps:
         """Outline and design edges at a pose (4,4), and the support of the picture for each of their points."""

@@ -7,7 +7,7 @@ are refined and scored by the same evidence as a tracked pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -20,11 +20,11 @@ from arview.geometry import Array, apply, are_near, rotation_angle_rad, turn_bal
 from arview.guideviews import GuideViewSet
 from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
 from arview.refinement.evidence import PoseEvidence
-from arview.refinement.modalities.edge import smoothed
 from arview.refinement.projection import intrinsics_of
 from arview.refinement.refiner import PoseRefiner
 from arview.refinement.schedules import SEARCH_STAGES
 from arview.refinement.view_model import PartView
+from arview.refinement.working_picture import WorkingPicture, WorkingScaleOptions, working_picture
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class GuidedInitOptions:
         crop_reach: half size of the crop, in half diameters, because the part may be nearer than the given pose.
         max_scored: best poses of a grid that are compared with each other.
         contour_points, design_points: points of outline and of design edges that are scored.
+        scale: options of the picture in which the best poses are refined and scored.
     """
 
     turn_limit_deg: float = 20.0
@@ -65,6 +66,7 @@ class GuidedInitOptions:
     max_scored: int = 400
     contour_points: int = 64
     design_points: int = 32
+    scale: WorkingScaleOptions = field(default_factory=WorkingScaleOptions)
 
 
 @dataclass(frozen=True)
@@ -292,17 +294,26 @@ class GuidedInit:
         """The start (4,4) with the best score after refinement."""
         if not starts:
             return None
-        gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        work = self._working(image, starts[0])
+        refiner = self._refiner.with_camera(work.camera)
 
         def refine(start: Array) -> GuidedPose:
-            pose = self._refiner.refine_fresh(image, gray, start, SEARCH_STAGES)
-            appearance = self._refiner.appearance_at(image, pose)
-            evidence = self._refiner.evidence(image, gray, pose, appearance)
+            pose = refiner.refine_fresh(work.image, work.smooth, start, SEARCH_STAGES)
+            appearance = refiner.appearance_at(work.image, pose)
+            evidence = refiner.evidence(work.image, work.smooth, pose, appearance)
             is_inside = evidence.points_in_picture >= self.options.min_in_picture
             quality = evidence.quality if is_inside else 0.0
             return GuidedPose(pose @ self._refiner.part.body_from_model, evidence, quality)
 
         return max(pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.score))
+
+    def _working(self, image: NDArray[np.uint8], cam_from_body: Array) -> WorkingPicture:
+        """The whole picture at the working scale of a pose (4,4) and of the sharpness of the edges there."""
+        o, radius_px = self.options.scale, self._refiner.radius_px(cam_from_body)
+        work = working_picture(image, self.camera, o.working_scale(radius_px))
+        spread_px = self._refiner.with_camera(work.camera).edge_spread_px(work.smooth, cam_from_body)
+        scale = o.working_scale(radius_px, 0.0 if spread_px is None else spread_px / work.scale)
+        return work if scale == work.scale else working_picture(image, self.camera, scale)
 
     def _is_same(self, a: Array, b: Array, angle_deg: float) -> bool:
         """Whether two poses (4,4) differ by less than an angle, and by as many per cent of the diameter."""

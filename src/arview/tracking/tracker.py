@@ -24,12 +24,12 @@ from arview.guideviews import GuideViewSet
 from arview.refinement.evidence import MIN_IN_PICTURE, quality_of
 from arview.refinement.gauss_newton import apply_twist, relative_twist
 from arview.refinement.kernels import median_brightness_ratio
-from arview.refinement.modalities.edge import smoothed
 from arview.refinement.modalities.region import value_bins
 from arview.refinement.modalities.texture import TextureModality
 from arview.refinement.refiner import NO_MATCHES, PoseRefiner
 from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES
 from arview.refinement.view_model import PartView
+from arview.refinement.working_picture import WorkingPicture, matches_in, window_around, working_picture
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import squared_motion_distance
 from arview.tracking.tracker_options import TrackerOptions
@@ -79,8 +79,6 @@ class Tracker:
         self._recheck = recheck
         self._search = WideSearch(self.refiner.part.arrays, camera, self.refiner.intrinsics, self.diameter_mm)
         self._state: TrackerState | None = None
-        self._gray = np.zeros((0, 0), dtype=np.uint8)
-        self._smooth = np.zeros((0, 0), dtype=np.uint8)
         self._texture: TextureModality | None = None
         if self.options.use_texture and model is not None:
             vertices, faces, _ = model.mesh
@@ -107,13 +105,16 @@ class Tracker:
         state = self._state = TrackerState(cam_from_model @ self.refiner.part.model_from_body)
         if self._texture is not None:
             self._texture.clear()
-        self._learn_colors(image, state.cam_from_body, 1.0)
+        o = self.options.scale
+        finest = o.quantised(o.fine_radius_px / self.refiner.radius_px(state.cam_from_body))
+        self._measure_spread(self._fine_picture(image, state.cam_from_body, finest), state.cam_from_body, 1.0)
+        work, refiner = self._working(image, state.cam_from_body)
+        self._learn_colors(work, refiner, state.cam_from_body, 1.0)
         if self._texture is not None and not (self.options.use_region or self.options.use_edge):
             # Nothing else can support the pose before there is a keyframe.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             self._texture.add_keyframe(self._texture.pyramid(gray), state.cam_from_body)
-        _, smooth = self._gray_around(image, state.cam_from_body)
-        state.usual_score = self.refiner.evidence(image, smooth, state.cam_from_body, state.appearance).score
+        state.usual_score = refiner.evidence(work.image, work.smooth, state.cam_from_body, state.appearance).score
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
         """Track the part into the next frame (H,W,3) uint8 RGB.
@@ -122,7 +123,9 @@ class Tracker:
             RuntimeError: before `start`.
         """
         frame = self._prepare(image)
-        for propose in (self._predicted, self._other_schedules, self._searched, self._rechecked, self._shaded):
+        for propose in (
+            self._predicted, self._other_schedules, self._searched, self._rechecked, self._refined, self._shaded,
+        ):  # fmt: skip
             for proposal in propose(frame):
                 candidate = self._refine(frame, proposal)
                 if self._is_better(frame, candidate, proposal):
@@ -159,7 +162,7 @@ class Tracker:
         if not self._is_suspicious(frame):
             return
         o, state = self.options, self.state
-        frame.gray, frame.smooth = self._gray_around(frame.image)
+        self._cover(frame, None)
         for start in self._search.find(frame.image, state.appearance.colors, frame.predicted):
             yield Proposal(start, o.stages, None, o.min_gain, o.motion_penalty)
         # This score is usual from now on, because a search of the whole neighbourhood found nothing better.
@@ -171,9 +174,18 @@ class Tracker:
             return
         pose = self._recheck.better(frame.image, frame.found.cam_from_body, [frame.predicted, self.state.cam_from_body])
         if pose is not None:
-            frame.gray, frame.smooth = self._gray_around(frame.image, pose)
+            self._cover(frame, pose)
             # Refinement with the learned colours would lead it back, because they misled the best pose.
             yield Proposal(pose, LAST_STAGES[-1:], None, -math.inf, is_final=True)
+
+    def _refined(self, frame: FrameContext) -> Iterator[Proposal]:
+        """The best pose so far, refined in the fine picture, where the frame is sharp enough for one."""
+        o, pose = self.options, frame.found.cam_from_body
+        scale = o.scale.fine_scale(self.refiner.radius_px(pose), self.state.spread_px)
+        if scale is None or frame.found.evidence.points_in_picture <= MIN_IN_PICTURE:
+            return
+        frame.fine = self._fine_picture(frame.image, pose, scale)
+        yield Proposal(pose, o.fine_stages, frame.found.matches, -o.min_gain, picture=frame.fine)
 
     def _shaded(self, frame: FrameContext) -> Iterator[Proposal]:
         """The best pose so far, refined by the shading of a curved surface."""
@@ -185,17 +197,20 @@ class Tracker:
 
     def _refine(self, frame: FrameContext, proposal: Proposal) -> RefinedPose:
         """Refine a proposal and collect its evidence."""
-        refiner, appearance = self.refiner, self.state.appearance
+        refiner, work, appearance = frame.refiner, frame.work, self.state.appearance
         if proposal.stages:
-            pose, information = refiner.refine(
-                frame.image, frame.smooth, proposal.cam_from_body, proposal.stages, appearance,
-                proposal.matches or NO_MATCHES,
-            )  # fmt: skip
+            fine = proposal.picture
+            refined_in, picture = (refiner, work) if fine is None else (self.refiner.with_camera(fine.camera), fine)
+            matches = NO_MATCHES if proposal.matches is None else matches_in(picture, proposal.matches)
+            pose, information = refined_in.refine(
+                picture.image, picture.smooth, proposal.cam_from_body, proposal.stages, appearance, matches
+            )
             if proposal.is_final:
                 pose = proposal.cam_from_body
         else:
-            pose, information = refiner.refine_shading(frame.gray, proposal.cam_from_body, frame.found.information)
-        evidence = refiner.evidence(frame.image, frame.smooth, pose, appearance)
+            gray = cv2.cvtColor(work.image, cv2.COLOR_RGB2GRAY)
+            pose, information = refiner.refine_shading(gray, proposal.cam_from_body, frame.found.information)
+        evidence = refiner.evidence(work.image, work.smooth, pose, appearance)
         return RefinedPose(pose, information, evidence, proposal.matches)
 
     def _is_better(self, frame: FrameContext, candidate: RefinedPose, proposal: Proposal) -> bool:
@@ -236,10 +251,10 @@ class Tracker:
         state, o = self.state, self.options
         self._follow_exposure(image[..., 1])
         predicted = apply_twist(state.cam_from_body, state.velocity)
-        gray, smooth = self._gray_around(image, state.cam_from_body, predicted)
-        frame = FrameContext(image, gray, smooth, predicted, predicted)
+        work, refiner = self._working(image, state.cam_from_body, predicted)
+        frame = FrameContext(image, work, refiner, predicted, predicted)
         if self._texture is not None:
-            frame.pyramid = self._texture.pyramid(gray)
+            frame.pyramid = self._texture.pyramid(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
             matches = self._texture.measure(frame.pyramid, predicted)
             frame.found_share = len(matches.weights) / max(matches.tried, 1)
             if len(matches.weights) >= o.min_matches and frame.found_share >= o.min_match_share:
@@ -253,16 +268,17 @@ class Tracker:
         state.usual_score += o.score_rate * (evidence.score - state.usual_score)
         state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
         state.cam_from_body = pose
+        self._measure_spread(frame.fine or frame.work, pose, o.spread_rate)
         if quality > o.min_learning_quality:
             if o.use_region:
-                self._learn_colors(frame.image, pose, o.learning_rate)
+                self._learn_colors(frame.work, frame.refiner, pose, o.learning_rate)
             if self._texture is not None:
                 self._remember_texture(frame)
 
-    def _learn_colors(self, image: NDArray[np.uint8], cam_from_body: Array, rate: float) -> None:
-        """Blend the colours along the outline at a pose into the histograms."""
+    def _learn_colors(self, work: WorkingPicture, refiner: PoseRefiner, cam_from_body: Array, rate: float) -> None:
+        """Blend the colours along the outline at a pose in a working picture into the histograms."""
         appearance = self.state.appearance
-        colors = self.refiner.color_histograms(image, cam_from_body, appearance.bin_of)
+        colors = refiner.color_histograms(work.image, cam_from_body, appearance.bin_of)
         if colors is not None:
             appearance.blend(colors, rate)
 
@@ -281,29 +297,38 @@ class Tracker:
             state.exposure = min(max(state.exposure**o.exposure_decay * ratio, low), high)
             state.appearance.bin_of = value_bins(state.exposure)
 
-    def _gray_around(self, image: NDArray[np.uint8], *poses: Array) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Grey picture (H,W) and its smoothed copy, computed only around the part at some poses (4,4).
+    def _working(self, image: NDArray[np.uint8], *poses: Array) -> tuple[WorkingPicture, PoseRefiner]:
+        """The working picture around the part at some poses (4,4), the last of which gives its scale, and its refiner.
 
-        Without poses, and for texture, the whole picture is computed.
+        Without poses it is the whole frame at the scale of the last frame.
         """
-        height, width = image.shape[:2]
-        first, last = np.array([0, 0]), np.array([width, height])
-        if self._texture is None and poses:
-            centers = np.array([self.camera.project(pose[:3, 3]) for pose in poses])
-            if np.all(np.isfinite(centers)):
-                o = self.options
-                reach = o.window_reach * max(self.refiner.radius_px(pose) for pose in poses) + o.window_margin_px
-                first = np.clip(centers.min(axis=0) - reach, 0, last).astype(int)
-                last = np.clip(centers.max(axis=0) + reach, 0, last).astype(int)
-        if np.any(last - first < 16):
-            first, last = np.array([0, 0]), np.array([width, height])
-        window = np.s_[first[1] : last[1], first[0] : last[0]]
-        if self._gray.shape != (height, width):
-            self._gray = np.zeros((height, width), dtype=np.uint8)
-            self._smooth = np.zeros((height, width), dtype=np.uint8)
-        self._gray[window] = cv2.cvtColor(image[window], cv2.COLOR_RGB2GRAY)
-        self._smooth[window] = smoothed(self._gray[window])
-        return self._gray, self._smooth
+        o = self.options.scale
+        radius_px = self.refiner.radius_px(poses[-1] if poses else self.state.cam_from_body)
+        scale = o.working_scale(radius_px, self.state.spread_px)
+        window = window_around(self.camera, poses, self.diameter_mm, o.margin_px / scale, o.reach) if poses else None
+        work = working_picture(image, self.camera, scale, window)
+        return work, self.refiner.with_camera(work.camera)
+
+    def _cover(self, frame: FrameContext, pose: Array | None) -> None:
+        """Make the working picture show the part at another pose (4,4), or the whole frame for None."""
+        if pose is None:
+            frame.work, frame.refiner = self._working(frame.image)
+            return
+        center = self.camera.project(pose[:3, 3])
+        if not frame.work.covers(center, self.options.scale.reach * self.refiner.radius_px(pose), self.camera):
+            frame.work, frame.refiner = self._working(frame.image, pose)
+
+    def _fine_picture(self, image: NDArray[np.uint8], cam_from_body: Array, scale: float) -> WorkingPicture:
+        """The picture around the part at a pose (4,4), at a scale finer than the working picture's."""
+        window = window_around(self.camera, [cam_from_body], self.diameter_mm, self.options.scale.margin_px / scale)
+        return working_picture(image, self.camera, scale, window)
+
+    def _measure_spread(self, picture: WorkingPicture, cam_from_body: Array, rate: float) -> None:
+        """Move the estimated blur of the part's edges by a share towards that of a picture at a pose (4,4)."""
+        state = self.state
+        spread_px = self.refiner.with_camera(picture.camera).edge_spread_px(picture.smooth, cam_from_body)
+        if spread_px is not None:
+            state.spread_px += rate * (spread_px / picture.scale - state.spread_px)
 
     def _remember_texture(self, frame: FrameContext) -> None:
         """Update the trust in the keyframes, and add one where it is missing and nothing hides the outline."""
@@ -327,10 +352,10 @@ class Tracker:
     def scores_near(self, image: NDArray[np.uint8], cams_from_model: list[Array]) -> list[float]:
         """Scores, see `PoseEvidence.score`, of other poses (4,4) in this frame, each after a fine refinement."""
         appearance, fine = self.state.appearance, self.options.stages[-2:]
-        smooth = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
-        poses = [self.refiner.refine(image, smooth, pose, fine, appearance)[0] for pose in in_body]
-        return [self.refiner.evidence(image, smooth, pose, appearance).score for pose in poses]
+        work, refiner = self._working(image, *in_body)
+        poses = [refiner.refine(work.image, work.smooth, pose, fine, appearance)[0] for pose in in_body]
+        return [refiner.evidence(work.image, work.smooth, pose, appearance).score for pose in poses]
 
     def covariance(self, estimate: Estimate) -> Array:
         """Covariance (6,6) of the twist (rad, mm) about the model's centre.

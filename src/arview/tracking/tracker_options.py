@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from arview.errors import InputError
 from arview.refinement.refiner import RefinerOptions
 from arview.refinement.schedules import TRACK_STAGES, Stage
+from arview.refinement.working_picture import WorkingScaleOptions
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,9 @@ class TrackerOptions(RefinerOptions):
         exposure_grid_px: distance of the pixels from which a change of exposure is measured.
         exposure_decay: exponent by which the estimated exposure fades, because the histograms follow slow changes.
         exposure_limits: smallest and largest exposure relative to the first frame.
-        window_margin_px: pixels around the part, in addition to ``window_reach`` half diameters, in which the grey
-            picture is computed.
-        window_reach: see ``window_margin_px``.
+        scale: options of the working picture.
+        fine_stages: schedule of the selected pose in the fine picture, where the frame is sharp enough for one.
+        spread_rate: share by which the estimated blur of the edges follows each frame.
         correlated_points: neighbouring edge points that share one error.
         velocity_decay: share of the last frame's motion that is expected in the next frame.
     """
@@ -77,8 +78,9 @@ class TrackerOptions(RefinerOptions):
     exposure_grid_px: int = 16
     exposure_decay: float = 0.9
     exposure_limits: tuple[float, float] = (0.2, 5.0)
-    window_margin_px: float = 50.0
-    window_reach: float = 1.15
+    scale: WorkingScaleOptions = field(default_factory=WorkingScaleOptions)
+    fine_stages: tuple[Stage, ...] = TRACK_STAGES[1:]
+    spread_rate: float = 0.3
     correlated_points: float = 8.0
     velocity_decay: float = 0.9
 

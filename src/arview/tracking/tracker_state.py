@@ -12,8 +12,9 @@ from arview.geometry import Array
 from arview.refinement.evidence import PoseEvidence
 from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.modalities.texture import TextureMatches
-from arview.refinement.refiner import Appearance
+from arview.refinement.refiner import Appearance, PoseRefiner
 from arview.refinement.schedules import Stage
+from arview.refinement.working_picture import WorkingPicture
 
 
 @dataclass
@@ -28,6 +29,7 @@ class TrackerState:
         exposure: brightness relative to the frame in which colours were first learned.
         sparse_gray: (rows,columns) brightness of the last frame on a coarse grid.
         best_contour_support: best recent support of the outline.
+        spread_px: standard deviation of the blur of the part's edges, px of the frame; 0 where it is not known.
     """
 
     cam_from_body: Array
@@ -37,6 +39,7 @@ class TrackerState:
     exposure: float = 1.0
     sparse_gray: NDArray[np.float64] | None = None
     best_contour_support: float = 0.0
+    spread_px: float = 0.0
 
 
 class RefinedPose(NamedTuple):
@@ -65,6 +68,7 @@ class Proposal(NamedTuple):
         min_gain: by how much its score must exceed that of the best pose so far.
         motion_penalty: score that a squared motion distance of 1 costs.
         is_final: keep the start as the pose and use the stages only for its information.
+        picture: where it is refined; None: in the working picture.
     """
 
     cam_from_body: Array
@@ -73,6 +77,7 @@ class Proposal(NamedTuple):
     min_gain: float = 0.0
     motion_penalty: float = 0.0
     is_final: bool = False
+    picture: WorkingPicture | None = None
 
 
 @dataclass
@@ -81,24 +86,27 @@ class FrameContext:
 
     Attributes:
         image: (H,W,3) uint8 RGB.
-        gray, smooth: (H,W) grey levels and their smoothed copy, computed where the part may be.
+        work: the working picture, in which poses are refined and scored.
+        refiner: refinement in the working picture.
         predicted: (4,4) pose predicted from the motion so far.
         start: (4,4) the predicted pose, aligned with the texture found.
         pyramid: image pyramid of the grey picture; None without texture.
         matches: texture found; None where it is too little.
         found_share: share of the expected texture that was found.
         best: the best pose so far; None before the first one.
+        fine: the fine picture, where the frame is sharp enough for one.
     """
 
     image: NDArray[np.uint8]
-    gray: NDArray[np.uint8]
-    smooth: NDArray[np.uint8]
+    work: WorkingPicture
+    refiner: PoseRefiner
     predicted: Array
     start: Array
     pyramid: Pyramid | None = None
     matches: TextureMatches | None = None
     found_share: float = 0.0
     best: RefinedPose | None = None
+    fine: WorkingPicture | None = None
 
     @property
     def found(self) -> RefinedPose:
