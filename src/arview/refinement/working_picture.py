@@ -62,6 +62,10 @@ class WorkingScaleOptions:
             scale = max(self.max_spread_px / spread_px, min(scale, self.soft_radius_px / radius_px))
         return self.quantised(scale)
 
+    def finest(self, radius_px: float) -> float:
+        """Scale of the fine picture of a sharp picture in which half the part's diameter is ``radius_px``."""
+        return self.quantised(self.fine_radius_px / radius_px)
+
     def fine_scale(self, radius_px: float, spread_px: float) -> float | None:
         """Scale of the fine picture; None where the working picture is as fine. Arguments as of `working_scale`."""
         scale = min(1.0, self.fine_radius_px / radius_px, self.max_spread_px / max(spread_px, 1e-6))

@@ -366,7 +366,8 @@ class TrackingSession:
         if not s.hypotheses:
             return estimate, reason
         others = s.hypotheses.poses(estimate.cam_from_model)
-        better = s.hypotheses.update(estimate.evidence.score, self.tracker.scores_near(image, others))
+        score, *other_scores = self.tracker.scores_near(image, [estimate.cam_from_model, *others])
+        better = s.hypotheses.update(score, other_scores)
         if better is not None:
             s.hypotheses = HypothesisSet([])
             return self._restart(image, estimate.cam_from_model @ better), reason

@@ -21,15 +21,16 @@ from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
-from arview.refinement.evidence import MIN_IN_PICTURE, quality_of
+from arview.refinement.evidence import MIN_IN_PICTURE, PoseEvidence, quality_of
 from arview.refinement.gauss_newton import apply_twist, relative_twist
 from arview.refinement.kernels import median_brightness_ratio
 from arview.refinement.modalities.region import value_bins
 from arview.refinement.modalities.texture import TextureModality
-from arview.refinement.refiner import NO_MATCHES, PoseRefiner
+from arview.refinement.picture_refiner import PictureRefiner
+from arview.refinement.refiner import PoseRefiner
 from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES
 from arview.refinement.view_model import PartView
-from arview.refinement.working_picture import WorkingPicture, matches_in, window_around, working_picture
+from arview.refinement.working_picture import window_around, working_picture
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import squared_motion_distance
 from arview.tracking.tracker_options import TrackerOptions
@@ -105,16 +106,17 @@ class Tracker:
         state = self._state = TrackerState(cam_from_model @ self.refiner.part.model_from_body)
         if self._texture is not None:
             self._texture.clear()
-        o = self.options.scale
-        finest = o.quantised(o.fine_radius_px / self.refiner.radius_px(state.cam_from_body))
-        self._measure_spread(self._fine_picture(image, state.cam_from_body, finest), state.cam_from_body, 1.0)
-        work, refiner = self._working(image, state.cam_from_body)
-        self._learn_colors(work, refiner, state.cam_from_body, 1.0)
+        finest = self._around(
+            image, self.options.scale.finest(self.refiner.radius_px(state.cam_from_body)), [state.cam_from_body]
+        )
+        self._measure_spread(finest, 1.0)
+        work, fine = self._pictures(image, [state.cam_from_body])
+        work.learn_colors(state.cam_from_body, state.appearance, 1.0)
         if self._texture is not None and not (self.options.use_region or self.options.use_edge):
             # Nothing else can support the pose before there is a keyframe.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             self._texture.add_keyframe(self._texture.pyramid(gray), state.cam_from_body)
-        state.usual_score = refiner.evidence(work.image, work.smooth, state.cam_from_body, state.appearance).score
+        state.usual_score = fine.evidence(state.cam_from_body, state.appearance).score
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
         """Track the part into the next frame (H,W,3) uint8 RGB.
@@ -130,17 +132,18 @@ class Tracker:
                 candidate = self._refine(frame, proposal)
                 if self._is_better(frame, candidate, proposal):
                     frame.best = candidate
-        quality = self._quality(frame)
-        self._update(frame, quality)
         best = frame.found
+        evidence = self._evidence(frame)
+        quality = self._quality(frame, evidence)
+        self._update(frame, evidence, quality)
         cam_from_model = best.cam_from_body @ self.refiner.part.body_from_model
-        return Estimate(cam_from_model, best.information, quality, best.evidence)
+        return Estimate(cam_from_model, best.information, quality, evidence)
 
     # --- Propose ------------------------------------------------------------------------------------------
 
     def _predicted(self, frame: FrameContext) -> Iterator[Proposal]:
         """The pose predicted from the motion so far and aligned with the texture found."""
-        yield Proposal(frame.start, self.options.stages, frame.matches)
+        yield Proposal(frame.start, LAST_STAGES, frame.matches, is_fine=True)
 
     def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
         """Other schedules, where the score is lower than usual."""
@@ -148,7 +151,11 @@ class Tracker:
         first = frame.found
         if first.evidence.score >= o.other_schedules_share * usual:
             return
-        yield Proposal(frame.start, LAST_STAGES, frame.matches)
+        yield Proposal(frame.start, o.stages, frame.matches, is_fine=True)
+        if frame.found.evidence.score >= o.other_schedules_share * usual:
+            return
+        if frame.fine is not frame.work:
+            yield Proposal(frame.start, o.stages, frame.matches, o.min_gain)
         if o.use_edge and first.evidence.inner_share > o.near_schedules_min_inner_share:
             yield Proposal(frame.start, NEAR_STAGES, frame.matches)
             yield Proposal(first.cam_from_body, NEAR_STAGES, frame.matches)
@@ -180,12 +187,11 @@ class Tracker:
 
     def _refined(self, frame: FrameContext) -> Iterator[Proposal]:
         """The best pose so far, refined in the fine picture, where the frame is sharp enough for one."""
-        o, pose = self.options, frame.found.cam_from_body
-        scale = o.scale.fine_scale(self.refiner.radius_px(pose), self.state.spread_px)
-        if scale is None or frame.found.evidence.points_in_picture <= MIN_IN_PICTURE:
-            return
-        frame.fine = self._fine_picture(frame.image, pose, scale)
-        yield Proposal(pose, o.fine_stages, frame.found.matches, -o.min_gain, picture=frame.fine)
+        if frame.fine is not frame.work and not frame.found.is_fine:
+            best = frame.found
+            yield Proposal(
+                best.cam_from_body, self.options.fine_stages, best.matches, -self.options.min_gain, is_fine=True
+            )
 
     def _shaded(self, frame: FrameContext) -> Iterator[Proposal]:
         """The best pose so far, refined by the shading of a curved surface."""
@@ -197,21 +203,23 @@ class Tracker:
 
     def _refine(self, frame: FrameContext, proposal: Proposal) -> RefinedPose:
         """Refine a proposal and collect its evidence."""
-        refiner, work, appearance = frame.refiner, frame.work, self.state.appearance
+        appearance, is_fine = self.state.appearance, proposal.is_fine
         if proposal.stages:
-            fine = proposal.picture
-            refined_in, picture = (refiner, work) if fine is None else (self.refiner.with_camera(fine.camera), fine)
-            matches = NO_MATCHES if proposal.matches is None else matches_in(picture, proposal.matches)
-            pose, information = refined_in.refine(
-                picture.image, picture.smooth, proposal.cam_from_body, proposal.stages, appearance, matches
-            )
+            refiner = frame.fine if is_fine else frame.work
+            pose, information = refiner.refine(proposal.cam_from_body, proposal.stages, appearance, proposal.matches)
             if proposal.is_final:
                 pose = proposal.cam_from_body
         else:
-            gray = cv2.cvtColor(work.image, cv2.COLOR_RGB2GRAY)
-            pose, information = refiner.refine_shading(gray, proposal.cam_from_body, frame.found.information)
-        evidence = refiner.evidence(work.image, work.smooth, pose, appearance)
-        return RefinedPose(pose, information, evidence, proposal.matches)
+            is_fine = frame.found.is_fine
+            pose, information = frame.work.refine_shading(proposal.cam_from_body, frame.found.information)
+        return RefinedPose(pose, information, frame.fine.evidence(pose, appearance), proposal.matches, is_fine)
+
+    def _evidence(self, frame: FrameContext) -> PoseEvidence:
+        """Evidence of the working picture for the best pose so far, which means the same in every frame."""
+        best = frame.found
+        if frame.fine is frame.work:
+            return best.evidence
+        return frame.work.evidence(best.cam_from_body, self.state.appearance)
 
     def _is_better(self, frame: FrameContext, candidate: RefinedPose, proposal: Proposal) -> bool:
         """Whether a refined proposal gains enough over the best pose so far."""
@@ -235,11 +243,10 @@ class Tracker:
         is_less = share < o.wide_search_share or (
             share < o.surprise_share and self._motion(frame, frame.found) > o.surprise
         )
-        return is_less or evidence.quality < o.min_learning_quality
+        return is_less or self._evidence(frame).quality < o.min_learning_quality
 
-    def _quality(self, frame: FrameContext) -> float:
-        """Quality of the selected pose by edges, colours and texture."""
-        evidence = frame.found.evidence
+    def _quality(self, frame: FrameContext, evidence: PoseEvidence) -> float:
+        """Quality of the selected pose by the evidence of edges and colours, and by texture."""
         if frame.found.matches is not None and evidence.points_in_picture > MIN_IN_PICTURE:
             return quality_of(evidence.score + self.options.texture_score * frame.found_share)
         return evidence.quality
@@ -251,8 +258,7 @@ class Tracker:
         state, o = self.state, self.options
         self._follow_exposure(image[..., 1])
         predicted = apply_twist(state.cam_from_body, state.velocity)
-        work, refiner = self._working(image, state.cam_from_body, predicted)
-        frame = FrameContext(image, work, refiner, predicted, predicted)
+        frame = FrameContext(image, *self._pictures(image, [state.cam_from_body, predicted]), predicted, predicted)
         if self._texture is not None:
             frame.pyramid = self._texture.pyramid(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
             matches = self._texture.measure(frame.pyramid, predicted)
@@ -261,26 +267,19 @@ class Tracker:
                 frame.matches, frame.start = matches, self._texture.align(matches, predicted)
         return frame
 
-    def _update(self, frame: FrameContext, quality: float) -> None:
+    def _update(self, frame: FrameContext, evidence: PoseEvidence, quality: float) -> None:
         """Update pose, velocity, usual score, colours and texture for the next frame."""
         state, o = self.state, self.options
-        pose, evidence = frame.found.cam_from_body, frame.found.evidence
-        state.usual_score += o.score_rate * (evidence.score - state.usual_score)
+        pose = frame.found.cam_from_body
+        state.usual_score += o.score_rate * (frame.found.evidence.score - state.usual_score)
         state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
         state.cam_from_body = pose
-        self._measure_spread(frame.fine or frame.work, pose, o.spread_rate)
+        self._measure_spread(frame.fine, o.spread_rate)
         if quality > o.min_learning_quality:
             if o.use_region:
-                self._learn_colors(frame.work, frame.refiner, pose, o.learning_rate)
+                frame.work.learn_colors(pose, state.appearance, o.learning_rate)
             if self._texture is not None:
-                self._remember_texture(frame)
-
-    def _learn_colors(self, work: WorkingPicture, refiner: PoseRefiner, cam_from_body: Array, rate: float) -> None:
-        """Blend the colours along the outline at a pose in a working picture into the histograms."""
-        appearance = self.state.appearance
-        colors = refiner.color_histograms(work.image, cam_from_body, appearance.bin_of)
-        if colors is not None:
-            appearance.blend(colors, rate)
+                self._remember_texture(frame, evidence)
 
     def _follow_exposure(self, channel: NDArray[np.uint8]) -> None:
         """Compensate the colours for a change of exposure since the last frame.
@@ -297,43 +296,47 @@ class Tracker:
             state.exposure = min(max(state.exposure**o.exposure_decay * ratio, low), high)
             state.appearance.bin_of = value_bins(state.exposure)
 
-    def _working(self, image: NDArray[np.uint8], *poses: Array) -> tuple[WorkingPicture, PoseRefiner]:
-        """The working picture around the part at some poses (4,4), the last of which gives its scale, and its refiner.
-
-        Without poses it is the whole frame at the scale of the last frame.
-        """
+    def _pictures(self, image: NDArray[np.uint8], poses: list[Array]) -> tuple[PictureRefiner, PictureRefiner]:
+        """The working and the fine picture around the part at some poses (4,4); the last pose gives their scales."""
         o = self.options.scale
-        radius_px = self.refiner.radius_px(poses[-1] if poses else self.state.cam_from_body)
-        scale = o.working_scale(radius_px, self.state.spread_px)
-        window = window_around(self.camera, poses, self.diameter_mm, o.margin_px / scale, o.reach) if poses else None
-        work = working_picture(image, self.camera, scale, window)
-        return work, self.refiner.with_camera(work.camera)
+        radius_px, spread_px = self.refiner.radius_px(poses[-1]), self.state.spread_px
+        work = self._around(image, o.working_scale(radius_px, spread_px), poses)
+        scale = o.fine_scale(radius_px, spread_px)
+        return work, work if scale is None else self._around(image, scale, poses)
+
+    def _around(self, image: NDArray[np.uint8], scale: float, poses: list[Array] | None) -> PictureRefiner:
+        """The picture around the part at some poses (4,4), or the whole frame, at a scale."""
+        window = None
+        if poses:
+            o = self.options.scale
+            window = window_around(self.camera, poses, self.diameter_mm, o.margin_px / scale, o.reach)
+        return PictureRefiner(self.refiner, working_picture(image, self.camera, scale, window))
 
     def _cover(self, frame: FrameContext, pose: Array | None) -> None:
-        """Make the working picture show the part at another pose (4,4), or the whole frame for None."""
-        if pose is None:
-            frame.work, frame.refiner = self._working(frame.image)
+        """Make the pictures show the part at another pose (4,4), or the whole frame for None."""
+        is_one = frame.fine is frame.work
+        reach = self.options.scale.reach
+        if (
+            pose is not None
+            and frame.work.shows(pose, self.camera, reach)
+            and frame.fine.shows(pose, self.camera, reach)
+        ):
             return
-        center = self.camera.project(pose[:3, 3])
-        if not frame.work.covers(center, self.options.scale.reach * self.refiner.radius_px(pose), self.camera):
-            frame.work, frame.refiner = self._working(frame.image, pose)
+        poses = None if pose is None else [pose]
+        frame.work = self._around(frame.image, frame.work.scale, poses)
+        frame.fine = frame.work if is_one else self._around(frame.image, frame.fine.scale, poses)
 
-    def _fine_picture(self, image: NDArray[np.uint8], cam_from_body: Array, scale: float) -> WorkingPicture:
-        """The picture around the part at a pose (4,4), at a scale finer than the working picture's."""
-        window = window_around(self.camera, [cam_from_body], self.diameter_mm, self.options.scale.margin_px / scale)
-        return working_picture(image, self.camera, scale, window)
-
-    def _measure_spread(self, picture: WorkingPicture, cam_from_body: Array, rate: float) -> None:
-        """Move the estimated blur of the part's edges by a share towards that of a picture at a pose (4,4)."""
+    def _measure_spread(self, picture: PictureRefiner, rate: float) -> None:
+        """Move the estimated blur of the part's edges by a share towards that of a picture at the last pose."""
         state = self.state
-        spread_px = self.refiner.with_camera(picture.camera).edge_spread_px(picture.smooth, cam_from_body)
+        spread_px = picture.edge_spread_px(state.cam_from_body)
         if spread_px is not None:
-            state.spread_px += rate * (spread_px / picture.scale - state.spread_px)
+            state.spread_px += rate * (spread_px - state.spread_px)
 
-    def _remember_texture(self, frame: FrameContext) -> None:
+    def _remember_texture(self, frame: FrameContext, evidence: PoseEvidence) -> None:
         """Update the trust in the keyframes, and add one where it is missing and nothing hides the outline."""
         assert self._texture is not None and frame.pyramid is not None
-        o, state, (pose, _, evidence, matches) = self.options, self.state, frame.found
+        o, state, pose, matches = self.options, self.state, frame.found.cam_from_body, frame.found.matches
         if matches is not None:
             self._texture.update_trust(pose)
         state.best_contour_support = max(o.support_decay * state.best_contour_support, evidence.contour_support)
@@ -350,12 +353,12 @@ class Tracker:
     # --- Other poses of the last frame, and covariance ----------------------------------------------------
 
     def scores_near(self, image: NDArray[np.uint8], cams_from_model: list[Array]) -> list[float]:
-        """Scores, see `PoseEvidence.score`, of other poses (4,4) in this frame, each after a fine refinement."""
+        """Scores, see `PoseEvidence.score`, of poses (4,4) in the last frame, each after a fine refinement."""
         appearance, fine = self.state.appearance, self.options.stages[-2:]
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
-        work, refiner = self._working(image, *in_body)
-        poses = [refiner.refine(work.image, work.smooth, pose, fine, appearance)[0] for pose in in_body]
-        return [refiner.evidence(work.image, work.smooth, pose, appearance).score for pose in poses]
+        _, picture = self._pictures(image, in_body)
+        poses = [picture.refine(pose, fine, appearance, None)[0] for pose in in_body]
+        return [picture.evidence(pose, appearance).score for pose in poses]
 
     def covariance(self, estimate: Estimate) -> Array:
         """Covariance (6,6) of the twist (rad, mm) about the model's centre.

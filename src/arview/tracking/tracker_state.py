@@ -12,9 +12,9 @@ from arview.geometry import Array
 from arview.refinement.evidence import PoseEvidence
 from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.modalities.texture import TextureMatches
-from arview.refinement.refiner import Appearance, PoseRefiner
+from arview.refinement.picture_refiner import PictureRefiner
+from arview.refinement.refiner import Appearance
 from arview.refinement.schedules import Stage
-from arview.refinement.working_picture import WorkingPicture
 
 
 @dataclass
@@ -48,14 +48,16 @@ class RefinedPose(NamedTuple):
     Attributes:
         cam_from_body: (4,4) pose.
         information: (6,6) of the twist on its right.
-        evidence: evidence of the picture for it.
+        evidence: evidence of the fine picture for it.
         matches: texture used; None without.
+        is_fine: whether it was refined in the fine picture.
     """
 
     cam_from_body: Array
     information: Array
     evidence: PoseEvidence
     matches: TextureMatches | None
+    is_fine: bool
 
 
 class Proposal(NamedTuple):
@@ -68,7 +70,7 @@ class Proposal(NamedTuple):
         min_gain: by how much its score must exceed that of the best pose so far.
         motion_penalty: score that a squared motion distance of 1 costs.
         is_final: keep the start as the pose and use the stages only for its information.
-        picture: where it is refined; None: in the working picture.
+        is_fine: refine it in the fine picture.
     """
 
     cam_from_body: Array
@@ -77,7 +79,7 @@ class Proposal(NamedTuple):
     min_gain: float = 0.0
     motion_penalty: float = 0.0
     is_final: bool = False
-    picture: WorkingPicture | None = None
+    is_fine: bool = False
 
 
 @dataclass
@@ -86,27 +88,25 @@ class FrameContext:
 
     Attributes:
         image: (H,W,3) uint8 RGB.
-        work: the working picture, in which poses are refined and scored.
-        refiner: refinement in the working picture.
+        work: refinement in the working picture, in which the part is about as large in every frame.
+        fine: refinement in the finest picture in which edges are sharp; the same as ``work`` where that is as fine.
         predicted: (4,4) pose predicted from the motion so far.
         start: (4,4) the predicted pose, aligned with the texture found.
         pyramid: image pyramid of the grey picture; None without texture.
         matches: texture found; None where it is too little.
         found_share: share of the expected texture that was found.
         best: the best pose so far; None before the first one.
-        fine: the fine picture, where the frame is sharp enough for one.
     """
 
     image: NDArray[np.uint8]
-    work: WorkingPicture
-    refiner: PoseRefiner
+    work: PictureRefiner
+    fine: PictureRefiner
     predicted: Array
     start: Array
     pyramid: Pyramid | None = None
     matches: TextureMatches | None = None
     found_share: float = 0.0
     best: RefinedPose | None = None
-    fine: WorkingPicture | None = None
 
     @property
     def found(self) -> RefinedPose:
