@@ -143,16 +143,19 @@ class Tracker:
 
     def _predicted(self, frame: FrameContext) -> Iterator[Proposal]:
         """The pose predicted from the motion so far and aligned with the texture found."""
-        yield Proposal(frame.start, LAST_STAGES, frame.matches, is_fine=True)
+        # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails.
+        stages = LAST_STAGES if self.options.use_edge else self.options.stages
+        yield Proposal(frame.start, stages, frame.matches, is_fine=True)
 
     def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
         """Other schedules, where the score is lower than usual."""
         o, usual = self.options, self.state.usual_score
         first = frame.found
-        if first.evidence.score >= o.other_schedules_share * usual:
+        # What is usual is not yet known in the first frame, whose start may be off.
+        if self.state.is_started and first.evidence.score >= o.other_schedules_share * usual:
             return
         yield Proposal(frame.start, o.stages, frame.matches, is_fine=True)
-        if frame.found.evidence.score >= o.other_schedules_share * usual:
+        if self.state.is_started and frame.found.evidence.score >= o.other_schedules_share * usual:
             return
         if frame.fine is not frame.work:
             yield Proposal(frame.start, o.stages, frame.matches, o.min_gain)
@@ -205,8 +208,11 @@ class Tracker:
         """Refine a proposal and collect its evidence."""
         appearance, is_fine = self.state.appearance, proposal.is_fine
         if proposal.stages:
-            refiner = frame.fine if is_fine else frame.work
-            pose, information = refiner.refine(proposal.cam_from_body, proposal.stages, appearance, proposal.matches)
+            used = frame.fine if is_fine else frame.work
+            pose, information = used.refiner.refine(
+                used.picture.image, used.picture.smooth, proposal.cam_from_body, proposal.stages, appearance,
+                used.matches(proposal.matches),
+            )  # fmt: skip
             if proposal.is_final:
                 pose = proposal.cam_from_body
         else:
@@ -271,6 +277,7 @@ class Tracker:
         """Update pose, velocity, usual score, colours and texture for the next frame."""
         state, o = self.state, self.options
         pose = frame.found.cam_from_body
+        state.is_started = True
         state.usual_score += o.score_rate * (frame.found.evidence.score - state.usual_score)
         state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
         state.cam_from_body = pose
@@ -356,9 +363,10 @@ class Tracker:
         """Scores, see `PoseEvidence.score`, of poses (4,4) in the last frame, each after a fine refinement."""
         appearance, fine = self.state.appearance, self.options.stages[-2:]
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
-        _, picture = self._pictures(image, in_body)
-        poses = [picture.refine(pose, fine, appearance, None)[0] for pose in in_body]
-        return [picture.evidence(pose, appearance).score for pose in poses]
+        _, used = self._pictures(image, in_body)
+        picture = used.picture
+        poses = [used.refiner.refine(picture.image, picture.smooth, pose, fine, appearance)[0] for pose in in_body]
+        return [used.evidence(pose, appearance).score for pose in poses]
 
     def covariance(self, estimate: Estimate) -> Array:
         """Covariance (6,6) of the twist (rad, mm) about the model's centre.

@@ -29,6 +29,7 @@ class TrackerState:
         exposure: brightness relative to the frame in which colours were first learned.
         sparse_gray: (rows,columns) brightness of the last frame on a coarse grid.
         best_contour_support: best recent support of the outline.
+        is_started: whether a frame has been tracked since the start.
         spread_px: standard deviation of the blur of the part's edges, px of the frame; 0 where it is not known.
     """
 
@@ -39,6 +40,7 @@ class TrackerState:
     exposure: float = 1.0
     sparse_gray: NDArray[np.float64] | None = None
     best_contour_support: float = 0.0
+    is_started: bool = False
     spread_px: float = 0.0
 
 
