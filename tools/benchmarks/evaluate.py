@@ -28,25 +28,38 @@ from arview.evaluation import (
     scene_guide_views,
     summarise,
 )
-from arview.evaluation.semisynthetic import SHAPES
+from arview.evaluation.semisynthetic import CONDITIONS, CURVED_SHAPES, SHAPES
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.pose import Pose, TrackingState
 from arview.tracking import Tracker, TrackingSession
 from options import positive
-from recordings import SAMPLE, photo_sets, sample_command, scenes, skip, table
+from recordings import (
+    PHOTO_SEQUENCES,
+    SAMPLE,
+    SEQUENCES,
+    VIDEOS,
+    photo_sets,
+    sample_command,
+    scenes,
+    skip,
+    table,
+)
 from rows import ResultRow
 from suites.detection import DetectionSuite
 from suites.guided_init import guided_init_rows
 from suites.measurement import measurement_rows
+from suites.quality import quality_rows
+from suites.real_conditions import REAL_FRAMES, REAL_SHAPES, RealConditionsSuite
 from suites.reconstruction import reconstruction_rows
 from suites.relocalization import relocalization_rows
+from suites.single_photos import evaluate_photos, photo_rows
 
 TRUSTED = (TrackingState.TRACKED, TrackingState.CRITICAL)
 START_COUNT = 50
 SEED = 7
 SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
-    "lookalike", "relocalize", "sample", "reconstruct", "measure",
+    "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
 )  # fmt: skip
 
 
@@ -56,7 +69,7 @@ def main() -> None:
         "--folder", type=Path, default=Path("out"), help="for evaluation.json and evaluation.md; default: out"
     )
     parser.add_argument("--only", choices=SECTIONS, help="only this section")
-    parser.add_argument("--shapes", type=names_of_shapes, default=SHAPES, help=f"of {','.join(SHAPES)}; default: all")
+    parser.add_argument("--shapes", type=names_of(SHAPES), default=SHAPES, help=f"of {','.join(SHAPES)}; default: all")
     parser.add_argument("--frames", type=positive, help="largest number of frames of a scene, for a quick run")
     parser.add_argument(
         "--sequences", type=Path, default=Path("out/sequences"), help="where semi-synthetic sequences are kept"
@@ -68,13 +81,29 @@ def main() -> None:
         "--photo-set", type=Path, action="append", default=[],
         help="another photo set: a folder made by samples/plate/generate.py --seed N -o FOLDER; may be given again",
     )  # fmt: skip
+    parser.add_argument(
+        "--conditions", type=names_of(tuple(CONDITIONS)), default=tuple(CONDITIONS),
+        help=f"of real-track, real-detect and quality: of {','.join(CONDITIONS)}; default: all",
+    )  # fmt: skip
+    parser.add_argument(
+        "--real-shapes", type=names_of((*SHAPES, *CURVED_SHAPES)), default=REAL_SHAPES,
+        help=f"of the same; under `curved` the curved ones of them, or all; default: {','.join(REAL_SHAPES)}",
+    )  # fmt: skip
+    parser.add_argument(
+        "--real-frames", type=positive, default=REAL_FRAMES, help=f"of their sequences; default: {REAL_FRAMES}"
+    )
     chosen = parser.parse_args()
-    found = scenes()
+    every = scenes(SEQUENCES)
+    found = {name: scene for name, scene in every.items() if name in VIDEOS}
     details: dict[str, Any] = {}
     sets, reconstructions = photo_sets(chosen.photo_set), chosen.folder / "photo_sets"
-    more = DetectionSuite(found, details, chosen.sequences, chosen.shapes, chosen.frames, chosen.backgrounds)
+    more = DetectionSuite(every, details, chosen.sequences, chosen.shapes, chosen.frames, chosen.backgrounds)
+    real = RealConditionsSuite(
+        details, chosen.sequences, chosen.conditions, chosen.real_shapes, chosen.real_frames, chosen.frames,
+        chosen.backgrounds,
+    )  # fmt: skip
     makers: tuple[Callable[[], list[ResultRow]], ...] = (
-        lambda: tracking_rows(found, details),
+        lambda: tracking_rows(every, details),
         lambda: convergence_rows(found),
         lambda: guided_init_rows(found, chosen.frames),
         more.detect,
@@ -86,6 +115,9 @@ def main() -> None:
         lambda: sample_rows(details),
         lambda: reconstruction_rows(sets, reconstructions, details),
         lambda: measurement_rows(sets, reconstructions, details),
+        real.track,
+        real.detect,
+        lambda: quality_rows(every, real, details, chosen.frames),
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []
@@ -105,11 +137,16 @@ def main() -> None:
     print(f"\nwrote {chosen.folder / 'evaluation.json'} and evaluation.md")
 
 
-def names_of_shapes(text: str) -> tuple[str, ...]:
-    names = tuple(text.split(","))
-    unknown = [name for name in names if name not in SHAPES]
-    if unknown:
-        raise argparse.ArgumentTypeError(f"{', '.join(unknown)}: no such shape; give some of {','.join(SHAPES)}")
+def names_of(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
+    """Type of an option that takes some of the known names, separated by commas."""
+
+    def names(text: str) -> tuple[str, ...]:
+        given = tuple(text.split(","))
+        unknown = [name for name in given if name not in known]
+        if unknown:
+            raise argparse.ArgumentTypeError(f"{', '.join(unknown)}: not known; give some of {','.join(known)}")
+        return given
+
     return names
 
 
@@ -120,7 +157,10 @@ def tracking_rows(found: dict[str, Scene], details: dict[str, Any]) -> list[Resu
     """Rows of the recorded sequences, tracked from truth or from detection."""
     rows = []
     for name, scene in found.items():
-        result = evaluate_scene(scene, "detect" if name == "plate" else "truth")
+        if name in PHOTO_SEQUENCES:
+            result = evaluate_photos(scene)
+        else:
+            result = evaluate_scene(scene, "detect" if name == "plate" else "truth")
         details[name] = result.to_dict()
         rows += TRACKING[name](result)
     if "dragon" in found:
@@ -182,6 +222,7 @@ TRACKING = {
     "teabox": rows_within("teabox", 4.0, 1.0),
     "dragon": dragon_rows,
     "plate": plate_rows,
+    "crate": lambda result: photo_rows("crate", result),
 }
 
 

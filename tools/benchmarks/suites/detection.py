@@ -45,7 +45,7 @@ from arview.pose import TrackingState
 from arview.tracking import TrackingSession
 from arview.video import Image
 from photos import all_photos, background_photos
-from recordings import SAMPLE
+from recordings import SAMPLE, VIDEOS
 from rows import ResultRow, timing, watched
 
 SCENE_FRAMES = 200
@@ -158,8 +158,9 @@ class DetectionSuite:
 
     def false_alarms(self) -> list[ResultRow]:
         """False alarms: the detector of each part on pictures without it."""
-        parts = [*self.shapes, *self.recorded]
+        parts = [*self.shapes, *(name for name in self.recorded if name in VIDEOS)]
         each = self.frames or -(-FALSE_ALARM_FRAMES // len(parts))
+        parts += [name for name in self.recorded if name not in VIDEOS]
         false: dict[str, list[str]] = {}
         looked = 0
         for number, name in enumerate(watched(parts, "false-alarms")):

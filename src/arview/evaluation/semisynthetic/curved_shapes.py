@@ -22,10 +22,12 @@ from arview.geometry import Array
 Field = Callable[[Array], Array]
 """Function of points (...,3) in mm, negative inside a body; near the surface about the distance to it in mm."""
 
-CELLS = 56
+CELLS = 72
 """Cells of the sampling grid along the longest side of a body."""
-PROJECTION_STEPS = 4
+PROJECTION_STEPS = 3
 """Newton steps that move the vertices onto the level set."""
+SMOOTHING_ROUNDS = 5
+"""Times that every vertex is moved to the mean of its neighbours, along the level set, for even triangles."""
 
 
 def curved_shape(name: str) -> Model:
@@ -183,29 +185,50 @@ def _negative(body: Field) -> Field:
 # --- Meshing --------------------------------------------------------------------------------------------
 
 
-def surface_net(field: Field, low: ArrayLike, high: ArrayLike, cells: int = CELLS) -> Mesh:
+def surface_net(field: Field, low: ArrayLike, high: ArrayLike) -> Mesh:
     """Closed mesh of the level set 0 of a field inside a box, whose vertices lie on it.
 
     Args:
         field: see `Field`; positive on the box's sides.
         low, high: (3,) corners of the box, mm.
-        cells: grid cells along its longest side.
     """
     first, last = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-    step = float((last - first).max()) / cells
+    # Where two sheets meet in one cell the net is not a manifold; another grid parts them.
+    for count in range(CELLS, 2 * CELLS):
+        step = float((last - first).max()) / count
+        cells, faces = _net(field, first, last, step)
+        if _is_closed(faces):
+            break
+    else:
+        raise ValueError("no grid gives a closed mesh of this body")
+    vertices = _on_level_set(field, first + step * (cells + 0.5), step)
+    for _ in range(SMOOTHING_ROUNDS):
+        vertices = _on_level_set(field, _averaged(vertices, faces), step)
+    return vertices, faces
+
+
+def _net(field: Field, first: Array, last: Array, step: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Cells (V,3) of a grid that the surface passes through, and the triangles (F,3) between them."""
     counts = np.ceil((last - first) / step).astype(int) + 1
     axes = [first[k] + step * np.arange(counts[k]) for k in range(3)]
-    values = field(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
-    inside = values < 0.0
+    inside = field(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)) < 0.0
     number = np.full(tuple(counts - 1), -1, dtype=np.int64)
     corners = np.stack([inside[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None]
                         for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # fmt: skip
     mixed = corners.any(axis=0) & ~corners.all(axis=0)
-    cells_of = np.argwhere(mixed)
-    number[mixed] = np.arange(len(cells_of))
-    vertices = _on_level_set(field, first + step * (cells_of + 0.5), step)
-    quads = [_quads(inside, number, axis) for axis in range(3)]
-    return vertices, np.concatenate(quads)
+    cells = np.argwhere(mixed)
+    number[mixed] = np.arange(len(cells))
+    return cells, np.concatenate([_quads(inside, number, axis) for axis in range(3)])
+
+
+def _averaged(vertices: Array, faces: NDArray[np.int64]) -> Array:
+    """Every vertex (V,3) moved half of the way to the mean of those it shares a triangle with."""
+    sums, counts = np.zeros_like(vertices), np.zeros(len(vertices))
+    for k in (1, 2):
+        other = np.roll(faces, -k, axis=1).ravel()
+        np.add.at(sums, faces.ravel(), vertices[other])
+        np.add.at(counts, faces.ravel(), 1.0)
+    return 0.5 * vertices + 0.5 * sums / np.maximum(counts, 1.0)[:, None]
 
 
 def _quads(inside: NDArray[np.bool_], number: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
@@ -247,12 +270,8 @@ def _model(name: str, field: Field, bounds: tuple[float, float], color: tuple[fl
     inside = places[field(places) < 0.0]
     margin = 2.0 * (axis[1] - axis[0])
     low, high = inside.min(axis=0) - margin, inside.max(axis=0) + margin
-    # Where two sheets meet in one cell the net is not a manifold; another grid parts them.
-    for cells in range(CELLS, 2 * CELLS):
-        vertices, faces = surface_net(field, low, high, cells)
-        if _is_closed(faces):
-            return make_model(name, (Component("body", vertices, faces.astype(np.int32), color),))
-    raise ValueError(f"{name}: no grid gives a closed mesh")
+    vertices, faces = surface_net(field, low, high)
+    return make_model(name, (Component("body", vertices, faces.astype(np.int32), color),))
 
 
 def _is_closed(faces: NDArray[np.int64]) -> bool:
