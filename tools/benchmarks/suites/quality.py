@@ -14,7 +14,7 @@ from arview.evaluation.protocols import box_symmetries
 from arview.evaluation.run import COARSE, IN_VIEW
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewSet
-from arview.pose import TrackingState
+from arview.pose import Pose, TrackingState
 from arview.refinement.modalities.edge import smoothed
 from arview.tracking import Tracker, TrackingSession
 from arview.video import Image
@@ -44,7 +44,8 @@ class PoseSample:
 
     Attributes:
         scene: name of the set.
-        kind: ``tracked``, ``critical`` (of a session); ``truth``, ``turned``, ``shifted`` (refined from there).
+        kind: ``tracked``, ``critical`` (of a session); ``truth``, ``turned``, ``shifted``,
+            ``half turned`` (refined from there).
         quality: 0–1.
         is_right: within 5 cm and 5° of the reference.
         rotation_deg: error of the rotation.
@@ -132,25 +133,38 @@ class _PoseSampler:
                     self._views, self._scene.camera, self._scene.part.model, initial_cam_from_model=truth
                 )
             pose = session.process(image, frame.index, number / 30.0)
-            if truth is None or pose.cam_from_model is None:
-                run = 0
-                continue
-            sample = self._sampled(str(pose.state), pose.cam_from_model, truth, pose.quality)
-            is_far = pose.state is TrackingState.TRACKED and sample.rotation_deg >= FAR_OFF_DEG
-            run = run + 1 if is_far else 0
+            run = run + 1 if self._is_far_off(pose, truth) else 0
             longest = max(longest, run)
-            if not is_shown(frame):
+            if truth is None or not is_shown(frame):
                 continue
-            samples.append(sample)
-            if sample.is_right and (number % PERTURBED_EVERY == 0 or self._name in PHOTO_SEQUENCES):
+            is_alone = self._name in PHOTO_SEQUENCES
+            is_right = is_alone
+            if pose.cam_from_model is not None:
+                sample = self._sampled(str(pose.state), pose.cam_from_model, truth, pose.quality)
+                samples.append(sample)
+                is_right = sample.is_right
+            # A tracker that is off knows the wrong colours; one just started at the truth does not.
+            if is_right and (is_alone or number % PERTURBED_EVERY == 0):
                 samples += self._perturbed(session.tracker, image, truth)
         return samples, longest
 
+    def _is_far_off(self, pose: Pose, truth: Array | None) -> bool:
+        """Whether a pose is `tracked` although it is rotated by far from the true one."""
+        if pose.state is not TrackingState.TRACKED or pose.cam_from_model is None or truth is None:
+            return False
+        return self._meter.measure(pose.cam_from_model, truth).rotation_deg >= FAR_OFF_DEG
+
     def _perturbed(self, tracker: Tracker, image: Image, truth: Array) -> Iterator[PoseSample]:
-        """The true pose, one turned from it and one shifted, each refined as a tracker refines them."""
+        """The true pose, and one turned, one shifted and one half turned, each refined as a tracker refines them."""
         smooth = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         part, appearance = tracker.refiner.part, tracker.state.appearance
-        for kind, start in (("truth", truth), ("turned", self._turned(truth)), ("shifted", self._shifted(truth))):
+        starts = {
+            "truth": truth,
+            "turned": self._turned(truth),
+            "shifted": self._shifted(truth),
+            "half turned": self._half_turned(truth),
+        }
+        for kind, start in starts.items():
             body = start @ part.model_from_body
             refined = tracker.refiner.refine(image, smooth, body, tracker.options.stages[-2:], appearance)[0]
             quality = tracker.refiner.evidence(image, smooth, refined, appearance).quality
@@ -166,6 +180,11 @@ class _PoseSampler:
         length = max(MIN_SHIFT_MM, self._rng.uniform(*SHIFTS) * self._diameter)
         limit = 0.5 * float(np.linalg.norm(apply(truth, self._center)))
         return rigid(np.eye(3), min(length, limit) * way / np.linalg.norm(way)) @ truth
+
+    def _half_turned(self, truth: Array) -> Array:
+        """Turned by 180° about one of the model's axes, as detectors confuse poses of nearly symmetric parts."""
+        turn = exp_so3(np.pi * np.eye(3)[int(self._rng.integers(3))])
+        return truth @ rigid(turn, self._center - turn @ self._center)
 
     def _sampled(self, kind: str, estimate: Array, truth: Array, quality: float) -> PoseSample:
         error = self._meter.measure(estimate, truth)
