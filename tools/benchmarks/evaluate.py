@@ -28,7 +28,7 @@ from arview.evaluation import (
     scene_guide_views,
     summarise,
 )
-from arview.evaluation.semisynthetic import CONDITIONS, CURVED_SHAPES, SHAPES
+from arview.evaluation.semisynthetic import BOX_SHAPES, CONDITIONS, CURVED_SHAPES, SHAPES
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.pose import Pose, TrackingState
 from arview.tracking import Tracker, TrackingSession
@@ -86,7 +86,7 @@ def main() -> None:
         help=f"of real-track, real-detect and quality: of {','.join(CONDITIONS)}; default: all",
     )  # fmt: skip
     parser.add_argument(
-        "--real-shapes", type=names_of((*SHAPES, *CURVED_SHAPES)), default=REAL_SHAPES,
+        "--real-shapes", type=names_of((*SHAPES, *BOX_SHAPES, *CURVED_SHAPES)), default=REAL_SHAPES,
         help=f"of the same; under `curved` the curved ones of them, or all; default: {','.join(REAL_SHAPES)}",
     )  # fmt: skip
     parser.add_argument(

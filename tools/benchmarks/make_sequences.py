@@ -14,6 +14,7 @@ from arview.core.progress import StepProgress
 from arview.errors import ArviewError, InputError
 from arview.evaluation import Scene, find_scenes, load_scene
 from arview.evaluation.semisynthetic import (
+    BOX_SHAPES,
     CONDITIONS,
     CURVED_SHAPES,
     SHAPES,
@@ -25,6 +26,7 @@ from arview.evaluation.semisynthetic import (
     look_alikes,
     make_sequence,
     shape,
+    symmetries_of,
 )
 from options import positive, seed, share
 from photos import background_photos
@@ -93,7 +95,7 @@ def parser() -> argparse.ArgumentParser:
     what = made.add_mutually_exclusive_group(required=True)
     what.add_argument("--cad", type=Path, metavar="PATH", help="a CAD file or part file (mm for STL, PLY and OBJ)")
     what.add_argument(
-        "--shape", choices=(*SHAPES, "all", *CURVED_SHAPES, "curved"),
+        "--shape", choices=(*SHAPES, "all", *BOX_SHAPES, *CURVED_SHAPES, "curved"),
         help="one of the shapes made in code; all: the first six; curved: all curved ones",
     )  # fmt: skip
     made.add_argument(
@@ -127,6 +129,8 @@ def jobs(chosen: argparse.Namespace) -> Iterator[Job]:
         models, symmetries = {recorded or part.name: part.model}, part.symmetries
     else:
         models, symmetries = {name: shape(name) for name in SHAPES if chosen.shape in (name, "all")}, ()
+        if chosen.shape in BOX_SHAPES:
+            models, symmetries = {chosen.shape: shape(chosen.shape)}, symmetries_of(chosen.shape)
         models |= {name: curved_shape(name) for name in CURVED_SHAPES if chosen.shape in (name, "curved")}
     for name, model in models.items():
         if chosen.lookalike and chosen.shape == "all" and len(model.components) < 2:

@@ -10,7 +10,7 @@ from typing import Any
 from arview.detection import Detector
 from arview.evaluation import PoseError, PoseMeter, Scene, SceneFrame, SceneResult, evaluate_scene, load_scene
 from arview.evaluation.protocols import Tally, detect_in_frames, spread_frames, true_pose
-from arview.evaluation.semisynthetic import CONDITIONS, CURVED_SHAPES, conditions_job, make_sequence
+from arview.evaluation.semisynthetic import BOX_SHAPES, CONDITIONS, CURVED_SHAPES, conditions_job, make_sequence
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.pose import TrackingState
@@ -36,7 +36,8 @@ class RealConditionsSuite:
         details: for evaluation.json; each section adds its own.
         folder: of the sequences, which are made when missing.
         conditions: names of the conditions.
-        shapes: names of the shapes; under ``curved`` all curved ones are used instead of plain ones.
+        shapes: names of the shapes; under ``printed`` boxes are added, and under ``curved`` the curved ones of them
+            are used, or all curved ones.
         length: frames of a sequence.
         frames: largest number of frames that are detected or tracked in each; None for the default.
         backgrounds: folder of photos, or None for the default.
@@ -52,6 +53,8 @@ class RealConditionsSuite:
 
     def names(self, conditions: str) -> tuple[str, ...]:
         """Shapes that are shown under conditions."""
+        if conditions == "printed":
+            return (*self.shapes, *(name for name in BOX_SHAPES if name not in self.shapes))
         if conditions != "curved":
             return self.shapes
         return tuple(name for name in self.shapes if name in CURVED_SHAPES) or CURVED_SHAPES
@@ -106,7 +109,8 @@ class _Meter:
     """Error of an estimated pose in a frame."""
 
     def __init__(self, scene: Scene) -> None:
-        self._meter = PoseMeter(scene.part.model, scene.camera, symmetries=scene.part.symmetries)
+        part = scene.part
+        self._meter = PoseMeter(part.model, scene.camera, None, part.symmetries, scene.symmetric_poses)
 
     def __call__(self, estimate: Array, frame: SceneFrame) -> PoseError:
         return self._meter.measure(estimate, true_pose(frame))

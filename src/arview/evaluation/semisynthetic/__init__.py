@@ -25,10 +25,11 @@ from arview.evaluation.semisynthetic.sequence import (
     render_sequence,
     trajectory,
 )
-from arview.evaluation.semisynthetic.shapes import SHAPES, near_symmetries, shape
+from arview.evaluation.semisynthetic.shapes import BOX_SHAPES, SHAPES, near_symmetries, shape, symmetries_of
 from arview.evaluation.semisynthetic.trajectory import TrajectoryOptions
 
 __all__ = [
+    "BOX_SHAPES",
     "CAMERA",
     "CONDITIONS",
     "CURVED_SHAPES",
@@ -58,5 +59,6 @@ __all__ = [
     "render_sequence",
     "shape",
     "shape_job",
+    "symmetries_of",
     "trajectory",
 ]

@@ -75,7 +75,7 @@ WORN = DecorationOptions(stickers=0.4, tapes=0.6, scratches=25.0, rust=0.22, dir
 CONDITIONS = {
     conditions.name: conditions
     for conditions in (
-        Conditions("printed", decoration=DecorationOptions(photos=0.75, stickers=0.6)),
+        Conditions("printed", decoration=DecorationOptions(photos=1.0, stickers=0.4)),
         Conditions("worn", decoration=WORN, reflectance=PAINTED, shadows=ShadowOptions()),
         Conditions("large", decoration=USED, motion=CLOSE, fill=(0.95, 1.25), camera=CameraEffects(lens_px=0.9)),
         Conditions(

@@ -32,7 +32,7 @@ from arview.evaluation.semisynthetic.sequence import (
     render_sequence,
     trajectory,
 )
-from arview.evaluation.semisynthetic.shapes import SHAPES, shape
+from arview.evaluation.semisynthetic.shapes import BOX_SHAPES, SHAPES, shape, symmetries_of
 from arview.evaluation.semisynthetic.trajectory import TrajectoryOptions, followed_trajectory
 from arview.geometry import Array
 
@@ -86,7 +86,7 @@ class Job:
         return self.photos[order[place % len(order)]]
 
     def _place_of_conditions(self) -> int:
-        names = (*SHAPES, *CURVED_SHAPES, self.model.name)
+        names = (*SHAPES, *BOX_SHAPES, *CURVED_SHAPES, self.model.name)
         assert self.conditions is not None
         known = list(CONDITIONS)
         number = known.index(self.conditions.name) if self.conditions.name in known else len(known)
@@ -114,11 +114,11 @@ def shape_job(name: str, options: SequenceOptions, photos: tuple[Path, ...]) -> 
 
 
 def conditions_job(name: str, conditions: Conditions, frames: int, seed: int, photos: tuple[Path, ...]) -> Job:
-    """A sequence of one of the test shapes, plain or curved, under real conditions."""
+    """A sequence of one of the test shapes, plain, box or curved, under real conditions."""
     model = curved_shape(name) if name in CURVED_SHAPES else shape(name)
-    return Job(
-        f"{name}_{conditions.name}", model, SequenceOptions(frames=frames, seed=seed), photos, conditions=conditions
-    )
+    options = SequenceOptions(frames=frames, seed=seed)
+    symmetries = symmetries_of(name)
+    return Job(f"{name}_{conditions.name}", model, options, photos, symmetries=symmetries, conditions=conditions)
 
 
 def look_alike_job(

@@ -14,6 +14,8 @@ from arview.video import Image
 Canvas = NDArray[np.uint8]
 GLOSS_UNIT = 64
 """Value of a canvas's last channel that leaves highlights as they are."""
+CROPS_TRIED = 4
+"""Crops of a photograph from which the one with most to see is printed."""
 WORDS = ("SERIES", "MODEL", "LOT", "REV", "TYPE", "IP 54", "24 V DC", "CE", "MADE IN", "PART NO", "CHECKED", "FRAGILE")
 INKS = ((20, 20, 24), (160, 24, 28), (24, 60, 150), (20, 110, 60), (235, 235, 230))
 PAPERS = ((238, 238, 232), (244, 208, 40), (196, 200, 204), (236, 232, 214))
@@ -28,19 +30,40 @@ def empty_canvas(height: int, width: int) -> Canvas:
 
 
 def print_photo(canvas: Canvas, photo: Image, rng: np.random.Generator) -> None:
-    """Print a random crop of a photograph over a canvas, with or without a margin."""
+    """Print a crop of a photograph over a canvas, with or without a margin: the richest of some random ones."""
     height, width = canvas.shape[:2]
     margin = int(rng.choice([0, 0, 1]) * rng.uniform(0.03, 0.10) * min(height, width))
     inner = canvas[margin : height - margin, margin : width - margin]
     rows, columns = inner.shape[:2]
-    scale = min(photo.shape[1] / columns, photo.shape[0] / rows) * rng.uniform(0.5, 1.0)
-    w, h = max(2, int(scale * columns)), max(2, int(scale * rows))
-    top, left = (int(rng.integers(photo.shape[k] - n + 1)) for k, n in ((0, h), (1, w)))
-    crop = photo[top : top + h, left : left + w]
-    method = cv2.INTER_AREA if scale > 1.0 else cv2.INTER_CUBIC
-    inner[..., :3] = cv2.resize(crop, (columns, rows), interpolation=method)
+    crops = [_random_crop(photo, rows / columns, rng) for _ in range(CROPS_TRIED)]
+    crop = max(crops, key=_richness)
+    method = cv2.INTER_AREA if crop.shape[1] > columns else cv2.INTER_CUBIC
+    inner[..., :3] = cv2.resize(_stretched(crop), (columns, rows), interpolation=method)
     inner[..., 3] = int(rng.uniform(225, 255))
     inner[..., 4] = int(GLOSS_UNIT * rng.uniform(0.6, 1.6))
+
+
+def _random_crop(photo: Image, aspect: float, rng: np.random.Generator) -> Image:
+    """A crop with a ratio of height to width."""
+    widest = min(photo.shape[1], photo.shape[0] / aspect)
+    width = max(2, int(rng.uniform(0.5, 1.0) * widest))
+    height = min(photo.shape[0], max(2, int(width * aspect)))
+    top, left = (int(rng.integers(photo.shape[k] - n + 1)) for k, n in ((0, height), (1, width)))
+    return photo[top : top + height, left : left + width]
+
+
+def _richness(image: Image) -> float:
+    """Mean difference of neighbouring pixels of a picture brought to one size."""
+    small = cv2.resize(image, (64, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
+    return float(np.abs(np.diff(small, axis=0)).mean() + np.abs(np.diff(small, axis=1)).mean())
+
+
+def _stretched(image: Image) -> Image:
+    """A picture whose brightness fills the range of print from black to white."""
+    low, high = np.percentile(image, (2, 98))
+    return np.asarray(
+        np.clip((image.astype(np.float32) - low) * (220.0 / max(high - low, 20.0)) + 15.0, 8, 245), np.uint8
+    )
 
 
 def label(texel_mm: float, rng: np.random.Generator) -> Canvas:

@@ -41,8 +41,8 @@ def shape(name: str) -> Model:
     Raises:
         InputError: there is no such shape.
     """
-    if name not in _MAKERS:
-        raise InputError(f"shape {name!r} is not known; give one of {', '.join(SHAPES)}")
+    if name not in _MAKERS and name not in _BOX_MAKERS:
+        raise InputError(f"shape {name!r} is not known; give one of {', '.join((*SHAPES, *BOX_SHAPES))}")
     return _made(name)
 
 
@@ -145,6 +145,20 @@ def ribbed() -> Model:
     return _model("ribbed", (("ribbed", joined(base, *ribs, *cross, *pins, boss), DARK),))
 
 
+def carton() -> Model:
+    """Carton: a plain box, 118 × 84 × 62 mm, of which only twelve edges are known."""
+    return _model("carton", (("carton", box((0, 0, 0), (118, 84, 62)), SAND),))
+
+
+def symmetries_of(name: str) -> tuple[Symmetry, ...]:
+    """Rotations under which the CAD of a shape is the same: half turns of a box."""
+    if name not in BOX_SHAPES:
+        return ()
+    x, y, z = shape(name).center_in_model.tolist()
+    axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    return tuple(Symmetry(axis, (x, y, z), 2) for axis in axes)
+
+
 def _model(name: str, parts: tuple[tuple[str, Mesh, Color], ...]) -> Model:
     components = [Component(part, vertices, faces.astype(np.int32), color) for part, (vertices, faces), color in parts]
     return make_model(name, tuple(components))
@@ -160,9 +174,12 @@ _MAKERS: dict[str, Callable[[], Model]] = {
 }
 SHAPES = tuple(_MAKERS)
 """Names of the shapes."""
+_BOX_MAKERS: dict[str, Callable[[], Model]] = {"carton": carton}
+BOX_SHAPES = tuple(_BOX_MAKERS)
+"""Names of plain boxes, which show little but what is printed on them; they do not belong to `SHAPES`."""
 NEAR_SYMMETRIES = {"flange": (Symmetry((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 6),)}
 
 
 @cache
 def _made(name: str) -> Model:
-    return _MAKERS[name]()
+    return (_MAKERS | _BOX_MAKERS)[name]()
