@@ -21,9 +21,12 @@ from typing import Protocol
 
 import numpy as np
 
+from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.errors import OutputError
 from arview.pose import Pose
+from arview.tracking.self_calibration.estimator import FocalEstimate
+from arview.tracking.self_calibration.session import SelfCalibratingSession
 from arview.video import Frame, FrameSource, Image
 
 QUEUED_FRAMES = 3
@@ -111,6 +114,7 @@ def annotate(
     progress: Callable[[int, Pose], None] | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
+    camera_of: Callable[[int], Camera] | None = None,
 ) -> AnnotateSummary:
     """Track the part through a source, and write the annotated video and the poses.
 
@@ -126,6 +130,7 @@ def annotate(
         progress: called after each frame with (frames done, pose).
         start_s: time stamp of the source from which on frames are tracked.
         end_s: time stamp of the source at which to stop.
+        camera_of: camera of the frame of an index, to be written beside its pose; None leaves it out.
 
     Raises:
         OutputError: a file cannot be written, or no frame is in the range.
@@ -138,7 +143,7 @@ def annotate(
     outputs = _OutputFiles(sink)
     began = time.perf_counter()
     try:
-        outputs.open(overlay, poses_path)
+        outputs.open(overlay, poses_path, camera_of)
         try:
             for frame in source:
                 if start_s is not None and frame.time_s < start_s:
@@ -160,6 +165,29 @@ def annotate(
         outputs.abort()
         raise
     return counts.summary(source, time.perf_counter() - began)
+
+
+def estimate_camera(
+    source: FrameSource, session: SelfCalibratingSession, progress: Callable[[int], None] | None = None
+) -> FocalEstimate:
+    """The focal length from a first pass over a film, which ends as soon as it is known well.
+
+    Args:
+        source: of the frames; it must start again with each iteration.
+        session: a new one; it is finished here.
+        progress: called with the number of frames done.
+    """
+    o = session.options
+    kept = idle = 0
+    for done, frame in enumerate(source, 1):
+        session.process(frame.image, frame.index, frame.time_s)
+        if progress:
+            progress(done)
+        idle = 0 if session.frames > kept else idle + 1
+        kept = session.frames
+        if session.is_done or done >= o.max_first_pass or idle >= o.max_idle_frames:
+            break
+    return session.finish()
 
 
 class _Counts:
@@ -205,10 +233,12 @@ class _OutputFiles:
         self._drawer: _Drawer | None = None
         self._poses: PoseWriter | None = None
 
-    def open(self, overlay: Overlay | None, poses_path: str | Path | None) -> None:
+    def open(
+        self, overlay: Overlay | None, poses_path: str | Path | None, camera_of: Callable[[int], Camera] | None
+    ) -> None:
         """Open the file of the poses and start drawing."""
         if poses_path is not None:
-            self._poses = PoseWriter(poses_path)
+            self._poses = PoseWriter(poses_path, camera_of)
         if self._sink is not None and overlay is not None:
             self._drawer = _Drawer(overlay, self._sink)
 
@@ -332,14 +362,19 @@ class PoseWriter:
     A line holds ``index``, ``time_s``, ``state``, ``quality``, ``cam_from_model`` (4×4 row-major, mm, or
     null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches``
     (list), ``unverified`` (names of components not yet confirmed) and ``alternatives`` (list of 4×4 poses that fit as
-    well).
+    well). Where the camera was not given, it also holds ``camera`` (fx, fy, cx, cy in px and dist).
+
+    Args:
+        path: of the file.
+        camera_of: camera of the frame of an index; None leaves it out.
 
     Raises:
         OutputError: the file cannot be written.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, camera_of: Callable[[int], Camera] | None = None) -> None:
         self.path = Path(path)
+        self._camera_of = camera_of
         self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
         if self.path.is_dir():
             raise OutputError(f"{path}: is a folder; give the name of a file")
@@ -351,7 +386,8 @@ class PoseWriter:
     def write(self, pose: Pose) -> None:
         """Add a line."""
         try:
-            self._file.write(pose_line(pose) + "\n")
+            camera = None if self._camera_of is None else self._camera_of(pose.index)
+            self._file.write(pose_line(pose, camera) + "\n")
         except OSError as error:
             raise self._explained(error) from error
 
@@ -374,10 +410,38 @@ class PoseWriter:
         return OutputError(f"{self.path}: cannot write the poses: {error.strerror or error}")
 
 
-def pose_line(pose: Pose) -> str:
-    """A pose as a line of ``poses.jsonl``, see `PoseWriter`; a covariance that is not finite becomes null."""
+class FollowingOverlay:
+    """Draws with the camera of each frame, where that is replaced while the frames are tracked.
+
+    Args:
+        make: makes the overlay of a camera.
+        camera_of: camera of the frame of an index.
+    """
+
+    def __init__(self, make: Callable[[Camera], Overlay], camera_of: Callable[[int], Camera]) -> None:
+        self._make, self._camera_of = make, camera_of
+        self._camera: Camera | None = None
+        self._overlay: Overlay | None = None
+
+    def draw(self, image: Image, pose: Pose, fps: float | None = None) -> Image:
+        """The annotated frame."""
+        camera = self._camera_of(pose.index)
+        if self._overlay is None or camera is not self._camera:
+            self._camera, self._overlay = camera, self._make(camera)
+        return self._overlay.draw(image, pose, fps=fps)
+
+
+def pose_line(pose: Pose, camera: Camera | None = None) -> str:
+    """A pose, and its camera if one is given, as a line of ``poses.jsonl``, see `PoseWriter`.
+
+    A covariance that is not finite becomes null.
+    """
     covariance = pose.covariance
     is_known = covariance is not None and bool(np.all(np.isfinite(covariance)))
+    stated = {}
+    if camera is not None:
+        values = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+        stated = {"camera": {**values, "dist": camera.dist.tolist()}}
     return json.dumps(
         {
             "index": pose.index,
@@ -391,6 +455,7 @@ def pose_line(pose: Pose) -> str:
             "mismatches": list(pose.mismatches),
             "unverified": list(pose.unverified),
             "alternatives": [alternative.tolist() for alternative in pose.alternatives],
+            **stated,
         },
         allow_nan=False,
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
@@ -21,15 +22,20 @@ from arview.cli.common import (
     session_options,
 )
 from arview.cli.exit_codes import ExitCode
+from arview.cli.guessed_camera import check_profile, report_estimate
 
 if TYPE_CHECKING:
     from arview.annotation import AnnotateSummary
     from arview.cad import Part
     from arview.camera import Camera
     from arview.geometry import Array
+    from arview.guideviews import GuideViewSet
     from arview.overlay import OverlayOptions
     from arview.overlay.options import EdgeMode
-    from arview.tracking import TrackingSession
+    from arview.tracking import SessionOptions, TrackingSession
+    from arview.tracking.self_calibration.estimator import FocalEstimate
+    from arview.tracking.self_calibration.session import MakeSession, SelfCalibratingSession
+    from arview.video import FrameSource
 
 
 class _Outputs(NamedTuple):
@@ -81,18 +87,22 @@ finds the part sooner. They only suggest where to search: what is found must sti
 \b
 CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt), fov:DEG
 (field of view along the longer side), exif, or profile:NAME (stored by `arview calibrate --profile`;
-profile alone takes the one that matches what the source says of its camera).
+profile alone takes the one that matches what the source says of its camera). Without it the focal length is
+guessed, and estimated from the frames in which the part is tracked: of a film in a first pass, of a camera or
+stream while it runs. --save-profile NAME keeps the estimate for --camera profile:NAME. Views from far away,
+or always from the same side, do not tell the focal length; then the guess is kept.
 
 \b
 Each line of a poses file is a JSON object: index, time_s, state, quality, cam_from_model (4x4 row-major,
 mm), covariance (6x6), ms, reason (why the part is not tracked), mismatches, unverified (components that have
-not been verified yet), alternatives (poses that fit as well).
+not been verified yet), alternatives (poses that fit as well), and camera where none was given.
 Ctrl-C ends the run and finishes the files.""",
 )
 @click.argument("source")
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
 @click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="See below; without it the camera is guessed.")
+@click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile; see below.")
 @click.option("--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are drawn.")
 @click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
 @click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
@@ -119,6 +129,7 @@ def annotate(
     part_path: str,
     views_path: str | None,
     camera_spec: str | None,
+    profile: str | None,
     inspection_path: str | None,
     output: str | None,
     poses_path: str | None,
@@ -145,8 +156,10 @@ def annotate(
     from arview.inspection import load_inspection
     from arview.overlay import OverlayRenderer
     from arview.tracking.guide_pose import GUIDE_PREFIX
+    from arview.tracking.self_calibration.session import SelfCalibratingSession
     from arview.video import VideoSink, open_source
 
+    check_profile(profile, camera_spec)
     if output is None and poses_path is None:
         output = _default_output(source)
         say(f"no -o or --poses given: writing {output}")
@@ -162,12 +175,17 @@ def annotate(
     last = end if isinstance(end, int) else None
     with open_source(source, start=first, end=last, stride=stride, fps=fps) as frames:
         camera = camera_for(frames, camera_spec, source)
-        session = _make_session(part, camera, views_path, renderer, modalities, guide_name, first_pose)
-        if outputs.learned is not None and outputs.learned.exists():
-            session.appearance_memory.load(outputs.learned)
+        views, guide = _views_and_guide(part, camera, views_path, renderer, guide_name)
+        make_session = partial(_session, part, views, session_options(modalities), guide, first_pose)
+        keep = partial(report_estimate, profile=profile, source=source, turns=frames.quarter_turns_clockwise)
+        is_guessed = camera_spec is None
+        session, camera_of = _start(make_session, frames, camera, is_guessed, views, keep)
+        _load_learned(session, outputs.learned)
         overlay = sink = None
         if outputs.video is not None:
-            overlay = OverlayRenderer(part.model, camera, inspection, drawing)
+            overlay = annotation.FollowingOverlay(
+                lambda camera: OverlayRenderer(part.model, camera, inspection, drawing), camera_of
+            )
             sink = VideoSink(outputs.video, frames.width, frames.height, frames.fps, frames)
         with progress_bar("frames", frames.frame_count) as progress:
             summary = annotation.annotate(
@@ -179,13 +197,14 @@ def annotate(
                 progress=lambda done, pose: progress(done, frames.frame_count or 0),
                 start_s=start if isinstance(start, float) else None,
                 end_s=end if isinstance(end, float) else None,
+                camera_of=camera_of if is_guessed else None,
             )
+        if isinstance(session, SelfCalibratingSession):
+            keep(session.finish())
     if sink is not None and sink.audio_note:
         say(f"warning: {sink.audio_note}")
     _print_summary(summary, [path for path in (outputs.video, outputs.poses) if path is not None])
-    if outputs.learned is not None:
-        session.appearance_memory.save(outputs.learned)
-        click.echo(f"wrote {outputs.learned}: {len(session.appearance_memory)} learned views")
+    _save_learned(session, outputs.learned)
     if summary.is_interrupted:
         say("interrupted")
         ctx.exit(ExitCode.INTERRUPTED)
@@ -213,19 +232,12 @@ def _check_outputs(
     )
 
 
-def _make_session(
-    part: Part,
-    camera: Camera,
-    views_path: str | None,
-    renderer: str,
-    modalities: tuple[str, ...],
-    guide_name: str | None,
-    first_pose: Array | None,
-) -> TrackingSession:
-    """A tracking session on guide views from a file, or on cached ones, that starts as the options say."""
+def _views_and_guide(
+    part: Part, camera: Camera, views_path: str | None, renderer: str, guide_name: str | None
+) -> tuple[GuideViewSet, Array | None]:
+    """Guide views from a file, or cached ones, and the guide pose (4,4) where one was asked for."""
     from arview.guideviews import GuideViewOptions, load_guide_views
     from arview.guideviews.cache import cached_guide_views
-    from arview.tracking import TrackingSession
     from arview.tracking.guide_pose import guide_pose
 
     views = load_guide_views(Path(views_path), part.model) if views_path else None
@@ -237,14 +249,75 @@ def _make_session(
             views = cached_guide_views(
                 part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress=progress
             )
+    return views, guide
+
+
+def _session(
+    part: Part,
+    views: GuideViewSet,
+    options: SessionOptions,
+    guide: Array | None,
+    first_pose: Array | None,
+    camera: Camera,
+    start: Array | None,
+) -> TrackingSession:
+    """A session with a camera, that goes on from a pose (4,4) or else begins as the command says."""
+    from arview.tracking import TrackingSession
+
     return TrackingSession(
         views,
         camera=camera,
         model=part.model,
-        options=session_options(modalities),
-        initial_cam_from_model=first_pose,
+        options=options,
+        initial_cam_from_model=first_pose if start is None else start,
         guide_cam_from_model=guide,
     )
+
+
+def _start(
+    make_session: MakeSession,
+    frames: FrameSource,
+    camera: Camera,
+    is_guessed: bool,
+    views: GuideViewSet,
+    keep: Callable[[FocalEstimate], None],
+) -> tuple[TrackingSession | SelfCalibratingSession, Callable[[int], Camera]]:
+    """The session for a source, and the camera of each of its frames by index.
+
+    A guessed camera is estimated: of a film in a first pass, of which ``keep`` gets the result, else while it runs.
+    """
+    from arview.annotation import estimate_camera
+    from arview.tracking.self_calibration.session import SelfCalibratingSession
+
+    if not is_guessed:
+        return make_session(camera, None), lambda index: camera
+    following = SelfCalibratingSession(make_session, views, camera)
+    if frames.is_live:
+        return following, following.camera_of
+    with progress_bar("focal length") as progress:
+        estimate = estimate_camera(frames, following, lambda done: progress(done, frames.frame_count or 0))
+    keep(estimate)
+    final = estimate.camera if estimate.is_determined else camera
+    return make_session(final, None), lambda index: final
+
+
+def _load_learned(session: TrackingSession | SelfCalibratingSession, path: Path | None) -> None:
+    if path is not None and path.exists():
+        _tracking(session).appearance_memory.load(path)
+
+
+def _save_learned(session: TrackingSession | SelfCalibratingSession, path: Path | None) -> None:
+    if path is not None:
+        memory = _tracking(session).appearance_memory
+        memory.save(path)
+        click.echo(f"wrote {path}: {len(memory)} learned views")
+
+
+def _tracking(session: TrackingSession | SelfCalibratingSession) -> TrackingSession:
+    """The session that tracks, within one that replaces its camera."""
+    from arview.tracking.self_calibration.session import SelfCalibratingSession
+
+    return session.session if isinstance(session, SelfCalibratingSession) else session
 
 
 def _print_summary(summary: AnnotateSummary, written: list[Path]) -> None:

@@ -16,6 +16,7 @@ import click
 
 from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, say
 from arview.cli.exit_codes import ExitCode
+from arview.cli.guessed_camera import check_profile
 from arview.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
@@ -75,7 +76,8 @@ browser of this machine only, without certificates, for trying things out.
 \b
 CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt) or fov:DEG. It
 is scaled to the frames if their aspect ratio is the same. Without it a common phone is assumed, and the
-page says so: the overlay fits roughly, and distances are unreliable.
+page says so, until the focal length has been estimated from views of the part from near and from several
+sides. --save-profile NAME keeps the estimate at the end, for --camera profile:NAME.
 
 \b
 The page reloads inspection.json when it changes, and warns when it is older than --max-age or has another
@@ -90,6 +92,7 @@ serial number than the part file (or --serial). Recordings made from the page ar
     "--source", default="phone", show_default=True, metavar="SOURCE", help="Camera or video to show; see below."
 )
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG; see below.")
+@click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile; see below.")
 @click.option("--init", metavar="guide:NAME", help="Align the part with an outline first, as in annotate.")
 @click.option(
     "--host", metavar="ADDRESS", help="Address to listen at; default: the one in the local network. 0.0.0.0: all."
@@ -118,6 +121,7 @@ def live(
     inspection_path: str | None,
     source: str,
     camera_spec: str | None,
+    profile: str | None,
     init: str | None,
     host: str | None,
     port: int,
@@ -142,6 +146,7 @@ def live(
     from arview.live.server.live_server import LiveServer, open_endpoint
     from arview.video.sources import check_source
 
+    check_profile(profile, camera_spec)
     find_part_file(part_path)
     if init is not None and not init.startswith("guide:"):
         raise InputError(f"--init {init}: expected guide:NAME")
@@ -156,6 +161,7 @@ def live(
     options = LiveOptions(
         source=source,
         camera=camera_spec,
+        profile=profile,
         inspection=Path(inspection_path) if inspection_path else None,
         serial=serial,
         max_age_s=max_age,

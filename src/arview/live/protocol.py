@@ -144,6 +144,7 @@ FRAME_IDS: Final = 1 << 20
 
 NOTICE_CODES: Final = {
     "camera_guessed": "no camera file was given: the error of the assumed focal length becomes an error of distances",
+    "camera_estimated": "no camera file was given: the focal length was estimated from the tracked frames",
     "frames_scaled": "the browser sends smaller pictures than it has",
     "inspection_none": "no inspection was given: ghosts have no verdicts",
     "inspection_old": "the inspection is older than the maximum age",

@@ -282,7 +282,10 @@ class Hub:
         if self._station is not None:
             notices = [*notices, *self._station.notices()]
         if feed is not None:
-            notices = [*notices, *feed.notices()]
+            own = feed.notices()
+            if any(notice.code == "camera_estimated" for notice in own):
+                notices = [notice for notice in notices if notice.code != "camera_guessed"]
+            notices = [*notices, *own]
             if self.recordings is not None:
                 notices = [*notices, *self.recordings.notices(feed)]
         return notices

@@ -21,6 +21,8 @@ from arview.live.stream.notices import Notice, without_folder
 from arview.live.stream.subject import Subject
 from arview.pose import Pose, TrackingState
 from arview.tracking import TrackingSession
+from arview.tracking.self_calibration.profile import keep_profile
+from arview.tracking.self_calibration.session import SelfCalibratingSession
 
 logger = logging.getLogger("arview.live")
 
@@ -93,7 +95,7 @@ class Feed:
         self._listeners: list[Callable[[TrackedFrame], None]] = []
         self._kept: deque[TrackedFrame] = deque(maxlen=self.options.kept_frames)
         self._arrived_s: float | None = None
-        self._session: TrackingSession | None = None
+        self._session: TrackingSession | SelfCalibratingSession | None = None
         self._wants_reset = False
         self._refused: Notice | None = None
         self._shape: tuple[int, int, int] | None = None
@@ -154,6 +156,10 @@ class Feed:
     def notices(self) -> list[Notice]:
         """Conditions of this feed that its viewers have to know of."""
         notices = [self._refused] if self._refused else []
+        session = self._session
+        estimate = session.estimate if isinstance(session, SelfCalibratingSession) else None
+        if estimate is not None and estimate.is_determined:
+            notices.append(Notice("camera_estimated", "info", estimate.text))
         newest = self.newest
         if newest is not None and newest.frame.scale < self.options.min_scale:
             notices.append(
@@ -169,6 +175,21 @@ class Feed:
             )
         return notices
 
+    def _tell_estimate(self) -> None:
+        """Report the estimate of a session that ends, and keep it as a profile if one was asked for."""
+        session, profile = self._session, self._subject.options.profile
+        if not isinstance(session, SelfCalibratingSession):
+            return
+        estimate = session.finish()
+        logger.info("%s", estimate.text)
+        if profile is None or not estimate.is_determined or self._shape is None:
+            return
+        try:
+            path = keep_profile(estimate, profile, self._subject.options.source, self._shape[2])
+            logger.info("wrote %s; use it with --camera profile:%s", path, profile)
+        except ArviewError as error:
+            logger.error("%s", error)
+
     def _run(self) -> None:
         while (incoming := self._slot.take()) is not None:
             try:
@@ -177,6 +198,7 @@ class Feed:
                 logger.exception("tracking failed and is restarted")
                 self.failures += 1
                 self._shape = None
+        self._tell_estimate()
         # Reference cycles can keep a broken connection alive for a while; its pictures are released now.
         self._kept.clear()
         self._session = self.newest = None
@@ -210,6 +232,8 @@ class Feed:
             pose = Pose(None, None, 0.0, TrackingState.SEARCHING, arrived_s, frame.frame_id, 0.0, reason)
         else:
             pose = self._session.process(np.ascontiguousarray(frame.image), frame.frame_id, arrived_s)
+            if isinstance(self._session, SelfCalibratingSession):
+                self._camera = self._session.camera
         return TrackedFrame(
             frame=frame,
             pose=pose,
@@ -225,6 +249,7 @@ class Feed:
     def _start_session(self, shape: tuple[int, int, int]) -> None:
         """Start a session for frames of another size or orientation, or note why there is none."""
         width, height, turns = shape
+        self._tell_estimate()
         self._shape, self._session, self._refused = shape, None, None
         try:
             self._camera = self._subject.camera(width, height, turns)

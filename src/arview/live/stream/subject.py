@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from arview.cad.part import Part
 from arview.camera import Camera
 from arview.camera.read import guess_camera, load_camera
+from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.inspection import Inspection
 from arview.live.options import LiveOptions
@@ -17,6 +18,7 @@ from arview.overlay import OverlayOptions, OverlayRenderer
 from arview.overlay.options import EdgeMode
 from arview.tracking import TrackingSession
 from arview.tracking.guide_pose import guide_pose
+from arview.tracking.self_calibration.session import SelfCalibratingSession
 
 PHONE_FOV = "fov:66"
 """Camera assumed for phones: field of view along the longer side. Their main cameras have 65 to 72° (24 to 28 mm)."""
@@ -117,12 +119,20 @@ class Subject:
             return load_camera(PHONE_FOV, width, height)
         return guess_camera(width, height)
 
-    def session(self, camera: Camera) -> TrackingSession:
-        """A new tracking session for a feed with this camera."""
+    def session(self, camera: Camera) -> TrackingSession | SelfCalibratingSession:
+        """A new tracking session for a feed with this camera, which is replaced while it runs if it is guessed."""
         guide = None
         if self.options.guide is not None:
             guide = guide_pose(self.options.guide, self.part, self.views.view_range, camera)
-        return TrackingSession(self.views, camera, self.part.model, guide_cam_from_model=guide)
+
+        def make_session(camera: Camera, start: Array | None) -> TrackingSession:
+            return TrackingSession(
+                self.views, camera, self.part.model, initial_cam_from_model=start, guide_cam_from_model=guide
+            )
+
+        if self.options.camera is not None:
+            return make_session(camera, None)
+        return SelfCalibratingSession(make_session, self.views, camera)
 
     def overlay(self, camera: Camera, style: OverlayStyle) -> OverlayRenderer:
         """A renderer of the overlay for a feed with this camera."""

@@ -1,0 +1,1 @@
+"""Self-calibration: an unknown focal length, estimated from the tracked frames of a video."""
