@@ -181,6 +181,8 @@ def estimate_camera(
     kept = idle = 0
     for done, frame in enumerate(source, 1):
         session.process(frame.image, frame.index, frame.time_s)
+        # A film gives the same result each time; a stream does not wait.
+        session.wait()
         if progress:
             progress(done)
         idle = 0 if session.frames > kept else idle + 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -33,7 +32,7 @@ from arview.version import __version__
 from helpers.bop_scene import write_scene
 from helpers.cad_files import box
 from helpers.fake_session import POSE, FakeSession
-from helpers.paths import SAMPLES, TESTS
+from helpers.paths import TESTS
 from helpers.video_files import numbered, write_clip
 
 PART = """
@@ -135,7 +134,6 @@ def test_annotate_names_the_output_and_the_guessed_camera(room: Path) -> None:
 @pytest.mark.slow
 def test_a_guess_that_cannot_be_improved_stays_one(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ARVIEW_PROFILES", str(room / "profiles"))
-    monkeypatch.setattr(arview.tracking, "TrackingSession", FakeSession)
     options = ("--part", "part.toml", "--renderer", "zbuffer", "--poses", "poses.jsonl", "--save-profile", "phone")
     result = run("annotate", "clip.mp4", *options)
     assert result.exit_code == 0, result.output
@@ -156,25 +154,6 @@ def test_a_profile_is_kept_of_an_estimate_only(room: Path, options: tuple[str, .
     for command in (("annotate", "clip.mp4"), ("live",)):
         result = run(*command, "--part", "part.toml", *options)
         assert result.exit_code == ExitCode.BAD_INPUT and words in result.stderr
-
-
-@pytest.mark.slow
-def test_the_focal_length_of_a_film_is_estimated_and_kept(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ARVIEW_PROFILES", str(room / "profiles"))
-    sample = SAMPLES / "bracket_plate"
-    options = ("--part", str(sample / "part.toml"), "--poses", "poses.jsonl", "--end", "200", "--stride", "2")
-    result = run("annotate", str(sample / "clip.mp4"), *options, "--save-profile", "film")
-    assert result.exit_code == 0, result.output
-    found = re.search(r"focal length estimated: (\d+) ± (\d+) px \(guessed 1536\)", result.stderr)
-    assert found is not None, result.stderr
-    focal_px, expanded_px = float(found[1]), float(found[2])
-    truth_px = json.loads((sample / "camera.json").read_text())["fx"]
-    assert abs(focal_px - truth_px) <= expanded_px < 0.05 * truth_px
-    profile = json.loads((room / "profiles" / "film.json").read_text())
-    assert profile["fx"] == pytest.approx(focal_px, abs=0.5)
-    assert profile["calibration"]["uncertainty"]["fx"] == pytest.approx(expanded_px, abs=0.5)
-    again = run("annotate", str(sample / "clip.mp4"), *options[:-4], "--end", "3", "--camera", "profile:film")
-    assert again.exit_code == 0 and again.stderr == ""
 
 
 def test_annotate_takes_a_part_of_the_frames_and_a_first_pose(room: Path) -> None:

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from arview.camera import Camera
     from arview.geometry import Array
     from arview.guideviews import GuideViewSet
-    from arview.overlay import OverlayOptions
+    from arview.inspection import Inspection
+    from arview.overlay import OverlayOptions, OverlayRenderer
     from arview.overlay.options import EdgeMode
     from arview.tracking import SessionOptions, TrackingSession
     from arview.tracking.self_calibration.estimator import FocalEstimate
@@ -154,7 +155,6 @@ def annotate(
     from arview import annotation
     from arview.cad import load_part
     from arview.inspection import load_inspection
-    from arview.overlay import OverlayRenderer
     from arview.tracking.guide_pose import GUIDE_PREFIX
     from arview.tracking.self_calibration.session import SelfCalibratingSession
     from arview.video import VideoSink, open_source
@@ -171,9 +171,8 @@ def annotate(
     inputs = (source, part.path, part.cad_path, views_path, camera_spec, inspection_path, init_path)
     outputs = _check_outputs(output, poses_path, learned_path, inputs)
     drawing = _drawing_options(show_edges, no_ghost, no_labels, opacity)
-    first = start if isinstance(start, int) else None
-    last = end if isinstance(end, int) else None
-    with open_source(source, start=first, end=last, stride=stride, fps=fps) as frames:
+    wanted = [moment if isinstance(moment, int) else None for moment in (start, end)]
+    with open_source(source, start=wanted[0], end=wanted[1], stride=stride, fps=fps) as frames:
         camera = camera_for(frames, camera_spec, source)
         views, guide = _views_and_guide(part, camera, views_path, renderer, guide_name)
         make_session = partial(_session, part, views, session_options(modalities), guide, first_pose)
@@ -183,9 +182,8 @@ def annotate(
         _load_learned(session, outputs.learned)
         overlay = sink = None
         if outputs.video is not None:
-            overlay = annotation.FollowingOverlay(
-                lambda camera: OverlayRenderer(part.model, camera, inspection, drawing), camera_of
-            )
+            make = partial(_overlay, part, inspection, drawing)
+            overlay = annotation.FollowingOverlay(make, camera_of)
             sink = VideoSink(outputs.video, frames.width, frames.height, frames.fps, frames)
         with progress_bar("frames", frames.frame_count) as progress:
             summary = annotation.annotate(
@@ -205,9 +203,19 @@ def annotate(
         say(f"warning: {sink.audio_note}")
     _print_summary(summary, [path for path in (outputs.video, outputs.poses) if path is not None])
     _save_learned(session, outputs.learned)
+    _exit_if_interrupted(ctx, summary)
+
+
+def _exit_if_interrupted(ctx: click.Context, summary: AnnotateSummary) -> None:
     if summary.is_interrupted:
         say("interrupted")
         ctx.exit(ExitCode.INTERRUPTED)
+
+
+def _overlay(part: Part, inspection: Inspection | None, options: OverlayOptions, camera: Camera) -> OverlayRenderer:
+    from arview.overlay import OverlayRenderer
+
+    return OverlayRenderer(part.model, camera, inspection, options)
 
 
 def _drawing_options(show_edges: str, no_ghost: bool, no_labels: bool, opacity: float | None) -> OverlayOptions:

@@ -26,8 +26,15 @@ def check_profile(name: str | None, camera_spec: str | None) -> None:
     profile_path(name)
 
 
-def report_estimate(estimate: FocalEstimate, profile: str | None, source: str, quarter_turns_clockwise: int) -> None:
-    """Say what was estimated, and keep it as a profile if one was asked for; see `keep_profile`, of which ``turns`` are the quarter turns."""
+def report_estimate(estimate: FocalEstimate, profile: str | None, source: str, turns: int) -> None:
+    """Say what was estimated, and keep it as a profile if one was asked for.
+
+    Args:
+        estimate: the result.
+        profile: name of the profile; None: none was asked for.
+        source: video that it was estimated from.
+        turns: quarter turns clockwise applied to its frames.
+    """
     from arview.tracking.self_calibration.profile import keep_profile
 
     can_be_kept = estimate.is_determined and profile is None

@@ -146,10 +146,13 @@ class FocalEstimator:
     def estimate(self, frames: list[CalibrationFrame] | None = None) -> FocalEstimate:
         """The focal length from the frames of `snapshot`, or from all frames kept now.
 
-        It is determined when it is precise enough, and agrees with the estimate before, which had fewer frames.
+        It is determined when it is precise enough, and agrees with the estimate before, which had fewer frames. The
+        first estimate is compared with one from two thirds of its frames.
         """
         o = self.options
         frames = self.snapshot() if frames is None else frames
+        if self._last is None and 2 * len(frames) >= 3 * o.min_frames:
+            self.estimate(frames[: 2 * len(frames) // 3])
         found = self._solve(frames) if len(frames) >= o.min_frames else None
         if found is None or len(found.used) < o.min_frames:
             return FocalEstimate(self.guess, float("inf"), self.guess.fx, len(frames), False)
