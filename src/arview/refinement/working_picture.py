@@ -1,9 +1,10 @@
-"""Working picture: the picture around the part, reduced to the scale at which poses are refined and scored.
+"""Working pictures: the picture around the part at the scales at which poses are refined and scored.
 
 Steps, tolerances and reaches of the measures are in pixels, so they only mean the same in every picture where the part
-has about the same size and its edges are about as sharp. A large or soft picture is therefore reduced until this holds;
-a pose is then worth the same at 320 px as at 4K, and the cost hardly grows with the number of pixels. Where the picture
-is sharp at a finer scale, the last stages measure there, because precision comes from fine pixels.
+has about the same size. Every picture is therefore brought to the same sizes of the part: a small one, in which poses
+are judged, and larger ones up to the finest that its sharpness allows, in which they are refined. A pose is then worth
+the same at 320 px as at 4K, and the cost hardly grows with the number of pixels. Small pictures are enlarged: on a
+larger part the same reach is narrower, which keeps other edges beside the right one out.
 """
 
 from __future__ import annotations
@@ -27,57 +28,54 @@ class WorkingScaleOptions:
     """Options of the working scale.
 
     Attributes:
-        radius_px: half the part's diameter in the working picture; smaller parts are not enlarged.
+        radius_px: half the part's diameter in the working picture, in which poses are judged.
         soft_radius_px: a soft picture is not reduced below this half diameter, because too few points would be left.
-        max_spread_px: standard deviation of the edges' blur above which a picture is reduced.
-        fine_radius_px: largest half diameter in the fine picture.
-        fine_gain: how much larger than the working picture the fine one must be to be worth its time.
+        max_spread_px: standard deviation of the edges' blur in the working picture above which it is reduced further.
+        fine_radius_px: half the part's diameter in the finest picture.
+        max_fine_spread_px: standard deviation of the edges' blur in the finest picture above which it is smaller.
+        max_enlargement: largest scale; more pixels than that only repeat what the camera saw.
+        level_ratio: largest ratio of the scales of successive pictures, from which a pose is refined to the next.
         steps_per_octave: scales are powers of two with this many steps in between, so that they seldom change.
         reach: half size of the window, in half diameters of the part.
-        margin_px: pixels of the working picture added to it.
+        margin_px: pixels of the reduced picture added to it.
     """
 
     radius_px: float = 100.0
     soft_radius_px: float = 50.0
     max_spread_px: float = 1.5
     fine_radius_px: float = 400.0
-    fine_gain: float = 1.3
+    max_fine_spread_px: float = 2.5
+    max_enlargement: float = 4.0
+    level_ratio: float = 2.0
     steps_per_octave: int = 2
     reach: float = 1.15
     margin_px: float = 24.0
 
-    def quantised(self, scale: float) -> float:
-        """The nearest scale of the series, at most 1."""
-        return float(min(1.0, 2.0 ** (np.round(self.steps_per_octave * np.log2(scale)) / self.steps_per_octave)))
-
-    def working_scale(self, radius_px: float, spread_px: float = 0.0) -> float:
-        """Scale of the working picture, at most 1.
+    def scales(self, radius_px: float, spread_px: float = 0.0) -> tuple[float, ...]:
+        """Scales of the pictures, from the working picture to the finest.
 
         Args:
             radius_px: half the part's diameter in the picture.
             spread_px: standard deviation of the blur of its edges in the picture; 0 where it is not known.
         """
-        scale = self.radius_px / radius_px
-        if spread_px * scale > self.max_spread_px:
-            scale = max(self.max_spread_px / spread_px, min(scale, self.soft_radius_px / radius_px))
-        return self.quantised(scale)
-
-    def finest(self, radius_px: float) -> float:
-        """Scale of the fine picture of a sharp picture in which half the part's diameter is ``radius_px``."""
-        return self.quantised(self.fine_radius_px / radius_px)
-
-    def fine_scale(self, radius_px: float, spread_px: float) -> float | None:
-        """Scale of the fine picture; None where the working picture is as fine. Arguments as of `working_scale`."""
-        scale = min(1.0, self.fine_radius_px / radius_px, self.max_spread_px / max(spread_px, 1e-6))
-        scale = self.quantised(scale)
-        return scale if scale > self.fine_gain * self.working_scale(radius_px, spread_px) else None
+        working = min(1.0, self.radius_px / radius_px)
+        if spread_px * working > self.max_spread_px:
+            working = max(self.max_spread_px / spread_px, min(working, self.soft_radius_px / radius_px))
+        finest = min(self.max_enlargement, self.fine_radius_px / radius_px)
+        if spread_px * finest > self.max_fine_spread_px:
+            finest = self.max_fine_spread_px / spread_px
+        step = 1.0 / self.steps_per_octave
+        first, last = step * np.round(np.log2([working, finest]) / step)
+        count = max(0, int(np.ceil((last - first) / np.log2(self.level_ratio) - 1e-6)))
+        between = [step * np.round((first + k * (last - first) / count) / step) for k in range(1, count)]
+        return tuple(float(2.0**x) for x in (first, *between, *([last] if count else [])))
 
 
 DEFAULT = WorkingScaleOptions()
 
 
 class WorkingPicture(NamedTuple):
-    """A window of a picture at a reduced scale.
+    """A window of a picture at a scale.
 
     Attributes:
         image: (h,w,3) uint8 RGB.
@@ -110,12 +108,12 @@ class WorkingPicture(NamedTuple):
 def working_picture(
     image: NDArray[np.uint8], camera: Camera, scale: float, window: tuple[float, float, float, float] | None = None
 ) -> WorkingPicture:
-    """A window of a picture, reduced.
+    """A window of a picture at a scale.
 
     Args:
         image: (H,W,3) uint8 RGB of the camera's size.
         camera: of the picture.
-        scale: at most 1.
+        scale: of the result.
         window: left, upper, right and lower border, px; parts outside the picture are left out. None, or a window with
             too little of the picture: the whole picture.
     """
@@ -134,15 +132,20 @@ def working_picture(
     for _ in range(halvings):
         small = cv2.resize(small, (small.shape[1] // 2, small.shape[0] // 2), interpolation=cv2.INTER_AREA)
     rest = scale * unit
-    if rest < 1.0 - 1e-6:
-        size = round(small.shape[1] * rest), round(small.shape[0] * rest)
-        small = cv2.resize(small, size, interpolation=cv2.INTER_AREA)
+    size = round(small.shape[1] * rest), round(small.shape[0] * rest)
+    if rest > 1.0 + 1e-6:
+        # The edge modality interpolates; the region modality reads single pixels.
+        gray = cv2.resize(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_LINEAR)
+        small = cv2.resize(small, size, interpolation=cv2.INTER_NEAREST)
+    else:
+        if rest < 1.0 - 1e-6:
+            small = cv2.resize(small, size, interpolation=cv2.INTER_AREA)
+        gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     is_whole = (left, top, right, bottom) == (0, 0, width, height)
     own = camera if is_whole else camera.cropped(left, top, right - left, bottom - top)
-    if scale < 1.0:
+    if scale != 1.0:
         own = own.scaled(small.shape[1], small.shape[0])
-    smooth = smoothed(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY))
-    return WorkingPicture(np.asarray(small), smooth, own, scale, left, top, right, bottom)
+    return WorkingPicture(np.asarray(small), smoothed(np.asarray(gray)), own, scale, left, top, right, bottom)
 
 
 def matches_in(picture: WorkingPicture, matches: TextureMatches) -> TextureMatches:

@@ -21,10 +21,11 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
 from arview.refinement.evidence import PoseEvidence
 from arview.refinement.projection import intrinsics_of
-from arview.refinement.refiner import PoseRefiner
-from arview.refinement.schedules import SEARCH_STAGES
+from arview.refinement.refinement_pyramid import RefinementPyramid
+from arview.refinement.refiner import Appearance, PoseRefiner
+from arview.refinement.schedules import LAST_STAGES, SEARCH_STAGES
 from arview.refinement.view_model import PartView
-from arview.refinement.working_picture import WorkingPicture, WorkingScaleOptions, working_picture
+from arview.refinement.working_picture import WorkingScaleOptions
 
 
 @dataclass(frozen=True)
@@ -294,26 +295,26 @@ class GuidedInit:
         """The start (4,4) with the best score after refinement."""
         if not starts:
             return None
-        work = self._working(image, starts[0])
-        refiner = self._refiner.with_camera(work.camera)
+        levels = self._levels(image, starts)
 
         def refine(start: Array) -> GuidedPose:
-            pose = refiner.refine_fresh(work.image, work.smooth, start, SEARCH_STAGES)
-            appearance = refiner.appearance_at(work.image, pose)
-            evidence = refiner.evidence(work.image, work.smooth, pose, appearance)
+            working, appearance = levels.working, Appearance()
+            picture = working.picture
+            pose = working.refiner.refine_fresh(picture.image, picture.smooth, start, SEARCH_STAGES)
+            working.learn_colors(pose, appearance, 1.0)
+            pose, _ = levels.refine(pose, LAST_STAGES, appearance)
+            evidence = working.evidence(pose, appearance)
             is_inside = evidence.points_in_picture >= self.options.min_in_picture
             quality = evidence.quality if is_inside else 0.0
             return GuidedPose(pose @ self._refiner.part.body_from_model, evidence, quality)
 
         return max(pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.score))
 
-    def _working(self, image: NDArray[np.uint8], cam_from_body: Array) -> WorkingPicture:
-        """The whole picture at the working scale of a pose (4,4) and of the sharpness of the edges there."""
-        o, radius_px = self.options.scale, self._refiner.radius_px(cam_from_body)
-        work = working_picture(image, self.camera, o.working_scale(radius_px))
-        spread_px = self._refiner.with_camera(work.camera).edge_spread_px(work.smooth, cam_from_body)
-        scale = o.working_scale(radius_px, 0.0 if spread_px is None else spread_px / work.scale)
-        return work if scale == work.scale else working_picture(image, self.camera, scale)
+    def _levels(self, image: NDArray[np.uint8], starts: list[Array]) -> RefinementPyramid:
+        """The picture at the scales of a part at some poses (4,4), the first of which tells how sharp its edges are."""
+        levels = RefinementPyramid(self._refiner, image, starts, options=self.options.scale)
+        spread_px = levels.finest.edge_spread_px(starts[0])
+        return RefinementPyramid(self._refiner, image, starts, spread_px or 0.0, self.options.scale)
 
     def _is_same(self, a: Array, b: Array, angle_deg: float) -> bool:
         """Whether two poses (4,4) differ by less than an angle, and by as many per cent of the diameter."""

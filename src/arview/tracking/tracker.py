@@ -26,11 +26,10 @@ from arview.refinement.gauss_newton import apply_twist, relative_twist
 from arview.refinement.kernels import median_brightness_ratio
 from arview.refinement.modalities.region import value_bins
 from arview.refinement.modalities.texture import TextureModality
-from arview.refinement.picture_refiner import PictureRefiner
+from arview.refinement.refinement_pyramid import RefinementPyramid
 from arview.refinement.refiner import PoseRefiner
 from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES
 from arview.refinement.view_model import PartView
-from arview.refinement.working_picture import window_around, working_picture
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import squared_motion_distance
 from arview.tracking.tracker_options import TrackerOptions
@@ -106,17 +105,15 @@ class Tracker:
         state = self._state = TrackerState(cam_from_model @ self.refiner.part.model_from_body)
         if self._texture is not None:
             self._texture.clear()
-        finest = self._around(
-            image, self.options.scale.finest(self.refiner.radius_px(state.cam_from_body)), [state.cam_from_body]
-        )
-        self._measure_spread(finest, 1.0)
-        work, fine = self._pictures(image, [state.cam_from_body])
-        work.learn_colors(state.cam_from_body, state.appearance, 1.0)
+        levels = self._levels(image, [state.cam_from_body])
+        self._measure_spread(levels, 1.0)
+        levels = self._levels(image, [state.cam_from_body])
+        levels.working.learn_colors(state.cam_from_body, state.appearance, 1.0)
         if self._texture is not None and not (self.options.use_region or self.options.use_edge):
             # Nothing else can support the pose before there is a keyframe.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             self._texture.add_keyframe(self._texture.pyramid(gray), state.cam_from_body)
-        state.usual_score = fine.evidence(state.cam_from_body, state.appearance).score
+        state.usual_score = levels.finest.evidence(state.cam_from_body, state.appearance).score
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
         """Track the part into the next frame (H,W,3) uint8 RGB.
@@ -126,7 +123,7 @@ class Tracker:
         """
         frame = self._prepare(image)
         for propose in (
-            self._predicted, self._other_schedules, self._searched, self._rechecked, self._refined, self._shaded,
+            self._predicted, self._other_schedules, self._searched, self._rechecked, self._shaded,
         ):  # fmt: skip
             for proposal in propose(frame):
                 candidate = self._refine(frame, proposal)
@@ -145,7 +142,7 @@ class Tracker:
         """The pose predicted from the motion so far and aligned with the texture found."""
         # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails.
         stages = LAST_STAGES if self.options.use_edge else self.options.stages
-        yield Proposal(frame.start, stages, frame.matches, is_fine=True)
+        yield Proposal(frame.start, stages, frame.matches, first_level=-1)
 
     def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
         """Other schedules, where the score is lower than usual."""
@@ -154,11 +151,10 @@ class Tracker:
         # What is usual is not yet known in the first frame, whose start may be off.
         if self.state.is_started and first.evidence.score >= o.other_schedules_share * usual:
             return
-        yield Proposal(frame.start, o.stages, frame.matches, is_fine=True)
-        if self.state.is_started and frame.found.evidence.score >= o.other_schedules_share * usual:
-            return
-        if frame.fine is not frame.work:
-            yield Proposal(frame.start, o.stages, frame.matches, o.min_gain)
+        for level in (-2, 0):
+            yield Proposal(frame.start, o.stages, frame.matches, first_level=level)
+            if self.state.is_started and frame.found.evidence.score >= o.other_schedules_share * usual:
+                return
         if o.use_edge and first.evidence.inner_share > o.near_schedules_min_inner_share:
             yield Proposal(frame.start, NEAR_STAGES, frame.matches)
             yield Proposal(first.cam_from_body, NEAR_STAGES, frame.matches)
@@ -172,8 +168,9 @@ class Tracker:
         if not self._is_suspicious(frame):
             return
         o, state = self.options, self.state
-        self._cover(frame, None)
-        for start in self._search.find(frame.image, state.appearance.colors, frame.predicted):
+        starts = self._search.find(frame.image, state.appearance.colors, frame.predicted)
+        frame.levels.cover(starts)
+        for start in starts:
             yield Proposal(start, o.stages, None, o.min_gain, o.motion_penalty)
         # This score is usual from now on, because a search of the whole neighbourhood found nothing better.
         state.usual_score = frame.found.evidence.score
@@ -184,17 +181,9 @@ class Tracker:
             return
         pose = self._recheck.better(frame.image, frame.found.cam_from_body, [frame.predicted, self.state.cam_from_body])
         if pose is not None:
-            self._cover(frame, pose)
+            frame.levels.cover([pose])
             # Refinement with the learned colours would lead it back, because they misled the best pose.
-            yield Proposal(pose, LAST_STAGES[-1:], None, -math.inf, is_final=True)
-
-    def _refined(self, frame: FrameContext) -> Iterator[Proposal]:
-        """The best pose so far, refined in the fine picture, where the frame is sharp enough for one."""
-        if frame.fine is not frame.work and not frame.found.is_fine:
-            best = frame.found
-            yield Proposal(
-                best.cam_from_body, self.options.fine_stages, best.matches, -self.options.min_gain, is_fine=True
-            )
+            yield Proposal(pose, LAST_STAGES[-1:], None, -math.inf, is_final=True, first_level=-1)
 
     def _shaded(self, frame: FrameContext) -> Iterator[Proposal]:
         """The best pose so far, refined by the shading of a curved surface."""
@@ -206,26 +195,23 @@ class Tracker:
 
     def _refine(self, frame: FrameContext, proposal: Proposal) -> RefinedPose:
         """Refine a proposal and collect its evidence."""
-        appearance, is_fine = self.state.appearance, proposal.is_fine
+        appearance, levels = self.state.appearance, frame.levels
         if proposal.stages:
-            used = frame.fine if is_fine else frame.work
-            pose, information = used.refiner.refine(
-                used.picture.image, used.picture.smooth, proposal.cam_from_body, proposal.stages, appearance,
-                used.matches(proposal.matches),
-            )  # fmt: skip
+            pose, information = levels.refine(
+                proposal.cam_from_body, proposal.stages, appearance, proposal.matches, proposal.first_level
+            )
             if proposal.is_final:
                 pose = proposal.cam_from_body
         else:
-            is_fine = frame.found.is_fine
-            pose, information = frame.work.refine_shading(proposal.cam_from_body, frame.found.information)
-        return RefinedPose(pose, information, frame.fine.evidence(pose, appearance), proposal.matches, is_fine)
+            pose, information = levels.working.refine_shading(proposal.cam_from_body, frame.found.information)
+        return RefinedPose(pose, information, levels.finest.evidence(pose, appearance), proposal.matches)
 
     def _evidence(self, frame: FrameContext) -> PoseEvidence:
         """Evidence of the working picture for the best pose so far, which means the same in every frame."""
         best = frame.found
-        if frame.fine is frame.work:
+        if len(frame.levels.scales) == 1:
             return best.evidence
-        return frame.work.evidence(best.cam_from_body, self.state.appearance)
+        return frame.levels.working.evidence(best.cam_from_body, self.state.appearance)
 
     def _is_better(self, frame: FrameContext, candidate: RefinedPose, proposal: Proposal) -> bool:
         """Whether a refined proposal gains enough over the best pose so far."""
@@ -264,7 +250,7 @@ class Tracker:
         state, o = self.state, self.options
         self._follow_exposure(image[..., 1])
         predicted = apply_twist(state.cam_from_body, state.velocity)
-        frame = FrameContext(image, *self._pictures(image, [state.cam_from_body, predicted]), predicted, predicted)
+        frame = FrameContext(image, self._levels(image, [state.cam_from_body, predicted]), predicted, predicted)
         if self._texture is not None:
             frame.pyramid = self._texture.pyramid(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
             matches = self._texture.measure(frame.pyramid, predicted)
@@ -281,10 +267,10 @@ class Tracker:
         state.usual_score += o.score_rate * (frame.found.evidence.score - state.usual_score)
         state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
         state.cam_from_body = pose
-        self._measure_spread(frame.fine, o.spread_rate)
+        self._measure_spread(frame.levels, o.spread_rate)
         if quality > o.min_learning_quality:
             if o.use_region:
-                frame.work.learn_colors(pose, state.appearance, o.learning_rate)
+                frame.levels.working.learn_colors(pose, state.appearance, o.learning_rate)
             if self._texture is not None:
                 self._remember_texture(frame, evidence)
 
@@ -303,40 +289,14 @@ class Tracker:
             state.exposure = min(max(state.exposure**o.exposure_decay * ratio, low), high)
             state.appearance.bin_of = value_bins(state.exposure)
 
-    def _pictures(self, image: NDArray[np.uint8], poses: list[Array]) -> tuple[PictureRefiner, PictureRefiner]:
-        """The working and the fine picture around the part at some poses (4,4); the last pose gives their scales."""
-        o = self.options.scale
-        radius_px, spread_px = self.refiner.radius_px(poses[-1]), self.state.spread_px
-        work = self._around(image, o.working_scale(radius_px, spread_px), poses)
-        scale = o.fine_scale(radius_px, spread_px)
-        return work, work if scale is None else self._around(image, scale, poses)
+    def _levels(self, image: NDArray[np.uint8], poses: list[Array]) -> RefinementPyramid:
+        """The frame at the scales of the last of some poses (4,4), around the part at all of them."""
+        return RefinementPyramid(self.refiner, image, poses, self.state.spread_px, self.options.scale)
 
-    def _around(self, image: NDArray[np.uint8], scale: float, poses: list[Array] | None) -> PictureRefiner:
-        """The picture around the part at some poses (4,4), or the whole frame, at a scale."""
-        window = None
-        if poses:
-            o = self.options.scale
-            window = window_around(self.camera, poses, self.diameter_mm, o.margin_px / scale, o.reach)
-        return PictureRefiner(self.refiner, working_picture(image, self.camera, scale, window))
-
-    def _cover(self, frame: FrameContext, pose: Array | None) -> None:
-        """Make the pictures show the part at another pose (4,4), or the whole frame for None."""
-        is_one = frame.fine is frame.work
-        reach = self.options.scale.reach
-        if (
-            pose is not None
-            and frame.work.shows(pose, self.camera, reach)
-            and frame.fine.shows(pose, self.camera, reach)
-        ):
-            return
-        poses = None if pose is None else [pose]
-        frame.work = self._around(frame.image, frame.work.scale, poses)
-        frame.fine = frame.work if is_one else self._around(frame.image, frame.fine.scale, poses)
-
-    def _measure_spread(self, picture: PictureRefiner, rate: float) -> None:
-        """Move the estimated blur of the part's edges by a share towards that of a picture at the last pose."""
+    def _measure_spread(self, levels: RefinementPyramid, rate: float) -> None:
+        """Move the estimated blur of the part's edges by a share towards that of a frame at the last pose."""
         state = self.state
-        spread_px = picture.edge_spread_px(state.cam_from_body)
+        spread_px = levels.finest.edge_spread_px(state.cam_from_body)
         if spread_px is not None:
             state.spread_px += rate * (spread_px - state.spread_px)
 
@@ -363,10 +323,9 @@ class Tracker:
         """Scores, see `PoseEvidence.score`, of poses (4,4) in the last frame, each after a fine refinement."""
         appearance, fine = self.state.appearance, self.options.stages[-2:]
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
-        _, used = self._pictures(image, in_body)
-        picture = used.picture
-        poses = [used.refiner.refine(picture.image, picture.smooth, pose, fine, appearance)[0] for pose in in_body]
-        return [used.evidence(pose, appearance).score for pose in poses]
+        levels = self._levels(image, in_body)
+        poses = [levels.refine(pose, fine, appearance, first=-1)[0] for pose in in_body]
+        return [levels.finest.evidence(pose, appearance).score for pose in poses]
 
     def covariance(self, estimate: Estimate) -> Array:
         """Covariance (6,6) of the twist (rad, mm) about the model's centre.

@@ -46,8 +46,7 @@ class TrackerOptions(RefinerOptions):
         exposure_grid_px: distance of the pixels from which a change of exposure is measured.
         exposure_decay: exponent by which the estimated exposure fades, because the histograms follow slow changes.
         exposure_limits: smallest and largest exposure relative to the first frame.
-        scale: options of the working picture.
-        fine_stages: schedule of the selected pose in the fine picture, where the frame is sharp enough for one.
+        scale: options of the pictures in which poses are refined and judged.
         spread_rate: share by which the estimated blur of the edges follows each frame.
         correlated_points: neighbouring edge points that share one error.
         velocity_decay: share of the last frame's motion that is expected in the next frame.
@@ -79,7 +78,6 @@ class TrackerOptions(RefinerOptions):
     exposure_decay: float = 0.9
     exposure_limits: tuple[float, float] = (0.2, 5.0)
     scale: WorkingScaleOptions = field(default_factory=WorkingScaleOptions)
-    fine_stages: tuple[Stage, ...] = TRACK_STAGES[1:]
     spread_rate: float = 0.3
     correlated_points: float = 8.0
     velocity_decay: float = 0.9

@@ -12,7 +12,7 @@ from arview.geometry import Array
 from arview.refinement.evidence import PoseEvidence
 from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.modalities.texture import TextureMatches
-from arview.refinement.picture_refiner import PictureRefiner
+from arview.refinement.refinement_pyramid import RefinementPyramid
 from arview.refinement.refiner import Appearance
 from arview.refinement.schedules import Stage
 
@@ -50,16 +50,14 @@ class RefinedPose(NamedTuple):
     Attributes:
         cam_from_body: (4,4) pose.
         information: (6,6) of the twist on its right.
-        evidence: evidence of the fine picture for it.
+        evidence: evidence of the finest picture for it.
         matches: texture used; None without.
-        is_fine: whether it was refined in the fine picture.
     """
 
     cam_from_body: Array
     information: Array
     evidence: PoseEvidence
     matches: TextureMatches | None
-    is_fine: bool
 
 
 class Proposal(NamedTuple):
@@ -72,7 +70,7 @@ class Proposal(NamedTuple):
         min_gain: by how much its score must exceed that of the best pose so far.
         motion_penalty: score that a squared motion distance of 1 costs.
         is_final: keep the start as the pose and use the stages only for its information.
-        is_fine: refine it in the fine picture.
+        first_level: number of the picture in which the schedule is run; finer ones follow. Negative: from the finest.
     """
 
     cam_from_body: Array
@@ -81,7 +79,7 @@ class Proposal(NamedTuple):
     min_gain: float = 0.0
     motion_penalty: float = 0.0
     is_final: bool = False
-    is_fine: bool = False
+    first_level: int = 0
 
 
 @dataclass
@@ -90,8 +88,7 @@ class FrameContext:
 
     Attributes:
         image: (H,W,3) uint8 RGB.
-        work: refinement in the working picture, in which the part is about as large in every frame.
-        fine: refinement in the finest picture in which edges are sharp; the same as ``work`` where that is as fine.
+        levels: the frame at the scales at which poses are refined and judged.
         predicted: (4,4) pose predicted from the motion so far.
         start: (4,4) the predicted pose, aligned with the texture found.
         pyramid: image pyramid of the grey picture; None without texture.
@@ -101,8 +98,7 @@ class FrameContext:
     """
 
     image: NDArray[np.uint8]
-    work: PictureRefiner
-    fine: PictureRefiner
+    levels: RefinementPyramid
     predicted: Array
     start: Array
     pyramid: Pyramid | None = None
