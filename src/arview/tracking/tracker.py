@@ -140,9 +140,10 @@ class Tracker:
 
     def _predicted(self, frame: FrameContext) -> Iterator[Proposal]:
         """The pose predicted from the motion so far and aligned with the texture found."""
-        # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails.
-        stages = LAST_STAGES if self.options.use_edge else self.options.stages
-        yield Proposal(frame.start, stages, frame.matches, first_level=-1)
+        # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails. So is
+        # texture, which carries the error of the pose at which it was learned.
+        o = self.options
+        yield Proposal(frame.predicted, LAST_STAGES if o.use_edge else o.stages, None, first_level=-1)
 
     def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
         """Other schedules, where the score is lower than usual."""
@@ -151,6 +152,10 @@ class Tracker:
         # What is usual is not yet known in the first frame, whose start may be off.
         if self.state.is_started and first.evidence.score >= o.other_schedules_share * usual:
             return
+        if frame.matches is not None:
+            yield Proposal(frame.start, LAST_STAGES, frame.matches, first_level=-1)
+            if self.state.is_started and frame.found.evidence.score >= o.other_schedules_share * usual:
+                return
         for level in (-2, 0):
             yield Proposal(frame.start, o.stages, frame.matches, first_level=level)
             if self.state.is_started and frame.found.evidence.score >= o.other_schedules_share * usual:
