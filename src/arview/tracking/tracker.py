@@ -113,7 +113,8 @@ class Tracker:
             # Nothing else can support the pose before there is a keyframe.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             self._texture.add_keyframe(self._texture.pyramid(gray), state.cam_from_body)
-        state.usual_score = levels.finest.evidence(state.cam_from_body, state.appearance).score
+        state.usual_score = levels.working.evidence(state.cam_from_body, state.appearance).score
+        state.usual_fine_score = levels.finest.evidence(state.cam_from_body, state.appearance).score
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
         """Track the part into the next frame (H,W,3) uint8 RGB.
@@ -146,25 +147,25 @@ class Tracker:
         yield Proposal(frame.predicted, LAST_STAGES if o.use_edge else o.stages, None, first_level=-1)
 
     def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
-        """Other schedules, where the score is lower than usual."""
-        o, usual = self.options, self.state.usual_score
-        first = frame.found
+        """Other schedules, where the scores are lower than usual."""
+        o = self.options
         # What is usual is not yet known in the first frame, whose start may be off.
-        if self.state.is_started and first.evidence.score >= o.other_schedules_share * usual:
+        if self.state.is_started and self._is_usual(frame):
             return
+        first = frame.found
         if frame.matches is not None:
             yield Proposal(frame.start, LAST_STAGES, frame.matches, first_level=-1)
-            if self.state.is_started and frame.found.evidence.score >= o.other_schedules_share * usual:
+            if self.state.is_started and self._is_usual(frame):
                 return
         for level in (-2, 0):
             yield Proposal(frame.start, o.stages, frame.matches, first_level=level)
-            if self.state.is_started and frame.found.evidence.score >= o.other_schedules_share * usual:
+            if self.state.is_started and self._is_usual(frame):
                 return
         if o.use_edge and first.evidence.inner_share > o.near_schedules_min_inner_share:
             yield Proposal(frame.start, NEAR_STAGES, frame.matches)
             yield Proposal(first.cam_from_body, NEAR_STAGES, frame.matches)
         for stages in FAR_STAGES:
-            if frame.found.evidence.score >= o.far_schedules_share * usual:
+            if self._evidence(frame).score >= o.far_schedules_share * self.state.usual_score:
                 return
             yield Proposal(frame.start, stages, frame.matches, o.min_gain)
 
@@ -178,7 +179,8 @@ class Tracker:
         for start in starts:
             yield Proposal(start, o.stages, None, o.min_gain, o.motion_penalty)
         # This score is usual from now on, because a search of the whole neighbourhood found nothing better.
-        state.usual_score = frame.found.evidence.score
+        state.usual_score = self._evidence(frame).score
+        state.usual_fine_score = frame.found.evidence.score
 
     def _rechecked(self, frame: FrameContext) -> Iterator[Proposal]:
         """The pose of the recheck, where the best pose so far is far from the predicted one."""
@@ -214,9 +216,19 @@ class Tracker:
     def _evidence(self, frame: FrameContext) -> PoseEvidence:
         """Evidence of the working picture for the best pose so far, which means the same in every frame."""
         best = frame.found
-        if len(frame.levels.scales) == 1:
-            return best.evidence
-        return frame.levels.working.evidence(best.cam_from_body, self.state.appearance)
+        if frame.judged is None or frame.judged[0] is not best:
+            is_one = len(frame.levels.scales) == 1
+            working = None if is_one else frame.levels.working.evidence(best.cam_from_body, self.state.appearance)
+            frame.judged = best, working or best.evidence
+        return frame.judged[1]
+
+    def _is_usual(self, frame: FrameContext) -> bool:
+        """Whether the scores of the best pose so far are as usual in the working and in the finest picture."""
+        o, state = self.options, self.state
+        return (
+            self._evidence(frame).score >= o.other_schedules_share * state.usual_score
+            and frame.found.evidence.score >= o.other_schedules_fine_share * state.usual_fine_score
+        )
 
     def _is_better(self, frame: FrameContext, candidate: RefinedPose, proposal: Proposal) -> bool:
         """Whether a refined proposal gains enough over the best pose so far."""
@@ -235,12 +247,12 @@ class Tracker:
 
     def _is_suspicious(self, frame: FrameContext) -> bool:
         """Whether the best pose may be wrong: its score is low, or lower than usual, or it is off the prediction."""
-        o, evidence = self.options, frame.found.evidence
+        o, evidence = self.options, self._evidence(frame)
         share = evidence.score / max(self.state.usual_score, 1e-6)
         is_less = share < o.wide_search_share or (
             share < o.surprise_share and self._motion(frame, frame.found) > o.surprise
         )
-        return is_less or self._evidence(frame).quality < o.min_learning_quality
+        return is_less or evidence.quality < o.min_learning_quality
 
     def _quality(self, frame: FrameContext, evidence: PoseEvidence) -> float:
         """Quality of the selected pose by the evidence of edges and colours, and by texture."""
@@ -269,7 +281,8 @@ class Tracker:
         state, o = self.state, self.options
         pose = frame.found.cam_from_body
         state.is_started = True
-        state.usual_score += o.score_rate * (frame.found.evidence.score - state.usual_score)
+        state.usual_score += o.score_rate * (evidence.score - state.usual_score)
+        state.usual_fine_score += o.score_rate * (frame.found.evidence.score - state.usual_fine_score)
         state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
         state.cam_from_body = pose
         self._measure_spread(frame.levels, o.spread_rate)

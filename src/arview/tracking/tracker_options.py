@@ -26,7 +26,8 @@ class TrackerOptions(RefinerOptions):
         min_learning_quality: quality below which colours are not learned, and the part is searched for around the
             predicted pose.
         score_rate: share by which the usual score follows each frame.
-        other_schedules_share: share of the usual score below which other schedules are tried.
+        other_schedules_share: share of the usual score in the working picture below which other schedules are tried.
+        other_schedules_fine_share: the same for the finest picture, in which scores vary more.
         near_schedules_min_inner_share: share of design edges needed for schedules without colours, because the apparent
             outline of a rounded part moves with the light.
         far_schedules_share: share of the usual score below which schedules for a part that moved far are tried.
@@ -62,6 +63,7 @@ class TrackerOptions(RefinerOptions):
     min_learning_quality: float = 0.4
     score_rate: float = 0.1
     other_schedules_share: float = 0.97
+    other_schedules_fine_share: float = 0.85
     near_schedules_min_inner_share: float = 0.05
     far_schedules_share: float = 0.9
     wide_search_share: float = 0.8

@@ -24,7 +24,7 @@ class TrackerState:
     Attributes:
         cam_from_body: (4,4) pose in the last frame.
         velocity: (6,) twist (rad, mm) expected until the next frame.
-        usual_score: running mean of the score.
+        usual_score, usual_fine_score: running means of the scores in the working and in the finest picture.
         appearance: colours of part and background.
         exposure: brightness relative to the frame in which colours were first learned.
         sparse_gray: (rows,columns) brightness of the last frame on a coarse grid.
@@ -36,6 +36,7 @@ class TrackerState:
     cam_from_body: Array
     velocity: Array = field(default_factory=lambda: np.zeros(6))
     usual_score: float = 0.0
+    usual_fine_score: float = 0.0
     appearance: Appearance = field(default_factory=Appearance)
     exposure: float = 1.0
     sparse_gray: NDArray[np.float64] | None = None
@@ -95,6 +96,7 @@ class FrameContext:
         matches: texture found; None where it is too little.
         found_share: share of the expected texture that was found.
         best: the best pose so far; None before the first one.
+        judged: a pose, and the evidence of the working picture for it.
     """
 
     image: NDArray[np.uint8]
@@ -105,6 +107,7 @@ class FrameContext:
     matches: TextureMatches | None = None
     found_share: float = 0.0
     best: RefinedPose | None = None
+    judged: tuple[RefinedPose, PoseEvidence] | None = None
 
     @property
     def found(self) -> RefinedPose:
