@@ -117,7 +117,8 @@ class RefinementPyramid:
                 picture.image, picture.smooth, cam_from_body, stages if number == start else finer_stages, appearance,
                 level.matches(matches),
             )  # fmt: skip
-        return cam_from_body, information
+        # An enlarged picture holds no more than the frame.
+        return cam_from_body, information / max(self.scales[-1], 1.0) ** 2
 
 
 class PictureRefiner:

@@ -41,7 +41,8 @@ class RefinerOptions:
         edge_weight: weight of edges.
         edge_sigma_px: standard deviation of a correct step from the edge of the CAD.
         edge_threshold: weakest step used, in grey levels over two pixels.
-        texture_sigma_px: standard deviation of a matched texture patch from its true position.
+        texture_sigma_px: standard deviation of a matched texture patch from its true position, including a share of the
+            error of the pose at which it was learned.
         rotation_sigma_rad: expected rotation error of a start, which sets the damping.
         translation_sigma: expected translation error of a start, in diameters, which sets the damping.
         min_inner_share: share of design edges inside the outline below which colours get more weight.
@@ -58,7 +59,7 @@ class RefinerOptions:
     edge_weight: float = 1.0
     edge_sigma_px: float = 0.7
     edge_threshold: float = 3.0
-    texture_sigma_px: float = 0.5
+    texture_sigma_px: float = 0.9
     rotation_sigma_rad: float = 0.3
     translation_sigma: float = 0.3
     min_inner_share: float = 0.3

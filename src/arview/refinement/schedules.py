@@ -95,7 +95,7 @@ SEARCH_STAGES = (
     Stage(region_scale=1, edge_reach=5, edge_step_px=1.0, edge_spread_px=1.0),
 )
 """Edges and colours, for a pose found by a search, which is off by some pixels."""
-LAST_STAGES = 2 * tuple(replace(stage, region_gain=0.02) for stage in TRACK_STAGES[2:])
+LAST_STAGES = 2 * tuple(replace(stage, region_gain=0.05) for stage in TRACK_STAGES[2:])
 """For a pose that is nearly right: coarse stages could lead it away, to an edge beside the outline."""
 
 

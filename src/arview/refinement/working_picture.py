@@ -149,11 +149,14 @@ def working_picture(
 
 
 def matches_in(picture: WorkingPicture, matches: TextureMatches) -> TextureMatches:
-    """Texture matches of a frame in the pixels of a working picture; their precision stays that in the frame."""
+    """Texture matches of a frame in the pixels of a working picture.
+
+    In a reduced picture their precision stays that in the frame; in an enlarged one that of all modalities is less.
+    """
     if (picture.scale, picture.left, picture.top) == (1.0, 0, 0):
         return matches
     pixels = (matches.pixels - (picture.left - 0.5, picture.top - 0.5)) * picture.scale - 0.5
-    return matches._replace(pixels=pixels, weights=matches.weights / picture.scale**2)
+    return matches._replace(pixels=pixels, weights=matches.weights / min(picture.scale, 1.0) ** 2)
 
 
 def window_around(

@@ -141,10 +141,10 @@ class Tracker:
 
     def _predicted(self, frame: FrameContext) -> Iterator[Proposal]:
         """The pose predicted from the motion so far and aligned with the texture found."""
-        # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails. So is
-        # texture, which carries the error of the pose at which it was learned.
+        # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails. So is a
+        # start from texture alone, which carries the error of the pose at which the texture was learned.
         o = self.options
-        yield Proposal(frame.predicted, LAST_STAGES if o.use_edge else o.stages, None, first_level=-1)
+        yield Proposal(frame.predicted, LAST_STAGES if o.use_edge else o.stages, frame.matches, first_level=-1)
 
     def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
         """Other schedules, where the scores are lower than usual."""
