@@ -113,8 +113,6 @@ class Tracker:
             # Nothing else can support the pose before there is a keyframe.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             self._texture.add_keyframe(self._texture.pyramid(gray), state.cam_from_body)
-        state.usual_score = levels.working.evidence(state.cam_from_body, state.appearance).score
-        state.usual_fine_score = levels.finest.evidence(state.cam_from_body, state.appearance).score
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
         """Track the part into the next frame (H,W,3) uint8 RGB.
@@ -280,10 +278,14 @@ class Tracker:
         """Update pose, velocity, usual score, colours and texture for the next frame."""
         state, o = self.state, self.options
         pose = frame.found.cam_from_body
-        state.is_started = True
-        state.usual_score += o.score_rate * (evidence.score - state.usual_score)
-        state.usual_fine_score += o.score_rate * (frame.found.evidence.score - state.usual_fine_score)
-        state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
+        fine_score = frame.found.evidence.score
+        if state.is_started:
+            state.usual_score += o.score_rate * (evidence.score - state.usual_score)
+            state.usual_fine_score += o.score_rate * (fine_score - state.usual_fine_score)
+            state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
+        else:
+            # The start may have been off, so neither its scores nor the motion from it mean anything.
+            state.is_started, state.usual_score, state.usual_fine_score = True, evidence.score, fine_score
         state.cam_from_body = pose
         self._measure_spread(frame.levels, o.spread_rate)
         if quality > o.min_learning_quality:
