@@ -23,6 +23,9 @@ from arview.refinement.working_picture import (
     working_picture,
 )
 
+NO_COLORS = Appearance()
+"""Colours that are not known."""
+
 
 class RefinementPyramid:
     """A frame at the scales of one part, made on demand; keep it only as long as the frame.
@@ -75,7 +78,8 @@ class RefinementPyramid:
             window = window_around(
                 refiner.camera, self._poses, refiner.diameter_mm, o.margin_px / min(scale, 1.0), o.reach
             )
-            picture = working_picture(self._image, refiner.camera, scale, window)
+            has_colors = number == 0 or not refiner.options.use_edge
+            picture = working_picture(self._image, refiner.camera, scale, window, has_colors)
             self._levels[number] = PictureRefiner(refiner, picture)
         return self._levels[number]
 
@@ -115,7 +119,7 @@ class RefinementPyramid:
             picture = level.picture
             cam_from_body, information = level.refiner.refine(
                 picture.image, picture.smooth, cam_from_body, stages if number == start else finer_stages, appearance,
-                level.matches(matches),
+                level.matches(matches), use_region=picture.has_colors,
             )  # fmt: skip
         # An enlarged picture holds no more than the frame.
         return cam_from_body, information / max(self.scales[-1], 1.0) ** 2
@@ -148,7 +152,8 @@ class PictureRefiner:
 
     def evidence(self, cam_from_body: Array, appearance: Appearance) -> PoseEvidence:
         """Evidence of the picture for a pose (4,4)."""
-        return self.refiner.evidence(self.picture.image, self.picture.smooth, cam_from_body, appearance)
+        used = appearance if self.picture.has_colors else NO_COLORS
+        return self.refiner.evidence(self.picture.image, self.picture.smooth, cam_from_body, used)
 
     def learn_colors(self, cam_from_body: Array, appearance: Appearance, rate: float) -> None:
         """Blend the colours along the outline at a pose (4,4) into an appearance."""

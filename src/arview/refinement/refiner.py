@@ -177,6 +177,7 @@ class PoseRefiner:
         stages: tuple[Stage, ...],
         appearance: Appearance,
         matches: TextureMatches = NO_MATCHES,
+        use_region: bool = True,
     ) -> tuple[Array, Array]:
         """Refine a pose through some stages.
 
@@ -187,11 +188,12 @@ class PoseRefiner:
             stages: see `schedules`.
             appearance: colours of part and background.
             matches: texture of the part found in this frame, the same for all stages.
+            use_region: use the colours, if they are known.
 
         Returns:
             ``cam_from_body`` (4,4) and information (6,6) of the twist (rad, mm) on its right.
         """
-        weights = self._weights if appearance.is_known else self._weights_without_color
+        weights = self._weights if use_region and appearance.is_known else self._weights_without_color
         pose, information = run_stages(
             image, gray, appearance.colors, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm,
             stage_table(stages), self._damping, weights, matches,

@@ -78,7 +78,7 @@ class WorkingPicture(NamedTuple):
     """A window of a picture at a scale.
 
     Attributes:
-        image: (h,w,3) uint8 RGB.
+        image: (h,w,3) uint8 RGB; empty in a picture made for edges only.
         smooth: (h,w) uint8 grey levels, smoothed for the edge modality.
         camera: intrinsics of the window at this scale.
         scale: of the window, relative to the picture.
@@ -94,6 +94,11 @@ class WorkingPicture(NamedTuple):
     right: int
     bottom: int
 
+    @property
+    def has_colors(self) -> bool:
+        """Whether colours can be measured in it."""
+        return self.image.shape[0] > 0
+
     def covers(self, center: Array, reach_px: float, camera: Camera) -> bool:
         """Whether the window holds all that a picture of ``camera`` shows around a pixel (2,) within a reach."""
         u, v = center
@@ -106,7 +111,11 @@ class WorkingPicture(NamedTuple):
 
 
 def working_picture(
-    image: NDArray[np.uint8], camera: Camera, scale: float, window: tuple[float, float, float, float] | None = None
+    image: NDArray[np.uint8],
+    camera: Camera,
+    scale: float,
+    window: tuple[float, float, float, float] | None = None,
+    has_colors: bool = True,
 ) -> WorkingPicture:
     """A window of a picture at a scale.
 
@@ -116,6 +125,7 @@ def working_picture(
         scale: of the result.
         window: left, upper, right and lower border, px; parts outside the picture are left out. None, or a window with
             too little of the picture: the whole picture.
+        has_colors: make the colours, too; the grey picture alone takes less time.
     """
     height, width = image.shape[:2]
     # Windows whose sides are multiples of the halvings are reduced by exactly two at each of them.
@@ -129,23 +139,21 @@ def working_picture(
             left, top, right, bottom = int(first[0]), int(first[1]), int(last[0]), int(last[1])
     right, bottom = left + (right - left) // unit * unit, top + (bottom - top) // unit * unit
     small = image[top:bottom, left:right]
+    if not has_colors:
+        small = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     for _ in range(halvings):
         small = cv2.resize(small, (small.shape[1] // 2, small.shape[0] // 2), interpolation=cv2.INTER_AREA)
     rest = scale * unit
-    size = round(small.shape[1] * rest), round(small.shape[0] * rest)
-    if rest > 1.0 + 1e-6:
-        # The edge modality interpolates; the region modality reads single pixels.
-        gray = cv2.resize(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_LINEAR)
-        small = cv2.resize(small, size, interpolation=cv2.INTER_NEAREST)
-    else:
-        if rest < 1.0 - 1e-6:
-            small = cv2.resize(small, size, interpolation=cv2.INTER_AREA)
-        gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    if abs(rest - 1.0) > 1e-6:
+        size = round(small.shape[1] * rest), round(small.shape[0] * rest)
+        small = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
+    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY) if has_colors else small
+    colors = small if has_colors else np.zeros((0, 0, 3), dtype=np.uint8)
     is_whole = (left, top, right, bottom) == (0, 0, width, height)
     own = camera if is_whole else camera.cropped(left, top, right - left, bottom - top)
     if scale != 1.0:
-        own = own.scaled(small.shape[1], small.shape[0])
-    return WorkingPicture(np.asarray(small), smoothed(np.asarray(gray)), own, scale, left, top, right, bottom)
+        own = own.scaled(gray.shape[1], gray.shape[0])
+    return WorkingPicture(np.asarray(colors), smoothed(np.asarray(gray)), own, scale, left, top, right, bottom)
 
 
 def matches_in(picture: WorkingPicture, matches: TextureMatches) -> TextureMatches:

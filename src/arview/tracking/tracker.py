@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from types import NoneType
 from typing import Protocol
 
@@ -21,7 +22,7 @@ from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
-from arview.refinement.evidence import MIN_IN_PICTURE, PoseEvidence, quality_of
+from arview.refinement.evidence import MIN_IN_PICTURE, quality_of
 from arview.refinement.gauss_newton import apply_twist, relative_twist
 from arview.refinement.kernels import median_brightness_ratio
 from arview.refinement.modalities.region import value_bins
@@ -76,6 +77,8 @@ class Tracker:
         self.options = options or TrackerOptions()
         self.camera = camera
         self.refiner = PoseRefiner(part or PartView(views), camera, self.options)
+        # Only edges gain from an enlarged picture.
+        self._scale = self.options.scale if self.options.use_edge else replace(self.options.scale, max_enlargement=1.0)
         self._recheck = recheck
         self._search = WideSearch(self.refiner.part.arrays, camera, self.refiner.intrinsics, self.diameter_mm)
         self._state: TrackerState | None = None
@@ -113,6 +116,7 @@ class Tracker:
             # Nothing else can support the pose before there is a keyframe.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             self._texture.add_keyframe(self._texture.pyramid(gray), state.cam_from_body)
+        state.usual_score = levels.working.evidence(state.cam_from_body, state.appearance).score
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
         """Track the part into the next frame (H,W,3) uint8 RGB.
@@ -129,11 +133,10 @@ class Tracker:
                 if self._is_better(frame, candidate, proposal):
                     frame.best = candidate
         best = frame.found
-        evidence = self._evidence(frame)
-        quality = self._quality(frame, evidence)
-        self._update(frame, evidence, quality)
+        quality = self._quality(frame)
+        self._update(frame, quality)
         cam_from_model = best.cam_from_body @ self.refiner.part.body_from_model
-        return Estimate(cam_from_model, best.information, quality, evidence)
+        return Estimate(cam_from_model, best.information, quality, best.evidence)
 
     # --- Propose ------------------------------------------------------------------------------------------
 
@@ -163,7 +166,7 @@ class Tracker:
             yield Proposal(frame.start, NEAR_STAGES, frame.matches)
             yield Proposal(first.cam_from_body, NEAR_STAGES, frame.matches)
         for stages in FAR_STAGES:
-            if self._evidence(frame).score >= o.far_schedules_share * self.state.usual_score:
+            if frame.found.evidence.score >= o.far_schedules_share * self.state.usual_score:
                 return
             yield Proposal(frame.start, stages, frame.matches, o.min_gain)
 
@@ -177,8 +180,8 @@ class Tracker:
         for start in starts:
             yield Proposal(start, o.stages, None, o.min_gain, o.motion_penalty)
         # This score is usual from now on, because a search of the whole neighbourhood found nothing better.
-        state.usual_score = self._evidence(frame).score
-        state.usual_fine_score = frame.found.evidence.score
+        state.usual_score = frame.found.evidence.score
+        state.usual_fine_score = frame.found.fine_score
 
     def _rechecked(self, frame: FrameContext) -> Iterator[Proposal]:
         """The pose of the recheck, where the best pose so far is far from the predicted one."""
@@ -209,23 +212,16 @@ class Tracker:
                 pose = proposal.cam_from_body
         else:
             pose, information = levels.working.refine_shading(proposal.cam_from_body, frame.found.information)
-        return RefinedPose(pose, information, levels.finest.evidence(pose, appearance), proposal.matches)
-
-    def _evidence(self, frame: FrameContext) -> PoseEvidence:
-        """Evidence of the working picture for the best pose so far, which means the same in every frame."""
-        best = frame.found
-        if frame.judged is None or frame.judged[0] is not best:
-            is_one = len(frame.levels.scales) == 1
-            working = None if is_one else frame.levels.working.evidence(best.cam_from_body, self.state.appearance)
-            frame.judged = best, working or best.evidence
-        return frame.judged[1]
+        evidence = levels.working.evidence(pose, appearance)
+        fine_score = levels.finest.evidence(pose, appearance).score if len(levels.scales) > 1 else evidence.score
+        return RefinedPose(pose, information, evidence, fine_score, proposal.matches)
 
     def _is_usual(self, frame: FrameContext) -> bool:
         """Whether the scores of the best pose so far are as usual in the working and in the finest picture."""
         o, state = self.options, self.state
         return (
-            self._evidence(frame).score >= o.other_schedules_share * state.usual_score
-            and frame.found.evidence.score >= o.other_schedules_fine_share * state.usual_fine_score
+            frame.found.evidence.score >= o.other_schedules_share * state.usual_score
+            and frame.found.fine_score >= o.other_schedules_fine_share * state.usual_fine_score
         )
 
     def _is_better(self, frame: FrameContext, candidate: RefinedPose, proposal: Proposal) -> bool:
@@ -233,7 +229,7 @@ class Tracker:
         if frame.best is None:
             return True
         penalty = proposal.motion_penalty
-        score, best = candidate.evidence.score, frame.best.evidence.score
+        score, best = candidate.score, frame.best.score
         if penalty:
             score -= penalty * self._motion(frame, candidate)
             best -= penalty * self._motion(frame, frame.best)
@@ -245,15 +241,16 @@ class Tracker:
 
     def _is_suspicious(self, frame: FrameContext) -> bool:
         """Whether the best pose may be wrong: its score is low, or lower than usual, or it is off the prediction."""
-        o, evidence = self.options, self._evidence(frame)
+        o, evidence = self.options, frame.found.evidence
         share = evidence.score / max(self.state.usual_score, 1e-6)
         is_less = share < o.wide_search_share or (
             share < o.surprise_share and self._motion(frame, frame.found) > o.surprise
         )
         return is_less or evidence.quality < o.min_learning_quality
 
-    def _quality(self, frame: FrameContext, evidence: PoseEvidence) -> float:
+    def _quality(self, frame: FrameContext) -> float:
         """Quality of the selected pose by the evidence of edges and colours, and by texture."""
+        evidence = frame.found.evidence
         if frame.found.matches is not None and evidence.points_in_picture > MIN_IN_PICTURE:
             return quality_of(evidence.score + self.options.texture_score * frame.found_share)
         return evidence.quality
@@ -274,11 +271,11 @@ class Tracker:
                 frame.matches, frame.start = matches, self._texture.align(matches, predicted)
         return frame
 
-    def _update(self, frame: FrameContext, evidence: PoseEvidence, quality: float) -> None:
+    def _update(self, frame: FrameContext, quality: float) -> None:
         """Update pose, velocity, usual score, colours and texture for the next frame."""
         state, o = self.state, self.options
-        pose = frame.found.cam_from_body
-        fine_score = frame.found.evidence.score
+        pose, evidence = frame.found.cam_from_body, frame.found.evidence
+        fine_score = frame.found.fine_score
         if state.is_started:
             state.usual_score += o.score_rate * (evidence.score - state.usual_score)
             state.usual_fine_score += o.score_rate * (fine_score - state.usual_fine_score)
@@ -292,7 +289,7 @@ class Tracker:
             if o.use_region:
                 frame.levels.working.learn_colors(pose, state.appearance, o.learning_rate)
             if self._texture is not None:
-                self._remember_texture(frame, evidence)
+                self._remember_texture(frame)
 
     def _follow_exposure(self, channel: NDArray[np.uint8]) -> None:
         """Compensate the colours for a change of exposure since the last frame.
@@ -311,7 +308,7 @@ class Tracker:
 
     def _levels(self, image: NDArray[np.uint8], poses: list[Array]) -> RefinementPyramid:
         """The frame at the scales of the last of some poses (4,4), around the part at all of them."""
-        return RefinementPyramid(self.refiner, image, poses, self.state.spread_px, self.options.scale)
+        return RefinementPyramid(self.refiner, image, poses, self.state.spread_px, self._scale)
 
     def _measure_spread(self, levels: RefinementPyramid, rate: float) -> None:
         """Move the estimated blur of the part's edges by a share towards that of a frame at the last pose."""
@@ -320,10 +317,10 @@ class Tracker:
         if spread_px is not None:
             state.spread_px += rate * (spread_px - state.spread_px)
 
-    def _remember_texture(self, frame: FrameContext, evidence: PoseEvidence) -> None:
+    def _remember_texture(self, frame: FrameContext) -> None:
         """Update the trust in the keyframes, and add one where it is missing and nothing hides the outline."""
         assert self._texture is not None and frame.pyramid is not None
-        o, state, pose, matches = self.options, self.state, frame.found.cam_from_body, frame.found.matches
+        o, state, (pose, _, evidence, _, matches) = self.options, self.state, frame.found
         if matches is not None:
             self._texture.update_trust(pose)
         state.best_contour_support = max(o.support_decay * state.best_contour_support, evidence.contour_support)
@@ -345,7 +342,10 @@ class Tracker:
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
         levels = self._levels(image, in_body)
         poses = [levels.refine(pose, fine, appearance, first=-1)[0] for pose in in_body]
-        return [levels.finest.evidence(pose, appearance).score for pose in poses]
+        found = [
+            (levels.working.evidence(pose, appearance), levels.finest.evidence(pose, appearance)) for pose in poses
+        ]
+        return [0.5 * (working.score + finest.score) for working, finest in found]
 
     def covariance(self, estimate: Estimate) -> Array:
         """Covariance (6,6) of the twist (rad, mm) about the model's centre.

@@ -51,14 +51,21 @@ class RefinedPose(NamedTuple):
     Attributes:
         cam_from_body: (4,4) pose.
         information: (6,6) of the twist on its right.
-        evidence: evidence of the finest picture for it.
+        evidence: evidence of the working picture for it, which means the same in every frame.
+        fine_score: score of its evidence in the finest picture, which tells near poses apart.
         matches: texture used; None without.
     """
 
     cam_from_body: Array
     information: Array
     evidence: PoseEvidence
+    fine_score: float
     matches: TextureMatches | None
+
+    @property
+    def score(self) -> float:
+        """Mean of both scores, by which poses of one frame are compared."""
+        return 0.5 * (self.evidence.score + self.fine_score)
 
 
 class Proposal(NamedTuple):
@@ -96,7 +103,6 @@ class FrameContext:
         matches: texture found; None where it is too little.
         found_share: share of the expected texture that was found.
         best: the best pose so far; None before the first one.
-        judged: a pose, and the evidence of the working picture for it.
     """
 
     image: NDArray[np.uint8]
@@ -107,7 +113,6 @@ class FrameContext:
     matches: TextureMatches | None = None
     found_share: float = 0.0
     best: RefinedPose | None = None
-    judged: tuple[RefinedPose, PoseEvidence] | None = None
 
     @property
     def found(self) -> RefinedPose:
