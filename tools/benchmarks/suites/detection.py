@@ -45,8 +45,9 @@ from arview.pose import TrackingState
 from arview.tracking import TrackingSession
 from arview.video import Image
 from photos import all_photos, background_photos
-from recordings import SAMPLE, VIDEOS
+from recordings import PHOTO_SEQUENCES, SAMPLE, VIDEOS
 from rows import ResultRow, timing, watched
+from suites.single_photos import photo_detection_row
 
 SCENE_FRAMES = 200
 """Frames of a semi-synthetic sequence."""
@@ -87,6 +88,9 @@ class DetectionSuite:
         """The detector, without a prior, on single frames of the recorded sequences."""
         rows = []
         for name, scene in watched(self.recorded.items(), "detect"):
+            if name in PHOTO_SEQUENCES:
+                rows.append(photo_detection_row(name, scene))
+                continue
             model = scene.part.model
             symmetries = box_symmetries(model) if name in BOXES else scene.part.symmetries
             meter = PoseMeter(model, scene.camera, symmetries=symmetries, symmetric_poses=scene.symmetric_poses)
