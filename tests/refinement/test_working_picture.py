@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ def test_the_part_has_the_same_sizes_whatever_the_size_of_the_picture(factor: fl
     scales = OPTIONS.scales(120.0 * factor, 0.5 * factor)
     assert scales[0] * 120.0 * factor == pytest.approx(100.0, rel=0.2)
     assert scales[-1] * 120.0 * factor == pytest.approx(400.0, rel=0.2)
-    assert all(1.0 < b / a <= 2.1 for a, b in zip(scales, scales[1:], strict=False))
+    assert all(1.0 < b / a <= 2.1 for a, b in pairwise(scales))
 
 
 def test_a_small_part_is_judged_as_it_is_and_enlarged_at_most_four_times() -> None:

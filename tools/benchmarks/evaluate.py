@@ -52,6 +52,7 @@ from suites.quality import quality_rows
 from suites.real_conditions import REAL_FRAMES, REAL_SHAPES, RealConditionsSuite
 from suites.reconstruction import reconstruction_rows
 from suites.relocalization import relocalization_rows
+from suites.scale import SCALED, acceptance_rows, scale_rows
 from suites.single_photos import evaluate_photos, photo_rows
 
 TRUSTED = (TrackingState.TRACKED, TrackingState.CRITICAL)
@@ -60,6 +61,7 @@ SEED = 7
 SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
     "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
+    "accepted", "scale",
 )  # fmt: skip
 
 
@@ -118,6 +120,8 @@ def main() -> None:
         real.track,
         real.detect,
         lambda: quality_rows(every, real, details, chosen.frames),
+        lambda: [row for name in PHOTO_SEQUENCES if name in every for row in acceptance_rows(every[name])],
+        lambda: [row for name in SCALED if name in every for row in scale_rows(every[name], "truth", details)],
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []

@@ -19,6 +19,8 @@ ACCEPTED = ((0.5, 0.0), (0.75, 0.0), (1.0, 0.0), (2.0, 0.0), (1.0, 0.6), (1.0, 1
 """Scale and blur, px of the original, at which photos are shown at their true poses."""
 TRACKED = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Scales at which sequences are tracked."""
+SCALED = ("castle", "dragon", "plate")
+"""Sequences tracked at several scales."""
 TOLERANCE = 0.1
 """Relative difference of median errors and of tracked frames from those at the original size."""
 
