@@ -58,17 +58,24 @@ class WorkingScaleOptions:
             radius_px: half the part's diameter in the picture.
             spread_px: standard deviation of the blur of its edges in the picture; 0 where it is not known.
         """
-        working = min(1.0, self.radius_px / radius_px)
-        if spread_px * working > self.max_spread_px:
-            working = max(self.max_spread_px / spread_px, min(working, self.soft_radius_px / radius_px))
         finest = min(self.max_enlargement, self.fine_radius_px / radius_px)
         if spread_px * finest > self.max_fine_spread_px:
             finest = self.max_fine_spread_px / spread_px
-        step = 1.0 / self.steps_per_octave
-        first, last = step * np.round(np.log2([working, finest]) / step)
+        first, last = np.log2(self.working_scale(radius_px, spread_px)), self._quantised(np.log2(finest))
         count = max(0, int(np.ceil((last - first) / np.log2(self.level_ratio) - 1e-6)))
-        between = [step * np.round((first + k * (last - first) / count) / step) for k in range(1, count)]
+        between = [self._quantised(first + k * (last - first) / count) for k in range(1, count)]
         return tuple(float(2.0**x) for x in (first, *between, *([last] if count else [])))
+
+    def working_scale(self, radius_px: float, spread_px: float = 0.0) -> float:
+        """Scale of the working picture, at most 1; arguments as of `scales`."""
+        scale = min(1.0, self.radius_px / radius_px)
+        if spread_px * scale > self.max_spread_px:
+            scale = max(self.max_spread_px / spread_px, min(scale, self.soft_radius_px / radius_px))
+        return float(2.0 ** self._quantised(np.log2(scale)))
+
+    def _quantised(self, octaves: float) -> float:
+        """The nearest scale of the series; both are logarithms to base 2."""
+        return float(np.round(octaves * self.steps_per_octave) / self.steps_per_octave)
 
 
 DEFAULT = WorkingScaleOptions()
