@@ -30,6 +30,9 @@ TANGENT_REACH_PX = 5
 SHORT_EDGE_PX = 6.0
 """Tangents of shorter edges are smoothed."""
 
+NORMAL_REACH_PX = 2.0
+"""Distance from the outline at which its two sides are told apart."""
+
 
 @dataclass(frozen=True)
 class ViewFeatures:
@@ -41,7 +44,7 @@ class ViewFeatures:
         contour_runs_mm: (C,2) how far the normal stays on the part, and on the background.
         contour_component: (C,) component index.
         edge_points: (E,3).
-        edge_tangents: (E,3) unit vectors.
+        edge_tangents: (E,3) unit vectors; along the outline so that the image normal (-v, u) points outwards.
         edge_kinds: (E,) EDGE_* bits.
         edge_component: (E,) component index.
     """
@@ -199,7 +202,7 @@ def extract_features(
     """
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     samples = sample_visible_edges(edges, cam_from_model, intrinsics, rendering.depth_mm, spacing_px=1.0)
-    tangents, usable = _edge_tangents(samples, cam_from_model, camera, rendering.depth_mm.shape)
+    tangents, usable = _edge_tangents(samples, cam_from_model, camera, rendering.silhouette)
     chosen = usable[_evenly(len(usable), edge_count)]
     contour = _contour(rendering, cam_from_model, camera, samples, contour_count)
     return ViewFeatures(
@@ -215,12 +218,12 @@ def extract_features(
 
 
 def _edge_tangents(
-    samples: ViewEdgeSamples, cam_from_model: Array, camera: Camera, shape: tuple[int, ...]
+    samples: ViewEdgeSamples, cam_from_model: Array, camera: Camera, mask: NDArray[np.uint8]
 ) -> tuple[Array, NDArray[np.intp]]:
     """Unit tangents (N,3) of edge samples in the model frame, and the indices of the samples that are usable.
 
     Short edges of curved surfaces zigzag: their tangents are smoothed. Long edges along the line of sight have no
-    direction in the picture and are left out.
+    direction in the picture and are left out. Tangents (u, v) of the outline run so that (-v, u) points outwards.
     """
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     tangents_in_cam = samples.tangents_in_model @ cam_from_model[:3, :3].T
@@ -239,11 +242,25 @@ def _edge_tangents(
     if not len(samples.pixels):
         return samples.tangents_in_model, np.zeros(0, dtype=np.intp)
     is_short = samples.lengths_px < SHORT_EDGE_PX
-    smooth_px = _smooth_tangents(samples.pixels, tangents_px, (shape[0], shape[1]))
+    smooth_px = _smooth_tangents(samples.pixels, tangents_px, (mask.shape[0], mask.shape[1]))
     smooth_in_cam = np.stack([smooth_px[:, 0] / fx, smooth_px[:, 1] / fy, np.zeros(len(smooth_px))], axis=1)
     smooth_in_cam /= np.linalg.norm(smooth_in_cam, axis=1, keepdims=True)
     tangents = np.where(is_short[:, None], smooth_in_cam @ cam_from_model[:3, :3], samples.tangents_in_model)
+    directions_px = np.where(is_short[:, None], smooth_px, tangents_px)
+    is_inward = _run_inwards(samples.pixels, directions_px, mask) & ((samples.kinds & EDGE_CONTOUR) > 0)
+    tangents[is_inward] *= -1.0
     return tangents, np.flatnonzero(~along_sight | is_short)
+
+
+def _run_inwards(pixels: Array, tangents_px: Array, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Of which edges (N,) the normal (-v, u) of the tangent (u, v) points to the inside of a silhouette (H,W)."""
+    inside = cv2.blur((mask > 0).astype(np.float32), (3, 3))
+    normals = NORMAL_REACH_PX * np.stack([-tangents_px[:, 1], tangents_px[:, 0]], axis=1)
+    ahead, behind = (
+        cv2.remap(inside, (pixels + shift).astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]
+        for shift in (normals, -normals)
+    )
+    return np.asarray(ahead > behind)
 
 
 def _contour(

@@ -178,7 +178,7 @@ def region_evidence(lines: RegionLines, tolerance_px: float) -> RegionTerms:
     near = 0.0
     count = 0
     for i in range(information.shape[0]):
-        if lines.agreement[i] < 0.0:
+        if lines.crossing[i] < 0.0:
             continue
         count += 1
         total += information[i]

@@ -81,6 +81,33 @@ def solve_step(
 
 
 @kernel
+def trust_in(
+    hessian: NDArray[np.float64], gradient: NDArray[np.float64], squares: float, count: float, weight: float
+) -> float:  # fmt: skip
+    """Trust in one modality, 0–1, by the scatter of its residuals about its own optimum.
+
+    Their variance relative to the one that they claim is the modality's variance component (Förstner, "Ein Verfahren
+    zur Schätzung von Varianz- und Kovarianzkomponenten", 1979). A motion of the part, which a pose explains, does not
+    count. The trust is the inverse of its square where it exceeds 1, because errors beyond the claimed noise are common
+    to many neighbouring residuals.
+
+    Args:
+        hessian, gradient: (6,6) lower triangle and (6,) of the modality alone.
+        squares: sum of its squared residuals, each divided by its claimed variance.
+        count: effective number of its residuals.
+        weight: factor of ``hessian`` and ``gradient``.
+    """
+    if count <= 7.0:
+        return 1.0
+    twist = solve_step(hessian, gradient, np.full(6, 1e-6 * weight))
+    explained = 0.0
+    for i in range(6):
+        explained -= gradient[i] * twist[i]
+    variance = (squares - explained / weight) / (count - 6.0)
+    return 1.0 / max(variance, 1.0) ** 2
+
+
+@kernel
 def apply_twist(cam_from_body: NDArray[np.float64], twist: NDArray[np.float64]) -> NDArray[np.float64]:
     """``cam_from_body`` (4,4) after a twist (rotation rad, translation mm) on the right.
 

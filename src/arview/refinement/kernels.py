@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.evidence import edge_evidence, region_evidence
-from arview.refinement.gauss_newton import apply_twist, solve_step
-from arview.refinement.modalities.edge import HYPOTHESES, EdgeProfiles, add_edges, measure_edges
+from arview.refinement.gauss_newton import apply_twist, solve_step, trust_in
+from arview.refinement.modalities.edge import HYPOTHESES, EdgeProfiles, add_edges, measure_edges, weigh_by_color
 from arview.refinement.modalities.region import ColorModel, RegionLines, add_histograms, add_region, measure_region
 from arview.refinement.modalities.texture import TextureMatches
 from arview.refinement.modalities.texture_matching import add_matches
@@ -32,6 +32,7 @@ class ModalityWeights(NamedTuple):
     """Weights of the modalities; a weight of 0 leaves a modality out. See `RefinerOptions`."""
 
     region: float
+    fine_region_gain: float
     edge: float
     edge_sigma_px: float
     edge_threshold: float
@@ -118,6 +119,8 @@ def run_stages(
     for s in range(stages.stride.shape[0]):
         stride = stages.stride[s]
         region_weight = weights.region * stages.region_gain[s] * stride
+        if stages.region_scale[s] == 1:
+            region_weight *= weights.fine_region_gain
         edge_weight = weights.edge * stride
         spread_px = stages.edge_spread_px[s]
         view = _project_view(part, pose, intrinsics, step_mm, stride)
@@ -125,14 +128,21 @@ def run_stages(
         profiles = _measure_profiles(
             gray, view, stages.edge_reach[s], stages.edge_step_px[s], weights.edge_threshold, edge_weight > 0
         )
-        for _ in range(stages.updates[s]):
+        if edge_weight > 0 and weights.region > 0:
+            weigh_by_color(image, colors, view.edge_lines, view.edge_kinds, profiles)
+        trust = 1.0
+        for update in range(stages.updates[s]):
             hessian[:] = 0.0
             gradient[:] = 0.0
             if region_weight > 0:
-                add_region(
+                squares, count = add_region(
                     hessian, gradient, view.contour, pose, intrinsics, view.contour_lines, region, region_weight,
                     3.0 * stages.region_scale[s],
                 )  # fmt: skip
+                if update == 0:
+                    trust = trust_in(hessian, gradient, squares, count, region_weight)
+                hessian *= trust
+                gradient *= trust
             if edge_weight > 0:
                 add_edges(
                     hessian, gradient, view.edges, view.edge_kinds, pose, intrinsics, view.edge_lines, profiles,

@@ -4,7 +4,7 @@ Colour histograms of both sides give a probability for every pixel. A line of pi
 posterior of the contour's displacement, approximated by a Gaussian: Stoiber et al., "SRT3D: A Sparse Region-Based 3D
 Object Tracking Approach for the Real World" (IJCV 2022), after Prisacariu & Reid, "PWP3D" (IJCV 2012). In addition to
 SRT3D, the information that a flat posterior seems to hold, because its support is bounded, is subtracted, so that lines
-without any contrast have no weight.
+without any contrast have no weight, and lines that the outline hardly crosses have little.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from arview.refinement.projection import ProjectedLines, project
 
 BINS = 16
 """Histogram bins per colour channel: 16³ log odds fit into the first-level cache."""
+STEP_HEIGHT = 0.86
+"""Largest difference between the probabilities of part and background at a pixel."""
 _DISPLACEMENTS = 12
 _SEGMENTS = 19
 
@@ -45,20 +47,20 @@ class RegionLines(NamedTuple):
     Attributes:
         mean: (N,) px along the outward normal.
         information: (N,) 1/px²; 0 for a line without contrast.
-        agreement: (N,) 0–1, how much better a contour explains the colours than none does; -1 for lines that were not
-            measured.
+        crossing: (N,) 0–1, probability that the outline crosses the line, against the whole line being part or
+            background; -1 for lines that were not measured.
     """
 
     mean: Array
     information: Array
-    agreement: Array
+    crossing: Array
 
 
 def _edge_function() -> Array:
     """(19,12) 2 h - 1, with the probability h of "part" for segment r at displacement d (SRT3D eq. 13)."""
     r = np.arange(_SEGMENTS) - 0.5 * (_SEGMENTS - 1)
     d = np.arange(_DISPLACEMENTS) - 0.5 * (_DISPLACEMENTS - 1)
-    return np.ascontiguousarray(-0.86 * np.tanh((r[:, None] - d[None, :]) / (2.0 * 0.5)))
+    return np.ascontiguousarray(-STEP_HEIGHT * np.tanh((r[:, None] - d[None, :]) / (2.0 * 0.5)))
 
 
 EDGE_FUNCTION = _edge_function()
@@ -140,7 +142,7 @@ def measure_region(
     pixels, normals, depths = lines.pixels, lines.normals, lines.depths
     height, width = image.shape[0], image.shape[1]
     count = pixels.shape[0]
-    mean, information, agreement = np.zeros(count), np.zeros(count), np.full(count, -1.0)
+    mean, information, crossing = np.zeros(count), np.zeros(count), np.full(count, -1.0)
     posterior = np.empty(12)
     flat = 1.0 / 12.0
     half = 0.5 * 19 * scale
@@ -166,6 +168,7 @@ def measure_region(
             continue
         for d in range(12):
             posterior[d] = 1.0
+        all_part, all_back = 1.0, 1.0
         for s in range(19):
             total = 0.0
             for k in range(0, scale, sample_step):
@@ -181,6 +184,8 @@ def measure_region(
             lean = total / np.sqrt(1.0 + total * total)
             for d in range(12):
                 posterior[d] *= 1.0 + edge_function[s, d] * lean
+            all_part *= 1.0 + STEP_HEIGHT * lean
+            all_back *= 1.0 - STEP_HEIGHT * lean
         norm = 0.0
         for d in range(12):
             norm += posterior[d]
@@ -195,13 +200,13 @@ def measure_region(
             variance += (d - 5.5 - m) ** 2 * posterior[d]
         variance = variance / norm + 1.0 / 12.0
         gain = 1.0 / variance - flat
-        agreement[i] = norm / (norm + 12.0)
+        crossing[i] = norm / (norm + 12.0 * (all_part + all_back))
         if gain <= 0.0:
             continue
         shrink = (1.0 / variance) / gain
         mean[i] = scale * min(max(m * shrink, -8.0), 8.0)
         information[i] = gain / (scale * scale)
-    return RegionLines(mean, information, agreement)
+    return RegionLines(mean, information, crossing)
 
 
 @kernel
@@ -209,7 +214,7 @@ def add_region(
     hessian: NDArray[np.float64], gradient: NDArray[np.float64], points: NDArray[np.float32],
     cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], lines: ProjectedLines, region: RegionLines,
     weight: float, robust_px: float
-) -> None:  # fmt: skip
+) -> tuple[float, float]:  # fmt: skip
     """Add the Gaussians of the lines to the 6×6 system.
 
     Args:
@@ -220,9 +225,14 @@ def add_region(
         region: `RegionLines` measured there.
         weight: of the modality.
         robust_px: residual that halves the weight of a line.
+
+    Returns:
+        sum of the squared residuals, each divided by the variance that its line claims, and effective number of lines.
     """
+    squares, count = 0.0, 0.0
     r = cam_from_body
-    pixels, normals, mean, information = lines.pixels, lines.normals, region.mean, region.information
+    pixels, normals = lines.pixels, lines.normals
+    mean, information, crossing = region
     for i in range(points.shape[0]):
         if information[i] <= 0.0:
             continue
@@ -234,5 +244,10 @@ def add_region(
             continue
         u, v = project(x, y, z, intrinsics)
         residual = (u - pixels[i, 0]) * normals[i, 0] + (v - pixels[i, 1]) * normals[i, 1] - mean[i]
-        w = weight * information[i] / (1.0 + (residual / robust_px) ** 2)
+        # A line that is likely to lie on one side as a whole still has a narrow posterior, at its end.
+        trust = crossing[i] * crossing[i] / (1.0 + (residual / robust_px) ** 2)
+        w = weight * information[i] * trust
+        squares += information[i] * trust * residual * residual
+        count += trust
         add_line(hessian, gradient, p, r, x, y, z, normals[i, 0], normals[i, 1], intrinsics, residual, w)
+    return squares, count
