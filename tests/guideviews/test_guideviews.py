@@ -222,6 +222,24 @@ def test_edges_lie_on_the_mesh_and_their_kinds_are_right(views: GuideViewSet) ->
         assert np.mean((f.edge_kinds & EDGE_CONTOUR) > 0) > 0.2
 
 
+def test_edges_of_the_outline_run_with_the_outside_on_one_side(views: GuideViewSet) -> None:
+    renderer = ZBufferRenderer(assembly(), views.camera)
+    right, count = 0, 0
+    for view in (views.view(k) for k in range(0, len(views), 4)):
+        mask = renderer.render(view.cam_from_model).silhouette > 0
+        outline = (view.features.edge_kinds & EDGE_CONTOUR) > 0
+        points, tangents = view.features.edge_points[outline], view.features.edge_tangents[outline]
+        pixels = views.camera.project(apply(view.cam_from_model, points))
+        along = views.camera.project(apply(view.cam_from_model, points + tangents)) - pixels
+        normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        ahead, behind = (np.round(pixels + shift).astype(int) for shift in (3.0 * normals, -3.0 * normals))
+        is_told = mask[ahead[:, 1], ahead[:, 0]] != mask[behind[:, 1], behind[:, 0]]
+        right += np.count_nonzero(~mask[ahead[:, 1], ahead[:, 0]][is_told])
+        count += np.count_nonzero(is_told)
+    assert count > 500 and right >= 0.99 * count
+
+
 def test_hidden_edges_are_left_out() -> None:
     """Of a block seen corner on, the three edges that meet at the far corner are hidden, the other nine seen."""
     corner = ViewRange((600.0, 600.0), elevation_deg=(30.0, 30.0), azimuth_deg=(40.0, 40.0))

@@ -32,7 +32,6 @@ class ModalityWeights(NamedTuple):
     """Weights of the modalities; a weight of 0 leaves a modality out. See `RefinerOptions`."""
 
     region: float
-    fine_region_gain: float
     edge: float
     edge_sigma_px: float
     edge_threshold: float
@@ -119,8 +118,6 @@ def run_stages(
     for s in range(stages.stride.shape[0]):
         stride = stages.stride[s]
         region_weight = weights.region * stages.region_gain[s] * stride
-        if stages.region_scale[s] == 1:
-            region_weight *= weights.fine_region_gain
         edge_weight = weights.edge * stride
         spread_px = stages.edge_spread_px[s]
         view = _project_view(part, pose, intrinsics, step_mm, stride)

@@ -47,8 +47,6 @@ class RefinerOptions:
         translation_sigma: expected translation error of a start, in diameters, which sets the damping.
         min_inner_share: share of design edges inside the outline below which colours get more weight.
         plain_region_gain: extra weight of colours, as a multiple of ``region_weight``, for a part without inner edges.
-        round_region_gain: extra weight of colours in the finest stages for a part whose outline is round throughout,
-            because shading and highlights displace steps at a round rim.
         min_histogram_count: pixels needed on either side of the outline to learn colours.
         size_unit_px: half diameter in the picture for which the stages are made; a larger part widens them.
         step_share: length, in diameters, by which the projections of normals and tangents are measured.
@@ -66,7 +64,6 @@ class RefinerOptions:
     translation_sigma: float = 0.3
     min_inner_share: float = 0.3
     plain_region_gain: float = 6.0
-    round_region_gain: float = 2.0
     min_histogram_count: int = 50
     size_unit_px: float = 80.0
     step_share: float = 0.01
@@ -125,13 +122,11 @@ class PoseRefiner:
         outline = int(np.count_nonzero(kinds & EDGE_CONTOUR))
         inner = int(np.count_nonzero(((kinds & EDGE_CONTOUR) == 0) & ((kinds & EDGE_SHARP) > 0)))
         inner_share = inner / max(outline + inner, 1)
-        is_round = 1.0 - np.count_nonzero((kinds & EDGE_CONTOUR) & (kinds // EDGE_SHARP)) / max(outline, 1)
         # Colours count more for a part with few design edges inside its outline.
         plainness = max(0.0, 1.0 - inner_share / o.min_inner_share)
         region_weight = o.region_weight * (1.0 + o.plain_region_gain * plainness)
         self._weights = ModalityWeights(
             region=region_weight if o.use_region else 0.0,
-            fine_region_gain=1.0 + o.round_region_gain * is_round,
             edge=o.edge_weight if o.use_edge else 0.0,
             edge_sigma_px=o.edge_sigma_px,
             edge_threshold=o.edge_threshold,

@@ -152,7 +152,7 @@ def weigh_by_color(
     positions, strengths = profiles.positions, profiles.strengths
     separation = np.zeros(HYPOTHESES)
     for i in range(kinds.shape[0]):
-        if (kinds[i] & EDGE_CONTOUR) == 0:
+        if (kinds[i] & (EDGE_CONTOUR | EDGE_SHARP)) != EDGE_CONTOUR:
             continue
         u, v = lines.pixels[i, 0], lines.pixels[i, 1]
         nu, nv = lines.normals[i, 0], lines.normals[i, 1]
