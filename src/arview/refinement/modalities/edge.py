@@ -26,7 +26,7 @@ edges. Both may be invisible, and highlights and texture are often near them."""
 COLOR_REACH_PX = 4
 """Pixels to either side of a step whose colours are compared."""
 COLOR_GAIN = 4.0
-"""Logarithm by which a step is weaker that has the same colours on both sides where another one separates them fully."""
+"""Logarithm by which a step with the same colours on both sides is weaker where another one separates them fully."""
 HYPOTHESES = 5
 """Steps kept per point, the strongest ones."""
 CUT_OFF = 2.5
