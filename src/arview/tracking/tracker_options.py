@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from arview.errors import InputError
+from arview.refinement.modalities.shading import ShadingOptions
 from arview.refinement.refiner import RefinerOptions
 from arview.refinement.schedules import TRACK_STAGES, Stage
 from arview.refinement.working_picture import WorkingScaleOptions
@@ -17,6 +18,8 @@ class TrackerOptions(RefinerOptions):
     Attributes:
         use_texture: match the part's own texture; needs the model's surface.
         use_shading: use the brightness of curved surfaces.
+        shading: as of the refinement, with less weight than for a pose found by a search, because the errors of the
+            brightness are common to many pixels and the tracked pose is nearly right.
         stages: schedule of a usual frame.
         min_matches: texture matches needed to use texture.
         min_match_share: share of the expected texture that must be found to use texture.
@@ -55,6 +58,7 @@ class TrackerOptions(RefinerOptions):
 
     use_texture: bool = True
     use_shading: bool = True
+    shading: ShadingOptions = field(default_factory=lambda: ShadingOptions(gain=0.5))
     stages: tuple[Stage, ...] = TRACK_STAGES
     min_matches: int = 12
     min_match_share: float = 0.4

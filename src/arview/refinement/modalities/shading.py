@@ -63,7 +63,7 @@ class ShadingOptions:
         min_curved_share: share of curved surface needed, because any light can explain the brightness of flat faces.
     """
 
-    gain: float = 0.5
+    gain: float = 5.0
     radius_px: float = 26.0
     reach: float = 1.15
     min_curved_share: float = 0.2
