@@ -116,10 +116,12 @@ class Disambiguator:
 
         The outline of such a part fits at any angle; the few small edges that break the symmetry do not guide a search.
         """
-        o, refiner = self.options, self._local.refiner
+        o = self.options
+        picture = self._local.work_picture(pyramid, pose)
+        refiner = self._local.refiner.with_camera(picture.camera)
 
         def mean_support(swept: Array) -> float:
-            support = refiner.edge_steps(pyramid.gray, swept).support
+            support = refiner.edge_steps(picture.gray, swept).support
             return float(support.mean()) if len(support) else 0.0
 
         starts = []
@@ -132,11 +134,12 @@ class Disambiguator:
 
     def evidence_margins(self, pyramid: ImagePyramid, hypotheses: list[Hypothesis]) -> Array:
         """Margins of evidence (N,N) for each of some hypotheses over each other one."""
-        refiner = self._local.refiner
+        picture = self._local.work_picture(pyramid, hypotheses[0].cam_from_body)
+        refiner = self._local.refiner.with_camera(picture.camera)
         logits = np.array([h.logit_without_contour for h in hypotheses])
         margins = self._pair_comparator.log_odds(pyramid, [h.cam_from_body for h in hypotheses])
         margins += self.options.logit_weight * (logits[:, None] - logits)
-        steps = list(pool().map(lambda h: refiner.edge_steps(pyramid.gray, h.cam_from_body), hypotheses))
+        steps = list(pool().map(lambda h: refiner.edge_steps(picture.gray, h.cam_from_body), hypotheses))
         for a, b in combinations(range(len(hypotheses)), 2):
             by_edges = edge_margin(steps[a], steps[b], self.options.edges)
             margins[a, b] += by_edges

@@ -45,6 +45,20 @@ class PyramidLevel(NamedTuple):
     intrinsics: Array
 
 
+class WorkPicture(NamedTuple):
+    """An image at the scale at which poses are refined and their evidence is measured.
+
+    Attributes:
+        image: (H,W,3) uint8 RGB.
+        gray: (H,W) uint8, smoothed by `smoothed`.
+        camera: of both.
+    """
+
+    image: NDArray[np.uint8]
+    gray: NDArray[np.uint8]
+    camera: Camera
+
+
 class EdgeResponses(NamedTuple):
     """Edge responses of an image.
 
@@ -95,7 +109,6 @@ class ImagePyramid:
         spread_px: int = 1,
     ) -> None:
         self.image = image
-        self.gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         self.pad_px = pad_px
         self.focal_px = 0.5 * (camera.fx + camera.fy)
         self._camera = camera
@@ -104,20 +117,30 @@ class ImagePyramid:
         self._halved = _halve_image(image)
         self._responses: list[NDArray[np.uint8]] = []
         self._lock = Lock()
-        self._edge_responses: EdgeResponses | None = None
+        self._edge_responses: dict[int, EdgeResponses] = {}
         self._maps: dict[int, tuple[NDArray[np.uint8], Array]] = {}
         self._levels: dict[int, PyramidLevel] = {}
+        self._pictures: dict[int, WorkPicture] = {}
 
     @cached_property
     def without_edge_net(self) -> ImagePyramid:
         """The same image with response maps made from gradients alone."""
         other = copy.copy(self)
-        other._edge_net, other._responses, other._edge_responses, other._maps, other._levels = None, [], None, {}, {}
+        other._edge_net, other._responses, other._edge_responses, other._maps, other._levels = None, [], {}, {}, {}
         return other
 
     def radii_px(self, diameter_mm: float, poses: Array) -> Array:
         """Half the diameter (N,) of a part in the image, at poses (N,4,4) about its centre."""
         return np.asarray(self.focal_px * 0.5 * diameter_mm / np.linalg.norm(poses[:, :3, 3], axis=1))
+
+    def picture(self, step: int) -> WorkPicture:
+        """The image at a scale step, as refinement and evidence take it."""
+        if step not in self._pictures:
+            width, height = self._size(step)
+            image = self._resized(width, height)
+            gray = smoothed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+            self._pictures[step] = WorkPicture(image, gray, self._camera.scaled(width, height))
+        return self._pictures[step]
 
     def make_maps(self, steps: Iterable[int]) -> None:
         """Make the response maps of several scale steps in parallel."""
@@ -134,16 +157,16 @@ class ImagePyramid:
             self._maps[step] = self._make_maps(step)
         return self._maps[step]
 
-    def edge_responses(self) -> EdgeResponses:
-        """The responses of the edge network alone; zero without a network."""
+    def edge_responses(self, step: int = 0) -> EdgeResponses:
+        """The responses of the edge network alone for a scale step, at half its size; zero without a network."""
         self._predict()
-        if self._edge_responses is None:
-            height, width = self._camera.height // 2, self._camera.width // 2
-            if self._responses:
+        if step not in self._edge_responses:
+            width, height = (side // 2 for side in self._size(step))
+            if self._responses and self._responses[0].shape[2] < width:
                 height, width = self._responses[0].shape[1:]
             intrinsics = intrinsics_of(self._camera.scaled(width, height))
-            self._edge_responses = EdgeResponses(self._responses_at(width, height), intrinsics)
-        return self._edge_responses
+            self._edge_responses[step] = EdgeResponses(self._responses_at(width, height), intrinsics)
+        return self._edge_responses[step]
 
     def level(self, step: int) -> PyramidLevel:
         """Gradients, colours and edge responses at a scale step."""

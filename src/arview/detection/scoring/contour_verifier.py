@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.detection.features.edge_net import MAX_SIDE_PX, SOLID_CHANNEL
-from arview.detection.features.image_pyramid import ImagePyramid, steps_to
+from arview.detection.features.image_pyramid import STEPS_PER_OCTAVE, ImagePyramid, steps_to
 from arview.detection.scoring.crops import MASK, write_relative_colours
 from arview.detection.scoring.profile_ranker import sample_lines
 from arview.detection.scoring.score_net import REFERENCE_RADIUS_PX, NetworkInput, ScoreNet, size_and_contrast
@@ -40,6 +40,8 @@ CHANNELS = RAW_CHANNELS + 2
 """Channels of the network's input: colours normalised, others scaled to 1."""
 CONTOUR_SCALARS = 3
 """Scalar inputs: size of the part, contrast of the profiles, share of the rows inside the image."""
+PROFILE_RADIUS_PX = 110.0
+"""Half the part's diameter in the images that profiles are cut from, if they are large enough."""
 MIN_MEAN_STEP = 1.0
 """Grey levels added to the mean step to which steps are relative."""
 
@@ -57,23 +59,34 @@ class ContourVerifier:
 
     def scores(self, pyramid: ImagePyramid, poses: Array) -> Array:
         """Log odds (N,) that the contour profiles add for refined poses (N,4,4) ``cam_from_body``."""
-        pyramid.level(profile_step(pyramid))
         radii_px = pyramid.radii_px(self._part.views.diameter_mm, poses)
+        steps = [profile_step(pyramid, radius_px) for radius_px in radii_px]
+        list(pool().map(pyramid.level, set(steps)))
 
-        def of_pose(pose: Array, radius_px: float) -> NetworkInput:
-            return network_input(contour_profiles(pyramid, self._part, pose), radius_px)
+        def of_pose(pose: Array, radius_px: float, step: int) -> NetworkInput:
+            scale = 2.0 ** (step / STEPS_PER_OCTAVE)
+            return network_input(contour_profiles(pyramid, self._part, pose), scale * radius_px)
 
-        return self._network.scores(list(pool().map(of_pose, poses, radii_px.tolist())))
+        return self._network.scores(list(pool().map(of_pose, poses, radii_px.tolist(), steps)))
 
 
-def profile_step(pyramid: ImagePyramid) -> int:
-    """Scale step at which profiles are cut: full resolution, unless the edge network takes a reduced image."""
-    return int(steps_to(float(MAX_SIDE_PX), np.array([float(max(pyramid.image.shape[:2]))]))[0])
+def profile_step(pyramid: ImagePyramid, radius_px: float) -> int:
+    """Scale step at which the profiles of a part are cut.
+
+    Full resolution, unless the edge network takes a reduced image or the part is larger than the network knows.
+
+    Args:
+        pyramid: of the image.
+        radius_px: half the part's diameter in the image.
+    """
+    by_image = steps_to(float(MAX_SIDE_PX), np.array([float(max(pyramid.image.shape[:2]))]))
+    return int(min(by_image[0], steps_to(PROFILE_RADIUS_PX, np.array([radius_px]))[0]))
 
 
 def contour_profiles(pyramid: ImagePyramid, part: PartView, pose: Array) -> NDArray[np.uint8]:
     """Raw profiles (RAW_CHANNELS, ROWS, COLUMNS) across the lines of a part at a pose (4,4) ``cam_from_body``."""
-    level = pyramid.level(profile_step(pyramid))
+    radius_px = float(pyramid.radii_px(part.views.diameter_mm, pose[None])[0])
+    level = pyramid.level(profile_step(pyramid, radius_px))
     profiles = np.zeros((RAW_CHANNELS, ROWS, COLUMNS), dtype=np.uint8)
     _sample_profiles(
         level.colours, level.edge_responses, part.arrays, pose, level.intrinsics, 0.01 * part.views.diameter_mm,

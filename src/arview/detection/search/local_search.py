@@ -19,7 +19,7 @@ from arview.camera import Camera
 from arview.core.parallel import pool
 from arview.detection.features.denoiser import Denoiser
 from arview.detection.features.edge_net import EdgeNet, mean_edge_response
-from arview.detection.features.image_pyramid import ImagePyramid, step_for
+from arview.detection.features.image_pyramid import ImagePyramid, WorkPicture, step_for, steps_to
 from arview.detection.scoring.contour_verifier import ContourVerifier
 from arview.detection.scoring.pose_verifier import PoseVerifier
 from arview.detection.scoring.profile_ranker import FINE, ProfileRanker
@@ -99,6 +99,8 @@ class LocalSearchOptions:
         neighbourhood_rad: rotation of the poses that are tried around it.
         max_shading_loss: largest drop in log odds accepted from the shading refinement.
         min_in_image: share of the outline inside the image below which poses are dropped.
+        work_radius_px: half the part's diameter in the images in which poses are refined and measured; where the part
+            is larger, the image is reduced.
     """
 
     radius_px: float = 20.0
@@ -130,6 +132,7 @@ class LocalSearchOptions:
     neighbourhood_rad: float = 0.05
     max_shading_loss: float = 3.0
     min_in_image: float = 0.4
+    work_radius_px: float = 110.0
 
 
 class LocalSearch:
@@ -274,8 +277,11 @@ class LocalSearch:
         poses = np.stack([h.cam_from_body for h in hypotheses])
         scores = self._pose_verifier.scores(pyramid, poses, known).tolist()
         contours = self._contour_verifier.scores(pyramid, poses).tolist()
-        edges = pyramid.edge_responses()
-        responses = [mean_edge_response(edges.maps, part.resolvable, pose, edges.intrinsics, step_mm) for pose in poses]
+        edges = [pyramid.edge_responses(self.work_step(pyramid, pose)) for pose in poses]
+        responses = [
+            mean_edge_response(some.maps, part.resolvable, pose, some.intrinsics, step_mm)
+            for some, pose in zip(edges, poses, strict=True)
+        ]
         return [
             replace(h, verifier_score=score, edge_response=float(response), contour_score=contour)
             for h, score, response, contour in zip(hypotheses, scores, responses, contours, strict=True)
@@ -283,14 +289,16 @@ class LocalSearch:
 
     def _refine_by_shading(self, pyramid: ImagePyramid, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """Hypotheses refined by the shading of the surface, each unless its log odds drop too far."""
-        o, refiner = self.options, self.refiner
+        o = self.options
 
         def refine(h: Hypothesis) -> tuple[Array, Schedule]:
-            appearance = refiner.appearance_at(pyramid.image, h.cam_from_body)
+            picture = self.work_picture(pyramid, h.cam_from_body)
+            refiner = self.refiner.with_camera(picture.camera)
+            appearance = refiner.appearance_at(picture.image, h.cam_from_body)
             pose, information = refiner.refine(
-                pyramid.image, pyramid.gray, h.cam_from_body, o.shading_stages, appearance
+                picture.image, picture.gray, h.cam_from_body, o.shading_stages, appearance
             )
-            return refiner.refine_shading(pyramid.gray, pose, information)[0], ()
+            return refiner.refine_shading(picture.gray, pose, information)[0], ()
 
         shaded = self.refine_through(pyramid, list(pool().map(refine, hypotheses)), o.fine_tolerance_px)
         return [
@@ -319,6 +327,15 @@ class LocalSearch:
         """Hypotheses of poses (4,4) as they are."""
         return self.refine_through(pyramid, [(pose, ()) for pose in poses], self.options.fine_tolerance_px)
 
+    def work_step(self, pyramid: ImagePyramid, cam_from_body: Array) -> int:
+        """The scale step at which a pose (4,4) is refined and its evidence measured."""
+        radii_px = pyramid.radii_px(self.views.diameter_mm, cam_from_body[None])
+        return int(steps_to(self.options.work_radius_px, radii_px)[0])
+
+    def work_picture(self, pyramid: ImagePyramid, cam_from_body: Array) -> WorkPicture:
+        """The image at the scale of `work_step`."""
+        return pyramid.picture(self.work_step(pyramid, cam_from_body))
+
     def refine_through(
         self, pyramid: ImagePyramid, scheduled: Sequence[tuple[Array, Schedule]], tolerance_px: float
     ) -> list[Hypothesis]:
@@ -330,13 +347,15 @@ class LocalSearch:
             tolerance_px: distance within which edges support a pose.
         """
 
-        def refine(start: tuple[Array, Schedule]) -> tuple[Array, PoseEvidence]:
-            pose = self.refiner.refine_fresh(pyramid.image, pyramid.gray, *start)
-            appearance = self.refiner.appearance_at(pyramid.image, pose)
-            return pose, self.refiner.evidence(pyramid.image, pyramid.gray, pose, appearance, tolerance_px)
+        def refine(start: tuple[Array, Schedule]) -> tuple[Array, PoseEvidence, float]:
+            image, gray, camera = self.work_picture(pyramid, start[0])
+            refiner = self.refiner.with_camera(camera)
+            pose = refiner.refine_fresh(image, gray, *start)
+            evidence = refiner.evidence(image, gray, pose, refiner.appearance_at(image, pose), tolerance_px)
+            return pose, evidence, refiner.radius_px(pose)
 
         refined = list(pool().map(refine, scheduled))
-        poses = np.array([pose for pose, _ in refined]).reshape(-1, 4, 4)
+        poses = np.array([pose for pose, *_ in refined]).reshape(-1, 4, 4)
         view_lines = np.array([self.view_lines(pose) for pose in poses])
         scores = self._fine_ranker.scores(pyramid, poses, view_lines)
         return [
@@ -345,9 +364,9 @@ class LocalSearch:
                 evidence=evidence,
                 profile_score=float(score),
                 view_lines=float(count),
-                radius_px=self.refiner.radius_px(pose),
+                radius_px=radius_px,
             )
-            for (pose, evidence), score, count in zip(refined, scores, view_lines, strict=True)
+            for (pose, evidence, radius_px), score, count in zip(refined, scores, view_lines, strict=True)
         ]
 
     def deduplicate(self, hypotheses: Iterable[Hypothesis], apart_deg: float, count: int = 1000) -> list[Hypothesis]:
