@@ -1,8 +1,9 @@
 """Probability that a pose found without history is right.
 
-Three linear models share the weights file ``pose_confidence.json``: a logit of the edge and colour evidence, a score
-that ranks the hypotheses of one image, and a logistic regression for the probability of the best of them. They were
-fitted as conditional logistic regressions (McFadden, "Conditional logit analysis of qualitative choice behavior", 1974)
+Four linear models share the weights file ``pose_confidence.json``: a logit of the edge and colour evidence, a score
+that ranks the hypotheses of one image, and two logistic regressions for the probability of the best of them. One of
+these relies on the pose verifier, the other on the outline alone, because the verifier can reject right poses of parts
+that look unlike all it was trained on; the surer one counts. They were fitted as conditional logistic regressions (McFadden, "Conditional logit analysis of qualitative choice behavior", 1974)
 and as a logistic regression with non-negative weights.
 """
 
@@ -27,6 +28,8 @@ class ConfidenceOptions:
         max_distant_margin: upper bound on the margin over poses at other places.
         min_view_richness, max_view_richness: bounds on the log ratio of distinct lines in the view to the usual number.
         small_radius_px: half diameter below which a part counts as small; small parts fit clutter more often.
+        outline_contour, outline_slope: score of the contour verifier at which a well-supported outline counts half,
+            and slope of the logistic function around it.
     """
 
     min_verifier_score: float = -4.0
@@ -35,6 +38,8 @@ class ConfidenceOptions:
     min_view_richness: float = -0.5
     max_view_richness: float = 0.3
     small_radius_px: float = 60.0
+    outline_contour: float = -1.0
+    outline_slope: float = 1.5
 
 
 CONFIDENCE = ConfidenceOptions()
@@ -79,6 +84,7 @@ class ConfidenceTerms(NamedTuple):
         is_alone: 1 where neither margin is below the bound of the nearby one.
         view_richness: bounded log ratio of distinct lines in the view to the usual number of the part.
         log_size: logarithm of the half diameter relative to `ConfidenceOptions.small_radius_px`, at most 0.
+        outline: support, sharpness and colours of the outline as one product, see `outline_score`.
     """
 
     appearance: float
@@ -90,6 +96,7 @@ class ConfidenceTerms(NamedTuple):
     is_alone: float
     view_richness: float
     log_size: float
+    outline: float
 
 
 class RankingWeights(NamedTuple):
@@ -108,7 +115,8 @@ class ConfidenceWeights(NamedTuple):
         evidence, evidence_bias: of `evidence_logit`.
         unverified_evidence: of the evidence logit beside the profile score, before verification.
         verified: of the ranking after verification.
-        probability, probability_bias: of `pose_probability`.
+        probability, probability_bias: of `pose_probability` with the pose verifier.
+        by_outline, by_outline_bias: of `pose_probability` without it.
         appearance_edge_response: of the edge response beside the verifier score in `appearance_score`.
     """
 
@@ -118,6 +126,8 @@ class ConfidenceWeights(NamedTuple):
     verified: RankingWeights
     probability: ConfidenceTerms
     probability_bias: float
+    by_outline: ConfidenceTerms
+    by_outline_bias: float
     appearance_edge_response: float
 
 
@@ -125,8 +135,10 @@ class ConfidenceWeights(NamedTuple):
 def confidence_weights() -> ConfidenceWeights:
     """The fitted weights of ``pose_confidence.json``."""
     groups = load_weights("pose_confidence")
-    evidence, probability = groups["evidence"], groups["probability"]
-    evidence_bias, probability_bias = evidence.pop("bias"), probability.pop("bias")
+    evidence, probability, by_outline = groups["evidence"], groups["probability"], groups["by_outline"]
+    evidence_bias, probability_bias, by_outline_bias = (
+        group.pop("bias") for group in (evidence, probability, by_outline)
+    )
     edge_response = probability.pop("edge_response")
     return ConfidenceWeights(
         evidence=EvidenceFeatures(**evidence),
@@ -135,6 +147,8 @@ def confidence_weights() -> ConfidenceWeights:
         verified=RankingWeights(**groups["verified"]),
         probability=ConfidenceTerms(**probability),
         probability_bias=probability_bias,
+        by_outline=ConfidenceTerms(**by_outline),
+        by_outline_bias=by_outline_bias,
         appearance_edge_response=edge_response,
     )
 
@@ -192,9 +206,22 @@ def appearance_score(verifier_score: float, edge_response: float, options: Confi
     return bounded + confidence_weights().appearance_edge_response * edge_response
 
 
+def outline_score(evidence: PoseEvidence, contour: float, options: ConfidenceOptions = CONFIDENCE) -> float:
+    """How clearly the image shows the outline of a pose, 0–1, as one term of the probability.
+
+    Args:
+        evidence: edge and colour evidence at the pose.
+        contour: score of the contour verifier; a low one says that the outline is not the part's.
+        options: where and how fast the score of the contour verifier counts.
+    """
+    shown = evidence.contour_support * evidence.sharpness * max(evidence.region_support, 0.0)
+    return shown / (1.0 + math.exp(-options.outline_slope * (contour - options.outline_contour)))
+
+
 def confidence_terms(
     appearance: float,
     evidence: float,
+    outline: float,
     profile: float,
     contour: float,
     margins: Margins,
@@ -208,6 +235,7 @@ def confidence_terms(
         appearance: see `appearance_score`.
         evidence: see `evidence_logit`; with the profile score more reliable than ``appearance`` on parts unlike the
             training solids.
+        outline: see `outline_score`.
         profile: score of the profile rankers.
         contour: score of the contour verifier.
         margins: over other hypotheses; a right pose stands out, poses that fit by chance come in groups.
@@ -227,14 +255,16 @@ def confidence_terms(
         is_alone=float(min(margins.nearby, margins.distant) >= o.max_nearby_margin),
         view_richness=min(max(math.log(relative_lines), o.min_view_richness), o.max_view_richness),
         log_size=min(math.log(max(radius_px, 1.0) / o.small_radius_px), 0.0),
+        outline=outline,
     )
 
 
 def pose_probability(terms: ConfidenceTerms) -> float:
-    """Probability that the best hypothesis of an image is right."""
+    """Probability that the best hypothesis of an image is right: that of the surer of both regressions."""
     weights = confidence_weights()
-    total = weights.probability_bias + _weighted(weights.probability, terms)
-    return 1.0 / (1.0 + math.exp(-min(max(total, -50.0), 50.0)))
+    with_verifier = weights.probability_bias + _weighted(weights.probability, terms)
+    by_outline = weights.by_outline_bias + _weighted(weights.by_outline, terms)
+    return 1.0 / (1.0 + math.exp(-min(max(with_verifier, by_outline, -50.0), 50.0)))
 
 
 def _weighted(weights: tuple[float, ...], features: tuple[float, ...]) -> float:

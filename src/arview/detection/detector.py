@@ -21,6 +21,7 @@ from arview.detection.confidence import (
     ConfidenceTerms,
     Margins,
     confidence_terms,
+    outline_score,
     pose_probability,
 )
 from arview.detection.disambiguation import DisambiguationOptions, Disambiguator, is_rotated_by
@@ -195,7 +196,9 @@ class Detector:
         searched = replace(
             o.global_search, radius_px=o.radius_px, roll_step_deg=o.roll_step_deg, subdivisions=o.subdivisions
         )
-        self.global_search = GlobalSearch(views, self.local.refiner.part, camera, searched, self.symmetries.exact)
+        self.global_search = GlobalSearch(
+            views, self.local.refiner.part, self.local.reduced_camera, searched, self.symmetries.exact
+        )
 
     def detect(
         self,
@@ -255,6 +258,7 @@ class Detector:
         return confidence_terms(
             appearance=best.appearance_score,
             evidence=best.evidence_logit,
+            outline=outline_score(best.evidence, best.contour_score, self.options.confidence),
             profile=best.profile_score,
             contour=best.contour_score,
             margins=self.margins(best, others),

@@ -93,7 +93,23 @@ class Disambiguator:
         leader = int(np.argmax((margins + np.diag(np.full(len(hypotheses), np.inf))).min(axis=1)))
         best = hypotheses[leader]
         close = [h for k, h in enumerate(hypotheses) if k != leader and margins[leader, k] < o.min_margin]
-        return best, [h for h in close if not is_rotated_by(h, best, self.exact_rotations, o.same_deg)]
+        others = [h for h in close if not is_rotated_by(h, best, self.exact_rotations, o.same_deg)]
+        return best, [*others, *self._close_twins(pyramid, best, others)]
+
+    def _close_twins(self, pyramid: ImagePyramid, best: Hypothesis, known: list[Hypothesis]) -> list[Hypothesis]:
+        """Near-symmetric poses, as the symmetries give them, from which no margin separates a pose; without known ones.
+
+        Refined by themselves, such poses may end a few degrees off, and then lose for that reason alone.
+        """
+        local = self._local
+        evaluated = local.evaluate(pyramid, turned(best.cam_from_body, self.symmetries.near))
+        twins = [
+            twin
+            for twin in local.verify(pyramid, evaluated)
+            if not any(is_rotated_by(twin, h, self.exact_rotations, self.options.same_deg) for h in known)
+        ]
+        margins = self.evidence_margins(pyramid, [best, *twins])[0, 1:]
+        return [twin for twin, margin in zip(twins, margins, strict=True) if margin < self.options.min_margin]
 
     def _near_symmetric(self, pyramid: ImagePyramid, best: Hypothesis, others: list[Hypothesis]) -> list[Hypothesis]:
         """The best hypothesis at a place, and those near-symmetric to it that are not clearly worse."""

@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -99,6 +100,8 @@ class LocalSearchOptions:
         neighbourhood_rad: rotation of the poses that are tried around it.
         max_shading_loss: largest drop in log odds accepted from the shading refinement.
         min_in_image: share of the outline inside the image below which poses are dropped.
+        max_scale: images are reduced as a whole, for all distances, by this factor or more or not at all.
+        side_unit_px: sides of reduced images are multiples of this, so that they can be halved.
         work_radius_px: half the part's diameter in the images in which poses are refined and measured; where the part
             is larger, the image is reduced.
     """
@@ -132,7 +135,9 @@ class LocalSearchOptions:
     neighbourhood_rad: float = 0.05
     max_shading_loss: float = 3.0
     min_in_image: float = 0.4
-    work_radius_px: float = 110.0
+    work_radius_px: float = 100.0
+    max_scale: float = 0.8
+    side_unit_px: int = 8
 
 
 class LocalSearch:
@@ -143,6 +148,10 @@ class LocalSearch:
         camera: of the images.
         options: see `LocalSearchOptions`.
         distances_mm: range of the distances outside of which poses are dropped.
+
+    Attributes:
+        reduced_camera: of the images in which the part is searched: where it is large at all distances, they are
+            smaller than those of ``camera``.
     """
 
     def __init__(
@@ -158,6 +167,7 @@ class LocalSearch:
         self.refiner = PoseRefiner(PartView(views), camera)
         part = self.refiner.part
         self._distances_mm = distances_mm
+        self.reduced_camera = self._reduced(camera)
         self._edge_net = EdgeNet()
         self._denoiser = Denoiser()
         self._rough_ranker = ProfileRanker(part)
@@ -167,20 +177,39 @@ class LocalSearch:
         self._line_counts = ViewLineCounts(views)
 
     def pyramid(self, image: NDArray[np.uint8]) -> ImagePyramid:
-        """The pyramid of a frame (H,W,3) uint8 RGB, denoised if it is noisy."""
+        """The pyramid of a frame (H,W,3) uint8 RGB, reduced to `reduced_camera` and denoised if it is noisy."""
+        camera = self.reduced_camera
+        if camera is not self.camera:
+            image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         clean = self._denoiser.denoise(image)
-        return ImagePyramid(clean, self.camera, round(self.options.pad_share * self.options.radius_px), self._edge_net)
+        return ImagePyramid(clean, camera, round(self.options.pad_share * self.options.radius_px), self._edge_net)
+
+    def _reduced(self, camera: Camera) -> Camera:
+        """The camera of images in which the part is as large at the farthest distance as it is measured at most."""
+        o = self.options
+        farthest_px = 0.25 * (camera.fx + camera.fy) * self.views.diameter_mm / self._distances_mm[1]
+        scale = o.work_radius_px / max(farthest_px, 1e-9)
+        if scale > o.max_scale:
+            return camera
+        # Sides that can be halved several times.
+        width, height = (
+            max(o.side_unit_px * round(scale * side / o.side_unit_px), o.side_unit_px)
+            for side in (camera.width, camera.height)
+        )
+        return camera.scaled(width, height)
 
     def with_options(self, options: LocalSearchOptions) -> LocalSearch:
         """The same search with other options and at any distance; it shares the networks with this one."""
         other = copy.copy(self)
         other.options, other._distances_mm = options, (0.0, math.inf)
+        other.reduced_camera = other._reduced(other.camera)
         return other
 
     def with_camera(self, camera: Camera) -> LocalSearch:
         """The same search for images of another camera, such as that of a window."""
         other = copy.copy(self)
         other.camera, other.refiner = camera, self.refiner.with_camera(camera)
+        other.reduced_camera = other._reduced(camera)
         return other
 
     def pattern_search(
