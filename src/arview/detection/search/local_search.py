@@ -135,7 +135,7 @@ class LocalSearchOptions:
     neighbourhood_rad: float = 0.05
     max_shading_loss: float = 3.0
     min_in_image: float = 0.4
-    work_radius_px: float = 100.0
+    work_radius_px: float = 84.0
     max_scale: float = 0.8
     side_unit_px: int = 8
 
