@@ -3,7 +3,8 @@
 Four linear models share the weights file ``pose_confidence.json``: a logit of the edge and colour evidence, a score
 that ranks the hypotheses of one image, and two logistic regressions for the probability of the best of them. One of
 these relies on the pose verifier, the other on the outline alone, because the verifier can reject right poses of parts
-that look unlike all it was trained on; the surer one counts. They were fitted as conditional logistic regressions (McFadden, "Conditional logit analysis of qualitative choice behavior", 1974)
+that look unlike all it was trained on; the surer one counts. They were fitted as conditional logistic regressions
+(McFadden, "Conditional logit analysis of qualitative choice behavior", 1974)
 and as a logistic regression with non-negative weights.
 """
 

@@ -304,15 +304,21 @@ class Detector:
                 self.best_rejected = RejectedHypothesis(self._in_model(rejected), rejected.evidence, qualities[0])
             return []
         best, alternatives = self.disambiguator.choose(pyramid, hypotheses[0], hypotheses[1:])
-        found = [self._detection(best, qualities[0], alternatives)]
+        found = [self._detection(pyramid, best, qualities[0], alternatives)]
         for hypothesis, quality in zip(hypotheses[1:], qualities[1:], strict=True):
             is_apart = all(not self._is_equal(hypothesis, h) for h in (best, *alternatives))
             if quality >= min_quality and is_apart:
-                found.append(self._detection(hypothesis, min(quality, qualities[0]), []))
+                found.append(self._detection(pyramid, hypothesis, min(quality, qualities[0]), []))
         return sorted(found, key=lambda detection: -detection.quality)[:max_results]
 
-    def _detection(self, hypothesis: Hypothesis, quality: float, alternatives: list[Hypothesis]) -> Detection:
-        return Detection(self._in_model(hypothesis), quality, tuple(map(self._in_model, alternatives)))
+    def _detection(
+        self, pyramid: ImagePyramid, hypothesis: Hypothesis, quality: float, alternatives: list[Hypothesis]
+    ) -> Detection:
+        body_from_model = self.local.refiner.part.body_from_model
+        pose, *others = (
+            self.local.polish(pyramid, h.cam_from_body) @ body_from_model for h in (hypothesis, *alternatives)
+        )
+        return Detection(pose, quality, tuple(others))
 
     def _in_model(self, hypothesis: Hypothesis) -> Array:
         return np.asarray(hypothesis.cam_from_body @ self.local.refiner.part.body_from_model)

@@ -98,6 +98,10 @@ class ImagePyramid:
         pad_px: empty border of the response maps.
         edge_net: its edge responses weigh as much as gradients in the response maps; None: gradients alone count.
         spread_px: radius by which responses are dilated, in pixels of the maps, which tolerates small errors of a pose.
+
+    Attributes:
+        image: of the pyramid, RGB.
+        finest: the image at the finest resolution known and its camera, for found poses.
     """
 
     def __init__(
@@ -109,6 +113,7 @@ class ImagePyramid:
         spread_px: int = 1,
     ) -> None:
         self.image = image
+        self.finest: tuple[NDArray[np.uint8], Camera] = (image, camera)
         self.pad_px = pad_px
         self.focal_px = 0.5 * (camera.fx + camera.fy)
         self._camera = camera

@@ -40,7 +40,7 @@ CHANNELS = RAW_CHANNELS + 2
 """Channels of the network's input: colours normalised, others scaled to 1."""
 CONTOUR_SCALARS = 3
 """Scalar inputs: size of the part, contrast of the profiles, share of the rows inside the image."""
-PROFILE_RADIUS_PX = 84.0
+PROFILE_RADIUS_PX = 120.0
 """Half the part's diameter in the images that profiles are cut from, if they are large enough."""
 MIN_MEAN_STEP = 1.0
 """Grey levels added to the mean step to which steps are relative."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from arview.camera import Camera
 from arview.core.parallel import pool
 from arview.detection.features.denoiser import Denoiser
 from arview.detection.features.edge_net import EdgeNet, mean_edge_response
-from arview.detection.features.image_pyramid import ImagePyramid, WorkPicture, step_for, steps_to
+from arview.detection.features.image_pyramid import STEPS_PER_OCTAVE, ImagePyramid, WorkPicture, step_for
 from arview.detection.scoring.contour_verifier import ContourVerifier
 from arview.detection.scoring.pose_verifier import PoseVerifier
 from arview.detection.scoring.profile_ranker import FINE, ProfileRanker
@@ -33,8 +33,9 @@ from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.refinement.evidence import DECISION_SCORE, PoseEvidence
 from arview.refinement.refiner import PoseRefiner
-from arview.refinement.schedules import NEAR_STAGES, SEARCH_STAGES, Stage
+from arview.refinement.schedules import LAST_STAGES, NEAR_STAGES, SEARCH_STAGES, Stage
 from arview.refinement.view_model import PartView
+from arview.refinement.working_picture import WorkingScaleOptions, window_around, working_picture
 
 Schedule = tuple[Stage, ...]
 
@@ -102,8 +103,10 @@ class LocalSearchOptions:
         min_in_image: share of the outline inside the image below which poses are dropped.
         max_scale: images are reduced as a whole, for all distances, by this factor or more or not at all.
         side_unit_px: sides of reduced images are multiples of this, so that they can be halved.
-        work_radius_px: half the part's diameter in the images in which poses are refined and measured; where the part
-            is larger, the image is reduced.
+        scale: of the images in which poses are refined and measured, by the size of the part.
+        polish_stages: stages through which a found pose is refined where the image is finer than it was measured in.
+        polish_deg: a found pose refined there may turn by this, and move by as many hundredths of the diameter.
+        max_polish_loss: drop of the evidence score up to which it is kept.
     """
 
     radius_px: float = 20.0
@@ -135,9 +138,12 @@ class LocalSearchOptions:
     neighbourhood_rad: float = 0.05
     max_shading_loss: float = 3.0
     min_in_image: float = 0.4
-    work_radius_px: float = 84.0
     max_scale: float = 0.8
     side_unit_px: int = 8
+    scale: WorkingScaleOptions = field(default_factory=lambda: WorkingScaleOptions(radius_px=120.0))
+    polish_stages: Schedule = SEARCH_STAGES + LAST_STAGES
+    polish_deg: float = 4.0
+    max_polish_loss: float = 0.03
 
 
 class LocalSearch:
@@ -178,17 +184,20 @@ class LocalSearch:
 
     def pyramid(self, image: NDArray[np.uint8]) -> ImagePyramid:
         """The pyramid of a frame (H,W,3) uint8 RGB, reduced to `reduced_camera` and denoised if it is noisy."""
-        camera = self.reduced_camera
+        camera, reduced = self.reduced_camera, image
         if camera is not self.camera:
-            image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        clean = self._denoiser.denoise(image)
-        return ImagePyramid(clean, camera, round(self.options.pad_share * self.options.radius_px), self._edge_net)
+            reduced = np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
+        clean = self._denoiser.denoise(reduced)
+        pyramid = ImagePyramid(clean, camera, round(self.options.pad_share * self.options.radius_px), self._edge_net)
+        if clean is reduced:
+            pyramid.finest = (image, self.camera)
+        return pyramid
 
     def _reduced(self, camera: Camera) -> Camera:
         """The camera of images in which the part is as large at the farthest distance as it is measured at most."""
         o = self.options
         farthest_px = 0.25 * (camera.fx + camera.fy) * self.views.diameter_mm / self._distances_mm[1]
-        scale = o.work_radius_px / max(farthest_px, 1e-9)
+        scale = o.scale.radius_px / max(farthest_px, 1e-9)
         if scale > o.max_scale:
             return camera
         # Sides that can be halved several times.
@@ -358,12 +367,36 @@ class LocalSearch:
 
     def work_step(self, pyramid: ImagePyramid, cam_from_body: Array) -> int:
         """The scale step at which a pose (4,4) is refined and its evidence measured."""
-        radii_px = pyramid.radii_px(self.views.diameter_mm, cam_from_body[None])
-        return int(steps_to(self.options.work_radius_px, radii_px)[0])
+        radius_px = float(pyramid.radii_px(self.views.diameter_mm, cam_from_body[None])[0])
+        return round(STEPS_PER_OCTAVE * math.log2(self.options.scale.working_scale(radius_px)))
 
     def work_picture(self, pyramid: ImagePyramid, cam_from_body: Array) -> WorkPicture:
         """The image at the scale of `work_step`."""
         return pyramid.picture(self.work_step(pyramid, cam_from_body))
+
+    def polish(self, pyramid: ImagePyramid, cam_from_body: Array) -> Array:
+        """A found pose (4,4) refined in the image at full resolution, unless it is as well measured without."""
+        o = self.options
+        image, camera = pyramid.finest
+        picture = self.work_picture(pyramid, cam_from_body)
+        refiner = self.refiner.with_camera(picture.camera)
+        full = self.refiner.with_camera(camera)
+        spread_px = refiner.edge_spread_px(picture.gray, cam_from_body) or 0.0
+        scale = o.scale.fine_scale(full.radius_px(cam_from_body), spread_px * camera.width / picture.camera.width)
+        if scale is None:
+            return cam_from_body
+        window = window_around(camera, [cam_from_body], self.views.diameter_mm, o.scale.margin_px / scale)
+        fine = working_picture(image, camera, scale, window)
+        polished = self.refiner.with_camera(fine.camera).refine_fresh(
+            fine.image, fine.smooth, cam_from_body, o.polish_stages
+        )
+        appearance = refiner.appearance_at(picture.image, cam_from_body)
+        before, after = (
+            refiner.evidence(picture.image, picture.gray, pose, appearance, o.fine_tolerance_px).score
+            for pose in (cam_from_body, polished)
+        )
+        is_near = self._same(polished, cam_from_body, o.polish_deg)
+        return polished if is_near and after >= before - o.max_polish_loss else cam_from_body
 
     def refine_through(
         self, pyramid: ImagePyramid, scheduled: Sequence[tuple[Array, Schedule]], tolerance_px: float
