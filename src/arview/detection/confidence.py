@@ -31,6 +31,9 @@ class ConfidenceOptions:
         small_radius_px: half diameter below which a part counts as small; small parts fit clutter more often.
         outline_contour, outline_slope: score of the contour verifier at which a well-supported outline counts half,
             and slope of the logistic function around it.
+        full_inner_share, full_inner_support: share of design edges inside the outline from which they must be seen,
+            too, and support with which they are.
+        min_outline: outline score below which the outline alone confirms no pose.
     """
 
     min_verifier_score: float = -4.0
@@ -41,6 +44,9 @@ class ConfidenceOptions:
     small_radius_px: float = 60.0
     outline_contour: float = -1.0
     outline_slope: float = 1.5
+    full_inner_share: float = 0.5
+    full_inner_support: float = 0.25
+    min_outline: float = 0.2
 
 
 CONFIDENCE = ConfidenceOptions()
@@ -207,16 +213,26 @@ def appearance_score(verifier_score: float, edge_response: float, options: Confi
     return bounded + confidence_weights().appearance_edge_response * edge_response
 
 
-def outline_score(evidence: PoseEvidence, contour: float, options: ConfidenceOptions = CONFIDENCE) -> float:
+def outline_score(
+    evidence: PoseEvidence, outline: PoseEvidence, contour: float, options: ConfidenceOptions = CONFIDENCE
+) -> float:
     """How clearly the image shows the outline of a pose, 0–1, as one term of the probability.
+
+    Things with two long straight sides fit the outline of many parts; a part with design edges inside must show some of
+    them, too, and a cut outline counts less.
 
     Args:
         evidence: edge and colour evidence at the pose.
+        outline: the same at the scale at which the outline is judged.
         contour: score of the contour verifier; a low one says that the outline is not the part's.
-        options: where and how fast the score of the contour verifier counts.
+        options: limits and slopes.
     """
-    shown = evidence.contour_support * evidence.sharpness * max(evidence.region_support, 0.0)
-    return shown / (1.0 + math.exp(-options.outline_slope * (contour - options.outline_contour)))
+    o = options
+    shown = outline.contour_support * outline.sharpness * max(outline.region_support, 0.0)
+    share = min(1.0, evidence.inner_share / o.full_inner_share)
+    inner = 1.0 - share + share * min(1.0, evidence.inner_support / o.full_inner_support)
+    shown *= inner * evidence.points_in_picture
+    return shown / (1.0 + math.exp(-o.outline_slope * (contour - o.outline_contour)))
 
 
 def confidence_terms(
@@ -260,12 +276,13 @@ def confidence_terms(
     )
 
 
-def pose_probability(terms: ConfidenceTerms) -> float:
+def pose_probability(terms: ConfidenceTerms, options: ConfidenceOptions = CONFIDENCE) -> float:
     """Probability that the best hypothesis of an image is right: that of the surer of both regressions."""
     weights = confidence_weights()
-    with_verifier = weights.probability_bias + _weighted(weights.probability, terms)
-    by_outline = weights.by_outline_bias + _weighted(weights.by_outline, terms)
-    return 1.0 / (1.0 + math.exp(-min(max(with_verifier, by_outline, -50.0), 50.0)))
+    total = weights.probability_bias + _weighted(weights.probability, terms)
+    if terms.outline >= options.min_outline:
+        total = max(total, weights.by_outline_bias + _weighted(weights.by_outline, terms))
+    return 1.0 / (1.0 + math.exp(-min(max(total, -50.0), 50.0)))
 
 
 def _weighted(weights: tuple[float, ...], features: tuple[float, ...]) -> float:

@@ -21,7 +21,6 @@ from arview.detection.confidence import (
     ConfidenceTerms,
     Margins,
     confidence_terms,
-    outline_score,
     pose_probability,
 )
 from arview.detection.disambiguation import DisambiguationOptions, Disambiguator, is_rotated_by
@@ -245,6 +244,10 @@ class Detector:
             starts = local.pattern_search(pyramid, self.global_search.starts(pyramid, budget), budget.kept)
             found = local.refine_and_verify(pyramid, starts)
             hypotheses = local.deduplicate([*hypotheses, *found], local.options.distinct_deg)
+            if hypotheses and self.qualities(hypotheses)[0] < min_quality:
+                # The search may have found a near-symmetric pose of the right one, which fits worse.
+                twins = self.disambiguator.twins(pyramid, hypotheses[0])
+                hypotheses = local.deduplicate([*hypotheses, *twins], local.options.distinct_deg)
             if hypotheses and self.qualities(hypotheses)[0] >= min_quality:
                 break
         return hypotheses
@@ -258,7 +261,7 @@ class Detector:
         return confidence_terms(
             appearance=best.appearance_score,
             evidence=best.evidence_logit,
-            outline=outline_score(best.evidence, best.contour_score, self.options.confidence),
+            outline=best.outline_score,
             profile=best.profile_score,
             contour=best.contour_score,
             margins=self.margins(best, others),

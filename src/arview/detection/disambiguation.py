@@ -111,6 +111,11 @@ class Disambiguator:
         margins = self.evidence_margins(pyramid, [best, *twins])[0, 1:]
         return [twin for twin, margin in zip(twins, margins, strict=True) if margin < self.options.min_margin]
 
+    def twins(self, pyramid: ImagePyramid, hypothesis: Hypothesis) -> list[Hypothesis]:
+        """The near-symmetric poses of a hypothesis, refined and verified."""
+        starts = turned(hypothesis.cam_from_body, self.symmetries.near)
+        return self._local.verify(pyramid, self._local.refine_fine(pyramid, starts))
+
     def _near_symmetric(self, pyramid: ImagePyramid, best: Hypothesis, others: list[Hypothesis]) -> list[Hypothesis]:
         """The best hypothesis at a place, and those near-symmetric to it that are not clearly worse."""
         o, local = self.options, self._local

@@ -22,6 +22,7 @@ class Hypothesis:
         verifier_score: of the pose verifier; None before verification.
         edge_response: mean edge response along the part's lines, 0–1; 0 before verification.
         contour_score: of the contour verifier; 0 before verification.
+        outline_score: how clearly the image shows the outline, see `confidence.outline_score`; 0 before verification.
     """
 
     cam_from_body: Array
@@ -32,6 +33,7 @@ class Hypothesis:
     verifier_score: float | None = None
     edge_response: float = 0.0
     contour_score: float = 0.0
+    outline_score: float = 0.0
 
     @property
     def evidence_logit(self) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.parallel import pool
+from arview.detection.confidence import outline_score
 from arview.detection.features.denoiser import Denoiser
 from arview.detection.features.edge_net import EdgeNet, mean_edge_response
 from arview.detection.features.image_pyramid import STEPS_PER_OCTAVE, ImagePyramid, WorkPicture, step_for
@@ -28,14 +29,15 @@ from arview.detection.search.global_search import QUICK, PoseCandidate, weight_b
 from arview.detection.search.hypothesis import Hypothesis
 from arview.detection.search.nms import select_distinct
 from arview.detection.search.pattern_search import search_poses
+from arview.detection.search.polish import PolishOptions, polish
 from arview.detection.search.template_bank import ViewLineCounts
 from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.refinement.evidence import DECISION_SCORE, PoseEvidence
 from arview.refinement.refiner import PoseRefiner
-from arview.refinement.schedules import LAST_STAGES, NEAR_STAGES, SEARCH_STAGES, Stage
+from arview.refinement.schedules import NEAR_STAGES, SEARCH_STAGES, Stage
 from arview.refinement.view_model import PartView
-from arview.refinement.working_picture import WorkingScaleOptions, window_around, working_picture
+from arview.refinement.working_picture import WorkingScaleOptions
 
 Schedule = tuple[Stage, ...]
 
@@ -104,9 +106,9 @@ class LocalSearchOptions:
         max_scale: images are reduced as a whole, for all distances, by this factor or more or not at all.
         side_unit_px: sides of reduced images are multiples of this, so that they can be halved.
         scale: of the images in which poses are refined and measured, by the size of the part.
-        polish_stages: stages through which a found pose is refined where the image is finer than it was measured in.
-        polish_deg: a found pose refined there may turn by this, and move by as many hundredths of the diameter.
-        max_polish_loss: drop of the evidence score up to which it is kept.
+        outline_scale: of the images in which the outline alone is judged: smaller, so that what differs between part
+            and CAD by less than some hundredths of the diameter does not count.
+        polish: of found poses.
     """
 
     radius_px: float = 20.0
@@ -141,9 +143,8 @@ class LocalSearchOptions:
     max_scale: float = 0.8
     side_unit_px: int = 8
     scale: WorkingScaleOptions = field(default_factory=lambda: WorkingScaleOptions(radius_px=120.0))
-    polish_stages: Schedule = SEARCH_STAGES + LAST_STAGES
-    polish_deg: float = 4.0
-    max_polish_loss: float = 0.03
+    outline_scale: WorkingScaleOptions = field(default_factory=lambda: WorkingScaleOptions(radius_px=64.0))
+    polish: PolishOptions = field(default_factory=PolishOptions)
 
 
 class LocalSearch:
@@ -320,10 +321,26 @@ class LocalSearch:
             mean_edge_response(some.maps, part.resolvable, pose, some.intrinsics, step_mm)
             for some, pose in zip(edges, poses, strict=True)
         ]
-        return [
-            replace(h, verifier_score=score, edge_response=float(response), contour_score=contour)
-            for h, score, response, contour in zip(hypotheses, scores, responses, contours, strict=True)
+        outlines = [
+            outline_score(h.evidence, self._outline(pyramid, h.cam_from_body), contour)
+            for h, contour in zip(hypotheses, contours, strict=True)
         ]
+        return [
+            replace(
+                h, verifier_score=score, edge_response=float(response), contour_score=contour, outline_score=outline
+            )
+            for h, score, response, contour, outline in zip(
+                hypotheses, scores, responses, contours, outlines, strict=True
+            )
+        ]
+
+    def _outline(self, pyramid: ImagePyramid, cam_from_body: Array) -> PoseEvidence:
+        """Evidence of a pose (4,4) at the scale at which the outline alone is judged."""
+        radius_px = float(pyramid.radii_px(self.views.diameter_mm, cam_from_body[None])[0])
+        image, gray, camera = pyramid.picture(_step_of(self.options.outline_scale.working_scale(radius_px)))
+        refiner = self.refiner.with_camera(camera)
+        appearance = refiner.appearance_at(image, cam_from_body)
+        return refiner.evidence(image, gray, cam_from_body, appearance, self.options.fine_tolerance_px)
 
     def _refine_by_shading(self, pyramid: ImagePyramid, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """Hypotheses refined by the shading of the surface, each unless its log odds drop too far."""
@@ -368,35 +385,16 @@ class LocalSearch:
     def work_step(self, pyramid: ImagePyramid, cam_from_body: Array) -> int:
         """The scale step at which a pose (4,4) is refined and its evidence measured."""
         radius_px = float(pyramid.radii_px(self.views.diameter_mm, cam_from_body[None])[0])
-        return round(STEPS_PER_OCTAVE * math.log2(self.options.scale.working_scale(radius_px)))
+        return _step_of(self.options.scale.working_scale(radius_px))
 
     def work_picture(self, pyramid: ImagePyramid, cam_from_body: Array) -> WorkPicture:
         """The image at the scale of `work_step`."""
         return pyramid.picture(self.work_step(pyramid, cam_from_body))
 
     def polish(self, pyramid: ImagePyramid, cam_from_body: Array) -> Array:
-        """A found pose (4,4) refined in the image at full resolution, unless it is as well measured without."""
-        o = self.options
-        image, camera = pyramid.finest
-        picture = self.work_picture(pyramid, cam_from_body)
-        refiner = self.refiner.with_camera(picture.camera)
-        full = self.refiner.with_camera(camera)
-        spread_px = refiner.edge_spread_px(picture.gray, cam_from_body) or 0.0
-        scale = o.scale.fine_scale(full.radius_px(cam_from_body), spread_px * camera.width / picture.camera.width)
-        if scale is None:
-            return cam_from_body
-        window = window_around(camera, [cam_from_body], self.views.diameter_mm, o.scale.margin_px / scale)
-        fine = working_picture(image, camera, scale, window)
-        polished = self.refiner.with_camera(fine.camera).refine_fresh(
-            fine.image, fine.smooth, cam_from_body, o.polish_stages
-        )
-        appearance = refiner.appearance_at(picture.image, cam_from_body)
-        before, after = (
-            refiner.evidence(picture.image, picture.gray, pose, appearance, o.fine_tolerance_px).score
-            for pose in (cam_from_body, polished)
-        )
-        is_near = self._same(polished, cam_from_body, o.polish_deg)
-        return polished if is_near and after >= before - o.max_polish_loss else cam_from_body
+        """A found pose (4,4) refined in the image at full resolution, see `polish.polish`."""
+        o, measured = self.options, self.work_picture(pyramid, cam_from_body)
+        return polish(self.refiner, pyramid, measured, cam_from_body, o.scale, o.polish)
 
     def refine_through(
         self, pyramid: ImagePyramid, scheduled: Sequence[tuple[Array, Schedule]], tolerance_px: float
@@ -470,6 +468,11 @@ class LocalSearch:
 
     def _same(self, a: Array, b: Array, angle_deg: float) -> bool:
         return are_near(a, b, 0.01 * angle_deg * self.views.diameter_mm, angle_deg)
+
+
+def _step_of(scale: float) -> int:
+    """Scale step of a scale."""
+    return round(STEPS_PER_OCTAVE * math.log2(scale))
 
 
 def _poses_around(cam_from_body: Array, angle_rad: float) -> list[Array]:
