@@ -103,7 +103,9 @@ def test_profiles_outside_the_image_are_zero() -> None:
 def test_large_images_are_sampled_at_the_scale_of_the_edge_network() -> None:
     large = cv2.resize(picture().image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
     twice = ImagePyramid(large, CAMERA.scaled(1280, 960), 12, EdgeNet())
-    assert (profile_step(picture()), profile_step(twice)) == (0, -4)
+    assert (profile_step(picture(), 60.0), profile_step(twice, 60.0)) == (0, -4)
+    # A part larger than the network knows is sampled in a smaller image, too.
+    assert (profile_step(picture(), 240.0), profile_step(picture(), 130.0)) == (-4, 0)
     one, other = (contour_profiles(seen, PART, TRUTH)[:3].astype(int) for seen in (picture(), twice))
     assert np.abs(one - other).mean() < 4.0
 

@@ -246,8 +246,8 @@ class Detector:
             hypotheses = local.deduplicate([*hypotheses, *found], local.options.distinct_deg)
             if hypotheses and self.qualities(hypotheses)[0] < min_quality:
                 # The search may have found a near-symmetric pose of the right one, which fits worse.
-                twins = self.disambiguator.twins(pyramid, hypotheses[0])
-                hypotheses = local.deduplicate([*hypotheses, *twins], local.options.distinct_deg)
+                counterparts = self.disambiguator.counterparts(pyramid, hypotheses[0])
+                hypotheses = local.deduplicate([*hypotheses, *counterparts], local.options.distinct_deg)
             if hypotheses and self.qualities(hypotheses)[0] >= min_quality:
                 break
         return hypotheses

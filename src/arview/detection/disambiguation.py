@@ -94,24 +94,24 @@ class Disambiguator:
         best = hypotheses[leader]
         close = [h for k, h in enumerate(hypotheses) if k != leader and margins[leader, k] < o.min_margin]
         others = [h for h in close if not is_rotated_by(h, best, self.exact_rotations, o.same_deg)]
-        return best, [*others, *self._close_twins(pyramid, best, others)]
+        return best, [*others, *self._close_counterparts(pyramid, best, others)]
 
-    def _close_twins(self, pyramid: ImagePyramid, best: Hypothesis, known: list[Hypothesis]) -> list[Hypothesis]:
+    def _close_counterparts(self, pyramid: ImagePyramid, best: Hypothesis, known: list[Hypothesis]) -> list[Hypothesis]:
         """Near-symmetric poses, as the symmetries give them, from which no margin separates a pose; without known ones.
 
         Refined by themselves, such poses may end a few degrees off, and then lose for that reason alone.
         """
         local = self._local
         evaluated = local.evaluate(pyramid, turned(best.cam_from_body, self.symmetries.near))
-        twins = [
-            twin
-            for twin in local.verify(pyramid, evaluated)
-            if not any(is_rotated_by(twin, h, self.exact_rotations, self.options.same_deg) for h in known)
+        counterparts = [
+            other
+            for other in local.verify(pyramid, evaluated)
+            if not any(is_rotated_by(other, h, self.exact_rotations, self.options.same_deg) for h in known)
         ]
-        margins = self.evidence_margins(pyramid, [best, *twins])[0, 1:]
-        return [twin for twin, margin in zip(twins, margins, strict=True) if margin < self.options.min_margin]
+        margins = self.evidence_margins(pyramid, [best, *counterparts])[0, 1:]
+        return [other for other, margin in zip(counterparts, margins, strict=True) if margin < self.options.min_margin]
 
-    def twins(self, pyramid: ImagePyramid, hypothesis: Hypothesis) -> list[Hypothesis]:
+    def counterparts(self, pyramid: ImagePyramid, hypothesis: Hypothesis) -> list[Hypothesis]:
         """The near-symmetric poses of a hypothesis, refined and verified."""
         starts = turned(hypothesis.cam_from_body, self.symmetries.near)
         return self._local.verify(pyramid, self._local.refine_fine(pyramid, starts))

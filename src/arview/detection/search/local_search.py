@@ -142,8 +142,12 @@ class LocalSearchOptions:
     min_in_image: float = 0.4
     max_scale: float = 0.8
     side_unit_px: int = 8
-    scale: WorkingScaleOptions = field(default_factory=lambda: WorkingScaleOptions(radius_px=120.0))
-    outline_scale: WorkingScaleOptions = field(default_factory=lambda: WorkingScaleOptions(radius_px=64.0))
+    scale: WorkingScaleOptions = field(
+        default_factory=lambda: WorkingScaleOptions(radius_px=120.0, max_enlargement=1.0)
+    )
+    outline_scale: WorkingScaleOptions = field(
+        default_factory=lambda: WorkingScaleOptions(radius_px=64.0, max_enlargement=1.0)
+    )
     polish: PolishOptions = field(default_factory=PolishOptions)
 
 
@@ -336,8 +340,7 @@ class LocalSearch:
 
     def _outline(self, pyramid: ImagePyramid, cam_from_body: Array) -> PoseEvidence:
         """Evidence of a pose (4,4) at the scale at which the outline alone is judged."""
-        radius_px = float(pyramid.radii_px(self.views.diameter_mm, cam_from_body[None])[0])
-        image, gray, camera = pyramid.picture(_step_of(self.options.outline_scale.working_scale(radius_px)))
+        image, gray, camera = pyramid.picture(self._step(pyramid, cam_from_body, self.options.outline_scale))
         refiner = self.refiner.with_camera(camera)
         appearance = refiner.appearance_at(image, cam_from_body)
         return refiner.evidence(image, gray, cam_from_body, appearance, self.options.fine_tolerance_px)
@@ -384,15 +387,26 @@ class LocalSearch:
 
     def work_step(self, pyramid: ImagePyramid, cam_from_body: Array) -> int:
         """The scale step at which a pose (4,4) is refined and its evidence measured."""
+        return self._step(pyramid, cam_from_body, self.options.scale)
+
+    def _step(self, pyramid: ImagePyramid, cam_from_body: Array, scale: WorkingScaleOptions) -> int:
+        """The scale step of the working picture at a pose (4,4)."""
         radius_px = float(pyramid.radii_px(self.views.diameter_mm, cam_from_body[None])[0])
-        return _step_of(self.options.scale.working_scale(radius_px))
+        # A part at the camera itself would be infinitely large.
+        radius_px = min(radius_px, float(pyramid.image.shape[1]))
+        return round(STEPS_PER_OCTAVE * math.log2(scale.scales(radius_px)[0]))
 
     def work_picture(self, pyramid: ImagePyramid, cam_from_body: Array) -> WorkPicture:
         """The image at the scale of `work_step`."""
         return pyramid.picture(self.work_step(pyramid, cam_from_body))
 
     def polish(self, pyramid: ImagePyramid, cam_from_body: Array) -> Array:
-        """A found pose (4,4) refined in the image at full resolution, see `polish.polish`."""
+        """A found pose (4,4) refined in the image at full resolution, see `polish.polish`.
+
+        Of curved parts it would undo the refinement by shading, which weighs down the edges of smooth contours.
+        """
+        if self.refiner.part.is_curved:
+            return cam_from_body
         o, measured = self.options, self.work_picture(pyramid, cam_from_body)
         return polish(self.refiner, pyramid, measured, cam_from_body, o.scale, o.polish)
 
@@ -468,11 +482,6 @@ class LocalSearch:
 
     def _same(self, a: Array, b: Array, angle_deg: float) -> bool:
         return are_near(a, b, 0.01 * angle_deg * self.views.diameter_mm, angle_deg)
-
-
-def _step_of(scale: float) -> int:
-    """Scale step of a scale."""
-    return round(STEPS_PER_OCTAVE * math.log2(scale))
 
 
 def _poses_around(cam_from_body: Array, angle_rad: float) -> list[Array]:

@@ -16,12 +16,14 @@ class PolishOptions:
     """Options of the polishing.
 
     Attributes:
+        min_gain: how much larger than the working picture the finest one must be to be worth its time.
         stages: through which a pose is refined.
         max_turn_deg: a pose may turn by this, and move by as many hundredths of the diameter.
         max_loss: drop of the evidence score up to which the refined pose is kept.
         tolerance_px: distance within which edges support a pose.
     """
 
+    min_gain: float = 1.3
     stages: tuple[Stage, ...] = field(default_factory=lambda: SEARCH_STAGES + LAST_STAGES)
     max_turn_deg: float = 4.0
     max_loss: float = 0.03
@@ -54,8 +56,8 @@ def polish(
     coarse = refiner.with_camera(measured.camera)
     spread_px = coarse.edge_spread_px(measured.gray, cam_from_body) or 0.0
     radius_px = refiner.with_camera(camera).radius_px(cam_from_body)
-    fine_scale = scale.fine_scale(radius_px, spread_px * camera.width / measured.camera.width)
-    if fine_scale is None:
+    working_scale, *_, fine_scale = 2 * scale.scales(radius_px, spread_px * camera.width / measured.camera.width)
+    if fine_scale < o.min_gain * working_scale:
         return cam_from_body
     window = window_around(camera, [cam_from_body], refiner.diameter_mm, scale.margin_px / fine_scale)
     fine = working_picture(image, camera, fine_scale, window)
