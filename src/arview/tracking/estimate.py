@@ -17,9 +17,11 @@ class Estimate:
         information: (6,6) of the twist (rad, mm) on the right of the pose, about the model's centre.
         quality: 0–1, see `PoseEvidence.quality`.
         evidence: evidence of the picture for the pose.
+        is_restless: whether the pose jumped in several of the last frames, as a wrong one does, see `MotionModel`.
     """
 
     cam_from_model: Array
     information: Array
     quality: float
     evidence: PoseEvidence
+    is_restless: bool = False

@@ -1,8 +1,19 @@
-"""Distance of a pose from the pose predicted from the motion so far."""
+"""Motion of a part from frame to frame: how far a pose is from the predicted one, and whether that is usual.
+
+A pose is predicted at constant velocity. What a tracked pose differs from its prediction by is its innovation. Hands
+accelerate and tremble, each in its own way, so the usual innovations are learned from the stream: their covariance is
+averaged over the last frames, with the weights of a robust M-estimator, because the innovation of a wrong pose must not
+count as usual. Whether an innovation is unusual is then a chi-squared test of its Mahalanobis distance (Bar-Shalom, Li
+& Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001).
+"""
 
 from __future__ import annotations
 
-from arview.geometry import Array, rotation_angle_rad
+from dataclasses import dataclass
+
+import numpy as np
+
+from arview.geometry import Array, log_so3, rotation_angle_rad
 
 ROTATION_UNIT_RAD = 0.785
 """Rotation that has a distance of 1."""
@@ -23,3 +34,128 @@ def squared_motion_distance(cam_from_body: Array, predicted: Array, diameter_mm:
     rotation = float(rotation_angle_rad(cam_from_body, predicted)) / ROTATION_UNIT_RAD
     shift = (cam_from_body[:3, 3] - predicted[:3, 3]) / (LATERAL_UNIT * diameter_mm)
     return float(rotation**2 + shift[0] ** 2 + shift[1] ** 2 + (LATERAL_UNIT / AXIAL_UNIT) ** 2 * shift[2] ** 2)
+
+
+def innovation(cam_from_body: Array, predicted: Array, diameter_mm: float) -> Array:
+    """Normalised difference (6,) of a pose from the predicted pose, in the camera frame.
+
+    Rotation and shift are in the units of `squared_motion_distance`, which is the square of its length.
+
+    Args:
+        cam_from_body: (4,4) pose about the part's centre.
+        predicted: (4,4) predicted pose about the part's centre.
+        diameter_mm: diameter of the part.
+    """
+    rotation = log_so3(cam_from_body[:3, :3] @ predicted[:3, :3].T)
+    return np.concatenate([rotation, cam_from_body[:3, 3] - predicted[:3, 3]]) / _units(diameter_mm)
+
+
+def normalised_covariance(covariance: Array, cam_from_body: Array, diameter_mm: float) -> Array:
+    """Covariance (6,6) of a twist (rad, mm) on the right of a pose (4,4), in the frame and units of `innovation`."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = cam_from_body[:3, :3]
+    turn /= _units(diameter_mm)[:, None]
+    return np.asarray(turn @ covariance @ turn.T)
+
+
+def _units(diameter_mm: float) -> Array:
+    """Units (6,) of an innovation: rad and mm."""
+    shifts = np.array([LATERAL_UNIT, LATERAL_UNIT, AXIAL_UNIT]) * diameter_mm
+    return np.concatenate([np.full(3, ROTATION_UNIT_RAD), shifts])
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """Options of the learned motion; lengths are in the units of `innovation`, 0.03 is 1.3° or 1 % of the diameter.
+
+    Attributes:
+        prior_sigma: standard deviation of each component before anything is learned: a steady hand.
+        min_sigma: standard deviation of the measured poses themselves, which is added.
+        rate: share by which the covariance follows each frame.
+        max_squared: squared Mahalanobis distance from which an innovation weighs less; one in eight normally
+            distributed ones exceeds it.
+        robust_gain: factor that makes up for this in the mean of normally distributed innovations.
+        min_unusual: squared Mahalanobis distance of an unusual innovation; one in seventy normally distributed ones
+            exceeds it, more where motion has heavy tails.
+        min_unusual_motion: smallest squared length of an unusual innovation, about 3°.
+        max_usual_motion: largest squared length of a usual one, about 14°: the refinement reaches no farther.
+        unrest_decay: factor by which the number of recent unusual innovations decreases in each frame.
+        max_unrest: number of recent unusual innovations from which the pose is not to be trusted: two within four
+            frames. A hand starts or stops; a wrong pose jumps again and again.
+        max_calm_unrest: number up to which motion is calm: none within three frames.
+    """
+
+    prior_sigma: float = 0.03
+    min_sigma: float = 0.012
+    rate: float = 0.05
+    max_squared: float = 10.0
+    robust_gain: float = 1.06
+    min_unusual: float = 16.0
+    min_unusual_motion: float = 0.005
+    max_usual_motion: float = 0.1
+    unrest_decay: float = 0.75
+    max_unrest: float = 1.4
+    max_calm_unrest: float = 0.5
+
+
+class MotionModel:
+    """The usual innovations of one part in one stream.
+
+    Args:
+        options: see `MotionOptions`.
+    """
+
+    def __init__(self, options: MotionOptions | None = None) -> None:
+        self.options = options or MotionOptions()
+        self._covariance = self.options.prior_sigma**2 * np.eye(6)
+        self._unrest = 0.0
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (6,6) of the usual innovations, with the noise of the measured poses."""
+        return self._covariance + self.options.min_sigma**2 * np.eye(6)
+
+    @property
+    def is_calm(self) -> bool:
+        """Whether none of the last innovations was unusual."""
+        return self._unrest < self.options.max_calm_unrest
+
+    @property
+    def is_restless(self) -> bool:
+        """Whether several of the last innovations were unusual, as those of a wrong pose are."""
+        return self._unrest > self.options.max_unrest
+
+    def squared_distance(self, difference: Array, pose_covariance: Array | None = None) -> float:
+        """Squared Mahalanobis distance of an innovation (6,).
+
+        Args:
+            difference: of `innovation`.
+            pose_covariance: (6,6) of `normalised_covariance`, of the pose that was measured.
+        """
+        covariance = self.covariance if pose_covariance is None else self.covariance + pose_covariance
+        return float(difference @ np.linalg.solve(covariance, difference))
+
+    def is_unusual(self, difference: Array, pose_covariance: Array) -> bool:
+        """Whether an innovation (6,) is neither usual in this stream nor explained by the covariance of the pose."""
+        o = self.options
+        squared_length = difference @ difference
+        if squared_length > o.max_usual_motion:
+            return True
+        if squared_length <= o.min_unusual_motion or self.squared_distance(difference) <= o.min_unusual:
+            return False
+        return self.squared_distance(difference, pose_covariance) > o.min_unusual
+
+    def learn(self, difference: Array, pose_covariance: Array, is_confirmed: bool = False) -> None:
+        """Take the innovation of a frame in; one confirmed by other means counts in full, however unusual.
+
+        Args:
+            difference: (6,) of `innovation`.
+            pose_covariance: (6,6) of `normalised_covariance`, of the pose.
+            is_confirmed: whether the pose was confirmed or found by a recheck.
+        """
+        o = self.options
+        self._unrest = o.unrest_decay * self._unrest + self.is_unusual(difference, pose_covariance)
+        weight = 1.0
+        if not is_confirmed:
+            weight = o.robust_gain * min(1.0, o.max_squared / max(self.squared_distance(difference), 1e-9))
+        self._covariance += o.rate * (weight * np.outer(difference, difference) - self._covariance)

@@ -1,27 +1,33 @@
-"""Recheck of a tracked pose that is far from the predicted one, by the local search of the detector.
+"""Recheck of a tracked pose whose motion is unusual, by the local search of the detector.
 
 Edges and colours along profiles cannot distinguish parallel lines, nor an edge of the part from one beside it. A part
 that turns fast or is partly hidden may therefore be tracked into a wrong pose that both support. The networks of the
 detector compare whole views and can tell. Their local search takes ten times as long as a tracked frame, so it is run
-only for poses far from the prediction, in a window around the part, with a prior around the predicted pose.
+only for poses whose motion is unusual in the stream, see `motion`, in a window around the part that is reduced to the
+size the networks need, with a prior around the predicted pose. It ends early when it leads back to the tracked pose.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.search.global_search import PoseCandidate
 from arview.detection.search.hypothesis import Hypothesis
 from arview.detection.search.local_search import LocalSearch, LocalSearchOptions
-from arview.geometry import Array
+from arview.geometry import Array, are_near
+from arview.refinement.modalities.edge import smoothed
+from arview.refinement.schedules import SEARCH_STAGES, Stage
 from arview.tracking.motion import squared_motion_distance
 
-WINDOW_STEP_PX = 64
+WINDOW_STEP_PX = 32
 """The sides of the window are multiples of this, so that networks see few different sizes."""
 
 
@@ -30,23 +36,49 @@ class RecheckOptions:
     """Options of the recheck.
 
     Attributes:
-        search: options of the local search, with fewer hypotheses than for a whole picture.
+        search: options of the local search, with one level of the pattern search and fewer hypotheses than for a whole
+            picture.
         kept: hypotheses kept after each level of the search.
+        radius_px: half diameter of the part to which the window is reduced.
         reach: half size of the window, in half diameters of the part.
-        margin_px: pixels added to it.
+        margin_px: pixels added to it, after the reduction.
+        min_in_picture: share of the outline inside the window below which hypotheses are dropped.
+        same_deg: hypotheses closer to the tracked pose are the tracked pose; hundredths of it are diameters.
         motion_penalty: log odds that a squared motion distance of 1 costs: a Gaussian prior with a standard deviation
             of 8°, or 6 % of the diameter sideways.
         min_gain: log odds by which another pose must be likelier than the tracked one.
+        final_stages: schedule at full resolution of a pose found in a reduced window.
     """
 
     search: LocalSearchOptions = field(
-        default_factory=lambda: LocalSearchOptions(max_coarse=6, max_fine=3, max_competitors=0, max_verified=3)
+        default_factory=lambda: LocalSearchOptions(
+            levels=LocalSearchOptions().levels[:1], max_verified=3, use_shading=False
+        )
     )
-    kept: tuple[int, ...] = (6, 4)
+    kept: tuple[int, ...] = (4,)
+    radius_px: float = 90.0
     reach: float = 1.25
-    margin_px: float = 20.0
+    margin_px: float = 12.0
+    min_in_picture: float = 0.4
+    same_deg: float = 2.0
     motion_penalty: float = 16.0
     min_gain: float = 1.0
+    final_stages: tuple[Stage, ...] = SEARCH_STAGES[-2:]
+
+
+class _Window(NamedTuple):
+    """The picture around a part.
+
+    Attributes:
+        image: (H,W,3) uint8 RGB at full resolution.
+        camera: of the image.
+        reduced, reduced_camera: the same at the size of the search.
+    """
+
+    image: NDArray[np.uint8]
+    camera: Camera
+    reduced: NDArray[np.uint8]
+    reduced_camera: Camera
 
 
 class LocalSearchRecheck:
@@ -71,19 +103,29 @@ class LocalSearchRecheck:
             predicted: predicted poses (4,4), from which the search starts, too. The prior is around the first.
         """
         poses = [cam_from_body, *predicted]
-        window = self._window(poses)
+        window = self._window(image, poses)
         if window is None:
             return None
-        left, top, camera = window
-        local = self._local.with_camera(camera)
-        picture = local.pyramid(np.ascontiguousarray(image[top : top + camera.height, left : left + camera.width]))
-        found = local.evaluate(picture, [cam_from_body])
-        starts = local.pattern_search(picture, [PoseCandidate(1.0, pose) for pose in poses], self.options.kept)
-        found = local.verify(picture, [*found, *local.refine_starts(picture, starts)])
-        scores = [self._score(h, predicted[0]) for h in found]
+        local = self._local.with_camera(window.reduced_camera)
+        picture = local.pyramid(window.reduced)
+        found = self._hypotheses(local, picture, poses)
+        if len(found) == 1:
+            return None
+        scores = [self._score(h, predicted[0]) for h in local.verify(picture, found)]
         scores[0] += self.options.min_gain
         best = int(np.argmax(scores))
-        return found[best].cam_from_body if best > 0 else None
+        return self._refined(window, found[best].cam_from_body) if best > 0 else None
+
+    def _hypotheses(self, local: LocalSearch, picture: ImagePyramid, poses: Sequence[Array]) -> list[Hypothesis]:
+        """The tracked pose, which is the first of some poses (4,4), and what a search from all of them leads to."""
+        o, tracked = self.options, poses[0]
+        starts = local.pattern_search(picture, [PoseCandidate(1.0, pose) for pose in poses], o.kept)
+        scheduled = [(start.cam_from_body, stages) for start in starts for stages in o.search.fine_schedules]
+        first, *others = local.refine_through(picture, [(tracked, ()), *scheduled], o.search.fine_tolerance_px)
+        shown = [h for h in others if h.evidence.points_in_picture >= o.min_in_picture]
+        apart = local.deduplicate(shown, o.search.distinct_deg, o.search.max_verified)
+        same_mm = 0.01 * o.same_deg * self._local.views.diameter_mm
+        return [first, *(h for h in apart if not are_near(h.cam_from_body, tracked, same_mm, o.same_deg))]
 
     def _score(self, hypothesis: Hypothesis, predicted: Array) -> float:
         """Log odds of a hypothesis, with the prior around the predicted pose (4,4)."""
@@ -91,24 +133,40 @@ class LocalSearchRecheck:
             hypothesis.cam_from_body, predicted, self._local.views.diameter_mm
         )
 
-    def _window(self, poses: Sequence[Array]) -> tuple[int, int, Camera] | None:
-        """Left and upper border of a window around the part at some poses (4,4), and its camera.
+    def _refined(self, window: _Window, cam_from_body: Array) -> Array:
+        """A pose (4,4) after refinement at full resolution."""
+        if window.reduced is window.image:
+            return cam_from_body
+        gray = smoothed(cv2.cvtColor(window.image, cv2.COLOR_RGB2GRAY))
+        refiner = self._local.refiner.with_camera(window.camera)
+        return refiner.refine_fresh(window.image, gray, cam_from_body, self.options.final_stages)
+
+    def _window(self, image: NDArray[np.uint8], poses: Sequence[Array]) -> _Window | None:
+        """The window of a picture (H,W,3) around the part at some poses (4,4).
 
         None where the part is outside the picture or behind the camera.
         """
         if any(pose[2, 3] <= 0 for pose in poses):
             return None
-        camera = self._camera
+        camera, o = self._camera, self.options
         centers = np.array([camera.project(pose[:3, 3]) for pose in poses])
-        o = self.options
-        reach = o.reach * max(self._local.refiner.radius_px(pose) for pose in poses) + o.margin_px
         if not np.all(np.isfinite(centers)):
             return None
+        radius_px = max(self._local.refiner.radius_px(pose) for pose in poses)
+        scale = min(1.0, o.radius_px / radius_px)
         size = np.array([camera.width, camera.height])
-        sides = np.ceil((np.ptp(centers, axis=0) + 2.0 * reach) / WINDOW_STEP_PX) * WINDOW_STEP_PX
-        sides = np.minimum(sides, size).astype(int)
         middle = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
         if np.any(middle < 0) or np.any(middle >= size):
             return None
+        wanted = scale * (np.ptp(centers, axis=0) + 2.0 * o.reach * radius_px) + 2.0 * o.margin_px
+        steps = np.ceil(wanted / WINDOW_STEP_PX) * WINDOW_STEP_PX
+        sides = np.minimum(np.round(steps / scale), size).astype(int)
+        reduced = np.where(sides < size, steps, np.round(scale * sides)).astype(int)
         left, top = np.clip(np.round(middle - 0.5 * sides), 0, size - sides).astype(int).tolist()
-        return left, top, camera.cropped(left, top, int(sides[0]), int(sides[1]))
+        width, height = sides.tolist()
+        cropped = camera.cropped(left, top, width, height)
+        part = np.ascontiguousarray(image[top : top + height, left : left + width])
+        if scale == 1.0:
+            return _Window(part, cropped, part, cropped)
+        small = np.asarray(cv2.resize(part, (int(reduced[0]), int(reduced[1])), interpolation=cv2.INTER_AREA))
+        return _Window(part, cropped, small, cropped.scaled(int(reduced[0]), int(reduced[1])))

@@ -235,14 +235,15 @@ class TrackingSession:
             return self._give_up(diagnose_loss(image, estimate, recent, self.camera, self._views, is_possible))
         if not is_poor:
             s.recent_poses = (*s.recent_poses[-1:], estimate.cam_from_model)
-            if estimate.quality >= (o.critical_quality if s.is_supported else o.tracked_quality):
+            is_supported = estimate.quality >= (o.critical_quality if s.is_supported else o.tracked_quality)
+            if is_supported and not estimate.is_restless:
                 s.confirm()
                 return estimate, ""
         s.apply(Event.WEAK)
         s.critical_frames += 1
         if s.critical_frames > o.critical_frames or not s.is_confirmed:
             return self._give_up("the outline is not seen where it should be")
-        return estimate, "the outline is hardly seen"
+        return estimate, "the pose jumps" if estimate.is_restless else "the outline is hardly seen"
 
     def _give_up(self, reason: str) -> tuple[None, str]:
         """Give the pose up; one from the guide view that was never confirmed leaves the session waiting as before."""

@@ -32,7 +32,7 @@ from arview.refinement.refiner import PoseRefiner
 from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES
 from arview.refinement.view_model import PartView
 from arview.tracking.estimate import Estimate
-from arview.tracking.motion import squared_motion_distance
+from arview.tracking.motion import innovation, normalised_covariance, squared_motion_distance
 from arview.tracking.tracker_options import TrackerOptions
 from arview.tracking.tracker_state import FrameContext, Proposal, RefinedPose, TrackerState
 from arview.tracking.wide_search import WideSearch
@@ -136,7 +136,7 @@ class Tracker:
         quality = self._quality(frame)
         self._update(frame, quality)
         cam_from_model = best.cam_from_body @ self.refiner.part.body_from_model
-        return Estimate(cam_from_model, best.information, quality, best.evidence)
+        return Estimate(cam_from_model, best.information, quality, best.evidence, self.state.motion.is_restless)
 
     # --- Propose ------------------------------------------------------------------------------------------
 
@@ -184,9 +184,10 @@ class Tracker:
         state.usual_fine_score = frame.found.fine_score
 
     def _rechecked(self, frame: FrameContext) -> Iterator[Proposal]:
-        """The pose of the recheck, where the best pose so far is far from the predicted one."""
-        if self._recheck is None or self._motion(frame, frame.found) <= self.options.recheck_distance:
+        """The pose of the recheck, where the motion to the best pose so far is unusual in this stream."""
+        if self._recheck is None or not self._is_unusual(frame):
             return
+        frame.is_rechecked = True
         pose = self._recheck.better(frame.image, frame.found.cam_from_body, [frame.predicted, self.state.cam_from_body])
         if pose is not None:
             frame.levels.cover([pose])
@@ -239,6 +240,17 @@ class Tracker:
         """Squared motion distance of a pose from the predicted one."""
         return squared_motion_distance(candidate.cam_from_body, frame.predicted, self.diameter_mm)
 
+    def _is_unusual(self, frame: FrameContext) -> bool:
+        """Whether the best pose differs from the predicted one more than usual, and than its covariance explains."""
+        return self.state.motion.is_unusual(*self._innovation(frame))
+
+    def _innovation(self, frame: FrameContext) -> tuple[Array, Array]:
+        """Difference (6,) of the best pose from the predicted one, and covariance (6,6) of the best pose."""
+        best = frame.found
+        covariance = self._covariance(best.information, best.evidence.quality)
+        difference = innovation(best.cam_from_body, frame.predicted, self.diameter_mm)
+        return difference, normalised_covariance(covariance, best.cam_from_body, self.diameter_mm)
+
     def _is_suspicious(self, frame: FrameContext) -> bool:
         """Whether the best pose may be wrong: its score is low, or lower than usual, or it is off the prediction."""
         o, evidence = self.options, frame.found.evidence
@@ -277,6 +289,7 @@ class Tracker:
         pose, evidence = frame.found.cam_from_body, frame.found.evidence
         fine_score = frame.found.fine_score
         if state.is_started:
+            state.motion.learn(*self._innovation(frame), frame.is_rechecked)
             state.usual_score += o.score_rate * (evidence.score - state.usual_score)
             state.usual_fine_score += o.score_rate * (fine_score - state.usual_fine_score)
             state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
@@ -329,6 +342,7 @@ class Tracker:
         tracked_count = 0 if matches is None else len(matches.weights)
         if (
             is_unhidden
+            and state.motion.is_calm
             and evidence.quality > o.min_keyframe_quality
             and self._texture.wants_keyframe(pose, tracked_count)
         ):
@@ -353,7 +367,11 @@ class Tracker:
         It is the inverse of the information, enlarged by the number of edge points that share an error, because the
         points along one edge are measured every few pixels, and limited by half a radian and half a diameter.
         """
-        scale = self.options.correlated_points / max(estimate.quality, 0.05)
+        return self._covariance(estimate.information, estimate.quality)
+
+    def _covariance(self, information: Array, quality: float) -> Array:
+        """Covariance (6,6) for an information (6,6) and the quality of its pose, see `covariance`."""
+        scale = self.options.correlated_points / max(quality, 0.05)
         max_sigma = np.array([0.5] * 3 + [0.5 * self.diameter_mm] * 3)
-        covariance = np.linalg.inv(estimate.information / scale + np.diag(1.0 / max_sigma**2))
+        covariance = np.linalg.inv(information / scale + np.diag(1.0 / max_sigma**2))
         return np.asarray(covariance, dtype=np.float64)

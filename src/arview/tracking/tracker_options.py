@@ -37,7 +37,6 @@ class TrackerOptions(RefinerOptions):
         wide_search_share: share of the usual score below which the part is searched for around the predicted pose.
         surprise_share: the same for a pose whose squared motion distance exceeds ``surprise``.
         surprise: squared motion distance of a surprising pose; 0.02 is about 6°.
-        recheck_distance: squared motion distance from which a pose is rechecked; 0.005 is about 3°.
         motion_penalty: score that a squared motion distance of 1 costs, because turned parts often look alike.
         min_gain: score by which a pose found far from the predicted one must be better, and largest loss of score
             accepted from the shading refinement.
@@ -73,7 +72,6 @@ class TrackerOptions(RefinerOptions):
     wide_search_share: float = 0.8
     surprise_share: float = 0.95
     surprise: float = 0.02
-    recheck_distance: float = 0.005
     motion_penalty: float = 0.15
     min_gain: float = 0.02
     min_keyframe_in_picture: float = 0.9

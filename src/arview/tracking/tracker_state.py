@@ -15,6 +15,7 @@ from arview.refinement.modalities.texture import TextureMatches
 from arview.refinement.refinement_pyramid import RefinementPyramid
 from arview.refinement.refiner import Appearance
 from arview.refinement.schedules import Stage
+from arview.tracking.motion import MotionModel
 
 
 @dataclass
@@ -31,6 +32,7 @@ class TrackerState:
         best_contour_support: best recent support of the outline.
         is_started: whether a frame has been tracked since the start.
         spread_px: standard deviation of the blur of the part's edges, px of the frame; 0 where it is not known.
+        motion: how far poses usually are from the predicted ones.
     """
 
     cam_from_body: Array
@@ -43,6 +45,7 @@ class TrackerState:
     best_contour_support: float = 0.0
     is_started: bool = False
     spread_px: float = 0.0
+    motion: MotionModel = field(default_factory=MotionModel)
 
 
 class RefinedPose(NamedTuple):
@@ -103,6 +106,7 @@ class FrameContext:
         matches: texture found; None where it is too little.
         found_share: share of the expected texture that was found.
         best: the best pose so far; None before the first one.
+        is_rechecked: whether the recheck was asked for.
     """
 
     image: NDArray[np.uint8]
@@ -113,6 +117,7 @@ class FrameContext:
     matches: TextureMatches | None = None
     found_share: float = 0.0
     best: RefinedPose | None = None
+    is_rechecked: bool = False
 
     @property
     def found(self) -> RefinedPose:

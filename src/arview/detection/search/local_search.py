@@ -93,6 +93,7 @@ class LocalSearchOptions:
             them tells whether the best one stands out.
         fine_schedules: schedules tried from each of these: with edges and colours, and with nearby edges alone, because
             occluders shift the colour statistics.
+        use_shading: refine curved parts by shading before they are verified.
         shading_stages: stages before the shading is used.
         max_verified: refined poses that are verified.
         coarse_tolerance_px, fine_tolerance_px: reach of the evidence after coarse and fine schedules.
@@ -128,6 +129,7 @@ class LocalSearchOptions:
     max_fine: int = 5
     max_competitors: int = 3
     fine_schedules: tuple[Schedule, ...] = (SEARCH_STAGES, NEAR_STAGES)
+    use_shading: bool = True
     shading_stages: Schedule = SEARCH_STAGES[-1:]
     max_verified: int = 5
     coarse_tolerance_px: float = 3.5
@@ -314,7 +316,7 @@ class LocalSearch:
         if not hypotheses:
             return []
         part, step_mm = self.refiner.part, 0.01 * self.views.diameter_mm
-        if part.is_curved:
+        if part.is_curved and self.options.use_shading:
             hypotheses = self._refine_by_shading(pyramid, hypotheses)
         known = np.array([(h.evidence_logit, h.profile_score, h.evidence.scatter_px) for h in hypotheses])
         poses = np.stack([h.cam_from_body for h in hypotheses])
