@@ -292,23 +292,29 @@ class GuidedInit:
         return response_maps(part, SPREAD_PX, pad), intrinsics
 
     def _best(self, image: NDArray[np.uint8], starts: list[Array]) -> GuidedPose | None:
-        """The start (4,4) with the best score after refinement."""
+        """The start (4,4) with the best scores after refinement.
+
+        The first start is refined by near edges alone, too: a wide schedule may leave a pose that is right.
+        """
         if not starts:
             return None
         levels = self._levels(image, starts)
+        working, finest = levels.working, levels.finest
 
-        def refine(start: Array) -> GuidedPose:
-            working, appearance = levels.working, Appearance()
-            picture = working.picture
-            pose = working.refiner.refine_fresh(picture.image, picture.smooth, start, SEARCH_STAGES)
+        def refine(job: tuple[Array, bool]) -> tuple[float, GuidedPose]:
+            (pose, is_near), appearance, picture = job, Appearance(), working.picture
+            if not is_near:
+                pose = working.refiner.refine_fresh(picture.image, picture.smooth, pose, SEARCH_STAGES)
             working.learn_colors(pose, appearance, 1.0)
-            pose, _ = levels.refine(pose, LAST_STAGES, appearance)
+            pose, _ = levels.refine(pose, LAST_STAGES, appearance, first=-1 if is_near else 0)
             evidence = working.evidence(pose, appearance)
             is_inside = evidence.points_in_picture >= self.options.min_in_picture
-            quality = evidence.quality if is_inside else 0.0
-            return GuidedPose(pose @ self._refiner.part.body_from_model, evidence, quality)
+            score = 0.5 * (evidence.score + finest.evidence(pose, appearance).score)
+            found = pose @ self._refiner.part.body_from_model
+            return score, GuidedPose(found, evidence, evidence.quality if is_inside else 0.0)
 
-        return max(pool().map(refine, starts), key=lambda item: (item.quality > 0, item.evidence.score))
+        jobs = [(starts[0], True), *((start, False) for start in starts)]
+        return max(pool().map(refine, jobs), key=lambda item: (item[1].quality > 0, item[0]))[1]
 
     def _levels(self, image: NDArray[np.uint8], starts: list[Array]) -> RefinementPyramid:
         """The picture at the scales of a part at some poses (4,4), the first of which tells how sharp its edges are."""

@@ -48,6 +48,7 @@ class SessionOptions:
         use_recheck: run the detector's local search where a tracked pose is far from the predicted one.
         use_appearance_memory: remember how the part looks while it is tracked, and look for that after a loss.
         lock_quality: a detection of this quality is accepted at once; a weaker one must be confirmed by a second frame.
+            Near a given initial pose ``tracked_quality`` is enough.
         tracked_quality: quality needed to become ``tracked``.
         critical_quality: a tracked pose becomes ``critical`` only below this quality (hysteresis).
         lost_quality: a pose below this quality for ``lost_frames`` frames is given up.
@@ -276,7 +277,7 @@ class TrackingSession:
         if detections:
             start = detections[0].cam_from_model
             s.hypotheses = HypothesisSet([invert(start) @ other for other in detections[0].alternatives])
-            return self._begin(image, start)
+            return self._begin(image, start, o.lock_quality)
         if not is_resting:
             return None, self._diagnose(image, self.detector.best_rejected)
         if self._guide is not None and self.is_aligning:
@@ -289,16 +290,19 @@ class TrackingSession:
         self._initial = None
         if found is None:
             return None, "the part is outside the picture at the initial pose"
-        return self._begin(image, found.cam_from_model)
+        # Where the part should be is known, so that less can be mistaken for it than in a search.
+        return self._begin(image, found.cam_from_model, self.options.tracked_quality)
 
-    def _begin(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[Estimate | None, str]:
-        """Accept a found pose if it is good enough; one that is not certain must be confirmed by the next frame."""
+    def _begin(
+        self, image: NDArray[np.uint8], cam_from_model: Array, lock_quality: float
+    ) -> tuple[Estimate | None, str]:
+        """Accept a found pose if it is good enough; one below a quality must be confirmed by the next frame."""
         o = self.options
         estimate = self._restart(image, cam_from_model)
         if estimate.quality < o.tracked_quality or not self._is_possible(estimate):
             rejected = RejectedHypothesis(estimate.cam_from_model, estimate.evidence, estimate.quality)
             return None, self._diagnose(image, rejected)
-        is_confirmed = estimate.quality >= o.lock_quality
+        is_confirmed = estimate.quality >= lock_quality
         self._state.begin(is_confirmed)
         return estimate, "" if is_confirmed else "found, to be confirmed"
 
