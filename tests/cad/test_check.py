@@ -220,7 +220,7 @@ def test_the_report_is_text(tmp_path):
     assert "0.5 mm 2°" in text
     assert "60° about Z" in text
     assert "camera (guessed): 1280×720, focal length 1536 px" in text
-    assert "view range (default): 244 to 976 mm, every direction, any roll" in text
+    assert "view range (default): 150 to 4163 mm, every direction, any roll" in text
     assert "note: renamed something" in text
     check = check_part(part).with_findings([PartFinding("problem", "views 3 and 7 look alike")])
     assert check.has_problems

@@ -126,7 +126,7 @@ def test_bare_cad_file_has_defaults(folder):
     view_range = part.effective_view_range
     assert view_range == default_view_range(part.model)
     assert view_range.is_full_sphere
-    np.testing.assert_allclose(view_range.distance_mm, [1.5 * part.model.diameter_mm, 6 * part.model.diameter_mm])
+    np.testing.assert_allclose(view_range.distance_mm, [0.9 * part.model.diameter_mm, 40 * part.model.diameter_mm])
 
 
 def test_a_folder_stands_for_its_part_file_and_unit_overrides(folder):

@@ -22,6 +22,8 @@ Severity = Literal["problem", "warning", "note"]
 GUESSED_CAMERA = Camera(width=1280, height=720, fx=1536.0, fy=1536.0, cx=639.5, cy=359.5)
 """Camera when none is given: a focal length of 1.2 times the longer side of a 720p picture."""
 
+USUAL_DIAMETERS = 6.0
+"""Distance, in diameters of the part, up to which its components are checked where no range is declared."""
 SMALL_PX = 12.0
 """Middle extent of a component in the picture below which its contour has too few lines."""
 
@@ -161,8 +163,12 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
     check_type(camera, (Camera, NoneType), "check_part: camera")
     is_guessed = camera is None
     camera = GUESSED_CAMERA if camera is None else camera
-    view_range = part.effective_view_range
-    components = tuple(_check_component(part, component, camera, view_range) for component in part.model.components)
+    view_range = part.effective_view_range.for_camera(camera, part.model.diameter_mm)
+    sized_range = view_range
+    if part.view_range is None:
+        # Nobody means to inspect a part as far away as it can be found.
+        sized_range = ViewRange((view_range.distance_mm[0], USUAL_DIAMETERS * part.model.diameter_mm))
+    components = tuple(_check_component(part, component, camera, sized_range) for component in part.model.components)
     vertices, faces, owners = part.model.mesh
     symmetries = find_symmetries(vertices, faces.astype(np.int64), owners.astype(np.int64))
     findings = [
@@ -171,7 +177,7 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         *_symmetry_findings(part, view_range, symmetries),
     ]
     for check in components:
-        findings += _size_findings(check, view_range)
+        findings += _size_findings(check, sized_range)
         findings += _mesh_findings(check)
     findings += _own_symmetry_findings(components)
     findings += _tolerance_findings(part)

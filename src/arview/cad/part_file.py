@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from arview.cad.load import SUFFIXES, load_cad
 from arview.cad.model import Model, make_model
@@ -44,7 +44,7 @@ serial = "BP-0042"             # of the specimen at hand, shown in the overlay
 
 # From where the camera may look at the middle of the part's bounding box. Azimuth runs from +X to +Y,
 # elevation from the XY plane to +Z, roll 0 has +Z up in the picture. All but distance_mm may be left out.
-# Without this table: every direction and roll, from 1.5 to 6 diameters of the part.
+# Without this table: every direction and roll, from where the part fills the picture to where it spans 60 px.
 [view_range]
 distance_mm = [400.0, 900.0]
 elevation_deg = [20.0, 85.0]
@@ -199,7 +199,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
 
 
 def _read_view_range(table: TomlTable) -> ViewRange:
-    intervals: dict[str, tuple[float, float]] = {"distance_mm": table.interval("distance_mm")}
+    intervals: dict[str, Any] = {"distance_mm": table.interval("distance_mm")}
     for key in ("elevation_deg", "azimuth_deg", "roll_deg"):
         if table.known(key):
             intervals[key] = table.interval(key)

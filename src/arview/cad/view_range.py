@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -22,12 +23,19 @@ class ViewRange:
         elevation_deg: from the XY plane of the model towards ``+Z``.
         azimuth_deg: from ``+X`` towards ``+Y``.
         roll_deg: about the viewing axis; at 0, ``+Z`` points up in the image.
+        min_span_px: the part's diameter in the picture at which the range ends for a camera, in pictures of up to
+            ``full_side_px``, see `for_camera`; None: the distances hold for every camera, because they were declared.
+        full_side_px: longer side of the picture above which ``min_span_px`` grows in proportion to it.
+        max_fill: the part's diameter, as a share of the picture's longer side, at which the range begins for a camera.
     """
 
     distance_mm: tuple[float, float]
     elevation_deg: tuple[float, float] = (-90.0, 90.0)
     azimuth_deg: tuple[float, float] = (-180.0, 180.0)
     roll_deg: tuple[float, float] = (-180.0, 180.0)
+    min_span_px: float | None = None
+    full_side_px: float = 1280.0
+    max_fill: float = 1.3
 
     def __post_init__(self) -> None:
         for name in ("distance_mm", "elevation_deg", "azimuth_deg", "roll_deg"):
@@ -38,6 +46,20 @@ class ViewRange:
             raise InputError(f"view range: distance_mm = {list(self.distance_mm)} must be positive")
         if self.elevation_deg[0] < -90 or self.elevation_deg[1] > 90:
             raise InputError(f"view range: elevation_deg = {list(self.elevation_deg)} leaves [-90, 90]")
+
+    def for_camera(self, camera: Camera, diameter_mm: float) -> ViewRange:
+        """The range at whose distances a camera shows a part of a diameter neither too small nor too large.
+
+        A declared range, without `min_span_px`, is returned as it is.
+        """
+        if self.min_span_px is None:
+            return self
+        low, high = self.distance_mm
+        longer_px = max(camera.width, camera.height)
+        scale_mm = 0.5 * (camera.fx + camera.fy) * diameter_mm
+        near = min(max(low, scale_mm / (self.max_fill * longer_px)), high)
+        span_px = self.min_span_px * max(1.0, longer_px / self.full_side_px)
+        return replace(self, distance_mm=(near, max(near, min(high, scale_mm / span_px))))
 
     @property
     def is_full_sphere(self) -> bool:

@@ -28,8 +28,10 @@ from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.search.global_search import (
     GRADIENTS_ONLY,
     QUICK,
+    QUICK_OUTER,
     UNTRIMMED,
     WIDE,
+    WIDE_OUTER,
     GlobalSearch,
     GlobalSearchOptions,
     PoseCandidate,
@@ -89,7 +91,7 @@ class DetectorOptions:
     radius_px: float = 20.0
     roll_step_deg: float = 18.0
     subdivisions: int = 2
-    budgets: tuple[SearchBudget, ...] = (QUICK, WIDE, GRADIENTS_ONLY, UNTRIMMED)
+    budgets: tuple[SearchBudget, ...] = (QUICK, QUICK_OUTER, WIDE, WIDE_OUTER, GRADIENTS_ONLY, UNTRIMMED)
     min_quality: float = 0.5
     min_quick_quality: float = 0.6
     global_search: GlobalSearchOptions = field(default_factory=GlobalSearchOptions)
@@ -154,7 +156,7 @@ class RejectedHypothesis:
 def local_search_for(views: GuideViewSet, camera: Camera, options: DetectorOptions | None = None) -> LocalSearch:
     """The local search that a detector with these options uses."""
     o = options or options_for(views)
-    return LocalSearch(views, camera, replace(o.local, radius_px=o.radius_px), search_distances_mm(views.view_range))
+    return LocalSearch(views, camera, replace(o.local, radius_px=o.radius_px), search_distances_mm(views, camera))
 
 
 class Detector:
@@ -240,7 +242,8 @@ class Detector:
         o, local = self.options, self.local
         hypotheses: list[Hypothesis] = []
         min_quality = max(o.min_quick_quality, o.min_quality)
-        for budget in o.budgets if is_thorough else o.budgets[:1]:
+        budgets = [budget for budget in o.budgets if self.global_search.has_outer or not budget.is_outer]
+        for budget in budgets if is_thorough else budgets[:1]:
             starts = local.pattern_search(pyramid, self.global_search.starts(pyramid, budget), budget.kept)
             found = local.refine_and_verify(pyramid, starts)
             hypotheses = local.deduplicate([*hypotheses, *found], local.options.distinct_deg)

@@ -199,12 +199,15 @@ def _from_parts(meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> GuideV
     """A set from the metadata and the arrays of a file."""
     width, height, fx, fy, cx, cy = meta["camera"]
     arrays = dict(arrays)
+    ranges: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in meta["view_range"].items()
+    }
     return GuideViewSet(
         model_name=meta["model_name"],
         model_hash=meta["model_hash"],
         component_names=tuple(meta["component_names"]),
         camera=Camera(width, height, fx, fy, cx, cy),
-        view_range=ViewRange(**{name: tuple(pair) for name, pair in meta["view_range"].items()}),
+        view_range=ViewRange(**ranges),
         options=GuideViewOptions(**meta["options"]),
         center_in_model=np.array(meta["center_in_model"]),
         diameter_mm=meta["diameter_mm"],

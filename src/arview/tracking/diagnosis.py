@@ -101,7 +101,7 @@ def diagnose_search(
         reason = reason or _partly_outside(camera, views, credible, options)
         reason = reason or _low_contrast(image, camera, views, credible.cam_from_model, options)
         reason = reason or f"only {100 * credible.evidence.contour_support:.0f} % of the outline found"
-    low, high = views.view_range.distance_mm
+    low, high = views.view_range.for_camera(camera, views.diameter_mm).distance_mm
     return reason or f"{NOTHING_IN_VIEW}, {low:.0f} to {high:.0f} mm away"
 
 

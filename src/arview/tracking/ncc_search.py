@@ -179,7 +179,7 @@ class NccSearch:
     def _search_space(self, rotations: Array, near: Array | None) -> tuple[NDArray[np.intp], Array]:
         """Views and rolls (T,2) to search for, and distances (D,) mm."""
         o = self.options
-        low, high = self._views.view_range.distance_mm
+        low, high = self._views.view_range.for_camera(self._camera, self._views.diameter_mm).distance_mm
         low, high = (1.0 - o.range_margin) * low, (1.0 + o.range_margin) * high
         rolls = 2.0 * np.pi * np.arange(o.roll_steps) / o.roll_steps
         if near is None:

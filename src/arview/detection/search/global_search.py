@@ -79,6 +79,9 @@ class GlobalSearchOptions:
         distinct_px, distinct_rad, distinct_ratio: offset at the scale of the templates, rotation and distance ratio
             within which improved matches are duplicates.
         response_weight: weight of the mean response beside the profile score when candidates are ranked.
+        max_octaves: a wider range of sizes is searched in two parts, so that the usual sizes take no longer.
+        core_fill: the part's diameter in the picture, as shares of its longer side, in the first of these parts.
+        min_map_px: side of a response map, without its border, below which nothing is searched.
     """
 
     radius_px: float = 20.0
@@ -102,6 +105,9 @@ class GlobalSearchOptions:
     distinct_rad: float = 0.15
     distinct_ratio: float = 1.06
     response_weight: float = 20.0
+    max_octaves: float = 2.6
+    core_fill: tuple[float, float] = (0.18, 0.85)
+    min_map_px: int = 16
 
 
 @dataclass(frozen=True)
@@ -117,6 +123,7 @@ class SearchBudget:
         scale_stride: spacing of the scale steps at which templates are matched.
         is_trimmed: leave out the quarter of each outline with the lowest responses, which may be occluded.
         use_edge_net: edge responses weigh as much as gradients until poses are ranked.
+        is_outer: search a wide range's outer sizes, see `GlobalSearchOptions.core_fill`, and nothing in other ranges.
     """
 
     matches: int
@@ -127,12 +134,17 @@ class SearchBudget:
     scale_stride: int
     is_trimmed: bool
     use_edge_net: bool = True
+    is_outer: bool = False
 
 
 QUICK = SearchBudget(matches=400, refined=200, ranked=100, starts=16, kept=(6, 4), scale_stride=2, is_trimmed=False)
 """The first search of every image; half of the scales, few matches."""
 WIDE = SearchBudget(matches=2500, refined=1400, ranked=700, starts=160, kept=(60, 20), scale_stride=1, is_trimmed=True)
 """For clutter, in which thousands of wrong matches score higher than the right one, and for occluded parts."""
+QUICK_OUTER = replace(QUICK, is_outer=True)
+"""The first search for a part that is smaller or larger in the picture than usual."""
+WIDE_OUTER = replace(WIDE, matches=1200, refined=700, ranked=350, starts=80, kept=(30, 10), is_outer=True)
+"""The same in clutter."""
 GRADIENTS_ONLY = replace(WIDE, is_trimmed=False, use_edge_net=False)
 """For materials to which the edge network does not respond."""
 UNTRIMMED = replace(WIDE, is_trimmed=False)
@@ -229,14 +241,17 @@ def in_fundamental_domain(
     return is_inside
 
 
-def search_distances_mm(view_range: ViewRange, nearest: float = 0.85, farthest: float = 1.18) -> tuple[float, float]:
+def search_distances_mm(
+    views: GuideViewSet, camera: Camera, nearest: float = 0.85, farthest: float = 1.18
+) -> tuple[float, float]:
     """Shortest and longest distance at which poses are searched.
 
     Args:
-        view_range: declared range.
-        nearest, farthest: shares of the declared shortest and longest distance.
+        views: guide views over the declared range.
+        camera: of the pictures.
+        nearest, farthest: shares of the shortest and longest distance of the range for this camera.
     """
-    low, high = view_range.distance_mm
+    low, high = views.view_range.for_camera(camera, views.diameter_mm).distance_mm
     return nearest * low, farthest * high
 
 
@@ -274,11 +289,12 @@ class GlobalSearch:
         self._ranker = ProfileRanker(part)
         self.outlines = make_outlines(views, part.model_from_body, o.outlines)
         # Scale steps of the templates, from far to near: large images first.
-        low, high = views.view_range.distance_mm
-        self._distances_mm = search_distances_mm(views.view_range)
+        low, high = views.view_range.for_camera(camera, views.diameter_mm).distance_mm
+        self._distances_mm = search_distances_mm(views, camera)
         near, far = self.step_at(low), self.step_at(high)
         top = int(np.floor(STEPS_PER_OCTAVE * np.log2(o.max_scale)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
+        self._core, self._outer = self._split(self._steps)
         chosen = outlines_near_icosphere(views, self.outlines, o.subdivisions)
         chosen = chosen[in_fundamental_domain(-self.outlines.rotations[chosen, 2], turns, views.view_range)]
         self._groups = len(np.unique(self.outlines.groups[chosen]))
@@ -288,6 +304,21 @@ class GlobalSearch:
             step: make_bank(self.outlines, chosen, rolls, o.radius_px, o.radius_px / focal_px)
             for step, focal_px in focals_px.items()
         }
+
+    @property
+    def has_outer(self) -> bool:
+        """Whether the range of sizes is so wide that its outer part is searched by budgets of its own."""
+        return bool(self._outer)
+
+    def _split(self, steps: list[int]) -> tuple[list[int], list[int]]:
+        """Scale steps of the usual sizes, and of all others where the range of sizes is wide."""
+        o = self.options
+        if len(steps) <= o.max_octaves * STEPS_PER_OCTAVE:
+            return steps, []
+        longer_px = max(self.camera.width, self.camera.height)
+        last, first = (step_for(0.5 * fill * longer_px, o.radius_px) for fill in o.core_fill)
+        core = [step for step in steps if round(first) <= step <= round(last)]
+        return core, [step for step in steps if step not in core]
 
     def step_at(self, distance_mm: float) -> float:
         """Scale step at which the part at a distance has the size of the templates."""
@@ -331,7 +362,10 @@ class GlobalSearch:
     def _match_all(self, pyramid: ImagePyramid, budget: SearchBudget) -> TemplateMatches:
         """The best template matches at all scales, without duplicates."""
         o = self.options
-        scales = self._steps[:: budget.scale_stride]
+        steps = self._outer if budget.is_outer else self._core
+        if not steps:
+            return self._no_matches()
+        scales = steps[:: budget.scale_stride]
         pyramid.make_maps(scales)
         phases = list(pool().map(lambda step: decimate(pyramid.maps(step)[0], o.grid_px), scales))
         count = len(next(iter(self.banks.values())).bins)
@@ -363,7 +397,7 @@ class GlobalSearch:
         """The matches of the templates ``first`` to ``last`` at one scale."""
         bank = self.banks[step]
         maps, _ = pyramid.maps(step)
-        if min(maps.shape[1:]) < 24 + 2 * pyramid.pad_px:
+        if min(maps.shape[1:]) < self.options.min_map_px + 2 * pyramid.pad_px:
             return self._no_matches()
         keys, templates, places = match_templates(
             phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, self.options.min_score, votes,
