@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 from arview.detection import Detector, DetectorOptions
+from arview.detection.confidence import CONFIDENCE, ConfidenceTerms
 from arview.errors import InputError
 from arview.evaluation.protocols import spread_frames
 from arview.evaluation.semisynthetic import frames_without_part
@@ -34,6 +35,14 @@ FOLDS = 5
 """Of the cross-validation, over parts."""
 FALSE_ALARMS = (15, 10, 5, 3)
 """Numbers of false alarms for which the report states detections."""
+
+OUTLINE = ConfidenceTerms._fields.index("outline")
+WITHOUT_OUTLINE = np.array([field != "outline" for field in ConfidenceTerms._fields], dtype=np.float64)
+"""Terms of the regression that relies on the pose verifier."""
+WITHOUT_VERIFIER = np.array(
+    [field not in ("appearance", "evidence", "profile") for field in ConfidenceTerms._fields], dtype=np.float64
+)
+"""Terms of the regression that relies on the outline alone."""
 
 LabelledPicture = tuple[Detector, NDArray[np.uint8], Array | None]
 
@@ -61,6 +70,7 @@ def fit_confidence(seeds: range, photos: Sequence[Path]) -> None:
     if len({outcome.is_right for outcome in outcomes}) < 2:
         raise InputError("fit.py: too few pictures to fit the confidence to; ask for more solids")
     terms = np.array([outcome.terms for outcome in outcomes])
+    known, terms = terms, terms * WITHOUT_OUTLINE
     is_right = np.array([outcome.is_right for outcome in outcomes])
     weights = np.array([outcome.weight for outcome in outcomes])
     parts = np.array([outcome.part for outcome in outcomes])
@@ -71,7 +81,11 @@ def fit_confidence(seeds: range, photos: Sequence[Path]) -> None:
         fitted = _fitted(terms[folds != fold], is_right[folds != fold], weights[folds != fold])
         predicted[folds == fold] = terms[folds == fold] @ fitted[:-1] + fitted[-1]
     final = _fitted(terms, is_right, weights)
-    print("weights", np.round(final[:-1], 2).tolist(), "bias", round(float(final[-1]), 2))
+    print("probability", np.round(final[:-1], 2).tolist(), "bias", round(float(final[-1]), 2))
+    shown = known[:, OUTLINE] >= CONFIDENCE.min_outline
+    if 0 < is_right[shown].sum() < shown.sum():
+        by_outline = _fitted(known[shown] * WITHOUT_VERIFIER, is_right[shown], weights[shown])
+        print("by_outline", np.round(by_outline[:-1], 2).tolist(), "bias", round(float(by_outline[-1]), 2))
     print(f"in {FOLDS} folds, of {is_right.sum()} right and {(~is_right).sum()} pictures without the part:")
     others = np.sort(predicted[~is_right])[::-1]
     for alarms in FALSE_ALARMS:
