@@ -40,7 +40,7 @@ class FocalOptions:
     sure_std: float = 0.025
     many_frames: int = 20
     enough_std: float = 0.006
-    inflation: float = 1.3
+    inflation: float = 1.5
     agreement: float = 2.0
     frames: FrameSetOptions = field(default_factory=FrameSetOptions)
     adjustment: AdjustmentOptions = field(default_factory=AdjustmentOptions)
