@@ -410,7 +410,7 @@ def test_options_out_of_range_are_refused() -> None:
 @pytest.mark.slow
 def test_no_search_leaves_the_declared_distances() -> None:
     seen = detector().local.pyramid(picture(pose_from(30, 40, 500.0), noise=12.0))
-    nearest_mm, farthest_mm = search_distances_mm(detector().views.view_range)
+    nearest_mm, farthest_mm = search_distances_mm(detector().views, CAMERA)
     candidates = detector().global_search.candidates(seen, WIDE).poses
     improved = detector().local.pattern_search(seen, detector().global_search.starts(seen, WIDE), WIDE.kept)
     poses = np.concatenate([candidates, [candidate.cam_from_body for candidate in improved]])

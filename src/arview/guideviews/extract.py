@@ -256,11 +256,11 @@ def _run_inwards(pixels: Array, tangents_px: Array, mask: NDArray[np.uint8]) -> 
     """Of which edges (N,) the normal (-v, u) of the tangent (u, v) points to the inside of a silhouette (H,W)."""
     inside = cv2.blur((mask > 0).astype(np.float32), (3, 3))
     normals = NORMAL_REACH_PX * np.stack([-tangents_px[:, 1], tangents_px[:, 0]], axis=1)
-    ahead, behind = (
+    outer, inner = (
         cv2.remap(inside, (pixels + shift).astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]
         for shift in (normals, -normals)
     )
-    return np.asarray(ahead > behind)
+    return np.asarray(outer > inner)
 
 
 def _contour(

@@ -191,14 +191,7 @@ def measure_region(
             norm += posterior[d]
         if norm < 1e-30:
             continue
-        m = 0.0
-        for d in range(12):
-            m += (d - 5.5) * posterior[d]
-        m /= norm
-        variance = 0.0
-        for d in range(12):
-            variance += (d - 5.5 - m) ** 2 * posterior[d]
-        variance = variance / norm + 1.0 / 12.0
+        m, variance = _moments(posterior, norm)
         gain = 1.0 / variance - flat
         crossing[i] = norm / (norm + 12.0 * (all_part + all_back))
         if gain <= 0.0:
@@ -207,6 +200,19 @@ def measure_region(
         mean[i] = scale * min(max(m * shrink, -8.0), 8.0)
         information[i] = gain / (scale * scale)
     return RegionLines(mean, information, crossing)
+
+
+@kernel(fastmath=True)
+def _moments(posterior: NDArray[np.float64], norm: float) -> tuple[float, float]:
+    """Mean and variance, in segments, of a displacement with a posterior (12,) whose sum is ``norm``."""
+    mean = 0.0
+    for d in range(12):
+        mean += (d - 5.5) * posterior[d]
+    mean /= norm
+    variance = 0.0
+    for d in range(12):
+        variance += (d - 5.5 - mean) ** 2 * posterior[d]
+    return mean, variance / norm + 1.0 / 12.0
 
 
 @kernel
