@@ -473,3 +473,17 @@ def test_edges_lie_on_the_edges_of_a_real_frame(index: int) -> None:
     }
     best = strength.pop((0, 0))
     assert best > 1.1 * max(strength.values())
+
+
+def test_labels_say_which_places_depend_on_the_ambiguous_pose() -> None:
+    model = make_model("plate", (box("base", (0, 0, -4), (200, 200, 8)), post("middle", 0, 0), post("side", 70, 0)))
+    result = inspection(model, deviation("middle", (0.9, 0, 0), "fail"), deviation("side", (0.9, 0, 0), "fail"))
+    renderer = OverlayRenderer(model, CAMERA, result)
+    turned = pose(orbit(20.0), TrackingState.CRITICAL)
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    ambiguous = replace(turned, alternatives=(orbit(20.0) @ half_turn,))
+    # The half turn about the middle leaves it where it is, and moves the post at the side.
+    assert set(renderer._open_sprites(ambiguous)) == {"side"}
+    assert renderer._open_sprites(turned) == {}
+    plain, marked = (renderer.draw(GREY, shown, now=NOW) for shown in (turned, ambiguous))
+    assert np.any(plain != marked)

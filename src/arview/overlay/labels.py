@@ -94,8 +94,10 @@ def text_size_px(image_height: int) -> int:
     return max(11, round(4.5 + image_height / 72))
 
 
-def label_sprite(deviation: ComponentDeviation, options: OverlayOptions, size_px: int, widest_px: int) -> paint.Sprite:
-    """Sprite of a label: name, distance and verdict, and a second line of details unless it passed."""
+def label_sprite(
+    deviation: ComponentDeviation, options: OverlayOptions, size_px: int, widest_px: int, note: str = ""
+) -> paint.Sprite:
+    """Sprite of a label: name, distance and verdict, and a second line with a note, or with details unless it passed."""
     color = VERDICT_RGB[deviation.verdict]
     small_px = max(10, round(0.86 * size_px))
     pad, bar = round(0.5 * size_px), max(3, round(0.28 * size_px))
@@ -108,7 +110,8 @@ def label_sprite(deviation: ComponentDeviation, options: OverlayOptions, size_px
     fixed = left + (value.shape[1] + gap if has_value else 0) + gap + chip_width + pad
     name = paint.text_mask(paint.shortened(deviation.name, size_px, widest_px - fixed, True), size_px, True)
     detail = None
-    if deviation.verdict is not Verdict.PASS and (text := detail_text(deviation, options)):
+    text = note or ("" if deviation.verdict is Verdict.PASS else detail_text(deviation, options))
+    if text:
         detail = paint.text_mask(paint.shortened(text, small_px, widest_px - left - pad), small_px)
 
     width = fixed + name.shape[1]

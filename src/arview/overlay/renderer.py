@@ -28,6 +28,8 @@ _CONTEXT_WEIGHT = 0.25
 """Cost of covering a component that was not inspected with a label, relative to one that was."""
 _CONTEXT_EDGE_ALPHA = 0.5
 """Opacity of the edges of components that were not inspected."""
+_SAME_PLACE = 0.02
+"""Distance in diameters within which a component is at one place in all ambiguous poses."""
 _CRITICAL_DIMMING = 0.55
 """Factor of the opacity of ghost and edges in the state `critical`."""
 _PASS_DIMMING = 0.65
@@ -87,11 +89,14 @@ class OverlayRenderer:
         self._verdict = {deviation.name: deviation.verdict for deviation in self._labelled}
         margin_px, gap_px = round(0.6 * size_px), round(0.5 * size_px)
         widest_px = (camera.width - 2 * margin_px - 2 * gap_px) // 2
+        self._noted: dict[tuple[str, int], paint.Sprite] = {}
         self._sprites = {
             deviation.name: labels.label_sprite(deviation, self.options, size_px, widest_px)
             for deviation in self._labelled
         }
         widest_px = max((sprite.width for sprite in self._sprites.values()), default=0)
+        # Labels with a note are at most as wide as the layout expects.
+        self._label_px = size_px, widest_px
         bottom_px = camera.height - margin_px - (self._status.height_px if self.options.show_status else 0)
         self._layout = LabelLayout(camera.width, margin_px, bottom_px, margin_px, gap_px, widest_px)
         self._was_seen: set[str] = set()
@@ -129,7 +134,7 @@ class OverlayRenderer:
                 self._guide.draw(canvas, pose.guide_cam_from_model)
         else:
             self._draw_model(canvas, view, pose.cam_from_model, pose.state)
-            self._draw_annotations(canvas, view, pose.cam_from_model)
+            self._draw_annotations(canvas, view, pose)
         if self.options.show_status:
             self._status.draw(canvas, pose, fps, now)
         return canvas
@@ -171,18 +176,41 @@ class OverlayRenderer:
             self._ghost_style * dimming, cover, owner, self._edge_style * dimming,
         )  # fmt: skip
 
-    def _draw_annotations(self, canvas: paint.Image, view: GhostView, cam_from_model: Array) -> None:
+    def _draw_annotations(self, canvas: paint.Image, view: GhostView, pose: Pose) -> None:
+        cam_from_model = pose.cam_from_model
+        assert cam_from_model is not None
         placed: list[PlacedLabel] = []
+        sprites = {**self._sprites, **self._open_sprites(pose)}
         if self._labelled:
             anchors_px = self._ghost.project(apply(cam_from_model, self._anchors_in_model))
-            seen_px, placed = self._place_labels(view, anchors_px)
+            seen_px, placed = self._place_labels(view, anchors_px, sprites)
             for label in placed:
                 self._draw_leader(canvas, label, anchors_px, seen_px)
         self._draw_arrows(canvas, cam_from_model)
         for label in placed:
-            paint.put_sprite(canvas, self._sprites[label.key], label.x, label.y, label.opacity)
+            paint.put_sprite(canvas, sprites[label.key], label.x, label.y, label.opacity)
 
-    def _place_labels(self, view: GhostView, anchors_px: Array) -> tuple[NDArray[np.int64], list[PlacedLabel]]:
+    def _open_sprites(self, pose: Pose) -> dict[str, paint.Sprite]:
+        """Sprites of the components whose place depends on which of the ambiguous poses is right."""
+        if pose.cam_from_model is None or not pose.alternatives:
+            return {}
+        anchors = apply(pose.cam_from_model, self._anchors_in_model)
+        moved = [apply(other, self._anchors_in_model) - anchors for other in pose.alternatives]
+        apart = np.max(np.linalg.norm(moved, axis=2), axis=0) > _SAME_PLACE * self.model.diameter_mm
+        count = len(pose.alternatives) + 1
+        note = "one of two places" if count == 2 else f"one of {count} places"
+        sprites = {}
+        for deviation in self._labelled:
+            if apart[self._index[deviation.name]]:
+                key = deviation.name, count
+                if key not in self._noted:
+                    self._noted[key] = labels.label_sprite(deviation, self.options, *self._label_px, note)
+                sprites[deviation.name] = self._noted[key]
+        return sprites
+
+    def _place_labels(
+        self, view: GhostView, anchors_px: Array, sprites: dict[str, paint.Sprite]
+    ) -> tuple[NDArray[np.int64], list[PlacedLabel]]:
         """Visible pixels (C,) of the components, and the placed labels."""
         camera = self.camera
         cells = np.zeros((-(-camera.height // CELL_PX), -(-camera.width // CELL_PX)), dtype=np.float32)
@@ -194,7 +222,7 @@ class OverlayRenderer:
                 break
             index = self._index[deviation.name]
             if self._deserves_label(deviation, anchors_px[index], int(seen_px[index])):
-                sprite = self._sprites[deviation.name]
+                sprite = sprites[deviation.name]
                 requests.append(LabelRequest(deviation.name, sprite.width, sprite.height, anchors_px[index]))
         self._was_seen = {request.key for request in requests}
         part_px = (float(view.u0), float(view.u0 + view.face_ids.shape[1]))
