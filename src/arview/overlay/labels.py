@@ -97,7 +97,7 @@ def text_size_px(image_height: int) -> int:
 def label_sprite(
     deviation: ComponentDeviation, options: OverlayOptions, size_px: int, widest_px: int, note: str = ""
 ) -> paint.Sprite:
-    """Sprite of a label: name, distance and verdict, and a second line with a note, or with details unless it passed."""
+    """Sprite of a label: name, distance and verdict; below a note, or details unless the component passed."""
     color = VERDICT_RGB[deviation.verdict]
     small_px = max(10, round(0.86 * size_px))
     pad, bar = round(0.5 * size_px), max(3, round(0.28 * size_px))
