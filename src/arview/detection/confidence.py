@@ -29,9 +29,8 @@ class ConfidenceOptions:
         max_distant_margin: upper bound on the margin over poses at other places.
         min_view_richness, max_view_richness: bounds on the log ratio of distinct lines in the view to the usual number.
         small_radius_px: half diameter below which a part counts as small; small parts fit clutter more often.
-        outline_contour, outline_verifier: scores of contour and pose verifier at which a well-supported outline counts
-            half.
-        outline_slope: slope of the logistic functions around them.
+        outline_contour, outline_slope: score of the contour verifier at which a well-supported outline counts half,
+            and slope of the logistic function around it.
         full_inner_share, full_inner_support: share of design edges inside the outline from which they must be seen,
             too, and support with which they are.
         min_outline: outline score below which the outline alone confirms no pose.
@@ -44,7 +43,6 @@ class ConfidenceOptions:
     max_view_richness: float = 0.3
     small_radius_px: float = 60.0
     outline_contour: float = -1.0
-    outline_verifier: float = -5.0
     outline_slope: float = 1.5
     full_inner_share: float = 0.5
     full_inner_support: float = 0.25
@@ -219,7 +217,6 @@ def outline_score(
     evidence: PoseEvidence,
     outline: PoseEvidence,
     contour: float,
-    verifier: float,
     options: ConfidenceOptions = CONFIDENCE,
 ) -> float:
     """How clearly the image shows the outline of a pose, 0–1, as one term of the probability.
@@ -231,7 +228,6 @@ def outline_score(
         evidence: edge and colour evidence at the pose.
         outline: the same at the scale at which the outline is judged.
         contour: score of the contour verifier; a low one says that the outline is not the part's.
-        verifier: score of the pose verifier; a very low one says that something else is there.
         options: limits and slopes.
     """
     o = options
@@ -240,8 +236,7 @@ def outline_score(
     share = min(1.0, evidence.inner_share / o.full_inner_share)
     inner = 1.0 - share + share * min(1.0, evidence.inner_support / o.full_inner_support)
     shown *= inner * evidence.points_in_picture
-    shown /= 1.0 + math.exp(-o.outline_slope * (contour - o.outline_contour))
-    return shown / (1.0 + math.exp(-o.outline_slope * (max(verifier, -50.0) - o.outline_verifier)))
+    return shown / (1.0 + math.exp(-o.outline_slope * (contour - o.outline_contour)))
 
 
 def confidence_terms(

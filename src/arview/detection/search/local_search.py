@@ -328,8 +328,8 @@ class LocalSearch:
             for some, pose in zip(edges, poses, strict=True)
         ]
         outlines = [
-            outline_score(h.evidence, self._outline(pyramid, h.cam_from_body), contour, score)
-            for h, contour, score in zip(hypotheses, contours, scores, strict=True)
+            outline_score(h.evidence, self._outline(pyramid, h.cam_from_body), contour)
+            for h, contour in zip(hypotheses, contours, strict=True)
         ]
         return [
             replace(
