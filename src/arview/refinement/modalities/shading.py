@@ -40,7 +40,7 @@ MEAN_PRIOR = 1e-9
 """The same for the mean brightness, which is always determined."""
 OUTLIER_SCALE = 2.0
 """Multiple of the median residual at which a pixel has a quarter of its weight."""
-POSE_ROUNDS, LIGHT_ROUNDS = 4, 3
+POSE_ROUNDS, LIGHT_ROUNDS = 2, 3
 """Updates of the pose, and of the light with robust weights before each."""
 MAX_TURN_RAD = 0.12
 """Largest rotation in one update."""
