@@ -97,7 +97,7 @@ def shaded(
     crop = crop_for_shading(image, CAMERA, model.diameter_mm, pose, OPTIONS)
     assert crop is not None
     found, more, explained = refine_by_shading(
-        crop, surface_of(model), corners_of(model), model.diameter_mm, pose, information, OPTIONS.gain
+        crop, surface_of(model), corners_of(model), model.diameter_mm, pose, information, OPTIONS.gain, OPTIONS.rounds
     )
     return found, more, float(explained)
 
@@ -204,7 +204,7 @@ def test_a_pose_that_nothing_determines_stays_as_it_is() -> None:
     crop = crop_for_shading(flat, CAMERA, blob().diameter_mm, TRUTH, OPTIONS)
     assert crop is not None
     pose, information, explained = refine_by_shading(
-        crop, surface, corners, blob().diameter_mm, TRUTH, np.zeros((6, 6)), OPTIONS.gain
+        crop, surface, corners, blob().diameter_mm, TRUTH, np.zeros((6, 6)), OPTIONS.gain, OPTIONS.rounds
     )
     np.testing.assert_array_equal(pose, TRUTH)
     assert not information.any() and explained == -1.0

@@ -67,6 +67,11 @@ class RefinementPyramid:
         return self.level(len(self.scales) - 1)
 
     @property
+    def finest_colors(self) -> PictureRefiner:
+        """The finest picture that has colours."""
+        return self.working if self._refiner.options.use_edge else self.finest
+
+    @property
     def camera(self) -> Camera:
         """Intrinsics of the frame."""
         return self._refiner.camera

@@ -227,7 +227,7 @@ class PoseRefiner:
             return cam_from_body, information
         part = self.part
         refined = refine_by_shading(
-            crop, part.surface, part.corner_normals, self.diameter_mm, cam_from_body, information, o.gain
+            crop, part.surface, part.corner_normals, self.diameter_mm, cam_from_body, information, o.gain, o.rounds
         )
         return refined.cam_from_body, refined.information
 

@@ -111,7 +111,7 @@ class Tracker:
         levels = self._levels(image, [state.cam_from_body])
         self._measure_spread(levels, 1.0)
         levels = self._levels(image, [state.cam_from_body])
-        levels.working.learn_colors(state.cam_from_body, state.appearance, 1.0)
+        levels.finest_colors.learn_colors(state.cam_from_body, state.appearance, 1.0)
         if self._texture is not None and not (self.options.use_region or self.options.use_edge):
             # Nothing else can support the pose before there is a keyframe.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -300,7 +300,7 @@ class Tracker:
         self._measure_spread(frame.levels, o.spread_rate)
         if quality > o.min_learning_quality:
             if o.use_region:
-                frame.levels.working.learn_colors(pose, state.appearance, o.learning_rate)
+                frame.levels.finest_colors.learn_colors(pose, state.appearance, o.learning_rate)
             if self._texture is not None:
                 self._remember_texture(frame)
 

@@ -18,8 +18,8 @@ class TrackerOptions(RefinerOptions):
     Attributes:
         use_texture: match the part's own texture; needs the model's surface.
         use_shading: use the brightness of curved surfaces.
-        shading: as of the refinement, with less weight than for a pose found by a search, because the errors of the
-            brightness are common to many pixels and the tracked pose is nearly right.
+        shading: as of the refinement, with fewer rounds and less weight than for a pose found by a search, because the
+            errors of the brightness are common to many pixels and the tracked pose is nearly right.
         stages: schedule of a usual frame.
         min_matches: texture matches needed to use texture.
         min_match_share: share of the expected texture that must be found to use texture.
@@ -57,7 +57,7 @@ class TrackerOptions(RefinerOptions):
 
     use_texture: bool = True
     use_shading: bool = True
-    shading: ShadingOptions = field(default_factory=lambda: ShadingOptions(gain=0.5))
+    shading: ShadingOptions = field(default_factory=lambda: ShadingOptions(gain=0.5, rounds=2))
     stages: tuple[Stage, ...] = TRACK_STAGES
     min_matches: int = 12
     min_match_share: float = 0.4

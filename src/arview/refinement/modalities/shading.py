@@ -40,8 +40,8 @@ MEAN_PRIOR = 1e-9
 """The same for the mean brightness, which is always determined."""
 OUTLIER_SCALE = 2.0
 """Multiple of the median residual at which a pixel has a quarter of its weight."""
-POSE_ROUNDS, LIGHT_ROUNDS = 2, 3
-"""Updates of the pose, and of the light with robust weights before each."""
+LIGHT_ROUNDS = 3
+"""Updates of the light with robust weights before each update of the pose."""
 MAX_TURN_RAD = 0.12
 """Largest rotation in one update."""
 MIN_DEVIATION = 1.0
@@ -61,12 +61,14 @@ class ShadingOptions:
         radius_px: half diameter of the part in the reduced picture; smaller parts are not enlarged.
         reach: half size of the crop, in half diameters of the part.
         min_curved_share: share of curved surface needed, because any light can explain the brightness of flat faces.
+        rounds: updates of the pose.
     """
 
     gain: float = 5.0
     radius_px: float = 26.0
     reach: float = 1.15
     min_curved_share: float = 0.2
+    rounds: int = 4
 
 
 class ShadingCrop(NamedTuple):
@@ -187,7 +189,7 @@ def crop_for_shading(
 @kernel
 def refine_by_shading(
     crop: ShadingCrop, surface: Surface, corners: NDArray[np.float32], diameter_mm: float,
-    cam_from_body: NDArray[np.float64], information: NDArray[np.float64], gain: float
+    cam_from_body: NDArray[np.float64], information: NDArray[np.float64], gain: float, rounds: int
 ) -> ShadedPose:  # fmt: skip
     """Refine a pose by the shading of the part's surface, see `ShadedPose`.
 
@@ -199,6 +201,7 @@ def refine_by_shading(
         cam_from_body: (4,4) the best pose by edges and colours.
         information: (6,6) of that pose.
         gain: weight of the shading relative to that information.
+        rounds: updates of the pose.
 
     Returns:
         The pose and information as they were, with -1, where too little of the surface is visible or the pose is not
@@ -212,7 +215,7 @@ def refine_by_shading(
     drawn = np.empty((4, bright.shape[0], bright.shape[1]), dtype=np.float32)
     face_ids = np.empty(bright.shape, dtype=np.int32)
     center_px = np.empty(2)
-    for _ in range(POSE_ROUNDS):
+    for _ in range(rounds):
         if pose[2, 3] <= 0.0:
             return ShadedPose(cam_from_body.copy(), information.copy(), -1.0)
         for k in range(2):
