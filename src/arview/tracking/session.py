@@ -55,7 +55,8 @@ class SessionOptions:
         lost_frames: frames in a row below ``lost_quality`` after which the part is lost.
         critical_frames: critical frames in a row after which the part is lost.
         eager_frames: frames after a loss in each of which the part is searched for.
-        search_every: later only every n-th frame is searched.
+        search_every: later only every n-th frame is searched, and at first every other of these thoroughly.
+        max_thorough_frames: frames between two thorough searches for a part that has been lost for long.
         min_resting_score: correlation with the remembered appearance from which a place is examined in frames between
             these searches.
         align_again_frames: frames after a loss from which the part may be aligned with the guide view again.
@@ -78,6 +79,7 @@ class SessionOptions:
     critical_frames: int = 45
     eager_frames: int = 2
     search_every: int = 3
+    max_thorough_frames: int = 30
     min_resting_score: float = 0.7
     align_again_frames: int = 60
     align_advice_every: int = 10
@@ -320,10 +322,18 @@ class TrackingSession:
             if s.last_sure_pose is not None and s.frames_without_pose <= o.eager_frames:
                 guesses = self._remembered(image, s.last_sure_pose)
             guesses = guesses or self._remembered(image)
-        # The thorough search takes long, so it is not run in every frame.
-        turn = s.frames_without_pose % (2 * o.search_every)
-        is_thorough = turn == 1 if s.state == TrackingState.SEARCHING else turn == 0
-        return self.detector.detect(image, max_results=1, is_thorough=is_thorough, guesses=guesses)
+        return self.detector.detect(image, max_results=1, is_thorough=self._is_thorough(), guesses=guesses)
+
+    def _is_thorough(self) -> bool:
+        """Whether this frame is searched thoroughly, which takes long; of a lost part ever more rarely."""
+        o, s = self.options, self._state
+        if s.state == TrackingState.SEARCHING:
+            return s.frames_without_pose % (2 * o.search_every) == 1
+        if s.frames_without_pose < max(s.next_thorough_frame, 2 * o.search_every):
+            return False
+        s.thorough_interval = min(2 * max(s.thorough_interval, o.search_every), o.max_thorough_frames)
+        s.next_thorough_frame = s.frames_without_pose + s.thorough_interval
+        return True
 
     def _detect_remembered(self, image: NDArray[np.uint8]) -> list[Detection]:
         """Detect the part only where the picture looks like the last sure view of it."""

@@ -54,6 +54,8 @@ class SessionState:
         poor_frames: frames in a row with hardly any support of the pose.
         critical_frames: frames in a row with weak support of the pose.
         frames_without_pose: frames since the last pose, or since the start.
+        next_thorough_frame, thorough_interval: number of frames without a pose from which the next search is thorough,
+            and the interval between the last two; 0: none since the loss.
         is_confirmed: whether the present pose has been supported clearly in a frame since it was found.
         is_supported: whether the last frame supported the pose clearly, whatever the components say.
         was_tracked: whether the part has been tracked since the last reset.
@@ -68,6 +70,8 @@ class SessionState:
     poor_frames: int = 0
     critical_frames: int = 0
     frames_without_pose: int = 0
+    next_thorough_frame: int = 0
+    thorough_interval: int = 0
     is_confirmed: bool = False
     is_supported: bool = False
     was_tracked: bool = False
@@ -108,6 +112,7 @@ class SessionState:
         """Give the pose up, for a reason in words."""
         self.hypotheses = HypothesisSet([])
         self.poor_frames = self.critical_frames = self.frames_without_pose = 0
+        self.next_thorough_frame = self.thorough_interval = 0
         self.is_confirmed = False
         self.reason = self.loss_reason = reason
         self.apply(Event.FAILED)
