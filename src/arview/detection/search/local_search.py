@@ -105,6 +105,7 @@ class LocalSearchOptions:
         max_shading_loss: largest drop in log odds accepted from the shading refinement.
         min_in_image: share of the outline inside the image below which poses are dropped.
         max_scale: images are reduced as a whole, for all distances, by this factor or more or not at all.
+        max_side_px: longer side of an image above which it is reduced whatever the distances.
         side_unit_px: sides of reduced images are multiples of this, so that they can be halved.
         scale: of the images in which poses are refined and measured, by the size of the part.
         outline_scale: of the images in which the outline alone is judged: smaller, so that what differs between part
@@ -143,6 +144,7 @@ class LocalSearchOptions:
     max_shading_loss: float = 3.0
     min_in_image: float = 0.4
     max_scale: float = 0.8
+    max_side_px: int = 1280
     side_unit_px: int = 8
     scale: WorkingScaleOptions = field(
         default_factory=lambda: WorkingScaleOptions(radius_px=120.0, max_enlargement=1.0)
@@ -201,10 +203,10 @@ class LocalSearch:
         return pyramid
 
     def _reduced(self, camera: Camera) -> Camera:
-        """The camera of images in which the part is as large at the farthest distance as it is measured at most."""
+        """The camera of images in which the part at the farthest distance is as large as it is measured at most."""
         o = self.options
         farthest_px = 0.25 * (camera.fx + camera.fy) * self.views.diameter_mm / self._distances_mm[1]
-        scale = o.scale.radius_px / max(farthest_px, 1e-9)
+        scale = min(o.scale.radius_px / max(farthest_px, 1e-9), o.max_side_px / max(camera.width, camera.height))
         if scale > o.max_scale:
             return camera
         # Sides that can be halved several times.
