@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -88,6 +89,13 @@ class RefinementPyramid:
             self._levels[number] = PictureRefiner(refiner, picture)
         return self._levels[number]
 
+    def scores(self, cam_from_body: Array, appearance: Appearance) -> PoseScores:
+        """Scores of a pose (4,4) in the working and in the finest picture."""
+        evidence = self.working.evidence(cam_from_body, appearance)
+        if len(self.scales) == 1:
+            return PoseScores(evidence, evidence.score)
+        return PoseScores(evidence, self.finest.evidence(cam_from_body, appearance).score)
+
     def cover(self, poses: Sequence[Array]) -> None:
         """Make all pictures show the part at some other poses (4,4), too."""
         made = self._levels.values()
@@ -128,6 +136,24 @@ class RefinementPyramid:
             )  # fmt: skip
         # An enlarged picture holds no more than the frame.
         return cam_from_body, information / max(self.scales[-1], 1.0) ** 2
+
+
+@dataclass(frozen=True)
+class PoseScores:
+    """How well a frame supports a pose, in the working and in the finest picture.
+
+    Attributes:
+        evidence: evidence of the working picture, which means the same in every frame.
+        fine_score: score of the evidence in the finest picture, which tells near poses apart.
+    """
+
+    evidence: PoseEvidence
+    fine_score: float
+
+    @property
+    def mean(self) -> float:
+        """Mean of both scores, by which poses of one frame are compared."""
+        return 0.5 * (self.evidence.score + self.fine_score)
 
 
 class PictureRefiner:

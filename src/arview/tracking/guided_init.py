@@ -299,7 +299,7 @@ class GuidedInit:
         if not starts:
             return None
         levels = self._levels(image, starts)
-        working, finest = levels.working, levels.finest
+        working = levels.working
 
         def refine(job: tuple[Array, bool]) -> tuple[float, GuidedPose]:
             (pose, is_near), appearance, picture = job, Appearance(), working.picture
@@ -307,11 +307,11 @@ class GuidedInit:
                 pose = working.refiner.refine_fresh(picture.image, picture.smooth, pose, SEARCH_STAGES)
             working.learn_colors(pose, appearance, 1.0)
             pose, _ = levels.refine(pose, LAST_STAGES, appearance, first=-1 if is_near else 0)
-            evidence = working.evidence(pose, appearance)
+            scores = levels.scores(pose, appearance)
+            evidence = scores.evidence
             is_inside = evidence.points_in_picture >= self.options.min_in_picture
-            score = 0.5 * (evidence.score + finest.evidence(pose, appearance).score)
             found = pose @ self._refiner.part.body_from_model
-            return score, GuidedPose(found, evidence, evidence.quality if is_inside else 0.0)
+            return scores.mean, GuidedPose(found, evidence, evidence.quality if is_inside else 0.0)
 
         jobs = [(starts[0], True), *((start, False) for start in starts)]
         return max(pool().map(refine, jobs), key=lambda item: (item[1].quality > 0, item[0]))[1]

@@ -141,7 +141,7 @@ class Tracker:
     # --- Propose ------------------------------------------------------------------------------------------
 
     def _predicted(self, frame: FrameContext) -> Iterator[Proposal]:
-        """The pose predicted from the motion so far and aligned with the texture found."""
+        """The pose predicted from the motion so far, refined by near edges and the texture found."""
         # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails. So is a
         # start from texture alone, which carries the error of the pose at which the texture was learned.
         o = self.options
@@ -181,7 +181,7 @@ class Tracker:
             yield Proposal(start, o.stages, None, o.min_gain, o.motion_penalty)
         # This score is usual from now on, because a search of the whole neighbourhood found nothing better.
         state.usual_score = frame.found.evidence.score
-        state.usual_fine_score = frame.found.fine_score
+        state.usual_fine_score = frame.found.scores.fine_score
 
     def _rechecked(self, frame: FrameContext) -> Iterator[Proposal]:
         """The pose of the recheck, where the motion to the best pose so far is unusual in this stream."""
@@ -213,16 +213,14 @@ class Tracker:
                 pose = proposal.cam_from_body
         else:
             pose, information = levels.working.refine_shading(proposal.cam_from_body, frame.found.information)
-        evidence = levels.working.evidence(pose, appearance)
-        fine_score = levels.finest.evidence(pose, appearance).score if len(levels.scales) > 1 else evidence.score
-        return RefinedPose(pose, information, evidence, fine_score, proposal.matches)
+        return RefinedPose(pose, information, levels.scores(pose, appearance), proposal.matches)
 
     def _is_usual(self, frame: FrameContext) -> bool:
         """Whether the scores of the best pose so far are as usual in the working and in the finest picture."""
         o, state = self.options, self.state
         return (
             frame.found.evidence.score >= o.other_schedules_share * state.usual_score
-            and frame.found.fine_score >= o.other_schedules_fine_share * state.usual_fine_score
+            and frame.found.scores.fine_score >= o.other_schedules_fine_share * state.usual_fine_score
         )
 
     def _is_better(self, frame: FrameContext, candidate: RefinedPose, proposal: Proposal) -> bool:
@@ -230,7 +228,7 @@ class Tracker:
         if frame.best is None:
             return True
         penalty = proposal.motion_penalty
-        score, best = candidate.score, frame.best.score
+        score, best = candidate.scores.mean, frame.best.scores.mean
         if penalty:
             score -= penalty * self._motion(frame, candidate)
             best -= penalty * self._motion(frame, frame.best)
@@ -287,7 +285,7 @@ class Tracker:
         """Update pose, velocity, usual score, colours and texture for the next frame."""
         state, o = self.state, self.options
         pose, evidence = frame.found.cam_from_body, frame.found.evidence
-        fine_score = frame.found.fine_score
+        fine_score = frame.found.scores.fine_score
         if state.is_started:
             state.motion.learn(*self._innovation(frame), frame.is_rechecked)
             state.usual_score += o.score_rate * (evidence.score - state.usual_score)
@@ -333,7 +331,8 @@ class Tracker:
     def _remember_texture(self, frame: FrameContext) -> None:
         """Update the trust in the keyframes, and add one where it is missing and nothing hides the outline."""
         assert self._texture is not None and frame.pyramid is not None
-        o, state, (pose, _, evidence, _, matches) = self.options, self.state, frame.found
+        o, state, best = self.options, self.state, frame.found
+        pose, evidence, matches = best.cam_from_body, best.evidence, best.matches
         if matches is not None:
             self._texture.update_trust(pose)
         state.best_contour_support = max(o.support_decay * state.best_contour_support, evidence.contour_support)
@@ -351,15 +350,12 @@ class Tracker:
     # --- Other poses of the last frame, and covariance ----------------------------------------------------
 
     def scores_near(self, image: NDArray[np.uint8], cams_from_model: list[Array]) -> list[float]:
-        """Scores, see `PoseEvidence.score`, of poses (4,4) in the last frame, each after a fine refinement."""
+        """Scores, see `PoseScores.mean`, of poses (4,4) in the last frame, each after a fine refinement."""
         appearance, fine = self.state.appearance, self.options.stages[-2:]
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
         levels = self._levels(image, in_body)
         poses = [levels.refine(pose, fine, appearance, first=-1)[0] for pose in in_body]
-        found = [
-            (levels.working.evidence(pose, appearance), levels.finest.evidence(pose, appearance)) for pose in poses
-        ]
-        return [0.5 * (working.score + finest.score) for working, finest in found]
+        return [levels.scores(pose, appearance).mean for pose in poses]
 
     def covariance(self, estimate: Estimate) -> Array:
         """Covariance (6,6) of the twist (rad, mm) about the model's centre.

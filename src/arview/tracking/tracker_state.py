@@ -12,7 +12,7 @@ from arview.geometry import Array
 from arview.refinement.evidence import PoseEvidence
 from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.modalities.texture import TextureMatches
-from arview.refinement.refinement_pyramid import RefinementPyramid
+from arview.refinement.refinement_pyramid import PoseScores, RefinementPyramid
 from arview.refinement.refiner import Appearance
 from arview.refinement.schedules import Stage
 from arview.tracking.motion import MotionModel
@@ -54,21 +54,19 @@ class RefinedPose(NamedTuple):
     Attributes:
         cam_from_body: (4,4) pose.
         information: (6,6) of the twist on its right.
-        evidence: evidence of the working picture for it, which means the same in every frame.
-        fine_score: score of its evidence in the finest picture, which tells near poses apart.
+        scores: how well the frame supports it.
         matches: texture used; None without.
     """
 
     cam_from_body: Array
     information: Array
-    evidence: PoseEvidence
-    fine_score: float
+    scores: PoseScores
     matches: TextureMatches | None
 
     @property
-    def score(self) -> float:
-        """Mean of both scores, by which poses of one frame are compared."""
-        return 0.5 * (self.evidence.score + self.fine_score)
+    def evidence(self) -> PoseEvidence:
+        """Evidence of the working picture for it."""
+        return self.scores.evidence
 
 
 class Proposal(NamedTuple):

@@ -137,20 +137,20 @@ class FocalEstimator:
         self._added += is_kept
         return is_kept
 
-    def snapshot(self) -> list[CalibrationFrame]:
+    def take_frames(self) -> list[CalibrationFrame]:
         """The frames kept, for `estimate` in another thread."""
         self._added = 0
         self._estimates += 1
         return list(self._set.frames)
 
     def estimate(self, frames: list[CalibrationFrame] | None = None) -> FocalEstimate:
-        """The focal length from the frames of `snapshot`, or from all frames kept now.
+        """The focal length from the frames of `take_frames`, or from all frames kept now.
 
         It is determined when it is precise enough, and agrees with the estimate before, which had fewer frames. The
         first estimate is compared with one from two thirds of its frames.
         """
         o = self.options
-        frames = self.snapshot() if frames is None else frames
+        frames = self.take_frames() if frames is None else frames
         if self._last is None and 2 * len(frames) >= 3 * o.min_frames:
             self.estimate(frames[: 2 * len(frames) // 3])
         found = self._solve(frames) if len(frames) >= o.min_frames else None

@@ -136,7 +136,7 @@ class SelfCalibratingSession:
             return
         estimator.add(image, pose, self.camera)
         if estimator.is_due and self._pending is None:
-            self._pending = self._worker.submit(estimator.estimate, estimator.snapshot())
+            self._pending = self._worker.submit(estimator.estimate, estimator.take_frames())
 
     def _finished(self, is_waiting: bool = False) -> FocalEstimate | None:
         """A new estimate that calls for another camera; None without one."""
