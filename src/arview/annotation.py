@@ -6,25 +6,21 @@ source's thread, tracked in the caller's, drawn in one worker and encoded in the
 
 from __future__ import annotations
 
-import json
-import os
 import queue
 import re
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
-
-import numpy as np
 
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.errors import OutputError
 from arview.pose import Pose
+from arview.pose_file import PoseWriter
 from arview.tracking.self_calibration.estimator import FocalEstimate
 from arview.tracking.self_calibration.session import SelfCalibratingSession
 from arview.video import Frame, FrameSource, Image
@@ -358,60 +354,6 @@ class _Rate:
         return self._fps
 
 
-class PoseWriter:
-    """Writes poses as JSON lines under a temporary name; `close` gives the file its name.
-
-    A line holds ``index``, ``time_s``, ``state``, ``quality``, ``cam_from_model`` (4×4 row-major, mm, or
-    null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches``
-    (list), ``unverified`` (names of components not yet confirmed) and ``alternatives`` (list of 4×4 poses that fit as
-    well). Where the camera was not given, it also holds ``camera`` (fx, fy, cx, cy in px and dist).
-
-    Args:
-        path: of the file.
-        camera_of: camera of the frame of an index; None leaves it out.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-
-    def __init__(self, path: str | Path, camera_of: Callable[[int], Camera] | None = None) -> None:
-        self.path = Path(path)
-        self._camera_of = camera_of
-        self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
-        if self.path.is_dir():
-            raise OutputError(f"{path}: is a folder; give the name of a file")
-        try:
-            self._file = self._part.open("w", encoding="utf-8")
-        except OSError as error:
-            raise self._explained(error) from error
-
-    def write(self, pose: Pose) -> None:
-        """Add a line."""
-        try:
-            camera = None if self._camera_of is None else self._camera_of(pose.index)
-            self._file.write(pose_line(pose, camera) + "\n")
-        except OSError as error:
-            raise self._explained(error) from error
-
-    def close(self) -> None:
-        """Complete the file."""
-        try:
-            self._file.close()
-            self._part.replace(self.path)
-        except OSError as error:
-            raise self._explained(error) from error
-
-    def abort(self) -> None:
-        """Remove what was written; an older file of the same name stays."""
-        with suppress(OSError):
-            self._file.close()
-        with suppress(OSError):
-            self._part.unlink(missing_ok=True)
-
-    def _explained(self, error: OSError) -> OutputError:
-        return OutputError(f"{self.path}: cannot write the poses: {error.strerror or error}")
-
-
 class FollowingOverlay:
     """Draws with the camera of each frame, where that is replaced while the frames are tracked.
 
@@ -431,33 +373,3 @@ class FollowingOverlay:
         if self._overlay is None or camera is not self._camera:
             self._camera, self._overlay = camera, self._make(camera)
         return self._overlay.draw(image, pose, fps=fps)
-
-
-def pose_line(pose: Pose, camera: Camera | None = None) -> str:
-    """A pose, and its camera if one is given, as a line of ``poses.jsonl``, see `PoseWriter`.
-
-    A covariance that is not finite becomes null.
-    """
-    covariance = pose.covariance
-    is_known = covariance is not None and bool(np.all(np.isfinite(covariance)))
-    stated = {}
-    if camera is not None:
-        values = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
-        stated = {"camera": {**values, "dist": camera.dist.tolist()}}
-    return json.dumps(
-        {
-            "index": pose.index,
-            "time_s": pose.time_s,
-            "state": str(pose.state),
-            "quality": pose.quality,
-            "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.tolist(),
-            "covariance": covariance.tolist() if covariance is not None and is_known else None,
-            "ms": round(pose.ms, 4),
-            "reason": pose.reason,
-            "mismatches": list(pose.mismatches),
-            "unverified": list(pose.unverified),
-            "alternatives": [alternative.tolist() for alternative in pose.alternatives],
-            **stated,
-        },
-        allow_nan=False,
-    )

@@ -1,9 +1,11 @@
-"""Pose: the result of detection and tracking for one frame, with its uncertainty and the tracking state."""
+"""Pose: the result of detection and tracking for one frame: uncertainty, tracking state, components and identity."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
+from types import MappingProxyType
 
 from arview.geometry import Array
 
@@ -15,6 +17,77 @@ class TrackingState(StrEnum):
     TRACKED = "tracked"
     CRITICAL = "critical"
     LOST = "lost"
+
+
+class Presence(StrEnum):
+    """What all frames so far say of a component; the measured verdict is another matter."""
+
+    UNVERIFIED = "unverified"
+    """Too little was seen of its place."""
+    UNCERTAIN = "uncertain"
+    """The evidence conflicts, or another pose fits as well in which it would be elsewhere."""
+    PRESENT = "present"
+    """Seen at its nominal place."""
+    MISSING = "missing"
+    """Its nominal place was seen without it."""
+    DISPLACED = "displaced"
+    """Not seen at its nominal place but at another, see `ComponentPresence.model_from_nominal`."""
+
+
+class Visibility(StrEnum):
+    """Whether one frame shows the place of a component."""
+
+    VISIBLE = "visible"
+    HIDDEN = "hidden"
+    """By the part itself or by something before it."""
+    OUTSIDE = "outside"
+    """Of the picture."""
+
+
+@dataclass(frozen=True)
+class ComponentPresence:
+    """Whether a component is where the CAD has it, by all frames since the lock, and whether this frame shows it.
+
+    Attributes:
+        presence: see `Presence`.
+        visibility: see `Visibility`; of this frame only.
+        probability: 0–1, calibrated, that the component is at its nominal place; 0.5 without evidence.
+        observations: pictures that showed its place and count.
+        spread_deg: largest angle between the directions from which these were taken.
+        model_from_nominal: (4,4) mm, where a displaced component was found: applied to its nominal place in the model
+            frame; None unless it is displaced.
+    """
+
+    presence: Presence = Presence.UNVERIFIED
+    visibility: Visibility = Visibility.HIDDEN
+    probability: float = 0.5
+    observations: int = 0
+    spread_deg: float = 0.0
+    model_from_nominal: Array | None = None
+
+
+class Completeness(StrEnum):
+    """The presence of all components in one word."""
+
+    COMPLETE = "complete"
+    """All are present."""
+    INCOMPLETE = "incomplete"
+    """At least one is missing or displaced."""
+    NOT_YET_CHECKED = "not yet checked"
+    """None is missing or displaced, but not all are known to be present."""
+
+
+class Identity(StrEnum):
+    """Whether the specimen in view is the one that was followed before, to which labels of a serial number belong."""
+
+    FOLLOWED = "followed"
+    """Since the first lock, or again where motion and scene allow no other; or there is only one."""
+    CONFIRMED = "confirmed"
+    """By the user, or by a serial code in the picture that agrees with the inspection."""
+    UNCONFIRMED = "unconfirmed"
+    """It may be another specimen of the same part: labels are withheld."""
+    OTHER = "other"
+    """A serial code in the picture names another specimen than the inspection: labels are withheld."""
 
 
 MAX_NAMES = 3
@@ -42,6 +115,11 @@ class Pose:
         alternatives: other poses (4,4) that the frames so far support equally well; if there are any, the view is
             ambiguous.
         guide_cam_from_model: (4,4) where the user should bring the part; None unless the session waits for that.
+        components: presence of each component by its name; empty without a pose, and of a part of one component.
+        identity: see `Identity`.
+        identity_reason: why the identity is unconfirmed or another, in words that say what to do.
+        serial: serial number read from a code on the part in view, or empty.
+        instance: names the part and which specimen of it this is where several are tracked at once, or empty.
     """
 
     cam_from_model: Array | None
@@ -56,12 +134,30 @@ class Pose:
     unverified: tuple[str, ...] = ()
     alternatives: tuple[Array, ...] = ()
     guide_cam_from_model: Array | None = None
+    components: Mapping[str, ComponentPresence] = field(default_factory=lambda: MappingProxyType({}))
+    identity: Identity = Identity.FOLLOWED
+    identity_reason: str = ""
+    serial: str = ""
+    instance: str = ""
 
     def __repr__(self) -> str:
         if self.cam_from_model is None:
             return f"<Pose {self.index}: {self.state}>"
         x, y, z = self.cam_from_model[:3, 3]
         return f"<Pose {self.index}: {self.state}, quality {self.quality:.2f}, at {x:.1f}, {y:.1f}, {z:.1f} mm>"
+
+    @property
+    def is_label_withheld(self) -> bool:
+        """Whether the labels of a serial number must not be shown with this pose."""
+        return self.identity in (Identity.UNCONFIRMED, Identity.OTHER)
+
+    @property
+    def completeness(self) -> Completeness:
+        """The presence of all components in one word; of a part of one component it is not checked."""
+        found = {one.presence for one in self.components.values()}
+        if found & {Presence.MISSING, Presence.DISPLACED}:
+            return Completeness.INCOMPLETE
+        return Completeness.COMPLETE if found == {Presence.PRESENT} else Completeness.NOT_YET_CHECKED
 
     @property
     def remark(self) -> str:

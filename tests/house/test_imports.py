@@ -20,6 +20,7 @@ ROOMS = (
     ("tracking",),
     ("video", "inspection"),
     ("overlay",),
+    ("pose_file",),
     ("annotation",),
     ("reconstruction",),
     ("measurement",),

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arview.annotation import QUEUED_FRAMES, PoseWriter, annotate, pose_line
+from arview.annotation import QUEUED_FRAMES, annotate
 from arview.errors import InputError, OutputError
 from arview.pose import Pose, TrackingState
+from arview.pose_file import PoseWriter, pose_line
 from arview.video import Frame, FrameSource, Image, VideoSink, open_source
 from helpers.video_files import number_of, numbered
 
@@ -84,7 +85,10 @@ def test_video_and_poses_hold_every_frame_in_order(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in (tmp_path / "poses.jsonl").read_text().splitlines()]
     assert [line["index"] for line in lines] == list(range(12))
     pose = {"index", "time_s", "state", "quality", "cam_from_model", "covariance", "ms", "reason"}
-    assert set(lines[0]) == pose | {"mismatches", "unverified", "alternatives"}
+    pose |= {"mismatches", "unverified", "alternatives"}
+    found = {"completeness", "presence", "presence_details", "identity", "identity_reason", "serial", "instance"}
+    assert set(lines[0]) == pose | found
+    assert set(lines[3]) == pose
     assert (
         lines[4]["unverified"] == ["post", "nut"] and lines[5]["unverified"] == ["nut"] and lines[3]["unverified"] == []
     )
