@@ -29,8 +29,10 @@ MIN_COMPONENTS = 4
 """Smallest number of components of an assembly."""
 PICTURES_EACH, RIGHT_SHARE = 36, 0.4
 """Pictures of an assembly, and the share of them that show it as designed; the others show a look-alike."""
-LOOK_ALIKES, RESIZED = 12, 6
-"""Look-alikes of an assembly, and those with one component of another size."""
+LOOK_ALIKES, RESIZED, REDUCED = 12, 6, 10
+"""Look-alikes of an assembly, those with one component of another size, and those without several components."""
+MIN_ABSENT_SHARE = 0.15
+"""Smallest share of the components besides the base that is left out of the last kind; the largest is all of them."""
 EXPECTED_EACH = 4
 """Look-alikes whose changed components are cropped in each picture, as if they were the design."""
 SIZES = (0.55, 0.8), (1.25, 1.7)
@@ -90,8 +92,11 @@ def _component_crops(seed: int, photos: Sequence[Path]) -> Iterator[ComponentCro
     found = look_alikes(model, rng.uniform(*MOVED_MM))
     variants = [(found[k].model, found[k].components) for k in rng.permutation(len(found))[:LOOK_ALIKES]]
     variants += [_resized(model, rng) for _ in range(RESIZED)]
+    variants += [_reduced(model, rng) for _ in range(REDUCED)]
     surfaces = [surface_about(*reduced_surface(one), model.center_in_model) for one, _ in variants]
     surface = surface_about(*reduced_surface(model), model.center_in_model)
+    # Where components are only left out, the CAD expects nothing else.
+    expectable = [k for k, (one, names) in enumerate(variants) if {c.name for c in one.components} & {*names}]
     others, network = some_solids(seed), EdgeNet()
     for _ in range(PICTURES_EACH):
         is_right = rng.random() < RIGHT_SHARE
@@ -106,7 +111,7 @@ def _component_crops(seed: int, photos: Sequence[Path]) -> Iterator[ComponentCro
         picture = PartImage(image, network.predict(image), intrinsics_of(CAMERA), cam_from_body)
         crops = component_crops(picture, surface, model.diameter_mm)
         is_wrong = [model.components[crop.index].name in changed for crop in crops]
-        for k in rng.permutation(len(variants))[:EXPECTED_EACH]:
+        for k in rng.permutation(expectable)[:EXPECTED_EACH]:
             expected, names = variants[k]
             only = [i for i, component in enumerate(expected.components) if component.name in names]
             more = component_crops(picture, surfaces[k], model.diameter_mm, only)
@@ -210,6 +215,16 @@ def _resized(model: Model, rng: np.random.Generator) -> tuple[Model, tuple[str, 
     vertices = foot + scale * (chosen.vertices_in_model - foot)
     changed = [replace(c, vertices_in_model=vertices) if c is chosen else c for c in model.components]
     return make_model(model.name, tuple(changed)), (chosen.name,)
+
+
+def _reduced(model: Model, rng: np.random.Generator) -> tuple[Model, tuple[str, ...]]:
+    """An assembly without several of its components, up to all but the base, and the names of those left out."""
+    base = _base(model)
+    others = [component for component in model.components if component is not base]
+    count = int(np.ceil(rng.uniform(MIN_ABSENT_SHARE, 1.0) * len(others)))
+    absent = {others[k].name for k in rng.permutation(len(others))[:count]}
+    left = tuple(component for component in model.components if component.name not in absent)
+    return make_model(model.name, left), tuple(sorted(absent))
 
 
 def _displaced(built: Model, model: Model, rng: np.random.Generator) -> Model:

@@ -71,13 +71,14 @@ def _fit(network: Any, examples: Sequence[ComponentCrops], epochs: int, rate: fl
 
     def batch_of(some: NDArray[np.intp], rng: np.random.Generator) -> Any:
         chosen = [places[i] for i in some]
-        wrong = torch.tensor([float(example.is_wrong[index]) for example, index in chosen])
+        wrong = np.array([float(example.is_wrong[index]) for example, index in chosen], dtype=np.float32)
         return *concatenated(_inputs(example, [index], rng) for example, index in chosen), wrong
 
     def loss_of(some: Any) -> Any:
-        maps, scalars, wrong = some
-        weight = torch.where(wrong > 0, 0.5 / share, 0.5 / (1.0 - share))
+        maps, scalars, is_wrong = some
         scores = half_precision_scores(network, maps, scalars, torch)
+        wrong = torch.from_numpy(is_wrong)
+        weight = torch.where(wrong > 0, 0.5 / share, 0.5 / (1.0 - share))
         return torch.nn.functional.binary_cross_entropy_with_logits(scores, wrong, weight)
 
     train("presence net", network.parameters(), (len(places), BATCH, epochs), rate, DECAY, batch_of, loss_of, torch)

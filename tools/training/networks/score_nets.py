@@ -82,9 +82,9 @@ def train_score_net(
         some = [augmented(fitted[i], rng)[0] for i in rng.integers(len(fitted), size=INITIAL_EXAMPLES)]
         continue_from(network, packaged_weights(f"{design.name}.onnx"), np.concatenate(some), torch)
         initial = _onnx_model(network, design, torch)
-    network.train().to(memory_format=torch.channels_last)
+    network.train().to("cuda" if torch.cuda.is_available() else "cpu", memory_format=torch.channels_last)
     fit_at(network, design.rate if from_scratch else CONTINUED_RATE_SHARE * design.rate)
-    network.eval()
+    network.to("cpu").eval()
     report(network)
     ended = _onnx_model(network, design, torch)
     write_model(ended if initial is None else mean_weights(initial, ended), folder / f"{design.name}.onnx")
@@ -146,7 +146,7 @@ def train(
         steps: number of examples, batch size, and epochs.
         rate, decay: largest learning rate of the one-cycle schedule, and weight decay.
         batch_of: the batch of some examples, by their indices, with random numbers for augmentation; called in a
-            thread during the step before.
+            thread or process during an earlier step, so that it holds no tensors.
         loss_of: the loss of a batch.
         torch: the module.
     """
@@ -157,12 +157,12 @@ def train(
     total = epochs * each
     rising = max(0.05, 2.0 / total)  # torch divides by zero for a single step
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total, pct_start=min(rising, 1.0))
-    rng, augmenting = (np.random.default_rng([0, k]) for k in range(2))
+    rng = np.random.default_rng([0, 0])
     orders = [rng.permutation(count) for _ in range(epochs)]
 
     def made(step: int) -> Any:
         epoch, k = divmod(step, each)
-        return batch_of(orders[epoch][k * batch : (k + 1) * batch], augmenting)
+        return batch_of(orders[epoch][k * batch : (k + 1) * batch], np.random.default_rng([0, 1, step]))
 
     batches = prefetched(made, total)
     for epoch in range(epochs):
@@ -178,12 +178,12 @@ def train(
 
 
 def half_precision_scores(network: Any, maps: NDArray[np.float32], scalars: NDArray[np.float32], torch: Any) -> Any:
-    """Scores (N,) of inputs in training, computed in half precision."""
-    with torch.autocast("cpu", torch.bfloat16):
-        scores = network(
-            torch.from_numpy(maps).contiguous(memory_format=torch.channels_last), torch.from_numpy(scalars)
-        )
-    return scores.float()
+    """Scores (N,) of inputs in training, computed in half precision where the network is."""
+    device = next(network.parameters()).device
+    with torch.autocast(device.type, torch.bfloat16):
+        shown = torch.from_numpy(maps).to(device).contiguous(memory_format=torch.channels_last)
+        scores = network(shown, torch.from_numpy(scalars).to(device))
+    return scores.float().cpu()
 
 
 def ranking_loss(scores: Any, truth: Sequence[Any], listwise_weight: float, torch: Any) -> Any:
