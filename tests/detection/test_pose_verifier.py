@@ -22,6 +22,7 @@ from arview.detection.scoring.crops import (
     append_gradients,
     normalise_colours,
     pose_crop,
+    without_outside,
 )
 from arview.detection.scoring.pose_verifier import PoseVerifier
 from arview.geometry import Array, apply
@@ -195,6 +196,35 @@ def test_a_pose_outside_the_image_is_scored() -> None:
     assert explained == 0.0
     assert contrast < 0.01
     assert scores(picture(), aside[None])[0] < scores(picture(), TRUTH[None])[0]
+
+
+@pytest.mark.parametrize(("aside_mm", "seed"), [(-205.0, 1), (205.0, 2)])
+def test_a_pose_cut_by_the_border_scores_above_wrong_ones(aside_mm: float, seed: int) -> None:
+    cut = TRUTH.copy()
+    cut[0, 3] += aside_mm
+    seen = ImagePyramid(drawn(cut @ PART.body_from_model, noise=6.0, seed=seed), CAMERA, 12, edge_net())
+    crop = crop_at(seen, cut)
+    is_beyond = crop.pixels[..., 3] == 0
+    assert 0.2 < np.mean(is_beyond[crop.drawn[0] < 0.0]) < 0.6
+    others = scores(seen, turned_about(cut, 30.0, 60))
+    assert scores(seen, cut[None])[0] > others.max() + 1.0
+    empty = ImagePyramid(background(seed), CAMERA, 12, edge_net())
+    assert scores(empty, cut[None])[0] < -3.0 < 0.0 < scores(seen, cut[None])[0]
+
+
+def test_nothing_is_expected_beyond_the_border() -> None:
+    cut = TRUTH.copy()
+    cut[0, 3] += 205.0
+    crop = crop_at(picture(), cut)
+    is_beyond = crop.pixels[..., 3] == 0
+    assert is_beyond.any() and not is_beyond.all()
+    shown = without_outside(crop)
+    assert (shown.drawn[0][is_beyond] == 1.0).all() and not shown.drawn[1:, is_beyond].any()
+    assert np.array_equal(shown.drawn[:, ~is_beyond], crop.drawn[:, ~is_beyond])
+    assert (shown.pixels[..., 3] == 255).all()
+    assert np.array_equal(shown.pixels[~is_beyond], crop.pixels[~is_beyond])
+    inside = crop_at(picture(), TRUTH)
+    assert without_outside(inside) is inside
 
 
 def test_batched_scores_equal_single_scores() -> None:

@@ -139,6 +139,22 @@ def pose_crop(pyramid: ImagePyramid, part: PartView, pose: Array, radius_px: flo
     return CropWindow(pyramid, part, pose, radius_px).crop(pose)
 
 
+def without_outside(crop: PoseCrop) -> PoseCrop:
+    """A crop in which nothing is expected beyond the image's border, and the colours at the border continue.
+
+    A network that saw few cut parts takes lines drawn beyond the border for lines that the image lacks.
+    """
+    is_inside = crop.pixels[..., 3] > 0
+    rows, columns = np.flatnonzero(is_inside.any(axis=1)), np.flatnonzero(is_inside.any(axis=0))
+    if is_inside.all() or not len(rows):
+        return crop
+    places = np.arange(len(is_inside))
+    nearest = np.ix_(np.clip(places, rows[0], rows[-1]), np.clip(places, columns[0], columns[-1]))
+    drawn = crop.drawn * is_inside.astype(np.float32)
+    drawn[0][~is_inside] = 1.0
+    return PoseCrop(np.ascontiguousarray(crop.pixels[nearest]), drawn, crop.responses)
+
+
 def append_edge_responses(channels: NDArray[np.float32], responses: NDArray[np.uint8]) -> NDArray[np.float32]:
     """All channels of a crop (CROP_CHANNELS + RESPONSE_CHANNELS,S,S)."""
     return np.concatenate([channels, responses.astype(np.float32) / np.float32(255.0)])

@@ -19,6 +19,7 @@ from arview.detection.scoring.crops import (
     append_gradients,
     normalise_colours,
     pose_crop,
+    without_outside,
 )
 from arview.detection.scoring.score_net import REFERENCE_RADIUS_PX, NetworkInput, ScoreNet, size_and_contrast
 from arview.geometry import Array
@@ -53,7 +54,7 @@ class PoseVerifier:
         list(pool().map(pyramid.level, set(steps_to(CROP_RADIUS_PX, radii_px).tolist())))
 
         def network_input(pose: Array, radius_px: float, of_pose: Array) -> NetworkInput:
-            crop = pose_crop(pyramid, self._part, pose, radius_px)
+            crop = without_outside(pose_crop(pyramid, self._part, pose, radius_px))
             plain, contrast = normalise_colours(crop.pixels, crop.drawn)
             channels, explained = append_gradients(plain)
             scalars = pose_scalars(radius_px, contrast, of_pose, explained)
