@@ -51,6 +51,7 @@ class Edges:
         self._ends, self._faces = np.concatenate(ends), np.concatenate(faces)
         self._is_crease, self._is_closed = np.concatenate(creases), np.concatenate(closed)
         self._owner = np.concatenate(owners)
+        self._components = len(shapes)
         if pieces_mm is not None:
             self._split(pieces_mm)
 
@@ -69,9 +70,15 @@ class Edges:
         self._owner = self._owner[edge]
 
     def draw(
-        self, ghost: Ghost, view: GhostView, cam_from_model: Array, width_px: float, with_hidden: bool
+        self,
+        ghost: Ghost,
+        view: GhostView,
+        cam_from_model: Array,
+        width_px: float,
+        with_hidden: bool,
+        dashed: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-        """Rasterise the edges in the window of a view.
+        """Rasterise the edges in the window of a view; ``dashed`` (C,) tells the components with dashed edges.
 
         Returns:
             coverage (h,w) 0–255, and index (h,w) of the component that each edge belongs to.
@@ -81,11 +88,14 @@ class Edges:
         points = ghost.bent(apply(cam_from_model, self._points))
         cover = np.zeros(view.face_ids.shape, dtype=np.uint8)
         owner = np.zeros(view.face_ids.shape, dtype=np.int16)
+        if dashed is None:
+            dashed = np.zeros(self._components, dtype=np.bool_)
+        dash_px = round(2.0 + 3.0 * width_px)
         _draw_edges(
             points, self._ends, self._faces, self._is_crease, self._is_closed, self._owner,
             self._normals, self._face_points, eye_in_model,
             camera.fx, camera.fy, camera.cx - view.u0, camera.cy - view.v0,
-            view.inverse_depth, width_px, with_hidden, cover, owner,
+            view.inverse_depth, width_px, with_hidden, dashed, dash_px, cover, owner,
         )  # fmt: skip
         return cover, owner
 
@@ -119,8 +129,8 @@ def _draw_edges(
     points: NDArray[np.float64], ends: NDArray[np.int64], faces: NDArray[np.int64], is_crease: NDArray[np.bool_],
     is_closed: NDArray[np.bool_], owners: NDArray[np.int16], normals: NDArray[np.float64],
     face_points: NDArray[np.float64], eye: NDArray[np.float64], fx: float, fy: float, cx: float, cy: float,
-    inverse_depth: NDArray[np.float64], width_px: float, with_hidden: bool, cover: NDArray[np.uint8],
-    owner: NDArray[np.int16]
+    inverse_depth: NDArray[np.float64], width_px: float, with_hidden: bool, dashed: NDArray[np.bool_], dash_px: int,
+    cover: NDArray[np.uint8], owner: NDArray[np.int16]
 ) -> None:  # fmt: skip
     height, width = inverse_depth.shape
     # One pixel of tolerance, in the image and in depth, keeps edges complete on faces at a grazing angle.
@@ -159,9 +169,12 @@ def _draw_edges(
         length = np.sqrt((a1 - a0) ** 2 + (b1 - b0) ** 2)
         cosine = (a1 - a0) / length if length > 1e-9 else 1.0
         reach = (0.5 * width_px + 0.5) / cosine
+        is_dashed = dashed[owners[edge]]
         first = int(np.round(max(a0, -1.0)))
         last = int(np.round(min(a1, a_size + 1.0)))
         for a in range(max(first, 0), min(last, a_size - 1) + 1):
+            if is_dashed and (a // dash_px) % 2 == 1:
+                continue
             t = (a - a0) / (a1 - a0) if a1 - a0 > 1e-9 else 0.0
             t = min(1.0, max(0.0, t))
             b = b0 + t * (b1 - b0)

@@ -18,6 +18,8 @@ NEAR_MM = 1.0
 """Geometry nearer to the camera is clipped."""
 CELL_PX = 8
 """Cell size of the coverage grid that the label layout uses."""
+GAP_OPACITY = 0.2
+"""Opacity of a hatched ghost between its lines, relative to that of the lines."""
 _WINDOW_MARGIN_PX = 4
 """Margin of the window around the projected part."""
 
@@ -208,12 +210,13 @@ def _faces_to_draw(
 def blend(
     image: NDArray[np.uint8], u0: int, v0: int, face_ids: NDArray[np.int32], shade: NDArray[np.float32],
     components: NDArray[np.int32], ghost_style: NDArray[np.float32], edge_cover: NDArray[np.uint8],
-    edge_owner: NDArray[np.int16], edge_style: NDArray[np.float32]
+    edge_owner: NDArray[np.int16], edge_style: NDArray[np.float32], patterns: NDArray[np.int8], hatch_px: int
 ) -> None:  # fmt: skip
     """Blend ghost and edges over the image in place.
 
     ``ghost_style`` and ``edge_style`` are (C,4) float32: r, g, b in 0–255 and alpha in 0–1 of each component;
-    ``edge_cover`` (h,w) uint8 and ``edge_owner`` (h,w) int16 are from `Edges.draw`.
+    ``edge_cover`` (h,w) uint8 and ``edge_owner`` (h,w) int16 are from `Edges.draw`. ``patterns`` (C,) int8: 0 for a
+    plain ghost, 1 for one of stripes, 2 for one of crossed lines, ``hatch_px`` apart.
     """
     height, width = face_ids.shape
     for row in range(height):
@@ -232,6 +235,13 @@ def blend(
             if alpha > 0:
                 # Faces at a grazing angle are a little denser, like glass; faces towards the camera are brighter.
                 facing = shade[face]
+                pattern = patterns[component]
+                if pattern > 0:
+                    on = (row + column) % hatch_px < (hatch_px + 1) // (2 * pattern)
+                    if pattern == 2:
+                        on = on or (row - column) % hatch_px < (hatch_px + 1) // 4
+                    if not on:
+                        alpha *= np.float32(GAP_OPACITY)
                 alpha = min(np.float32(1.0), alpha * (np.float32(1.25) - np.float32(0.35) * facing))
                 light = np.float32(0.45) + np.float32(0.55) * facing
                 r += alpha * (ghost_style[component, 0] * light - r)

@@ -1,20 +1,38 @@
-"""Text and appearance of labels. Everything on them is from the inspection, never from a pose."""
+"""Texts of labels: what was measured, and beside it whether the pictures confirm it; the two are never mixed.
+
+Numbers are from the inspection. Only of a displaced component the distance is from the pictures, and then the label has
+no number of the inspection.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
 
 import numpy as np
 
+from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
-from arview.overlay import paint
-from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, OverlayOptions
+from arview.overlay.evidence import DISPLACED_RGB, MISSING_RGB, Evidence, dimmed, evidence_of
+from arview.overlay.options import NEUTRAL_RGB, VERDICT_RGB, VERDICT_WORD, OverlayOptions, Rgb
+from arview.pose import ComponentPresence
 
 _MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
 _UNIT_SUFFIX = {"mm": " mm", "inch": " in"}
-_WHITE = (246, 248, 250)
-_MUTED = (176, 186, 200)
 _RANK = {Verdict.FAIL: 0, Verdict.UNDECIDED: 1, Verdict.NOT_MEASURED: 3, Verdict.PASS: 2}
+CHANGED = "changed since measured"
+UNVERIFIED = "not verified here"
+UNCERTAIN = "evidence here conflicts"
+OCCLUDED = "hidden by something"
+_SECONDS_PER_DAY = 86400.0
+_MIN_TURN_DEG = 5.0
+"""Rotation of a displaced component below which its label does not tell it."""
+_SAME_PLACE_MM = 2.0
+"""Distance within which a component that was measured as displaced is seen at the same place."""
+_SAME_PLACE_SHARE = 0.3
+"""The same as a share of its displacement."""
 _ARROW_SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _ARROW_FRACTION = 0.14
 """Length of the longest arrow, at most, in diameters of the part."""
@@ -49,13 +67,13 @@ def value_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
     return _number(deviation.distance_mm, options) + _UNIT_SUFFIX[options.unit]
 
 
-def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
-    """Displacement per axis, rotation and U; axes within U of zero are left out.
+def detail_parts(deviation: ComponentDeviation, options: OverlayOptions) -> tuple[str, ...]:
+    """Displacement per axis, rotation and U, as texts that must not be broken; axes within U of zero are left out.
 
     Undetermined axes are shown with a question mark.
     """
     if deviation.distance_mm is None:
-        return ""
+        return ()
     uncertainty_mm = deviation.uncertainty_mm or 0.0
     shown = []
     for axis, value in zip("xyz", deviation.displacement_mm, strict=True):
@@ -63,13 +81,20 @@ def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
             shown.append(f"d{axis} ?")
         elif abs(value) > uncertainty_mm:
             shown.append(f"d{axis} {_number(value, options, signed=True)}")
-    parts = ["  ".join(shown)] if shown else []
+    parts = list(shown)
     if deviation.tilt_deg is not None and deviation.tilt_deg >= 0.1:
         parts.append(f"tilt {deviation.tilt_deg:.1f}°")
     if deviation.twist_deg is not None and abs(deviation.twist_deg) >= 0.1:
         parts.append(f"twist {deviation.twist_deg:+.1f}°".replace("-", "−"))
     parts.append(f"U {_number(uncertainty_mm, options)}")
-    return "   ".join(parts)
+    return tuple(parts)
+
+
+def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
+    """The parts of `detail_parts` in one line, the axes closer together than the others."""
+    parts = detail_parts(deviation, options)
+    axes = "  ".join(part for part in parts if part.startswith("d"))
+    return "   ".join([*([axes] if axes else []), *(part for part in parts if not part.startswith("d"))])
 
 
 def arrow_scale(inspection: Inspection, diameter_mm: float, options: OverlayOptions) -> float:
@@ -89,53 +114,158 @@ def arrow_in_model(deviation: ComponentDeviation) -> tuple[float, float, float] 
     return dx, dy, dz
 
 
+@dataclass(frozen=True)
+class LabelText:
+    """The texts of a label.
+
+    Attributes:
+        name: of the component; the only text that may be shortened.
+        value: distance with its unit, or empty.
+        word: verdict, or what the pictures say instead of it.
+        notes: texts below, none of which may be broken: details of the measurement, or doubts.
+        verdict: measured verdict; None if there is none, or it does not hold any longer.
+        evidence: how label and component are drawn.
+        is_dimmed: the verdict was measured, but is not supported by what is seen now.
+    """
+
+    name: str
+    value: str
+    word: str
+    notes: tuple[str, ...] = ()
+    verdict: Verdict | None = None
+    evidence: Evidence = Evidence.SEEN
+    is_dimmed: bool = False
+
+    @property
+    def rgb(self) -> Rgb:
+        """Colour of label and leader."""
+        if self.evidence is Evidence.MISSING:
+            return MISSING_RGB
+        if self.evidence is Evidence.DISPLACED:
+            return DISPLACED_RGB
+        color = NEUTRAL_RGB if self.verdict is None else VERDICT_RGB[self.verdict]
+        return dimmed(color) if self.is_dimmed else color
+
+    @property
+    def is_urgent(self) -> bool:
+        """Whether the component must be shown by its label or an arrow: failed, undecided, missing or displaced."""
+        return self.evidence.is_refuted or self.verdict in (Verdict.FAIL, Verdict.UNDECIDED)
+
+
+def inspection_doubt(
+    inspection: Inspection, serial: str | None, options: OverlayOptions, now: datetime | None = None
+) -> str:
+    """Why an inspection may not hold for the part in view, to be shown on each of its labels, or an empty text.
+
+    Args:
+        inspection: what was measured.
+        serial: serial number of the part in view; None or empty: not known.
+        options: with the age from which on an inspection is stale.
+        now: time from which the age is computed; None: the current time.
+    """
+    if serial and inspection.serial != serial:
+        return f"measured on {inspection.serial or 'a part without serial'}, not on this one"
+    if options.max_age_days is not None:
+        age_days = inspection.age_s(now) / _SECONDS_PER_DAY
+        if age_days > options.max_age_days:
+            return f"measured {age_days:.0f} d ago" if age_days >= 2 else f"measured {24 * age_days:.0f} h ago"
+    return ""
+
+
+def label_text(
+    name: str,
+    deviation: ComponentDeviation | None,
+    presence: ComponentPresence | None,
+    options: OverlayOptions,
+    *,
+    center_in_model: Array | None = None,
+    is_withheld: bool = False,
+    doubt: str = "",
+    note: str = "",
+) -> LabelText:
+    """Texts of a component's label, for the picture and for the page.
+
+    Args:
+        name: of the component.
+        deviation: what was measured; None if it was not.
+        presence: what the pictures say of it; None if it is not checked.
+        options: unit and decimals.
+        center_in_model: (3,) mm of the component, needed to tell how far a displaced one is away.
+        is_withheld: the labels of a serial number must not be shown with this pose.
+        doubt: from `inspection_doubt`.
+        note: a further remark, e.g. that the place depends on which pose is right.
+    """
+    evidence = evidence_of(presence, is_withheld)
+    if evidence is Evidence.WITHHELD:
+        return LabelText(name, "", "WITHHELD", (), None, evidence, True)
+    was_missing = deviation is not None and deviation.finding is Finding.MISSING
+    was_measured = deviation is not None and deviation.distance_mm is not None
+    if evidence is Evidence.MISSING:
+        notes = _with((), CHANGED if was_measured else "as measured" if was_missing else "")
+        return LabelText(name, "", "MISSING", _with(notes, note), None, evidence)
+    if evidence is Evidence.DISPLACED:
+        assert presence is not None
+        away, turned = displacement_texts(presence, center_in_model, options)
+        is_new = was_missing or (was_measured and not _is_as_measured(deviation, presence, center_in_model))
+        return LabelText(name, away, "DISPLACED", _with(turned, CHANGED if is_new else "", note), None, evidence)
+    if deviation is None:
+        word = {Evidence.UNVERIFIED: "NOT VERIFIED", Evidence.UNCERTAIN: "UNCERTAIN"}.get(evidence, "SEEN")
+        return LabelText(name, "", word, _with((), note), None, evidence, evidence.is_open)
+    value, word, verdict = value_text(deviation, options), VERDICT_WORD[deviation.verdict], deviation.verdict
+    is_measured = verdict is not Verdict.NOT_MEASURED
+    remark = ""
+    if evidence.is_open:
+        remark = UNVERIFIED if evidence is Evidence.UNVERIFIED else UNCERTAIN
+        remark = f"measured, {remark}" if is_measured else remark
+    elif was_missing and presence is not None:
+        remark = f"seen now: {CHANGED}"
+    notes = _with((), remark, doubt, note)
+    is_dimmed = bool(remark or doubt)
+    if not notes and verdict is not Verdict.PASS:
+        notes = detail_parts(deviation, options)
+    return LabelText(name, value, word, notes, verdict, evidence, is_dimmed)
+
+
+def displacement_texts(
+    presence: ComponentPresence, center_in_model: Array | None, options: OverlayOptions
+) -> tuple[str, tuple[str, ...]]:
+    """How far away a displaced component is seen, and by how much it is turned; rounded, because it is an estimate."""
+    if presence.model_from_nominal is None or center_in_model is None:
+        return "", ()
+    moved = presence.model_from_nominal
+    distance = float(np.linalg.norm(apply(moved, center_in_model[None])[0] - center_in_model))
+    cosine = min(1.0, max(-1.0, 0.5 * (float(np.trace(moved[:3, :3])) - 1.0)))
+    turn_deg = math.degrees(math.acos(cosine))
+    digits = (2 if options.unit == "inch" else 1) if distance < 10.0 else (1 if options.unit == "inch" else 0)
+    away = f"≈ {distance / _MM_PER_UNIT[options.unit]:.{digits}f}{_UNIT_SUFFIX[options.unit]} away"
+    return away, (f"turned {turn_deg:.0f}°",) if turn_deg >= _MIN_TURN_DEG else ()
+
+
+def _is_as_measured(
+    deviation: ComponentDeviation | None, presence: ComponentPresence, center_in_model: Array | None
+) -> bool:
+    """Whether a displaced component is seen where it was measured."""
+    if deviation is None or presence.model_from_nominal is None or center_in_model is None:
+        return False
+    seen = apply(presence.model_from_nominal, center_in_model[None])[0] - center_in_model
+    measured = np.array([value or 0.0 for value in deviation.displacement_mm])
+    slack = max(_SAME_PLACE_MM, _SAME_PLACE_SHARE * float(np.linalg.norm(seen)))
+    return float(np.linalg.norm(seen - measured)) <= slack
+
+
+def _with(notes: tuple[str, ...], *more: str) -> tuple[str, ...]:
+    return (*notes, *(one for one in more if one))
+
+
+def text_urgency(names: tuple[str, ...], inspection: Inspection | None, evidence: Mapping[str, Evidence]) -> list[str]:
+    """Components that deserve a label, the most urgent first: missing or displaced ones, then by `by_urgency`."""
+    measured = [deviation.name for deviation in by_urgency(inspection)] if inspection else []
+    refuted = [name for name in names if evidence[name].is_refuted]
+    rank = {name: index for index, name in enumerate(measured)}
+    refuted.sort(key=lambda name: (evidence[name] is Evidence.DISPLACED, rank.get(name, len(rank)), name))
+    return [*refuted, *(name for name in measured if name in evidence and not evidence[name].is_refuted)]
+
+
 def text_size_px(image_height: int) -> int:
     """Size of the label text: legible at 480 rows, and in proportion to the height above."""
     return max(11, round(4.5 + image_height / 72))
-
-
-def label_sprite(
-    deviation: ComponentDeviation, options: OverlayOptions, size_px: int, widest_px: int, note: str = ""
-) -> paint.Sprite:
-    """Sprite of a label: name, distance and verdict; below a note, or details unless the component passed."""
-    color = VERDICT_RGB[deviation.verdict]
-    small_px = max(10, round(0.86 * size_px))
-    pad, bar = round(0.5 * size_px), max(3, round(0.28 * size_px))
-    left = bar + pad
-    value = paint.text_mask(value_text(deviation, options), size_px)
-    word = paint.text_mask(VERDICT_WORD[deviation.verdict], small_px, True)
-    gap = round(0.6 * size_px)
-    chip_width = word.shape[1] + round(0.8 * small_px)
-    has_value = bool(value_text(deviation, options))
-    fixed = left + (value.shape[1] + gap if has_value else 0) + gap + chip_width + pad
-    name = paint.text_mask(paint.shortened(deviation.name, size_px, widest_px - fixed, True), size_px, True)
-    detail = None
-    text = note or ("" if deviation.verdict is Verdict.PASS else detail_text(deviation, options))
-    if text:
-        detail = paint.text_mask(paint.shortened(text, small_px, widest_px - left - pad), small_px)
-
-    width = fixed + name.shape[1]
-    if detail is not None:
-        width = max(width, left + detail.shape[1] + pad)
-    top = round(0.22 * size_px)
-    first_height = name.shape[0]
-    height = 2 * top + first_height + (detail.shape[0] if detail is not None else 0)
-    sprite = paint.panel(width, height, 0.36 * size_px, 0.8)
-    inside = sprite.alpha > 0
-    sprite.rgb[:, :bar][inside[:, :bar]] = color
-    sprite.alpha[:, :bar] = np.minimum(255, sprite.alpha[:, :bar].astype(np.int32) * 5 // 4).astype(np.uint8)
-
-    x = left
-    paint.write(sprite, name, x, top, _WHITE)
-    x += name.shape[1] + gap
-    if has_value:
-        paint.write(sprite, value, x, top, _WHITE)
-    chip_height = round(1.3 * small_px)
-    chip = paint.panel(chip_width, chip_height, 0.3 * small_px, 1.0, color)
-    chip_x, chip_y = width - pad - chip_width, top + (first_height - chip_height) // 2
-    paint.write(sprite, chip.alpha, chip_x, chip_y, color)
-    word_x = chip_x + (chip_width - word.shape[1]) // 2
-    paint.write(sprite, word, word_x, top + round(1.08 * size_px) - round(1.08 * small_px), (14, 16, 20))
-    if detail is not None:
-        paint.write(sprite, detail, left, top + first_height - 1, _MUTED)
-    return sprite

@@ -5,11 +5,14 @@ frame to frame; the rows are found by dynamic programming over the area that a l
 component and the distance it would have to move. Because the old and the new rows of a column do not overlap and have
 the same order, rows in between do not overlap either, so labels can glide without crossing. A label that must change
 column or order fades out and reappears at its new place.
+
+Where leaders cross each other or labels, places without crossings are searched (`arview.overlay.leaders`): at once in
+the first picture, later when the crossings last. Labels of components that need none give way if there are none.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +21,7 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.overlay.ghost import CELL_PX
+from arview.overlay.leaders import LabelPlaces, count_crossings, leader_points, uncrossed
 
 _ROW_PX = 4
 """Grid of the rows that are tried; a label does not move to a row nearer than this."""
@@ -29,6 +33,12 @@ _GLIDE = 0.16
 """Fraction of the remaining way that a label moves in a frame."""
 _COVER_COST = 60.0
 """Cost of a label that covers components with its whole area; a distance of a tenth of the image's height costs 1."""
+_ANCHOR_AREA = 1.5
+"""Area that counts as covered where a label covers the anchor of another, in squared heights of a row of text."""
+_STUB = 1.6
+"""Length of the horizontal beginning of a leader, in gaps between labels."""
+_SEARCH_ROWS = 100
+"""Rows that are tried, at least, where crossings are removed."""
 _SIDE_HYSTERESIS = 1.5
 """Advantage that the other column must have before a label changes, in the costs of ``_choose_side``."""
 
@@ -41,17 +51,22 @@ class LabelRequest:
         key: identifies the label from frame to frame.
         width, height: of its box, px.
         anchor_px: (2,) image point of its component.
+        is_required: the label stays even where its leader crosses others.
     """
 
     key: str
     width: int
     height: int
     anchor_px: Array
+    is_required: bool = False
 
 
 @dataclass(frozen=True)
 class PlacedLabel:
-    """Box of a label: upper left (x, y), size in px, on the left or right of the part, opacity 0–1."""
+    """Box of a label: upper left (x, y), size in px, on the left or right of the part, opacity 0–1.
+
+    ``leader`` are the points of its line, from the box to the anchor.
+    """
 
     key: str
     x: int
@@ -60,6 +75,7 @@ class PlacedLabel:
     height: int
     on_left: bool
     opacity: float
+    leader: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass
@@ -94,10 +110,21 @@ class LabelLayout:
         self._left: list[_Slot] = []
         self._right: list[_Slot] = []
         self._edges: tuple[float, float] | None = None
+        self._stub = _STUB * gap_px
+        self._plan: dict[str, tuple[bool, float]] = {}
+        self._crossed_frames, self._wait_frames = 0, _REST_FRAMES
+
+    def set_bottom(self, bottom_px: int) -> None:
+        """Change where labels must end."""
+        if bottom_px != self._bottom:
+            self._bottom = bottom_px
+            self._rows = np.arange(self._top, bottom_px, _ROW_PX, dtype=np.float64)
 
     def reset(self) -> None:
         """Forget all labels: the next ones appear at once at their places."""
         self._left, self._right, self._edges = [], [], None
+        self._plan.clear()
+        self._crossed_frames, self._wait_frames = 0, _REST_FRAMES
 
     def place(
         self, requests: list[LabelRequest], part_px: tuple[float, float], cells: NDArray[np.float32]
@@ -115,12 +142,27 @@ class LabelLayout:
         is_first = not (self._left or self._right)
         self._move_edges(part_px)
         self._update_slots(requests)
-        integral = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=np.float64)
-        np.cumsum(np.cumsum(cells, axis=0, dtype=np.float64), axis=1, out=integral[1:, 1:])
+        integral = self._integral(requests, cells)
+        goals = [self._goals(column, integral) for column in (self._left, self._right)]
+        if not is_first and self._crosses_more(goals):
+            goals = [np.array([slot.y for slot in column]) for column in (self._left, self._right)]
+        for column, tops in zip((self._left, self._right), goals, strict=True):
+            self._move(column, tops, is_first)
+        self._uncross(integral, is_first)
         for column in (self._left, self._right):
-            self._solve(column, integral, is_first)
             self._fade(column)
         return [self._box(slot) for slot in (*self._left, *self._right) if slot.opacity > 0]
+
+    def _integral(self, requests: list[LabelRequest], cells: NDArray[np.float32]) -> Array:
+        """Integral image of the area that labels should not cover: components, and the anchors of all labels."""
+        covered = cells.astype(np.float64)
+        for request in requests:
+            column, row = (int(value // CELL_PX) for value in request.anchor_px)
+            if 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]:
+                covered[row, column] += _ANCHOR_AREA * (4.0 * self._gap) ** 2
+        integral = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=np.float64)
+        np.cumsum(np.cumsum(covered, axis=0), axis=1, out=integral[1:, 1:])
+        return integral
 
     def _move_edges(self, part_px: tuple[float, float]) -> None:
         """Move the inner edges of both columns towards the part's sides."""
@@ -149,7 +191,9 @@ class LabelLayout:
     def _box(self, slot: _Slot) -> PlacedLabel:
         request = slot.request
         x, y = round(self._x(request, slot.on_left)), round(slot.y)
-        return PlacedLabel(request.key, x, y, request.width, request.height, slot.on_left, slot.opacity)
+        box = (float(x), float(y), float(request.width), float(request.height))
+        leader = tuple(leader_points(box, not slot.on_left, request.anchor_px, self._stub))
+        return PlacedLabel(request.key, x, y, request.width, request.height, slot.on_left, slot.opacity, leader)
 
     def _update_slots(self, requests: list[LabelRequest]) -> None:
         """Update the anchors, choose columns, mark labels that must leave, insert new ones."""
@@ -180,6 +224,9 @@ class LabelLayout:
     def _choose_side(self, request: LabelRequest, present: _Slot | None, free_px: dict[bool, float]) -> bool | None:
         """True for left, False for right, None if neither column has room."""
         assert self._edges is not None
+        planned = self._plan.get(request.key)
+        if present is None and planned is not None and free_px[planned[0]] >= request.height + self._gap:
+            return planned[0]
         room = [side for side in (True, False) if free_px[side] >= request.height + self._gap]
         if present is not None and present.age < _REST_FRAMES and present.on_left in room:
             return present.on_left
@@ -197,7 +244,12 @@ class LabelLayout:
 
     def _insert(self, slot: _Slot) -> None:
         column = self._left if slot.on_left else self._right
-        place = sum(other.anchor_y < slot.anchor_y for other in column)
+        planned = self._plan.get(slot.request.key)
+        if planned is None:
+            place = sum(other.anchor_y < slot.anchor_y for other in column)
+        else:
+            tops = [other.anchor_y if np.isnan(other.y) else other.y for other in column]
+            place = sum(top < planned[1] for top in tops)
         column.insert(place, slot)
 
     def _mark_disorder(self, column: list[_Slot]) -> None:
@@ -211,22 +263,30 @@ class LabelLayout:
             (upper if upper.urgency > lower.urgency else lower).is_leaving = True
             return
 
-    def _solve(self, column: list[_Slot], integral: Array, is_first: bool) -> None:
-        """Set the row of every label of a column."""
+    def _goals(self, column: list[_Slot], integral: Array) -> Array:
+        """Best top (N,) of every label of a column, in its order."""
         self._drop_overflow(column)
         if not column:
-            return
+            return np.zeros(0)
         heights = np.array([slot.request.height + self._gap for slot in column], dtype=np.float64)
         x0 = np.array([self._x(slot.request, slot.on_left) for slot in column])
         widths = np.array([slot.request.width for slot in column], dtype=np.float64)
         anchors = np.array([slot.anchor_y for slot in column]) - 0.5 * (heights - self._gap)
-        previous = np.array([slot.y for slot in column])
-        goals = _best_rows(
+        previous = np.array([self._planned_y(slot) for slot in column])
+        return _best_rows(
             self._rows, heights, self._gap, self._bottom, x0, widths, anchors, previous, integral, _COVER_COST
         )
+
+    def _planned_y(self, slot: _Slot) -> float:
+        planned = self._plan.get(slot.request.key)
+        return planned[1] if np.isnan(slot.y) and planned is not None else slot.y
+
+    def _move(self, column: list[_Slot], goals: Array, is_first: bool) -> None:
+        """Move the labels of a column towards their goals, and show new ones where there is room."""
         for slot, goal in zip(column, goals, strict=True):
             if is_first or slot.opacity == 0:
-                slot.y = float(goal)
+                planned = self._planned_y(slot)
+                slot.y = float(goal) if np.isnan(planned) or is_first else planned
             elif abs(goal - slot.y) > _ROW_PX:
                 slot.y = self._glide(slot.y, float(goal))
         self._part([slot for slot in column if slot.opacity > 0])
@@ -234,8 +294,86 @@ class LabelLayout:
             if slot.opacity > 0 or slot.is_leaving:
                 continue
             above = all(self._is_above(other, slot) for other in column[:place] if other.opacity > 0)
-            if above and all(self._is_above(slot, other) for other in column[place + 1 :] if other.opacity > 0):
+            below = all(self._is_above(slot, other) for other in column[place + 1 :] if other.opacity > 0)
+            if above and below and (is_first or slot.request.is_required or not self._would_cross(slot)):
                 slot.opacity = 1.0 if is_first else 1.0 / _FADE_FRAMES
+
+    def _places(self, slots: list[_Slot], tops: Array) -> LabelPlaces:
+        x = [[self._x(slot.request, on_left) for on_left in (True, False)] for slot in slots]
+        return LabelPlaces(
+            np.array(x, dtype=np.float64).reshape(-1, 2),
+            np.array([[slot.request.width, slot.request.height] for slot in slots], dtype=np.float64).reshape(-1, 2),
+            np.array([slot.request.anchor_px for slot in slots], dtype=np.float64).reshape(-1, 2),
+            np.array([0 if slot.on_left else 1 for slot in slots], dtype=np.int64),
+            np.asarray(tops, dtype=np.float64),
+        )
+
+    def _crosses_more(self, goals: list[Array]) -> bool:
+        """Whether more leaders would cross at the goals than do at the present places."""
+        pairs = [
+            (slot, goal)
+            for column, tops in zip((self._left, self._right), goals, strict=True)
+            for slot, goal in zip(column, tops, strict=True)
+            if slot.opacity > 0 and not slot.is_leaving
+        ]
+        if len(pairs) < 2:
+            return False
+        slots = [slot for slot, _ in pairs]
+        then = self._places(slots, np.array([goal for _, goal in pairs]))
+        now = replace(then, y=np.array([slot.y for slot in slots]))
+        return bool(count_crossings(then, self._stub).sum() > count_crossings(now, self._stub).sum())
+
+    def _would_cross(self, new: _Slot) -> bool:
+        """Whether a label that is not drawn yet would cross those that are."""
+        slots = [slot for slot in (*self._left, *self._right) if slot.opacity > 0 and not slot.is_leaving]
+        places = self._places([*slots, new], np.array([slot.y for slot in (*slots, new)]))
+        crossings = count_crossings(places, self._stub)
+        return bool(crossings[-1].any() or crossings[:, -1].any())
+
+    def _uncross(self, integral: Array, is_first: bool) -> None:
+        """Remove crossings: at once in the first picture, later if they last."""
+        slots = [slot for slot in (*self._left, *self._right) if slot.opacity > 0 and not slot.is_leaving]
+        places = self._places(slots, np.array([slot.y for slot in slots]))
+        if not slots or not count_crossings(places, self._stub).any():
+            self._crossed_frames, self._wait_frames = 0, _REST_FRAMES
+            return
+        self._crossed_frames += 1
+        if not is_first and self._crossed_frames < self._wait_frames:
+            return
+        kept, found = self._searched(slots, places, integral)
+        # Where nothing can be mended, the next search waits longer.
+        self._crossed_frames, self._wait_frames = 0, 2 * self._wait_frames
+        self._plan = {slot.request.key: (found.sides[i] == 0, float(found.y[i])) for i, slot in enumerate(kept)}
+        if is_first:
+            self._left = [slot for slot in self._left if slot.opacity == 0]
+            self._right = [slot for slot in self._right if slot.opacity == 0]
+            for slot in kept:
+                slot.on_left, slot.y = self._plan[slot.request.key]
+                (self._left if slot.on_left else self._right).append(slot)
+            for column in (self._left, self._right):
+                column.sort(key=lambda slot: slot.y)
+            return
+        for slot in slots:
+            planned = self._plan.get(slot.request.key)
+            if planned is None or planned[0] != slot.on_left or abs(planned[1] - slot.y) > _ROW_PX:
+                slot.is_leaving = True
+
+    def _searched(self, slots: list[_Slot], places: LabelPlaces, integral: Array) -> tuple[list[_Slot], LabelPlaces]:
+        """Labels that stay, and their places; labels that need not be shown give way to crossings."""
+        step = max(_ROW_PX, (self._bottom - self._top) // _SEARCH_ROWS)
+        rows = np.append(np.arange(self._top, self._bottom, step, dtype=np.float64), float(self._bottom))
+        kept = list(slots)
+        while True:
+            found = uncrossed(places, rows, self._gap, self._stub, integral, self._width)
+            crossings = count_crossings(found, self._stub)
+            crossed = crossings.sum(axis=0) + crossings.sum(axis=1)
+            free = [i for i, slot in enumerate(kept) if crossed[i] and not slot.request.is_required]
+            if not free:
+                return kept, found
+            worst = max(free, key=lambda i: (crossed[i], kept[i].urgency))
+            del kept[worst]
+            places = self._places(kept, np.delete(found.y, worst))
+            places = replace(places, sides=np.delete(found.sides, worst))
 
     def _drop_overflow(self, column: list[_Slot]) -> None:
         """Remove new labels while labels that are fading out still fill the column."""

@@ -44,10 +44,14 @@ class OverlayOptions:
         show_labels: draw a label for each component.
         show_arrows: draw displacements as arrows.
         show_status: draw the status line.
+        show_evidence: draw components by what the pictures say of them, see `arview.pose.Presence`; without it all are
+            drawn as measured, for pictures that document a measurement.
+        show_legend: explain the kinds of evidence that are in the picture.
         unit: of the numbers on labels.
         decimals: of the numbers on labels, 0–4.
         arrow_scale: exaggeration of displacements; None: chosen from the largest one.
-        max_labels: more would hide the part; failures come first.
+        max_labels: more would hide the part; failures come first, and those without a label are marked by an arrow.
+        max_age_days: labels of an older inspection are dimmed and tell its age; None: of any age.
 
     Raises:
         InputError: a value is outside its range.
@@ -59,10 +63,13 @@ class OverlayOptions:
     show_labels: bool = True
     show_arrows: bool = True
     show_status: bool = True
+    show_evidence: bool = True
+    show_legend: bool = True
     unit: Unit = "mm"
     decimals: int = 2
     arrow_scale: float | None = None
     max_labels: int = 12
+    max_age_days: float | None = None
 
     def __post_init__(self) -> None:
         if self.show_edges not in get_args(EdgeMode):
@@ -77,3 +84,5 @@ class OverlayOptions:
             raise InputError(f"overlay: arrow_scale is {self.arrow_scale}, expected a positive number")
         if self.max_labels < 0:
             raise InputError(f"overlay: max_labels is {self.max_labels}, expected 0 or more")
+        if self.max_age_days is not None and not self.max_age_days > 0:
+            raise InputError(f"overlay: max_age_days is {self.max_age_days}, expected a positive number or None")

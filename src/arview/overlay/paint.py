@@ -19,7 +19,7 @@ Image = NDArray[np.uint8]
 _SHIFT = 4
 """Fractional bits of coordinates in OpenCV's drawing functions: sixteenths of a pixel."""
 _OUTLINE_RGB: Rgb = (12, 14, 18)
-_HERSHEY_ASCII = str.maketrans({"−": "-", "±": "~", "×": "x", "·": "|", "…": "~"})
+_HERSHEY_ASCII = str.maketrans({"−": "-", "±": "~", "≈": "~", "×": "x", "·": "|", "…": "~", "°": "*"})
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,11 @@ class Sprite:
 def text_mask(text: str, size_px: int, bold: bool = False) -> NDArray[np.uint8]:
     """Coverage (h,w) uint8 of a line of text; h depends only on the size, so that baselines agree.
 
-    OpenCV 5 draws its built-in TrueType font; OpenCV 4 has only the Hershey fonts, where characters outside ASCII
-    are replaced.
+    OpenCV 5 draws its built-in TrueType font; OpenCV 4 has only the Hershey fonts of ASCII. Characters that the font
+    lacks are drawn as their code points, see `legible`.
     """
     baseline, height = round(1.08 * size_px), round(1.42 * size_px)
+    text = legible(text)
     canvas = np.zeros((height, (size_px + 4) * (len(text) + 1), 3), dtype=np.uint8)
     white = (255, 255, 255)
     font = _font()
@@ -66,15 +67,54 @@ def _font() -> Any:
     return cv2.FontFace("sans") if hasattr(cv2, "FontFace") else None
 
 
+def legible(text: str) -> str:
+    """The text with each character that the font lacks replaced by its code point, so that names stay distinct."""
+    if text.isascii() and text.isprintable():
+        return text
+    has_font = _font() is not None
+    return "".join(char if _has_glyph(char, has_font) else _replacement(char) for char in text)
+
+
+def _replacement(char: str) -> str:
+    return " " if char.isspace() else f"<{ord(char):X}>"
+
+
+@lru_cache(maxsize=4096)
+def _has_glyph(char: str, has_font: bool) -> bool:
+    if char.isascii():
+        return char.isprintable()
+    if not has_font:
+        return ord(char) in _HERSHEY_ASCII
+    drawn, lacking = (_glyph(one) for one in (char, "?"))
+    return drawn.shape != lacking.shape or not np.array_equal(drawn, lacking)
+
+
+def _glyph(char: str) -> NDArray[np.uint8]:
+    canvas = np.zeros((40, 60, 3), dtype=np.uint8)
+    end, _ = cv2.putText(canvas, char, (4, 28), (255, 255, 255), _font(), 24, 420)
+    return np.ascontiguousarray(canvas[:, : max(1, int(end[0])), 0])
+
+
+def text_width(text: str, size_px: int, bold: bool = False) -> int:
+    """Width of a line of text, px."""
+    return int(text_mask(text, size_px, bold).shape[1])
+
+
 def shortened(text: str, size_px: int, width_px: int, bold: bool = False) -> str:
     """The text, shortened in its middle by an ellipsis if it is wider than ``width_px``."""
-    if text_mask(text, size_px, bold).shape[1] <= width_px:
+    text = legible(text)
+    if text_width(text, size_px, bold) <= width_px:
         return text
-    for kept in range(len(text) - 1, 1, -1):
-        short = text[: (kept + 1) // 2] + "…" + text[len(text) - kept // 2 :]
-        if text_mask(short, size_px, bold).shape[1] <= width_px:
-            return short
-    return "…"
+    fitting, too_many = 0, len(text)
+    short = "…"
+    while too_many - fitting > 1:
+        kept = (fitting + too_many) // 2
+        tried = text[: (kept + 1) // 2] + "…" + text[len(text) - kept // 2 :]
+        if text_width(tried, size_px, bold) <= width_px:
+            fitting, short = kept, tried
+        else:
+            too_many = kept
+    return short
 
 
 def panel(width: int, height: int, radius_px: float, opacity: float, rgb: Rgb = PANEL_RGB) -> Sprite:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import datetime
 from types import NoneType
 
@@ -15,37 +16,61 @@ from arview.errors import MismatchError
 from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Inspection, Verdict
 from arview.overlay import labels, paint
+from arview.overlay.annotations import Annotations, LabelledComponent, LaidOut
+from arview.overlay.displaced import DisplacedGhosts
 from arview.overlay.edges import Edges
+from arview.overlay.evidence import ComponentStyles, Evidence, component_styles, evidence_of, presence_of
 from arview.overlay.ghost import CELL_PX, NEAR_MM, Ghost, GhostView, blend, count_cells
 from arview.overlay.guide import GuideOutline
-from arview.overlay.layout import LabelLayout, LabelRequest, PlacedLabel
+from arview.overlay.legend import banner_sprite, legend_entries, legend_sprite
 from arview.overlay.mesh import anchor_in_model, topology
-from arview.overlay.options import CONTEXT_RGB, NEUTRAL_RGB, VERDICT_RGB, OverlayOptions
+from arview.overlay.options import OverlayOptions
 from arview.overlay.status import StatusLine
-from arview.pose import Pose, TrackingState
+from arview.pose import ComponentPresence, Pose, TrackingState, Visibility
 
-_CONTEXT_WEIGHT = 0.25
-"""Cost of covering a component that was not inspected with a label, relative to one that was."""
-_CONTEXT_EDGE_ALPHA = 0.5
-"""Opacity of the edges of components that were not inspected."""
 _SAME_PLACE = 0.02
 """Distance in diameters within which a component is at one place in all ambiguous poses."""
 _CRITICAL_DIMMING = 0.55
 """Factor of the opacity of ghost and edges in the state `critical`."""
-_PASS_DIMMING = 0.65
-"""Factor of the opacity of components that passed, so that the others stand out."""
 _PIECES = 16
 """Pieces per diameter of the part into which edges are cut for a distorting lens: exact to about 0.2 px."""
+_HATCH = 7.0
+"""Distance of the lines of a hatched ghost, in widths of an edge."""
+_OCCLUDED_FRAMES = 5
+"""Frames after which a component that something hides is labelled so, and after which it is not any longer."""
+_OCCLUDED_PX = 60
+"""Visible pixels of a component's ghost from which on only something before the part can hide it."""
 _ARROW_RGB = (255, 255, 255)
-_SEEN_PX = 12
-"""Visible pixels below which a component that passed gets no label."""
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What is drawn of the components, as long as the evidence on them stays the same.
+
+    Attributes:
+        key: evidence on each component, and the doubt about the inspection.
+        evidence: the same by component.
+        styles: their appearance.
+        order: components that may get a label, the most urgent first.
+        arrows: (A,2,3) mm, tail and tip in the model frame.
+    """
+
+    key: tuple[tuple[Evidence, ...], str]
+    evidence: tuple[Evidence, ...]
+    styles: ComponentStyles
+    order: tuple[int, ...]
+    arrows: Array
 
 
 class OverlayRenderer:
     """Draws ghosts, edges, labels, arrows and the status line for one model, camera and inspection.
 
     The places of labels depend on earlier frames, so each video needs a renderer of its own; it is not thread-safe. All
-    numbers in the picture are from the inspection; the pose only determines where they are drawn.
+    measured numbers in the picture are from the inspection; the pose determines where they are drawn, and whether they
+    are drawn at all.
+
+    Attributes:
+        laid_out: labels and arrows of the last picture, as drawn.
 
     Raises:
         MismatchError: the inspection belongs to another model.
@@ -57,49 +82,39 @@ class OverlayRenderer:
         camera: Camera,
         inspection: Inspection | None = None,
         options: OverlayOptions | None = None,
+        serial: str | None = None,
     ) -> None:
+        """Prepare the drawing; ``serial`` is the serial number of the part in view, where it is known."""
         check_type(model, Model, "OverlayRenderer: model")
         check_type(camera, Camera, "OverlayRenderer: camera")
         check_type(inspection, (Inspection, NoneType), "OverlayRenderer: inspection")
         if inspection is not None:
             inspection.check_model(model)
         self.model, self.camera, self.inspection = model, camera, inspection
-        self.options = options or OverlayOptions()
+        self.options, self._serial = options or OverlayOptions(), serial
         shapes = [topology(component) for component in model.components]
         self._ghost = Ghost(model, camera, shapes)
-        self._edges = Edges(shapes, model.diameter_mm / _PIECES if camera.is_distorted else None)
-        self._ghost_style, self._edge_style, self._weight = self._styles()
+        pieces_mm = model.diameter_mm / _PIECES if camera.is_distorted else None
+        self._edges = Edges(shapes, pieces_mm)
+        self._displaced = DisplacedGhosts(model, camera, shapes, pieces_mm)
         self._anchors_in_model = np.stack(
             [anchor_in_model(component, shape) for component, shape in zip(model.components, shapes, strict=True)]
         )
+        self._centers_in_model = np.stack([one.bounds_in_model.mean(axis=0) for one in model.components])
         self._line_px = max(1.0, 0.7 + camera.height / 800)
         self._guide = GuideOutline(self._ghost, self._edges, self._line_px)
-
-        size_px = labels.text_size_px(camera.height)
-        self._size_px = size_px
-        urgent = labels.by_urgency(inspection) if inspection else []
+        self._size_px = labels.text_size_px(camera.height)
         self._arrow_scale = labels.arrow_scale(inspection, model.diameter_mm, self.options) if inspection else 1.0
-        self._arrows = self._arrow_list(urgent) if self.options.show_arrows else []
-        self._status = StatusLine(
-            camera.width, camera.height, round(0.95 * size_px), inspection,
-            self._arrow_scale if self._arrows else None,
-        )  # fmt: skip
-        self._labelled = urgent if self.options.show_labels else []
-        self._index = {component.name: index for index, component in enumerate(model.components)}
-        self._verdict = {deviation.name: deviation.verdict for deviation in self._labelled}
-        margin_px, gap_px = round(0.6 * size_px), round(0.5 * size_px)
-        widest_px = (camera.width - 2 * margin_px - 2 * gap_px) // 2
-        self._noted: dict[tuple[str, int], paint.Sprite] = {}
-        self._sprites = {
-            deviation.name: labels.label_sprite(deviation, self.options, size_px, widest_px)
-            for deviation in self._labelled
-        }
-        widest_px = max((sprite.width for sprite in self._sprites.values()), default=0)
-        # Labels with a note are at most as wide as the layout expects.
-        self._label_px = size_px, widest_px
-        bottom_px = camera.height - margin_px - (self._status.height_px if self.options.show_status else 0)
-        self._layout = LabelLayout(camera.width, margin_px, bottom_px, margin_px, gap_px, widest_px)
-        self._was_seen: set[str] = set()
+        self._names = tuple(component.name for component in model.components)
+        self._deviations = [inspection.find(name) if inspection else None for name in self._names]
+        self._status = self._make_status()
+        bottom_px = camera.height - (self._status.height_px if self.options.show_status else 0)
+        self._annotations = self._make_annotations(bottom_px)
+        self._bottom_px = bottom_px
+        self._hidden_frames = np.zeros(len(self._names), dtype=np.int64)
+        self._is_occluded = np.zeros(len(self._names), dtype=np.bool_)
+        self._scene: _Scene | None = None
+        self.laid_out = LaidOut()
 
     def draw(
         self,
@@ -127,71 +142,158 @@ class OverlayRenderer:
             raise MismatchError(f"overlay: image is {image.dtype} {image.shape}, the camera expects uint8 {expected}")
         canvas = image if in_place else np.array(image, order="C")
         view = self._ghost.view(pose.cam_from_model) if pose.cam_from_model is not None else None
+        self.laid_out = LaidOut()
         if pose.cam_from_model is None or view is None:
-            self._layout.reset()
-            self._was_seen.clear()
+            self._annotations.reset()
             if pose.guide_cam_from_model is not None:
                 self._guide.draw(canvas, pose.guide_cam_from_model)
         else:
-            self._draw_model(canvas, view, pose.cam_from_model, pose.state)
-            self._draw_annotations(canvas, view, pose)
+            presences = self._presences(pose)
+            scene = self._scene_of(pose, presences, now)
+            self._draw_model(canvas, view, pose, scene, presences)
+            self._draw_annotations(canvas, view, pose, scene, presences)
+        if pose.is_label_withheld and self.options.show_evidence:
+            self._draw_banner(canvas, pose)
         if self.options.show_status:
             self._status.draw(canvas, pose, fps, now)
         return canvas
 
-    def _styles(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Ghost and edge style (C,4) r, g, b, alpha of all components, and their weight (C,) in the layout."""
-        ghost_style, edge_style, weight = [], [], []
-        for component in self.model.components:
-            deviation = self.inspection.find(component.name) if self.inspection else None
-            opacity, edge_alpha, cost = self.options.opacity, 1.0, 1.0
-            if deviation is not None:
-                color = VERDICT_RGB[deviation.verdict]
-                opacity *= _PASS_DIMMING if deviation.verdict is Verdict.PASS else 1.0
-            elif self.inspection is None:
-                color = NEUTRAL_RGB
-            else:
-                color, opacity, edge_alpha, cost = CONTEXT_RGB, 0.0, _CONTEXT_EDGE_ALPHA, _CONTEXT_WEIGHT
-            ghost_style.append([*color, opacity if self.options.show_ghost else 0.0])
-            edge_style.append([*(0.75 * np.array(color) + 0.25 * 255), edge_alpha])
-            weight.append(cost)
-        return (
-            np.array(ghost_style, dtype=np.float32),
-            np.array(edge_style, dtype=np.float32),
-            np.array(weight, dtype=np.float32),
-        )
+    def _make_status(self) -> StatusLine:
+        arrows = self._arrows_in_model([Evidence.SEEN] * len(self._names))
+        return StatusLine(
+            self.camera.width, self.camera.height, round(0.95 * self._size_px), self.inspection,
+            self._arrow_scale if self.options.show_arrows and len(arrows) else None,
+            len(self._names) > 1 and self.options.show_evidence,
+        )  # fmt: skip
 
-    def _draw_model(self, canvas: paint.Image, view: GhostView, cam_from_model: Array, state: TrackingState) -> None:
-        options = self.options
+    def _make_annotations(self, bottom_px: int) -> Annotations:
+        texts = [
+            labels.label_text(deviation.name, deviation, None, self.options)
+            for deviation in self._deviations
+            if deviation is not None and self.options.show_labels
+        ]
+        return Annotations(self.camera, self._size_px, texts, self.options.max_labels, bottom_px)
+
+    def _presences(self, pose: Pose) -> list[ComponentPresence | None]:
+        """Presence of each component; None if it is not checked."""
+        if not self.options.show_evidence:
+            return [None] * len(self._names)
+        return [presence_of(pose, name, len(self._names)) for name in self._names]
+
+    def _scene_of(self, pose: Pose, presences: list[ComponentPresence | None], now: datetime | None) -> _Scene:
+        """What is drawn of the components; computed again when the evidence changes."""
+        is_withheld = pose.is_label_withheld and self.options.show_evidence
+        evidence = tuple(evidence_of(presence, is_withheld) for presence in presences)
+        doubt = labels.inspection_doubt(self.inspection, self._serial, self.options, now) if self.inspection else ""
+        key = evidence, doubt
+        if self._scene is None or self._scene.key != key:
+            styles = component_styles(self.model, self.inspection, self.options, evidence, bool(doubt))
+            by_name = dict(zip(self._names, evidence, strict=True))
+            index = {name: number for number, name in enumerate(self._names)}
+            wanted = labels.text_urgency(self._names, self.inspection, by_name)
+            order = tuple(index[name] for name in wanted) if self.options.show_labels and not is_withheld else ()
+            arrows = self._arrows_in_model(list(evidence)) if self.options.show_arrows else np.zeros((0, 2, 3))
+            self._scene = _Scene(key, evidence, styles, order, arrows)
+        return self._scene
+
+    def _draw_model(
+        self,
+        canvas: paint.Image,
+        view: GhostView,
+        pose: Pose,
+        scene: _Scene,
+        presences: list[ComponentPresence | None],
+    ) -> None:
+        assert pose.cam_from_model is not None
+        options, styles = self.options, scene.styles
         if options.show_edges == "none":
             cover = np.zeros(view.face_ids.shape, dtype=np.uint8)
             owner = np.zeros(view.face_ids.shape, dtype=np.int16)
         else:
             cover, owner = self._edges.draw(
-                self._ghost, view, cam_from_model, self._line_px, options.show_edges == "all"
+                self._ghost, view, pose.cam_from_model, self._line_px, options.show_edges == "all", styles.dashed
             )
-        dimming = np.array([1, 1, 1, _CRITICAL_DIMMING if state is TrackingState.CRITICAL else 1], dtype=np.float32)
+        is_critical = pose.state is TrackingState.CRITICAL
+        dimming = np.array([1, 1, 1, _CRITICAL_DIMMING if is_critical else 1], dtype=np.float32)
         blend(
             canvas, view.u0, view.v0, view.face_ids, view.shade, view.components,
-            self._ghost_style * dimming, cover, owner, self._edge_style * dimming,
+            styles.ghost * dimming, cover, owner, styles.edges * dimming, styles.patterns, self._hatch_px,
         )  # fmt: skip
+        for index, seen in enumerate(scene.evidence):
+            presence = presences[index]
+            if seen is Evidence.DISPLACED and presence is not None and presence.model_from_nominal is not None:
+                moved = pose.cam_from_model @ presence.model_from_nominal
+                opacity = float(dimming[3]) * (options.opacity if options.show_ghost else 0.0)
+                line_px = 0.0 if options.show_edges == "none" else self._line_px
+                self._displaced.draw(canvas, view, index, moved, opacity, line_px)
 
-    def _draw_annotations(self, canvas: paint.Image, view: GhostView, pose: Pose) -> None:
-        cam_from_model = pose.cam_from_model
-        assert cam_from_model is not None
-        placed: list[PlacedLabel] = []
-        sprites = {**self._sprites, **self._open_sprites(pose)}
-        if self._labelled:
-            anchors_px = self._ghost.project(apply(cam_from_model, self._anchors_in_model))
-            seen_px, placed = self._place_labels(view, anchors_px, sprites)
-            for label in placed:
-                self._draw_leader(canvas, label, anchors_px, seen_px)
-        self._draw_arrows(canvas, cam_from_model)
-        for label in placed:
-            paint.put_sprite(canvas, sprites[label.key], label.x, label.y, label.opacity)
+    @property
+    def _hatch_px(self) -> int:
+        return max(6, round(_HATCH * self._line_px))
 
-    def _open_sprites(self, pose: Pose) -> dict[str, paint.Sprite]:
-        """Sprites of the components whose place depends on which of the ambiguous poses is right."""
+    def _draw_annotations(
+        self,
+        canvas: paint.Image,
+        view: GhostView,
+        pose: Pose,
+        scene: _Scene,
+        presences: list[ComponentPresence | None],
+    ) -> None:
+        assert pose.cam_from_model is not None
+        bottom_px = self._draw_legend(canvas, scene)
+        seen: dict[str, int] = {}
+        if scene.order:
+            components, cells = self._labelled(view, pose, scene, presences)
+            part_px = (float(view.u0), float(view.u0 + view.face_ids.shape[1]))
+            self.laid_out = self._annotations.lay_out(components, part_px, cells, bottom_px)
+            seen = {one.text.name: one.seen_px for one in components}
+            self._annotations.draw_leaders(canvas, self.laid_out, seen)
+        else:
+            self._annotations.reset()
+        self._draw_arrows(canvas, pose.cam_from_model, scene.arrows)
+        self._draw_links(canvas, pose.cam_from_model, scene, presences)
+        self._annotations.draw_labels(canvas, self.laid_out)
+
+    def _labelled(
+        self, view: GhostView, pose: Pose, scene: _Scene, presences: list[ComponentPresence | None]
+    ) -> tuple[list[LabelledComponent], NDArray[np.float32]]:
+        """Components that may get a label, and the weighted covered area of each cell of the picture."""
+        assert pose.cam_from_model is not None
+        camera = self.camera
+        cells = np.zeros((-(-camera.height // CELL_PX), -(-camera.width // CELL_PX)), dtype=np.float32)
+        seen_px = np.zeros(len(self._names), dtype=np.int64)
+        count_cells(view.u0, view.v0, view.face_ids, view.components, scene.styles.weight, cells, seen_px)
+        anchors_in_cam = apply(pose.cam_from_model, self._anchors_in_model)
+        anchors_px = self._ghost.project(anchors_in_cam)
+        self._count_occluded(presences, seen_px)
+        notes = self._open_notes(pose)
+        result = []
+        for index in scene.order:
+            text = labels.label_text(
+                self._names[index],
+                self._deviations[index],
+                presences[index],
+                self.options,
+                center_in_model=self._centers_in_model[index],
+                doubt=scene.key[1],
+                note=notes.get(index) or (labels.OCCLUDED if self._is_occluded[index] else ""),
+            )
+            result.append(LabelledComponent(index, text, anchors_px[index], anchors_in_cam[index], int(seen_px[index])))
+        return result, cells
+
+    def _count_occluded(self, presences: list[ComponentPresence | None], seen_px: NDArray[np.int64]) -> None:
+        """Tell, after some frames and for some frames, which components something before the part hides."""
+        hidden = [
+            presence is not None and presence.observations > 0 and presence.visibility is Visibility.HIDDEN
+            for presence in presences
+        ]
+        step = np.where(np.array(hidden) & (seen_px >= _OCCLUDED_PX), 1, -1)
+        self._hidden_frames = np.clip(self._hidden_frames + step, 0, _OCCLUDED_FRAMES)
+        self._is_occluded |= self._hidden_frames == _OCCLUDED_FRAMES
+        self._is_occluded &= self._hidden_frames > 0
+
+    def _open_notes(self, pose: Pose) -> dict[int, str]:
+        """Notes on the components, by index, whose place depends on which of the ambiguous poses is right."""
         if pose.cam_from_model is None or not pose.alternatives:
             return {}
         anchors = apply(pose.cam_from_model, self._anchors_in_model)
@@ -199,86 +301,67 @@ class OverlayRenderer:
         apart = np.max(np.linalg.norm(moved, axis=2), axis=0) > _SAME_PLACE * self.model.diameter_mm
         count = len(pose.alternatives) + 1
         note = "one of two places" if count == 2 else f"one of {count} places"
-        sprites = {}
-        for deviation in self._labelled:
-            if apart[self._index[deviation.name]]:
-                key = deviation.name, count
-                if key not in self._noted:
-                    self._noted[key] = labels.label_sprite(deviation, self.options, *self._label_px, note)
-                sprites[deviation.name] = self._noted[key]
-        return sprites
+        return {int(index): note for index in np.flatnonzero(apart)}
 
-    def _place_labels(
-        self, view: GhostView, anchors_px: Array, sprites: dict[str, paint.Sprite]
-    ) -> tuple[NDArray[np.int64], list[PlacedLabel]]:
-        """Visible pixels (C,) of the components, and the placed labels."""
-        camera = self.camera
-        cells = np.zeros((-(-camera.height // CELL_PX), -(-camera.width // CELL_PX)), dtype=np.float32)
-        seen_px = np.zeros(len(self.model.components), dtype=np.int64)
-        count_cells(view.u0, view.v0, view.face_ids, view.components, self._weight, cells, seen_px)
-        requests: list[LabelRequest] = []
-        for deviation in self._labelled:
-            if len(requests) == self.options.max_labels:
-                break
-            index = self._index[deviation.name]
-            if self._deserves_label(deviation, anchors_px[index], int(seen_px[index])):
-                sprite = sprites[deviation.name]
-                requests.append(LabelRequest(deviation.name, sprite.width, sprite.height, anchors_px[index]))
-        self._was_seen = {request.key for request in requests}
-        part_px = (float(view.u0), float(view.u0 + view.face_ids.shape[1]))
-        return seen_px, self._layout.place(requests, part_px, cells)
+    def _draw_legend(self, canvas: paint.Image, scene: _Scene) -> int:
+        """Draw the legend above the status line if it is needed; returns the row above which labels must stay."""
+        entries = legend_entries(scene.evidence) if self.options.show_legend else ()
+        if not entries:
+            return self._bottom_px
+        margin = round(0.4 * self._size_px)
+        sprite = legend_sprite(entries, self._size_px, self.camera.width - 2 * margin)
+        top = self._bottom_px - margin - sprite.height
+        paint.put_sprite(canvas, sprite, margin, top)
+        return top
 
-    def _deserves_label(self, deviation: ComponentDeviation, anchor_px: Array, seen_px: int) -> bool:
-        """Whether the component is in the picture, and visible if it passed; with hysteresis."""
-        was_seen = deviation.name in self._was_seen
-        slack = 0.02 * self.camera.height if was_seen else 0.0
-        u, v = anchor_px
-        inside = -slack <= u < self.camera.width + slack and -slack <= v < self.camera.height + slack
-        if not inside:
-            return False
-        if deviation.verdict in (Verdict.FAIL, Verdict.UNDECIDED):
-            return True
-        return seen_px >= (_SEEN_PX // 3 if was_seen else _SEEN_PX)
+    def _draw_banner(self, canvas: paint.Image, pose: Pose) -> None:
+        margin = round(0.6 * self._size_px)
+        title = "Labels withheld" if not pose.serial else f"Labels withheld: this is {pose.serial}"
+        sprite = banner_sprite(title, pose.identity_reason, self._size_px, self.camera.width - 2 * margin)
+        paint.put_sprite(canvas, sprite, (self.camera.width - sprite.width) // 2, margin)
 
-    def _draw_leader(
-        self, canvas: paint.Image, label: PlacedLabel, anchors_px: Array, seen_px: NDArray[np.int64]
-    ) -> None:
-        if label.opacity < 0.5:
-            return
-        index, verdict = self._index[label.key], self._verdict[label.key]
-        color = VERDICT_RGB[verdict]
-        anchor = np.clip(anchors_px[index], 0, [self.camera.width - 1, self.camera.height - 1])
-        points = np.array([*self._leader_start(label, anchor), anchor])
-        is_urgent = verdict in (Verdict.FAIL, Verdict.UNDECIDED)
-        paint.line(canvas, points, color, 2 if is_urgent and self._size_px > 13 else 1)
-        paint.dot(canvas, anchor, color, 0.2 * self._size_px, bool(seen_px[index] == 0))
+    def _arrows_in_model(self, evidence: list[Evidence]) -> Array:
+        """Tail and exaggerated tip (A,2,3) of the arrows in the model frame, mm, the most urgent last.
 
-    def _leader_start(self, label: PlacedLabel, anchor_px: Array) -> list[tuple[float, float]]:
-        """First points of a leader line: sideways from its box with a short stub, else from its top or bottom."""
-        stub = 0.8 * self._size_px if label.on_left else -0.8 * self._size_px
-        x = float(label.x + label.width if label.on_left else label.x)
-        if (anchor_px[0] - x - stub) * stub > 0:
-            y = label.y + 0.5 * min(label.height, 1.9 * self._size_px)
-            return [(x, y), (x + stub, y)]
-        inside = min(max(float(anchor_px[0]), label.x + 4.0), label.x + label.width - 4.0)
-        return [(inside, float(label.y if anchor_px[1] < label.y else label.y + label.height))]
-
-    def _arrow_list(self, deviations: list[ComponentDeviation]) -> list[Array]:
-        """Tail and exaggerated tip (2,3) of all arrows in the model frame, mm, the most urgent last."""
+        Components have none that were seen to be elsewhere, are not verified, or whose measurement is withheld.
+        """
         arrows = []
-        for deviation in reversed(deviations):
+        seen = dict(zip(self._names, evidence, strict=True))
+        urgent: list[ComponentDeviation] = labels.by_urgency(self.inspection) if self.inspection else []
+        for deviation in reversed(urgent):
             displacement = labels.arrow_in_model(deviation)
-            if displacement is not None and deviation.verdict is not Verdict.PASS:
+            is_shown = seen.get(deviation.name) is Evidence.SEEN and deviation.verdict is not Verdict.PASS
+            if displacement is not None and is_shown:
                 tail = self.model.component(deviation.name).bounds_in_model.mean(axis=0)
                 arrows.append(np.stack([tail, tail + self._arrow_scale * np.array(displacement)]))
-        return arrows
+        return np.stack(arrows) if arrows else np.zeros((0, 2, 3))
 
-    def _draw_arrows(self, canvas: paint.Image, cam_from_model: Array) -> None:
-        if not self._arrows:
-            return
-        ends_in_cam = apply(cam_from_model, np.stack(self._arrows))
+    def _draw_arrows(self, canvas: paint.Image, cam_from_model: Array, arrows: Array) -> None:
+        for tail_px, tip_px in self._projected(cam_from_model, arrows):
+            paint.arrow(canvas, tail_px, tip_px, _ARROW_RGB, 0.24 * self._size_px)
+
+    def _draw_links(
+        self, canvas: paint.Image, cam_from_model: Array, scene: _Scene, presences: list[ComponentPresence | None]
+    ) -> None:
+        """Arrows from the nominal places of displaced components to where they are seen."""
+        links = [
+            np.stack([center, apply(presence.model_from_nominal, center[None])[0]])
+            for center, presence, seen in zip(self._centers_in_model, presences, scene.evidence, strict=True)
+            if seen is Evidence.DISPLACED and presence is not None and presence.model_from_nominal is not None
+        ]
+        if links:
+            for tail_px, tip_px in self._projected(cam_from_model, np.stack(links)):
+                paint.arrow(canvas, tail_px, tip_px, self._displaced.color, 0.3 * self._size_px)
+
+    def _projected(self, cam_from_model: Array, ends_in_model: Array) -> list[Array]:
+        """Ends (2,2) px of those arrows (A,2,3) that lie in front of the camera and near the picture."""
+        if not len(ends_in_model):
+            return []
+        ends_in_cam = apply(cam_from_model, ends_in_model)
         ends_px = self._ghost.project(ends_in_cam)
         limit_px = 2 * max(self.camera.width, self.camera.height)
-        for in_cam, (tail_px, tip_px) in zip(ends_in_cam, ends_px, strict=True):
-            if in_cam[:, 2].min() > NEAR_MM and max(np.abs(tail_px).max(), np.abs(tip_px).max()) < limit_px:
-                paint.arrow(canvas, tail_px, tip_px, _ARROW_RGB, 0.24 * self._size_px)
+        return [
+            ends
+            for in_cam, ends in zip(ends_in_cam, ends_px, strict=True)
+            if in_cam[:, 2].min() > NEAR_MM and np.abs(ends).max() < limit_px
+        ]

@@ -1,0 +1,291 @@
+"""Leaders: the lines from labels to their components, and a search for places in which they do not cross.
+
+A leader that crosses another one or a label is moved: its label takes the best free place, or it and the label that it
+crosses are both taken off and placed again one after the other. Straight leaders of least total length do not cross
+(Bekos et al., "Boundary labeling", 2007), so exchanges that shorten them end without crossings where there is room.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.core.kernel import kernel
+from arview.geometry import Array
+from arview.overlay.ghost import CELL_PX
+
+_CROSSING_COST = 1000.0
+"""Cost of a crossing; it outweighs all others."""
+_COVER_COST = 60.0
+"""Cost of a label that covers components with its whole area; a distance of a tenth of the image's height costs 1."""
+_REACH_COST = 10.0
+"""Cost of a leader across the whole width of the image."""
+_MOVE_COST = 1.0
+"""Cost of moving a label by a tenth of the image's height."""
+_SWEEPS = 6
+"""Sweeps over all labels, at most."""
+
+
+@dataclass(frozen=True)
+class LabelPlaces:
+    """Labels in two columns, of which N have a place.
+
+    Attributes:
+        x: (N,2) left side of the box in the left and in the right column, px.
+        sizes: (N,2) width and height of the box.
+        anchors: (N,2) image points of the components.
+        sides: (N,) 0 in the left column, 1 in the right one.
+        y: (N,) top of the box.
+    """
+
+    x: Array
+    sizes: Array
+    anchors: Array
+    sides: NDArray[np.int64]
+    y: Array
+
+
+def leader_points(
+    box: tuple[float, float, float, float], is_right: bool, anchor: Array, stub_px: float
+) -> list[tuple[float, float]]:
+    """Points of a leader from a box (x, y, width, height): sideways with a short stub, else from its top or bottom."""
+    x, y, width, height = box
+    u, v = float(anchor[0]), float(anchor[1])
+    px, py, bend = _port(x, y, width, height, 1 if is_right else 0, u, v, stub_px)
+    return [(px, py), (u, v)] if bend == px else [(px, py), (bend, py), (u, v)]
+
+
+def count_crossings(places: LabelPlaces, stub_px: float) -> NDArray[np.int64]:
+    """(N,N) number of crossings of the leader of one label (row) with leader or box of another (column)."""
+    return _crossings(places.x, places.sizes, places.anchors, places.sides, places.y, stub_px)
+
+
+def uncrossed(
+    places: LabelPlaces, rows: Array, gap_px: float, stub_px: float, integral: Array, width_px: float
+) -> LabelPlaces:
+    """Places with fewer crossings, or the same.
+
+    Args:
+        places: to begin with.
+        rows: (R,) tops that may be tried; the last one is where boxes must end.
+        gap_px: between boxes.
+        stub_px: length of the horizontal beginning of a leader.
+        integral: integral image of the covered area of each cell.
+        width_px: of the image.
+    """
+    sides, y = places.sides.copy(), places.y.astype(np.float64)
+    _search(places.x, places.sizes, places.anchors, sides, y, rows, gap_px, stub_px, integral, width_px)
+    return LabelPlaces(places.x, places.sizes, places.anchors, sides, y)
+
+
+@kernel
+def _port(
+    x: float, y: float, width: float, height: float, side: int, u: float, v: float, stub: float
+) -> tuple[float, float, float]:
+    """Point (x, y) at which the leader leaves the box, and the column at which its stub ends; the same without one."""
+    if side == 0:
+        px, bend = x + width, x + width + stub
+        is_beside = u > bend
+    else:
+        px, bend = x, x - stub
+        is_beside = u < bend
+    if is_beside:
+        return px, y + 0.5 * min(height, 2.4 * stub), bend
+    px = min(max(u, x + 4.0), x + width - 4.0)
+    return px, y if v < y + 0.5 * height else y + height, px
+
+
+@kernel
+def _side_of(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> float:
+    return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+
+
+@kernel
+def _meet(
+    ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float
+) -> bool:  # fmt: skip
+    """Whether two segments cross, apart from common ends."""
+    if max(ax, bx) < min(cx, dx) or max(cx, dx) < min(ax, bx) or max(ay, by) < min(cy, dy) or max(cy, dy) < min(ay, by):
+        return False
+    p, q = _side_of(ax, ay, bx, by, cx, cy), _side_of(ax, ay, bx, by, dx, dy)
+    r, s = _side_of(cx, cy, dx, dy, ax, ay), _side_of(cx, cy, dx, dy, bx, by)
+    return p * q < 0.0 and r * s < 0.0
+
+
+@kernel
+def _enters(
+    ax: float, ay: float, bx: float, by: float, x: float, y: float, width: float, height: float
+) -> bool:  # fmt: skip
+    """Whether a segment enters a box (Liang and Barsky, "A new concept and method for line clipping", 1984)."""
+    low, high = 0.0, 1.0
+    for axis in range(2):
+        start, along = (ax, bx - ax) if axis == 0 else (ay, by - ay)
+        first, last = (x + 0.5, x + width - 0.5) if axis == 0 else (y + 0.5, y + height - 0.5)
+        if abs(along) < 1e-9:
+            if start < first or start > last:
+                return False
+            continue
+        t0, t1 = (first - start) / along, (last - start) / along
+        low, high = max(low, min(t0, t1)), min(high, max(t0, t1))
+        if low >= high:
+            return False
+    return True
+
+
+@kernel
+def _pair_crossings(
+    xi: float, yi: float, wi: float, hi: float, si: int, ui: float, vi: float,
+    xj: float, yj: float, wj: float, hj: float, sj: int, uj: float, vj: float, stub: float
+) -> tuple[int, int, int]:  # fmt: skip
+    """Crossings of leader i with leader j, of leader i with box j and of leader j with box i."""
+    pi, qi, bi = _port(xi, yi, wi, hi, si, ui, vi, stub)
+    pj, qj, bj = _port(xj, yj, wj, hj, sj, uj, vj, stub)
+    leaders = 0
+    if (
+        _meet(bi, qi, ui, vi, bj, qj, uj, vj)
+        or _meet(pi, qi, bi, qi, bj, qj, uj, vj)
+        or _meet(bi, qi, ui, vi, pj, qj, bj, qj)
+    ):
+        leaders = 1
+    i_in_j = 1 if _enters(bi, qi, ui, vi, xj, yj, wj, hj) or _enters(pi, qi, bi, qi, xj, yj, wj, hj) else 0
+    j_in_i = 1 if _enters(bj, qj, uj, vj, xi, yi, wi, hi) or _enters(pj, qj, bj, qj, xi, yi, wi, hi) else 0
+    return leaders, i_in_j, j_in_i
+
+
+@kernel
+def _crossings(
+    x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64], sides: NDArray[np.int64],
+    y: NDArray[np.float64], stub: float
+) -> NDArray[np.int64]:  # fmt: skip
+    count = len(y)
+    result = np.zeros((count, count), dtype=np.int64)
+    for i in range(count):
+        xi, wi, hi = x[i, sides[i]], sizes[i, 0], sizes[i, 1]
+        if xi < anchors[i, 0] < xi + wi and y[i] < anchors[i, 1] < y[i] + hi:
+            result[i, i] = 1
+        for j in range(i):
+            leaders, i_in_j, j_in_i = _pair_crossings(
+                xi, y[i], wi, hi, sides[i], anchors[i, 0], anchors[i, 1],
+                x[j, sides[j]], y[j], sizes[j, 0], sizes[j, 1], sides[j], anchors[j, 0], anchors[j, 1], stub,
+            )  # fmt: skip
+            result[i, j] = leaders + i_in_j
+            result[j, i] = leaders + j_in_i
+    return result
+
+
+@kernel
+def _cost(
+    i: int, side: int, top: float, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
+    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old_side: int, old_y: float,
+    gap: float, stub: float, bottom: float, integral: NDArray[np.float64], width_px: float
+) -> float:  # fmt: skip
+    """Cost of a place of label i beside the others that are on; infinite if it overlaps one."""
+    xi, wi, hi = x[i, side], sizes[i, 0], sizes[i, 1]
+    u, v = anchors[i, 0], anchors[i, 1]
+    total = 0
+    for j in range(len(y)):
+        if j == i or not is_on[j]:
+            continue
+        xj, wj, hj = x[j, sides[j]], sizes[j, 0], sizes[j, 1]
+        if xi < xj + wj and xj < xi + wi and top < y[j] + hj + gap and y[j] < top + hi + gap:
+            return np.inf
+        leaders, i_in_j, j_in_i = _pair_crossings(
+            xi, top, wi, hi, side, u, v, xj, y[j], wj, hj, sides[j], anchors[j, 0], anchors[j, 1], stub
+        )
+        total += leaders + i_in_j + j_in_i
+    if xi < u < xi + wi and top < v < top + hi:
+        total += 1
+    grid_h, grid_w = integral.shape[0] - 1, integral.shape[1] - 1
+    c0, c1 = max(0, min(grid_w, int(xi // CELL_PX))), max(0, min(grid_w, int((xi + wi) // CELL_PX) + 1))
+    r0, r1 = max(0, min(grid_h, int(top // CELL_PX))), max(0, min(grid_h, int((top + hi) // CELL_PX) + 1))
+    covered = integral[r1, c1] - integral[r0, c1] - integral[r1, c0] + integral[r0, c0]
+    span = 0.1 * bottom
+    edge = xi + wi if side == 0 else xi
+    cost: float = _COVER_COST * covered / (wi * hi) + ((top + 0.5 * hi - v) / span) ** 2
+    cost += _REACH_COST * abs(u - edge) / width_px
+    cost += _MOVE_COST * (abs(top - old_y) / span if side == old_side else 2.0)
+    return cost + _CROSSING_COST * total
+
+
+@kernel
+def _best_place(
+    i: int, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
+    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old_side: int, old_y: float,
+    rows: NDArray[np.float64], gap: float, stub: float, integral: NDArray[np.float64], width_px: float
+) -> tuple[float, int, float]:  # fmt: skip
+    """Least cost of label i over all places, and that place."""
+    best, best_side, best_y = np.inf, sides[i], y[i]
+    bottom = rows[-1]
+    for side in range(2):
+        for k in range(len(rows)):
+            if rows[k] + sizes[i, 1] > bottom:
+                break
+            cost = _cost(
+                i, side, rows[k], x, sizes, anchors, sides, y, is_on, old_side, old_y, gap, stub, bottom,
+                integral, width_px,
+            )  # fmt: skip
+            if cost < best:
+                best, best_side, best_y = cost, side, rows[k]
+    return best, best_side, best_y
+
+
+@kernel
+def _search(
+    x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64], sides: NDArray[np.int64],
+    y: NDArray[np.float64], rows: NDArray[np.float64], gap: float, stub: float, integral: NDArray[np.float64],
+    width_px: float
+) -> None:  # fmt: skip
+    """Improve sides and tops in place until nothing crosses or no move of one or two labels helps."""
+    count = len(y)
+    is_on = np.ones(count, dtype=np.bool_)
+    old_sides, old_y = sides.copy(), y.copy()
+    bottom = rows[-1]
+    for _ in range(_SWEEPS):
+        crossings = _crossings(x, sizes, anchors, sides, y, stub)
+        if crossings.sum() == 0:
+            return
+        has_improved = False
+        for i in range(count):
+            if crossings[i].sum() + crossings[:, i].sum() == 0:
+                continue
+            now = _cost(
+                i, sides[i], y[i], x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], gap, stub, bottom,
+                integral, width_px,
+            )  # fmt: skip
+            cost, side, top = _best_place(
+                i, x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], rows, gap, stub, integral, width_px
+            )
+            if cost < now - 1e-6:
+                sides[i], y[i] = side, top
+                has_improved = True
+        for i in range(count):
+            for j in range(count):
+                if i == j or crossings[i, j] + crossings[j, i] == 0:
+                    continue
+                side_i, y_i, side_j, y_j = sides[i], y[i], sides[j], y[j]
+                is_on[j] = False
+                before = _cost(
+                    i, side_i, y_i, x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], gap, stub, bottom,
+                    integral, width_px,
+                )  # fmt: skip
+                is_on[j] = True
+                before += _cost(
+                    j, side_j, y_j, x, sizes, anchors, sides, y, is_on, old_sides[j], old_y[j], gap, stub, bottom,
+                    integral, width_px,
+                )  # fmt: skip
+                is_on[j] = False
+                first, sides[i], y[i] = _best_place(
+                    i, x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], rows, gap, stub, integral, width_px
+                )
+                is_on[j] = True
+                second, sides[j], y[j] = _best_place(
+                    j, x, sizes, anchors, sides, y, is_on, old_sides[j], old_y[j], rows, gap, stub, integral, width_px
+                )
+                if first + second < before - 1e-6:
+                    has_improved = True
+                else:
+                    sides[i], y[i], sides[j], y[j] = side_i, y_i, side_j, y_j
+        if not has_improved:
+            return
