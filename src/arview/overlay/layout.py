@@ -29,6 +29,12 @@ _FADE_FRAMES = 6
 """Frames in which a label fades in or out."""
 _REST_FRAMES = 30
 """Frames for which a label stays in a new column or order."""
+_REQUIRED_INERTIA = 3.0
+"""Factor of the cost of moving a label that must be shown, because it is away while it moves."""
+_CROSSED_FRAMES = 6
+"""Frames for which leaders may cross before other places are searched; twice as long after each search."""
+_PLAN_FRAMES = 90
+"""Frames for which labels stay in the columns in which they do not cross."""
 _GLIDE = 0.16
 """Fraction of the remaining way that a label moves in a frame."""
 _COVER_COST = 60.0
@@ -112,7 +118,8 @@ class LabelLayout:
         self._edges: tuple[float, float] | None = None
         self._stub = _STUB * gap_px
         self._plan: dict[str, tuple[bool, float]] = {}
-        self._crossed_frames, self._wait_frames = 0, _REST_FRAMES
+        self._plan_frames = 0
+        self._crossed_frames, self._wait_frames = 0, _CROSSED_FRAMES
 
     def set_bottom(self, bottom_px: int) -> None:
         """Change where labels must end."""
@@ -124,7 +131,7 @@ class LabelLayout:
         """Forget all labels: the next ones appear at once at their places."""
         self._left, self._right, self._edges = [], [], None
         self._plan.clear()
-        self._crossed_frames, self._wait_frames = 0, _REST_FRAMES
+        self._crossed_frames, self._wait_frames = 0, _CROSSED_FRAMES
 
     def place(
         self, requests: list[LabelRequest], part_px: tuple[float, float], cells: NDArray[np.float32]
@@ -140,6 +147,9 @@ class LabelLayout:
             Labels to draw, in any order; those for which there is no room are left out.
         """
         is_first = not (self._left or self._right)
+        self._plan_frames += 1
+        if self._plan_frames > _PLAN_FRAMES:
+            self._plan.clear()
         self._move_edges(part_px)
         self._update_slots(requests)
         integral = self._integral(requests, cells)
@@ -225,7 +235,7 @@ class LabelLayout:
         """True for left, False for right, None if neither column has room."""
         assert self._edges is not None
         planned = self._plan.get(request.key)
-        if present is None and planned is not None and free_px[planned[0]] >= request.height + self._gap:
+        if planned is not None and free_px[planned[0]] >= request.height + self._gap:
             return planned[0]
         room = [side for side in (True, False) if free_px[side] >= request.height + self._gap]
         if present is not None and present.age < _REST_FRAMES and present.on_left in room:
@@ -306,6 +316,7 @@ class LabelLayout:
             np.array([slot.request.anchor_px for slot in slots], dtype=np.float64).reshape(-1, 2),
             np.array([0 if slot.on_left else 1 for slot in slots], dtype=np.int64),
             np.asarray(tops, dtype=np.float64),
+            np.array([_REQUIRED_INERTIA if slot.request.is_required else 1.0 for slot in slots]),
         )
 
     def _crosses_more(self, goals: list[Array]) -> bool:
@@ -335,7 +346,7 @@ class LabelLayout:
         slots = [slot for slot in (*self._left, *self._right) if slot.opacity > 0 and not slot.is_leaving]
         places = self._places(slots, np.array([slot.y for slot in slots]))
         if not slots or not count_crossings(places, self._stub).any():
-            self._crossed_frames, self._wait_frames = 0, _REST_FRAMES
+            self._crossed_frames, self._wait_frames = 0, _CROSSED_FRAMES
             return
         self._crossed_frames += 1
         if not is_first and self._crossed_frames < self._wait_frames:
@@ -343,6 +354,7 @@ class LabelLayout:
         kept, found = self._searched(slots, places, integral)
         # Where nothing can be mended, the next search waits longer.
         self._crossed_frames, self._wait_frames = 0, 2 * self._wait_frames
+        self._plan_frames = 0
         self._plan = {slot.request.key: (found.sides[i] == 0, float(found.y[i])) for i, slot in enumerate(kept)}
         if is_first:
             self._left = [slot for slot in self._left if slot.opacity == 0]

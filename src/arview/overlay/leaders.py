@@ -7,7 +7,7 @@ crosses are both taken off and placed again one after the other. Straight leader
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ class LabelPlaces:
         anchors: (N,2) image points of the components.
         sides: (N,) 0 in the left column, 1 in the right one.
         y: (N,) top of the box.
+        inertia: (N,) factor of the cost of moving the label.
     """
 
     x: Array
@@ -45,6 +46,7 @@ class LabelPlaces:
     anchors: Array
     sides: NDArray[np.int64]
     y: Array
+    inertia: Array
 
 
 def leader_points(
@@ -76,8 +78,8 @@ def uncrossed(
         width_px: of the image.
     """
     sides, y = places.sides.copy(), places.y.astype(np.float64)
-    _search(places.x, places.sizes, places.anchors, sides, y, rows, gap_px, stub_px, integral, width_px)
-    return LabelPlaces(places.x, places.sizes, places.anchors, sides, y)
+    _search(places.x, places.sizes, places.anchors, sides, y, places.inertia, rows, gap_px, stub_px, integral, width_px)
+    return replace(places, sides=sides, y=y)
 
 
 @kernel
@@ -179,6 +181,7 @@ def _crossings(
 def _cost(
     i: int, side: int, top: float, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
     sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old_side: int, old_y: float,
+    inertia: NDArray[np.float64],
     gap: float, stub: float, bottom: float, integral: NDArray[np.float64], width_px: float
 ) -> float:  # fmt: skip
     """Cost of a place of label i beside the others that are on; infinite if it overlaps one."""
@@ -205,7 +208,7 @@ def _cost(
     edge = xi + wi if side == 0 else xi
     cost: float = _COVER_COST * covered / (wi * hi) + ((top + 0.5 * hi - v) / span) ** 2
     cost += _REACH_COST * abs(u - edge) / width_px
-    cost += _MOVE_COST * (abs(top - old_y) / span if side == old_side else 2.0)
+    cost += _MOVE_COST * inertia[i] * (abs(top - old_y) / span if side == old_side else 2.0)
     return cost + _CROSSING_COST * total
 
 
@@ -213,6 +216,7 @@ def _cost(
 def _best_place(
     i: int, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
     sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old_side: int, old_y: float,
+    inertia: NDArray[np.float64],
     rows: NDArray[np.float64], gap: float, stub: float, integral: NDArray[np.float64], width_px: float
 ) -> tuple[float, int, float]:  # fmt: skip
     """Least cost of label i over all places, and that place."""
@@ -223,7 +227,7 @@ def _best_place(
             if rows[k] + sizes[i, 1] > bottom:
                 break
             cost = _cost(
-                i, side, rows[k], x, sizes, anchors, sides, y, is_on, old_side, old_y, gap, stub, bottom,
+                i, side, rows[k], x, sizes, anchors, sides, y, is_on, old_side, old_y, inertia, gap, stub, bottom,
                 integral, width_px,
             )  # fmt: skip
             if cost < best:
@@ -234,8 +238,8 @@ def _best_place(
 @kernel
 def _search(
     x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64], sides: NDArray[np.int64],
-    y: NDArray[np.float64], rows: NDArray[np.float64], gap: float, stub: float, integral: NDArray[np.float64],
-    width_px: float
+    y: NDArray[np.float64], inertia: NDArray[np.float64], rows: NDArray[np.float64], gap: float, stub: float,
+    integral: NDArray[np.float64], width_px: float
 ) -> None:  # fmt: skip
     """Improve sides and tops in place until nothing crosses or no move of one or two labels helps."""
     count = len(y)
@@ -251,11 +255,25 @@ def _search(
             if crossings[i].sum() + crossings[:, i].sum() == 0:
                 continue
             now = _cost(
-                i, sides[i], y[i], x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], gap, stub, bottom,
+                i, sides[i], y[i], x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], inertia, gap, stub, bottom,
                 integral, width_px,
             )  # fmt: skip
             cost, side, top = _best_place(
-                i, x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], rows, gap, stub, integral, width_px
+                i,
+                x,
+                sizes,
+                anchors,
+                sides,
+                y,
+                is_on,
+                old_sides[i],
+                old_y[i],
+                inertia,
+                rows,
+                gap,
+                stub,
+                integral,
+                width_px,
             )
             if cost < now - 1e-6:
                 sides[i], y[i] = side, top
@@ -267,21 +285,49 @@ def _search(
                 side_i, y_i, side_j, y_j = sides[i], y[i], sides[j], y[j]
                 is_on[j] = False
                 before = _cost(
-                    i, side_i, y_i, x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], gap, stub, bottom,
+                    i, side_i, y_i, x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], inertia, gap, stub, bottom,
                     integral, width_px,
                 )  # fmt: skip
                 is_on[j] = True
                 before += _cost(
-                    j, side_j, y_j, x, sizes, anchors, sides, y, is_on, old_sides[j], old_y[j], gap, stub, bottom,
+                    j, side_j, y_j, x, sizes, anchors, sides, y, is_on, old_sides[j], old_y[j], inertia, gap, stub, bottom,
                     integral, width_px,
                 )  # fmt: skip
                 is_on[j] = False
                 first, sides[i], y[i] = _best_place(
-                    i, x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], rows, gap, stub, integral, width_px
+                    i,
+                    x,
+                    sizes,
+                    anchors,
+                    sides,
+                    y,
+                    is_on,
+                    old_sides[i],
+                    old_y[i],
+                    inertia,
+                    rows,
+                    gap,
+                    stub,
+                    integral,
+                    width_px,
                 )
                 is_on[j] = True
                 second, sides[j], y[j] = _best_place(
-                    j, x, sizes, anchors, sides, y, is_on, old_sides[j], old_y[j], rows, gap, stub, integral, width_px
+                    j,
+                    x,
+                    sizes,
+                    anchors,
+                    sides,
+                    y,
+                    is_on,
+                    old_sides[j],
+                    old_y[j],
+                    inertia,
+                    rows,
+                    gap,
+                    stub,
+                    integral,
+                    width_px,
                 )
                 if first + second < before - 1e-6:
                     has_improved = True
