@@ -24,6 +24,8 @@ _REACH_COST = 10.0
 """Cost of a leader across the whole width of the image."""
 _MOVE_COST = 1.0
 """Cost of moving a label by a tenth of the image's height."""
+_OTHER_SIDE = 2.0
+"""The same for a move to the other column, in tenths of the image's height."""
 _SWEEPS = 6
 """Sweeps over all labels, at most."""
 
@@ -78,7 +80,9 @@ def uncrossed(
         width_px: of the image.
     """
     sides, y = places.sides.copy(), places.y.astype(np.float64)
-    _search(places.x, places.sizes, places.anchors, sides, y, places.inertia, rows, gap_px, stub_px, integral, width_px)
+    old = np.stack([sides.astype(np.float64), y, places.inertia], axis=1)
+    bounds = np.array([gap_px, stub_px, rows[-1], width_px], dtype=np.float64)
+    _search(places.x, places.sizes, places.anchors, sides, y, old, rows, bounds, integral)
     return replace(places, sides=sides, y=y)
 
 
@@ -180,11 +184,14 @@ def _crossings(
 @kernel
 def _cost(
     i: int, side: int, top: float, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
-    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old_side: int, old_y: float,
-    inertia: NDArray[np.float64],
-    gap: float, stub: float, bottom: float, integral: NDArray[np.float64], width_px: float
+    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old: NDArray[np.float64],
+    bounds: NDArray[np.float64], integral: NDArray[np.float64]
 ) -> float:  # fmt: skip
-    """Cost of a place of label i beside the others that are on; infinite if it overlaps one."""
+    """Cost of a place of label i beside the others that are on; infinite if it overlaps one.
+
+    ``old`` (N,3): side and top before the search, and inertia. ``bounds``: gap, stub, bottom, width of the image.
+    """
+    gap, stub, bottom, width_px = bounds
     xi, wi, hi = x[i, side], sizes[i, 0], sizes[i, 1]
     u, v = anchors[i, 0], anchors[i, 1]
     total = 0
@@ -206,132 +213,78 @@ def _cost(
     covered = integral[r1, c1] - integral[r0, c1] - integral[r1, c0] + integral[r0, c0]
     span = 0.1 * bottom
     edge = xi + wi if side == 0 else xi
-    cost: float = _COVER_COST * covered / (wi * hi) + ((top + 0.5 * hi - v) / span) ** 2
+    cost = _COVER_COST * covered / (wi * hi) + ((top + 0.5 * hi - v) / span) ** 2
     cost += _REACH_COST * abs(u - edge) / width_px
-    cost += _MOVE_COST * inertia[i] * (abs(top - old_y) / span if side == old_side else 2.0)
-    return cost + _CROSSING_COST * total
+    moved = abs(top - old[i, 1]) / span if side == int(old[i, 0]) else _OTHER_SIDE
+    cost += _MOVE_COST * old[i, 2] * moved
+    return float(cost + _CROSSING_COST * total)
 
 
 @kernel
 def _best_place(
     i: int, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
-    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old_side: int, old_y: float,
-    inertia: NDArray[np.float64],
-    rows: NDArray[np.float64], gap: float, stub: float, integral: NDArray[np.float64], width_px: float
+    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old: NDArray[np.float64],
+    rows: NDArray[np.float64], bounds: NDArray[np.float64], integral: NDArray[np.float64]
 ) -> tuple[float, int, float]:  # fmt: skip
     """Least cost of label i over all places, and that place."""
     best, best_side, best_y = np.inf, sides[i], y[i]
-    bottom = rows[-1]
     for side in range(2):
         for k in range(len(rows)):
-            if rows[k] + sizes[i, 1] > bottom:
+            if rows[k] + sizes[i, 1] > bounds[2]:
                 break
-            cost = _cost(
-                i, side, rows[k], x, sizes, anchors, sides, y, is_on, old_side, old_y, inertia, gap, stub, bottom,
-                integral, width_px,
-            )  # fmt: skip
+            cost = _cost(i, side, rows[k], x, sizes, anchors, sides, y, is_on, old, bounds, integral)
             if cost < best:
                 best, best_side, best_y = cost, side, rows[k]
     return best, best_side, best_y
 
 
 @kernel
+def _place_both(
+    i: int, j: int, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
+    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old: NDArray[np.float64],
+    rows: NDArray[np.float64], bounds: NDArray[np.float64], integral: NDArray[np.float64]
+) -> bool:  # fmt: skip
+    """Take labels i and j off and place first i, then j, where that is better; returns whether it was."""
+    side_i, y_i, side_j, y_j = sides[i], y[i], sides[j], y[j]
+    before = _cost(j, side_j, y_j, x, sizes, anchors, sides, y, is_on, old, bounds, integral)
+    is_on[j] = False
+    before += _cost(i, side_i, y_i, x, sizes, anchors, sides, y, is_on, old, bounds, integral)
+    first, sides[i], y[i] = _best_place(i, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral)
+    is_on[j] = True
+    second, sides[j], y[j] = _best_place(j, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral)
+    if first + second < before - 1e-6:
+        return True
+    sides[i], y[i], sides[j], y[j] = side_i, y_i, side_j, y_j
+    return False
+
+
+@kernel
 def _search(
     x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64], sides: NDArray[np.int64],
-    y: NDArray[np.float64], inertia: NDArray[np.float64], rows: NDArray[np.float64], gap: float, stub: float,
-    integral: NDArray[np.float64], width_px: float
+    y: NDArray[np.float64], old: NDArray[np.float64], rows: NDArray[np.float64], bounds: NDArray[np.float64],
+    integral: NDArray[np.float64]
 ) -> None:  # fmt: skip
     """Improve sides and tops in place until nothing crosses or no move of one or two labels helps."""
     count = len(y)
     is_on = np.ones(count, dtype=np.bool_)
-    old_sides, old_y = sides.copy(), y.copy()
-    bottom = rows[-1]
     for _ in range(_SWEEPS):
-        crossings = _crossings(x, sizes, anchors, sides, y, stub)
+        crossings = _crossings(x, sizes, anchors, sides, y, bounds[1])
         if crossings.sum() == 0:
             return
         has_improved = False
         for i in range(count):
             if crossings[i].sum() + crossings[:, i].sum() == 0:
                 continue
-            now = _cost(
-                i, sides[i], y[i], x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], inertia, gap, stub, bottom,
-                integral, width_px,
-            )  # fmt: skip
-            cost, side, top = _best_place(
-                i,
-                x,
-                sizes,
-                anchors,
-                sides,
-                y,
-                is_on,
-                old_sides[i],
-                old_y[i],
-                inertia,
-                rows,
-                gap,
-                stub,
-                integral,
-                width_px,
-            )
+            now = _cost(i, sides[i], y[i], x, sizes, anchors, sides, y, is_on, old, bounds, integral)
+            cost, side, top = _best_place(i, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral)
             if cost < now - 1e-6:
                 sides[i], y[i] = side, top
                 has_improved = True
         for i in range(count):
             for j in range(count):
-                if i == j or crossings[i, j] + crossings[j, i] == 0:
-                    continue
-                side_i, y_i, side_j, y_j = sides[i], y[i], sides[j], y[j]
-                is_on[j] = False
-                before = _cost(
-                    i, side_i, y_i, x, sizes, anchors, sides, y, is_on, old_sides[i], old_y[i], inertia, gap, stub, bottom,
-                    integral, width_px,
-                )  # fmt: skip
-                is_on[j] = True
-                before += _cost(
-                    j, side_j, y_j, x, sizes, anchors, sides, y, is_on, old_sides[j], old_y[j], inertia, gap, stub, bottom,
-                    integral, width_px,
-                )  # fmt: skip
-                is_on[j] = False
-                first, sides[i], y[i] = _best_place(
-                    i,
-                    x,
-                    sizes,
-                    anchors,
-                    sides,
-                    y,
-                    is_on,
-                    old_sides[i],
-                    old_y[i],
-                    inertia,
-                    rows,
-                    gap,
-                    stub,
-                    integral,
-                    width_px,
-                )
-                is_on[j] = True
-                second, sides[j], y[j] = _best_place(
-                    j,
-                    x,
-                    sizes,
-                    anchors,
-                    sides,
-                    y,
-                    is_on,
-                    old_sides[j],
-                    old_y[j],
-                    inertia,
-                    rows,
-                    gap,
-                    stub,
-                    integral,
-                    width_px,
-                )
-                if first + second < before - 1e-6:
+                if i != j and crossings[i, j] + crossings[j, i] > 0 and _place_both(
+                    i, j, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral
+                ):  # fmt: skip
                     has_improved = True
-                else:
-                    sides[i], y[i], sides[j], y[j] = side_i, y_i, side_j, y_j
         if not has_improved:
             return
