@@ -207,6 +207,7 @@ class Detector:
         max_results: int = 3,
         is_thorough: bool = True,
         guesses: Sequence[Array] = (),
+        searches: Sequence[int] | None = None,
     ) -> list[Detection]:
         """Poses of the part in an image, best first; an empty list when it is not found.
 
@@ -215,13 +216,17 @@ class Detector:
             max_results: maximum number of poses; all are above the quality threshold and apart from each other.
             is_thorough: search more widely when the quick search gives no sure result.
             guesses: rough poses (4,4) ``cam_from_model``; if one of them leads to the part, nothing else is searched.
+            searches: indices of the only budgets that are used, so that a thorough search can be spread over several
+                frames; a result must then be as sure as one of the quick search.
         """
         pyramid = self.local.pyramid(image)
         if found := self._detect_near(pyramid, guesses):
             return found
         o = self.options
-        min_quality = o.min_quality if is_thorough else max(o.min_quick_quality, o.min_quality)
-        return self._detections(pyramid, self.hypotheses(pyramid, is_thorough), max_results, min_quality)
+        is_complete = is_thorough and searches is None
+        min_quality = o.min_quality if is_complete else max(o.min_quick_quality, o.min_quality)
+        hypotheses = self.hypotheses(pyramid, is_thorough, searches)
+        return self._detections(pyramid, hypotheses, max_results, min_quality)
 
     def detect_near(self, image: NDArray[np.uint8], guesses: Sequence[Array]) -> list[Detection]:
         """The best pose, or none, that some rough poses lead to.
@@ -232,18 +237,28 @@ class Detector:
         """
         return self._detect_near(self.local.pyramid(image), guesses)
 
-    def hypotheses(self, pyramid: ImagePyramid, is_thorough: bool = True) -> list[Hypothesis]:
+    @property
+    def wider_searches(self) -> list[int]:
+        """Indices of the budgets after the first one that apply to this part."""
+        has_outer = self.global_search.has_outer
+        return [k for k, budget in enumerate(self.options.budgets) if k and (has_outer or not budget.is_outer)]
+
+    def hypotheses(
+        self, pyramid: ImagePyramid, is_thorough: bool = True, searches: Sequence[int] | None = None
+    ) -> list[Hypothesis]:
         """All verified hypotheses of the searches, right or wrong, apart from each other, best first.
 
         Args:
             pyramid: of the image, see `LocalSearch.pyramid`.
             is_thorough: make all searches until one gives a sure result, not only the first.
+            searches: indices of the only budgets that are used; None leaves the choice to ``is_thorough``.
         """
         o, local = self.options, self.local
         hypotheses: list[Hypothesis] = []
         min_quality = max(o.min_quick_quality, o.min_quality)
-        budgets = [budget for budget in o.budgets if self.global_search.has_outer or not budget.is_outer]
-        for budget in budgets if is_thorough else budgets[:1]:
+        if searches is None:
+            searches = [0, *self.wider_searches] if is_thorough else [0]
+        for budget in (o.budgets[k] for k in searches):
             starts = local.pattern_search(pyramid, self.global_search.starts(pyramid, budget), budget.kept)
             found = local.refine_and_verify(pyramid, starts)
             hypotheses = local.deduplicate([*hypotheses, *found], local.options.distinct_deg)

@@ -9,7 +9,7 @@ states are a table, see `session_state`.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ from arview.tracking.disambiguation import HypothesisSet
 from arview.tracking.estimate import Estimate
 from arview.tracking.guided_init import GuidedInit
 from arview.tracking.pose_recheck import LocalSearchRecheck
+from arview.tracking.scene_change import SceneChange, SceneChangeOptions
 from arview.tracking.session_state import Event, SessionState
 from arview.tracking.tracker import Tracker
 from arview.tracking.tracker_options import TrackerOptions
@@ -55,8 +56,11 @@ class SessionOptions:
         lost_frames: frames in a row below ``lost_quality`` after which the part is lost.
         critical_frames: critical frames in a row after which the part is lost.
         eager_frames: frames after a loss in each of which the part is searched for.
-        search_every: later only every n-th frame is searched, and at first every other of these thoroughly.
+        search_every: later the part is searched for only so many frames after the last search.
         max_thorough_frames: frames between two thorough searches for a part that has been lost for long.
+        thorough_parts: number of searches over which a thorough one is spread, so that no frame takes long.
+        max_unchanged_frames: frames after which a picture in which nothing has changed is searched again.
+        scene_change: what counts as a change of the picture.
         min_resting_score: correlation with the remembered appearance from which a place is examined in frames between
             these searches.
         align_again_frames: frames after a loss from which the part may be aligned with the guide view again.
@@ -80,6 +84,9 @@ class SessionOptions:
     eager_frames: int = 2
     search_every: int = 3
     max_thorough_frames: int = 30
+    thorough_parts: int = 3
+    max_unchanged_frames: int = 30
+    scene_change: SceneChangeOptions = field(default_factory=SceneChangeOptions)
     min_resting_score: float = 0.7
     align_again_frames: int = 60
     align_advice_every: int = 10
@@ -145,6 +152,7 @@ class TrackingSession:
         self._guided_init: GuidedInit | None = None
         self.components = AssemblyMonitor(views, camera, model)
         self.appearance_memory = AppearanceMemory(views, camera)
+        self._scene = SceneChange(views, camera, o.scene_change)
         self._state = SessionState()
 
     def __repr__(self) -> str:
@@ -273,9 +281,9 @@ class TrackingSession:
             return self._initialize(image, self._initial)
         if s.state == TrackingState.SEARCHING and self._guide is not None:
             return self._align(image, self._guide)
-        is_resting = s.frames_without_pose > o.eager_frames and s.frames_without_pose % o.search_every != 0
-        is_resting = is_resting and s.state == TrackingState.LOST
-        detections = self._detect_remembered(image) if is_resting else self._detect(image)
+        searches = self._plan(image)
+        is_resting = searches == []
+        detections = self._detect_remembered(image) if is_resting else self._detect(image, searches)
         if detections:
             start = detections[0].cam_from_model
             s.hypotheses = HypothesisSet([invert(start) @ other for other in detections[0].alternatives])
@@ -314,7 +322,43 @@ class TrackingSession:
         self.components.reset()
         return self.tracker.track(image)
 
-    def _detect(self, image: NDArray[np.uint8]) -> list[Detection]:
+    def _plan(self, image: NDArray[np.uint8]) -> list[int] | None:
+        """The searches of the detector in this frame; None: all until one gives a sure result, empty: none.
+
+        A lost part is not searched for soon after a search, nor where nothing has changed since. The thorough search
+        for it is spread over several frames and becomes ever rarer.
+        """
+        o, s = self.options, self._state
+        frame = s.frames_without_pose
+        if s.state == TrackingState.SEARCHING:
+            return None if frame % (2 * o.search_every) == 1 else [0]
+        if frame > o.eager_frames and frame - s.last_search_frame < o.search_every:
+            return []
+        picture = self._scene.reduced(image)
+        is_known = s.searched_picture is not None and not self._scene.has_changed(s.searched_picture, picture)
+        is_known = is_known and frame - s.last_search_frame < o.max_unchanged_frames
+        if not is_known:
+            # Compared with this picture from now on, so that slow changes add up.
+            s.searched_picture, s.parts_left = picture, o.thorough_parts
+        searches = [] if is_known and frame > o.eager_frames else [0]
+        if s.parts_left and (s.thorough_part or frame >= max(s.next_thorough_frame, 2 * o.search_every)):
+            searches += self._next_thorough_part()
+        if searches:
+            s.last_search_frame = frame
+        return searches
+
+    def _next_thorough_part(self) -> list[int]:
+        """The next part of the thorough search for a lost part; after the last one it is done for a while."""
+        o, s = self.options, self._state
+        part = np.array_split(self.detector.wider_searches, o.thorough_parts)[s.thorough_part]
+        s.thorough_part = (s.thorough_part + 1) % o.thorough_parts
+        s.parts_left -= 1
+        if s.thorough_part == 0:
+            s.thorough_interval = min(2 * max(s.thorough_interval, 2 * o.search_every), o.max_thorough_frames)
+            s.next_thorough_frame = s.frames_without_pose + s.thorough_interval
+        return [int(k) for k in part]
+
+    def _detect(self, image: NDArray[np.uint8], searches: list[int] | None) -> list[Detection]:
         """Detect the part in the whole picture, with the remembered appearance as a hint."""
         o, s = self.options, self._state
         guesses: list[Array] = []
@@ -322,18 +366,7 @@ class TrackingSession:
             if s.last_sure_pose is not None and s.frames_without_pose <= o.eager_frames:
                 guesses = self._remembered(image, s.last_sure_pose)
             guesses = guesses or self._remembered(image)
-        return self.detector.detect(image, max_results=1, is_thorough=self._is_thorough(), guesses=guesses)
-
-    def _is_thorough(self) -> bool:
-        """Whether this frame is searched thoroughly, which takes long; of a lost part ever more rarely."""
-        o, s = self.options, self._state
-        if s.state == TrackingState.SEARCHING:
-            return s.frames_without_pose % (2 * o.search_every) == 1
-        if s.frames_without_pose < max(s.next_thorough_frame, 2 * o.search_every):
-            return False
-        s.thorough_interval = min(2 * max(s.thorough_interval, o.search_every), o.max_thorough_frames)
-        s.next_thorough_frame = s.frames_without_pose + s.thorough_interval
-        return True
+        return self.detector.detect(image, max_results=1, guesses=guesses, searches=searches)
 
     def _detect_remembered(self, image: NDArray[np.uint8]) -> list[Detection]:
         """Detect the part only where the picture looks like the last sure view of it."""

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+import numpy as np
+from numpy.typing import NDArray
+
 from arview.geometry import Array
 from arview.pose import TrackingState
 from arview.tracking.disambiguation import HypothesisSet
@@ -54,8 +57,13 @@ class SessionState:
         poor_frames: frames in a row with hardly any support of the pose.
         critical_frames: frames in a row with weak support of the pose.
         frames_without_pose: frames since the last pose, or since the start.
-        next_thorough_frame, thorough_interval: number of frames without a pose from which the next search is thorough,
-            and the interval between the last two; 0: none since the loss.
+        next_thorough_frame, thorough_interval: number of frames without a pose from which the next searches are
+            thorough, and the interval between the last two of these; 0: none since the loss.
+        thorough_part: number of parts already made of a thorough search that is spread over several frames.
+        last_search_frame: number of frames without a pose at the last search.
+        searched_picture: reduced picture in which the part was searched, and since which nothing has changed; None:
+            none since the loss.
+        parts_left: parts of the thorough search that have not been made since then.
         is_confirmed: whether the present pose has been supported clearly in a frame since it was found.
         is_supported: whether the last frame supported the pose clearly, whatever the components say.
         was_tracked: whether the part has been tracked since the last reset.
@@ -72,6 +80,10 @@ class SessionState:
     frames_without_pose: int = 0
     next_thorough_frame: int = 0
     thorough_interval: int = 0
+    thorough_part: int = 0
+    last_search_frame: int = 0
+    searched_picture: NDArray[np.uint8] | None = None
+    parts_left: int = 0
     is_confirmed: bool = False
     is_supported: bool = False
     was_tracked: bool = False
@@ -112,7 +124,8 @@ class SessionState:
         """Give the pose up, for a reason in words."""
         self.hypotheses = HypothesisSet([])
         self.poor_frames = self.critical_frames = self.frames_without_pose = 0
-        self.next_thorough_frame = self.thorough_interval = 0
+        self.next_thorough_frame = self.thorough_interval = self.thorough_part = self.last_search_frame = 0
+        self.searched_picture, self.parts_left = None, 0
         self.is_confirmed = False
         self.reason = self.loss_reason = reason
         self.apply(Event.FAILED)
