@@ -20,6 +20,8 @@ _MIN_WIDEST = 14.0
 """Width to which labels may always extend, in letter heights, as far as the picture has room for two side by side."""
 _SEEN_PX = 12
 """Visible pixels below which a component that need not be shown gets no label."""
+_MAX_COVERED = 0.35
+"""Share of the picture that labels may cover; the least urgent ones are left out."""
 _EDGE_MARGIN = 1.1
 """Distance of an arrow's tail from the border of the picture, in letter heights; its tip is near the border."""
 _POINTER_LENGTH = 2.0
@@ -131,6 +133,7 @@ class Annotations:
         self._layout.set_bottom(bottom_px - self._margin_px)
         requests: list[LabelRequest] = []
         edges: dict[str, Pointer] = {}
+        covered_px = 0
         for one in components:
             name = one.text.name
             is_inside = self._is_inside(one.anchor_px, name in self._was_shown)
@@ -138,18 +141,23 @@ class Annotations:
                 edges[name] = self._edge_pointer(one)
             if not self._deserves_label(one, is_inside) or len(requests) >= self._max_labels:
                 continue
+            sprite = self._sprite(one.text).sprite
+            covered_px += sprite.width * sprite.height
+            if covered_px > _MAX_COVERED * self._camera.width * bottom_px:
+                continue
             anchor = np.array(edges[name].tail_px) if name in edges else self._clipped(one.anchor_px)
             self._texts[name] = one.text
-            sprite = self._sprite(one.text).sprite
             requests.append(LabelRequest(name, sprite.width, sprite.height, anchor, one.text.is_urgent))
         self._was_shown = {request.key for request in requests}
-        placed = self._layout.place(requests, part_px, cells)
+        asked = {request.key for request in requests}
+        unlabelled = [one.anchor_px for one in components if one.text.is_urgent and one.text.name not in asked]
+        placed = self._layout.place(requests, part_px, cells, unlabelled)
         # Labels that fade out are no longer asked for.
         drawn = [(self._sprite(self._texts[box.key]), box) for box in placed]
         labels = tuple(LaidOutLabel(sprite.text, sprite.lines, box) for sprite, box in drawn)
         shown = {label.box.key for label in labels}
         without = [one for one in components if one.text.is_urgent and one.text.name not in {*shown, *edges}]
-        return LaidOut(labels, (*edges.values(), *(self._pointer(one) for one in without)))
+        return LaidOut(labels, (*edges.values(), *(self._pointer(one, placed) for one in without)))
 
     def draw_leaders(self, canvas: paint.Image, laid_out: LaidOut, seen_px: Mapping[str, int]) -> None:
         """Draw leaders and arrows; ``seen_px`` are the visible pixels of each component."""
@@ -212,12 +220,38 @@ class Annotations:
         tip = tail + 0.9 * margin * along
         return Pointer(one.text.name, _xy(tail), _xy(tip), one.text.rgb, True)
 
-    def _pointer(self, one: LabelledComponent) -> Pointer:
-        """Arrow at a component in the picture that has no label."""
-        tip = self._clipped(one.anchor_px)
+    def _pointer(self, one: LabelledComponent, boxes: Sequence[PlacedLabel]) -> Pointer:
+        """Arrow at a component in the picture that has no label; it ends at the border of a label that covers it."""
+        anchor = self._clipped(one.anchor_px)
         length = _POINTER_LENGTH * self._size_px
-        tail = tip + np.array([0.0, -length if tip[1] > 1.5 * length else length])
-        return Pointer(one.text.name, _xy(tail), _xy(tip), one.text.rgb, False)
+        best: tuple[float, Array, Array] | None = None
+        for away in np.array([[0.0, -1.0], [0.0, 1.0], [-1.0, 0.0], [1.0, 0.0]]):
+            tip = anchor
+            for _ in boxes:
+                covering = [box for box in boxes if _is_within(tip, box)]
+                if not covering:
+                    break
+                tip = _border(tip, covering[0], away)
+            tail = tip + length * away
+            covered = sum(_is_within(tail, box) or _is_within(0.5 * (tip + tail), box) for box in boxes)
+            limit = np.array([self._camera.width, self._bottom])
+            outside = float(np.sum(np.maximum(-tail, 0.0)) + np.sum(np.maximum(tail - limit, 0.0)))
+            cost = 1e3 * covered + 10.0 * outside + float(np.linalg.norm(tip - anchor))
+            if best is None or cost < best[0]:
+                best = cost, tail, tip
+        assert best is not None
+        return Pointer(one.text.name, _xy(best[1]), _xy(best[2]), one.text.rgb, False)
+
+
+def _is_within(point: Array, box: PlacedLabel) -> bool:
+    return bool(box.x < point[0] < box.x + box.width and box.y < point[1] < box.y + box.height)
+
+
+def _border(point: Array, box: PlacedLabel, away: Array) -> Array:
+    """The point moved along one of the axes to the border of a box."""
+    if away[0] != 0.0:
+        return np.array([box.x + (box.width if away[0] > 0 else 0), point[1]])
+    return np.array([point[0], box.y + (box.height if away[1] > 0 else 0)])
 
 
 def _xy(point: Array) -> tuple[float, float]:

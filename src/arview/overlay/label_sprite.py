@@ -20,7 +20,9 @@ _MUTED: Rgb = (176, 186, 200)
 _DARK: Rgb = (14, 16, 20)
 _MIN_SIZE_PX = 7
 """Size of text below which it is not made smaller to fit."""
-_MIN_NAME = 5.0
+_DETAILS = 18.0
+"""Width allowed, in letter heights, below which a label leaves the details out: it would hide too much of the part."""
+_MIN_NAME = 10.0
 """Room for the name, in letter heights, below which it gets a row of its own."""
 _NARROW_NAME = 8.0
 """Width of a shortened name in a row of its own, in letter heights, unless other rows are wider."""
@@ -90,7 +92,8 @@ def _rows(text: LabelText, size: int, widest_px: int) -> list[list[_Item]]:
     verdict.append(_item(text.word, "word", size))
     name = _item(text.name, "name", size)
     beside = room - _row_width([name, *verdict], size) + name.width
-    notes = _wrapped([_item(note, "note", size) for note in text.notes], room, size)
+    below_verdict = (*text.notes, *(text.details if widest_px >= _DETAILS * size else ()))
+    notes = _wrapped([_item(note, "note", size) for note in below_verdict], room, size)
     if beside >= min(name.width, _MIN_NAME * size):
         return [[_item(paint.shortened(text.name, size, beside, True), "name", size), *verdict], *notes]
     below = [verdict] if _row_width(verdict, size) <= room else [[item] for item in verdict]

@@ -122,7 +122,8 @@ class LabelText:
         name: of the component; the only text that may be shortened.
         value: distance with its unit, or empty.
         word: verdict, or what the pictures say instead of it.
-        notes: texts below, none of which may be broken: details of the measurement, or doubts.
+        notes: doubts and remarks, in texts that are shown below.
+        details: of the measurement, in texts that must not be broken; shown where there is room and no note.
         verdict: measured verdict; None if there is none, or it does not hold any longer.
         evidence: how label and component are drawn.
         is_dimmed: the verdict was measured, but is not supported by what is seen now.
@@ -132,6 +133,7 @@ class LabelText:
     value: str
     word: str
     notes: tuple[str, ...] = ()
+    details: tuple[str, ...] = ()
     verdict: Verdict | None = None
     evidence: Evidence = Evidence.SEEN
     is_dimmed: bool = False
@@ -197,20 +199,21 @@ def label_text(
     """
     evidence = evidence_of(presence, is_withheld)
     if evidence is Evidence.WITHHELD:
-        return LabelText(name, "", "WITHHELD", (), None, evidence, True)
+        return LabelText(name, "", "WITHHELD", evidence=evidence, is_dimmed=True)
     was_missing = deviation is not None and deviation.finding is Finding.MISSING
     was_measured = deviation is not None and deviation.distance_mm is not None
     if evidence is Evidence.MISSING:
         notes = _with((), CHANGED if was_measured else "as measured" if was_missing else "")
-        return LabelText(name, "", "MISSING", _with(notes, note), None, evidence)
+        return LabelText(name, "", "MISSING", _with(notes, note), evidence=evidence)
     if evidence is Evidence.DISPLACED:
         assert presence is not None
         away, turned = displacement_texts(presence, center_in_model, options)
         is_new = was_missing or (was_measured and not _is_as_measured(deviation, presence, center_in_model))
-        return LabelText(name, away, "DISPLACED", _with(turned, CHANGED if is_new else "", note), None, evidence)
+        notes = _with(turned, CHANGED if is_new else "", note)
+        return LabelText(name, away, "DISPLACED", notes, evidence=evidence)
     if deviation is None:
         word = {Evidence.UNVERIFIED: "NOT VERIFIED", Evidence.UNCERTAIN: "UNCERTAIN"}.get(evidence, "SEEN")
-        return LabelText(name, "", word, _with((), note), None, evidence, evidence.is_open)
+        return LabelText(name, "", word, _with((), note), evidence=evidence, is_dimmed=evidence.is_open)
     value, word, verdict = value_text(deviation, options), VERDICT_WORD[deviation.verdict], deviation.verdict
     is_measured = verdict is not Verdict.NOT_MEASURED
     remark = ""
@@ -221,9 +224,8 @@ def label_text(
         remark = f"seen now: {CHANGED}"
     notes = _with((), remark, doubt, note)
     is_dimmed = bool(remark or doubt)
-    if not notes and verdict is not Verdict.PASS:
-        notes = detail_parts(deviation, options)
-    return LabelText(name, value, word, notes, verdict, evidence, is_dimmed)
+    details = () if notes or verdict is Verdict.PASS else detail_parts(deviation, options)
+    return LabelText(name, value, word, notes, details, verdict, evidence, is_dimmed)
 
 
 def displacement_texts(

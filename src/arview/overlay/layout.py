@@ -7,11 +7,12 @@ the same order, rows in between do not overlap either, so labels can glide witho
 column or order fades out and reappears at its new place.
 
 Where leaders cross each other or labels, places without crossings are searched (`arview.overlay.leaders`): at once in
-the first picture, later when the crossings last. Labels of components that need none give way if there are none.
+the first picture, later when the crossings last. A label for which there is no such place is left out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -57,7 +58,7 @@ class LabelRequest:
         key: identifies the label from frame to frame.
         width, height: of its box, px.
         anchor_px: (2,) image point of its component.
-        is_required: the label stays even where its leader crosses others.
+        is_required: others give way to the label.
     """
 
     key: str
@@ -134,7 +135,11 @@ class LabelLayout:
         self._crossed_frames, self._wait_frames = 0, _CROSSED_FRAMES
 
     def place(
-        self, requests: list[LabelRequest], part_px: tuple[float, float], cells: NDArray[np.float32]
+        self,
+        requests: list[LabelRequest],
+        part_px: tuple[float, float],
+        cells: NDArray[np.float32],
+        others_px: Sequence[Array] = (),
     ) -> list[PlacedLabel]:
         """Boxes for one frame.
 
@@ -142,6 +147,7 @@ class LabelLayout:
             requests: labels wanted, the most urgent first.
             part_px: first and last column of the image that the part covers.
             cells: weighted covered area, px², of each cell of CELL_PX × CELL_PX of the image.
+            others_px: (2,) image points, each, of components without a label that should not be covered either.
 
         Returns:
             Labels to draw, in any order; those for which there is no room are left out.
@@ -152,7 +158,7 @@ class LabelLayout:
             self._plan.clear()
         self._move_edges(part_px)
         self._update_slots(requests)
-        integral = self._integral(requests, cells)
+        integral = self._integral([*(request.anchor_px for request in requests), *others_px], cells)
         goals = [self._goals(column, integral) for column in (self._left, self._right)]
         if not is_first and self._crosses_more(goals):
             goals = [np.array([slot.y for slot in column]) for column in (self._left, self._right)]
@@ -163,11 +169,13 @@ class LabelLayout:
             self._fade(column)
         return [self._box(slot) for slot in (*self._left, *self._right) if slot.opacity > 0]
 
-    def _integral(self, requests: list[LabelRequest], cells: NDArray[np.float32]) -> Array:
+    def _integral(self, anchors: list[Array], cells: NDArray[np.float32]) -> Array:
         """Integral image of the area that labels should not cover: components, and the anchors of all labels."""
         covered = cells.astype(np.float64)
-        for request in requests:
-            column, row = (int(value // CELL_PX) for value in request.anchor_px)
+        for anchor in anchors:
+            if not np.isfinite(anchor).all():
+                continue
+            column, row = (int(value // CELL_PX) for value in anchor)
             if 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]:
                 covered[row, column] += _ANCHOR_AREA * (4.0 * self._gap) ** 2
         integral = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=np.float64)
@@ -305,7 +313,7 @@ class LabelLayout:
                 continue
             above = all(self._is_above(other, slot) for other in column[:place] if other.opacity > 0)
             below = all(self._is_above(slot, other) for other in column[place + 1 :] if other.opacity > 0)
-            if above and below and (is_first or slot.request.is_required or not self._would_cross(slot)):
+            if above and below and (is_first or not self._would_cross(slot)):
                 slot.opacity = 1.0 if is_first else 1.0 / _FADE_FRAMES
 
     def _places(self, slots: list[_Slot], tops: Array) -> LabelPlaces:
@@ -342,10 +350,15 @@ class LabelLayout:
         return bool(crossings[-1].any() or crossings[:, -1].any())
 
     def _uncross(self, integral: Array, is_first: bool) -> None:
-        """Remove crossings: at once in the first picture, later if they last."""
-        slots = [slot for slot in (*self._left, *self._right) if slot.opacity > 0 and not slot.is_leaving]
+        """Remove crossings: at once in the first picture, later if they last or keep a required label away."""
+        slots = [
+            slot
+            for slot in (*self._left, *self._right)
+            if not slot.is_leaving and (slot.opacity > 0 or slot.request.is_required)
+        ]
         places = self._places(slots, np.array([slot.y for slot in slots]))
-        if not slots or not count_crossings(places, self._stub).any():
+        is_waiting = any(slot.opacity == 0 for slot in slots)
+        if not slots or not (is_waiting or count_crossings(places, self._stub).any()):
             self._crossed_frames, self._wait_frames = 0, _CROSSED_FRAMES
             return
         self._crossed_frames += 1
@@ -371,7 +384,7 @@ class LabelLayout:
                 slot.is_leaving = True
 
     def _searched(self, slots: list[_Slot], places: LabelPlaces, integral: Array) -> tuple[list[_Slot], LabelPlaces]:
-        """Labels that stay, and their places; labels that need not be shown give way to crossings."""
+        """Labels that stay, and their places, without crossings: those that cannot be placed so are left out."""
         step = max(_ROW_PX, (self._bottom - self._top) // _SEARCH_ROWS)
         rows = np.append(np.arange(self._top, self._bottom, step, dtype=np.float64), float(self._bottom))
         kept = list(slots)
@@ -379,10 +392,10 @@ class LabelLayout:
             found = uncrossed(places, rows, self._gap, self._stub, integral, self._width)
             crossings = count_crossings(found, self._stub)
             crossed = crossings.sum(axis=0) + crossings.sum(axis=1)
-            free = [i for i, slot in enumerate(kept) if crossed[i] and not slot.request.is_required]
-            if not free:
+            if not crossed.any():
                 return kept, found
-            worst = max(free, key=lambda i: (crossed[i], kept[i].urgency))
+            crossing = np.flatnonzero(crossed)
+            worst = max(crossing, key=lambda i: (not kept[i].request.is_required, crossed[i], kept[i].urgency))
             del kept[worst]
             places = self._places(kept, np.delete(found.y, worst))
             places = replace(places, sides=np.delete(found.sides, worst))

@@ -62,7 +62,10 @@ def leader_points(
 
 
 def count_crossings(places: LabelPlaces, stub_px: float) -> NDArray[np.int64]:
-    """(N,N) number of crossings of the leader of one label (row) with leader or box of another (column)."""
+    """(N,N) number of crossings of the leader of one label (row) with leader or box of another (column).
+
+    Boxes that overlap count as a crossing, too.
+    """
     return _crossings(places.x, places.sizes, places.anchors, places.sides, places.y, stub_px)
 
 
@@ -176,6 +179,13 @@ def _crossings(
                 xi, y[i], wi, hi, sides[i], anchors[i, 0], anchors[i, 1],
                 x[j, sides[j]], y[j], sizes[j, 0], sizes[j, 1], sides[j], anchors[j, 0], anchors[j, 1], stub,
             )  # fmt: skip
+            if (
+                xi < x[j, sides[j]] + sizes[j, 0]
+                and x[j, sides[j]] < xi + wi
+                and y[i] < y[j] + sizes[j, 1]
+                and y[j] < y[i] + hi
+            ):
+                leaders += 1
             result[i, j] = leaders + i_in_j
             result[j, i] = leaders + j_in_i
     return result
