@@ -76,14 +76,12 @@ class LabelledComponent:
     """A component that may get a label.
 
     Attributes:
-        index: of the component in the model.
         text: texts of its label.
         anchor_px: (2,) its point in the image; NaN if it is not in front of the camera.
         anchor_in_cam: (3,) mm, the same point.
         seen_px: its visible pixels.
     """
 
-    index: int
     text: LabelText
     anchor_px: Array
     anchor_in_cam: Array
@@ -106,13 +104,13 @@ class Annotations:
         self._margin_px = margin_px
         self._layout = LabelLayout(camera.width, margin_px, bottom_px - margin_px, margin_px, gap_px, self._widest_px)
         self._was_shown: set[str] = set()
-        self._texts: dict[str, LabelText] = {}
+        self._shown: dict[str, tuple[LabelText, LabelSprite]] = {}
 
     def reset(self) -> None:
         """Forget where labels were."""
         self._layout.reset()
         self._was_shown.clear()
-        self._texts.clear()
+        self._shown.clear()
 
     def lay_out(
         self,
@@ -136,24 +134,25 @@ class Annotations:
         covered_px = 0
         for one in components:
             name = one.text.name
+            if len(requests) >= self._max_labels and not one.text.is_urgent:
+                continue
             is_inside = self._is_inside(one.anchor_px, name in self._was_shown)
             if not is_inside and one.text.is_urgent:
                 edges[name] = self._edge_pointer(one)
             if not self._deserves_label(one, is_inside) or len(requests) >= self._max_labels:
                 continue
-            sprite = self._sprite(one.text).sprite
+            sprite = self._kept_sprite(one.text).sprite
             covered_px += sprite.width * sprite.height
             if covered_px > _MAX_COVERED * self._camera.width * bottom_px:
                 continue
             anchor = np.array(edges[name].tail_px) if name in edges else self._clipped(one.anchor_px)
-            self._texts[name] = one.text
             requests.append(LabelRequest(name, sprite.width, sprite.height, anchor, one.text.is_urgent))
         self._was_shown = {request.key for request in requests}
         asked = {request.key for request in requests}
         unlabelled = [one.anchor_px for one in components if one.text.is_urgent and one.text.name not in asked]
         placed = self._layout.place(requests, part_px, cells, unlabelled)
         # Labels that fade out are no longer asked for.
-        drawn = [(self._sprite(self._texts[box.key]), box) for box in placed]
+        drawn = [(self._shown[box.key][1], box) for box in placed]
         labels = tuple(LaidOutLabel(sprite.text, sprite.lines, box) for sprite, box in drawn)
         shown = {label.box.key for label in labels}
         without = [one for one in components if one.text.is_urgent and one.text.name not in {*shown, *edges}]
@@ -178,8 +177,15 @@ class Annotations:
     def draw_labels(self, canvas: paint.Image, laid_out: LaidOut) -> None:
         """Draw the boxes of the labels."""
         for label in laid_out.labels:
-            sprite = self._sprite(label.text).sprite
+            sprite = self._shown[label.box.key][1].sprite
             paint.put_sprite(canvas, sprite, label.box.x, label.box.y, label.box.opacity)
+
+    def _kept_sprite(self, text: LabelText) -> LabelSprite:
+        """Sprite of a label, looked up only when its text has changed."""
+        kept = self._shown.get(text.name)
+        if kept is None or (kept[0] is not text and kept[0] != text):
+            kept = self._shown[text.name] = text, self._sprite(text)
+        return kept[1]
 
     def _sprite(self, text: LabelText) -> LabelSprite:
         if text not in self._sprites:
@@ -200,7 +206,8 @@ class Annotations:
         return is_inside and one.seen_px >= (_SEEN_PX // 3 if one.text.name in self._was_shown else _SEEN_PX)
 
     def _clipped(self, anchor_px: Array) -> Array:
-        return np.clip(anchor_px, 0, [self._camera.width - 1, self._bottom - 1])
+        u, v = anchor_px
+        return np.array([min(max(u, 0.0), self._camera.width - 1.0), min(max(v, 0.0), self._bottom - 1.0)])
 
     def _edge_pointer(self, one: LabelledComponent) -> Pointer:
         """Arrow at the border towards a component off the picture."""

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 
 import numpy as np
 
@@ -138,7 +139,7 @@ class LabelText:
     evidence: Evidence = Evidence.SEEN
     is_dimmed: bool = False
 
-    @property
+    @cached_property
     def rgb(self) -> Rgb:
         """Colour of label and leader."""
         if self.evidence is Evidence.MISSING:
@@ -148,7 +149,7 @@ class LabelText:
         color = NEUTRAL_RGB if self.verdict is None else VERDICT_RGB[self.verdict]
         return dimmed(color) if self.is_dimmed else color
 
-    @property
+    @cached_property
     def is_urgent(self) -> bool:
         """Whether the component must be shown by its label or an arrow: failed, undecided, missing or displaced."""
         return self.evidence.is_refuted or self.verdict in (Verdict.FAIL, Verdict.UNDECIDED)

@@ -158,7 +158,8 @@ class LabelLayout:
             self._plan.clear()
         self._move_edges(part_px)
         self._update_slots(requests)
-        integral = self._integral([*(request.anchor_px for request in requests), *others_px], cells)
+        anchors = np.array([*(request.anchor_px for request in requests), *others_px], dtype=np.float64).reshape(-1, 2)
+        integral = _integral(cells, anchors, _ANCHOR_AREA * (4.0 * self._gap) ** 2)
         goals = [self._goals(column, integral) for column in (self._left, self._right)]
         if not is_first and self._crosses_more(goals):
             goals = [np.array([slot.y for slot in column]) for column in (self._left, self._right)]
@@ -168,19 +169,6 @@ class LabelLayout:
         for column in (self._left, self._right):
             self._fade(column)
         return [self._box(slot) for slot in (*self._left, *self._right) if slot.opacity > 0]
-
-    def _integral(self, anchors: list[Array], cells: NDArray[np.float32]) -> Array:
-        """Integral image of the area that labels should not cover: components, and the anchors of all labels."""
-        covered = cells.astype(np.float64)
-        for anchor in anchors:
-            if not np.isfinite(anchor).all():
-                continue
-            column, row = (int(value // CELL_PX) for value in anchor)
-            if 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]:
-                covered[row, column] += _ANCHOR_AREA * (4.0 * self._gap) ** 2
-        integral = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=np.float64)
-        np.cumsum(np.cumsum(covered, axis=0), axis=1, out=integral[1:, 1:])
-        return integral
 
     def _move_edges(self, part_px: tuple[float, float]) -> None:
         """Move the inner edges of both columns towards the part's sides."""
@@ -317,7 +305,10 @@ class LabelLayout:
                 slot.opacity = 1.0 if is_first else 1.0 / _FADE_FRAMES
 
     def _places(self, slots: list[_Slot], tops: Array) -> LabelPlaces:
-        x = [[self._x(slot.request, on_left) for on_left in (True, False)] for slot in slots]
+        assert self._edges is not None
+        left, right = self._edges
+        low, high = float(self._margin), float(self._width - self._margin)
+        x = [[max(low, left - one.request.width), min(high - one.request.width, right)] for one in slots]
         return LabelPlaces(
             np.array(x, dtype=np.float64).reshape(-1, 2),
             np.array([[slot.request.width, slot.request.height] for slot in slots], dtype=np.float64).reshape(-1, 2),
@@ -335,7 +326,7 @@ class LabelLayout:
             for slot, goal in zip(column, tops, strict=True)
             if slot.opacity > 0 and not slot.is_leaving
         ]
-        if len(pairs) < 2:
+        if len(pairs) < 2 or all(abs(goal - slot.y) <= _ROW_PX for slot, goal in pairs):
             return False
         slots = [slot for slot, _ in pairs]
         then = self._places(slots, np.array([goal for _, goal in pairs]))
@@ -428,6 +419,23 @@ class LabelLayout:
                     column.remove(slot)
             elif slot.opacity > 0:
                 slot.opacity = min(1.0, slot.opacity + 1.0 / _FADE_FRAMES)
+
+
+@kernel
+def _integral(cells: NDArray[np.float32], anchors: NDArray[np.float64], area: float) -> NDArray[np.float64]:
+    """Integral image of the area that labels should not cover: components, and some more at each anchor (K,2)."""
+    rows, columns = cells.shape
+    result = np.zeros((rows + 1, columns + 1))
+    for i in range(len(anchors)):
+        u, v = anchors[i] / CELL_PX
+        if 0.0 <= u < columns and 0.0 <= v < rows:
+            result[int(v) + 1, int(u) + 1] += area
+    for row in range(rows):
+        total = 0.0
+        for column in range(columns):
+            total += cells[row, column] + result[row + 1, column + 1]
+            result[row + 1, column + 1] = result[row, column + 1] + total
+    return result
 
 
 @kernel

@@ -53,6 +53,7 @@ class _Scene:
         styles: their appearance.
         order: components that may get a label, the most urgent first.
         arrows: (A,2,3) mm, tail and tip in the model frame.
+        texts: of the labels, by component and note; those of displaced components change from frame to frame.
     """
 
     key: tuple[tuple[Evidence, ...], str]
@@ -60,6 +61,7 @@ class _Scene:
     styles: ComponentStyles
     order: tuple[int, ...]
     arrows: Array
+    texts: dict[tuple[int, str], labels.LabelText]
 
 
 class OverlayRenderer:
@@ -193,7 +195,7 @@ class OverlayRenderer:
             wanted = labels.text_urgency(self._names, self.inspection, by_name)
             order = tuple(index[name] for name in wanted) if self.options.show_labels and not is_withheld else ()
             arrows = self._arrows_in_model(list(evidence)) if self.options.show_arrows else np.zeros((0, 2, 3))
-            self._scene = _Scene(key, evidence, styles, order, arrows)
+            self._scene = _Scene(key, evidence, styles, order, arrows, {})
         return self._scene
 
     def _draw_model(
@@ -269,25 +271,38 @@ class OverlayRenderer:
         notes = self._open_notes(pose)
         result = []
         for index in scene.order:
+            note = notes.get(index) or (labels.OCCLUDED if self._is_occluded[index] else "")
+            text = self._text(index, presences[index], scene, note)
+            result.append(LabelledComponent(text, anchors_px[index], anchors_in_cam[index], int(seen_px[index])))
+        return result, cells
+
+    def _text(self, index: int, presence: ComponentPresence | None, scene: _Scene, note: str) -> labels.LabelText:
+        """Texts of a component's label."""
+        text = scene.texts.get((index, note))
+        if text is None or scene.evidence[index] is Evidence.DISPLACED:
             text = labels.label_text(
                 self._names[index],
                 self._deviations[index],
-                presences[index],
+                presence,
                 self.options,
                 center_in_model=self._centers_in_model[index],
                 doubt=scene.key[1],
-                note=notes.get(index) or (labels.OCCLUDED if self._is_occluded[index] else ""),
+                note=note,
             )
-            result.append(LabelledComponent(index, text, anchors_px[index], anchors_in_cam[index], int(seen_px[index])))
-        return result, cells
+            scene.texts[index, note] = text
+        return text
 
     def _count_occluded(self, presences: list[ComponentPresence | None], seen_px: NDArray[np.int64]) -> None:
         """Tell, after some frames and for some frames, which components something before the part hides."""
         hidden = [
-            presence is not None and presence.observations > 0 and presence.visibility is Visibility.HIDDEN
-            for presence in presences
+            index
+            for index, presence in enumerate(presences)
+            if presence is not None and presence.observations > 0 and presence.visibility is Visibility.HIDDEN
         ]
-        step = np.where(np.array(hidden) & (seen_px >= _OCCLUDED_PX), 1, -1)
+        if not hidden and not self._hidden_frames.any():
+            return
+        step = np.full(len(presences), -1)
+        step[hidden] = np.where(seen_px[hidden] >= _OCCLUDED_PX, 1, -1)
         self._hidden_frames = np.clip(self._hidden_frames + step, 0, _OCCLUDED_FRAMES)
         self._is_occluded |= self._hidden_frames == _OCCLUDED_FRAMES
         self._is_occluded &= self._hidden_frames > 0
