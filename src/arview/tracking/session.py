@@ -19,6 +19,7 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.detection.detector import Detection, Detector, DetectorOptions, RejectedHypothesis, local_search_for
+from arview.detection.search.local_search import LocalSearch
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, check_rigid, invert
 from arview.guideviews import GuideViewSet
@@ -31,6 +32,7 @@ from arview.tracking.guided_init import GuidedInit
 from arview.tracking.pose_recheck import LocalSearchRecheck
 from arview.tracking.scene_change import SceneChange, SceneChangeOptions
 from arview.tracking.session_state import Event, SessionState
+from arview.tracking.specimens import hide_specimens, is_same_specimen
 from arview.tracking.tracker import Tracker
 from arview.tracking.tracker_options import TrackerOptions
 
@@ -110,6 +112,11 @@ class TrackingSession:
         initial_cam_from_model: (4,4) mm, rough pose in the first frame, which is refined instead of a search.
         guide_cam_from_model: (4,4) mm, guide pose. The part is first found when it is brought near this pose, not by
             a search, and by both after it has been lost for a while.
+        like: another session of the same guide views, camera and options, whose detector is shared.
+
+    Attributes:
+        views: guide views of the model.
+        elsewhere: poses (4,4) of other specimens of the part, which are not taken for this one.
 
     Raises:
         MismatchError: the guide views belong to another model.
@@ -125,6 +132,7 @@ class TrackingSession:
         *,
         initial_cam_from_model: Array | None = None,
         guide_cam_from_model: Array | None = None,
+        like: TrackingSession | None = None,
     ) -> None:
         check_type(views, GuideViewSet, "TrackingSession: views")
         check_type(camera, Camera, "TrackingSession: camera")
@@ -136,8 +144,9 @@ class TrackingSession:
                 f"{model.name!r} ({model.source_hash[:12]})"
             )
         self.camera = camera
-        self._views = views
-        self._local = local_search_for(views, camera, o.detector)
+        self.views = views
+        self.elsewhere: tuple[Array, ...] = ()
+        self._local: LocalSearch = local_search_for(views, camera, o.detector) if like is None else like._local
         self.tracker = Tracker(
             views,
             camera,
@@ -146,7 +155,7 @@ class TrackingSession:
             recheck=LocalSearchRecheck(self._local) if o.use_recheck else None,
             part=self._local.refiner.part,
         )
-        self._detector: Detector | None = None
+        self._detector: Detector | None = None if like is None else like.detector
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
         self._guided_init: GuidedInit | None = None
@@ -156,7 +165,7 @@ class TrackingSession:
         self._state = SessionState()
 
     def __repr__(self) -> str:
-        return f"<TrackingSession {self._views.model_name}: {self.state}, {len(self._views)} views, {self.camera!r}>"
+        return f"<TrackingSession {self.views.model_name}: {self.state}, {len(self.views)} views, {self.camera!r}>"
 
     @property
     def state(self) -> TrackingState:
@@ -164,17 +173,27 @@ class TrackingSession:
         return self._state.state
 
     @property
+    def has_pose(self) -> bool:
+        """Whether the part was found and is followed."""
+        return self._state.has_pose
+
+    @property
+    def reason(self) -> str:
+        """Why the last search found nothing, or why the part was lost."""
+        return self._state.reason
+
+    @property
     def detector(self) -> Detector:
         """The detector, created when first needed."""
         if self._detector is None:
-            self._detector = Detector(self._views, self.camera, self.options.detector, local=self._local)
+            self._detector = Detector(self.views, self.camera, self.options.detector, local=self._local)
         return self._detector
 
     @property
     def guided_init(self) -> GuidedInit:
         """The search around a given pose, created when first needed."""
         if self._guided_init is None:
-            self._guided_init = GuidedInit(self._views, self.camera)
+            self._guided_init = GuidedInit(self.views, self.camera)
         return self._guided_init
 
     @property
@@ -187,6 +206,11 @@ class TrackingSession:
     def reset(self) -> None:
         """Forget the part's pose and search again. The remembered appearance is kept."""
         self._state = SessionState()
+
+    def give_up(self, reason: str) -> None:
+        """Give the pose up, for a reason in words, and search again."""
+        if self.has_pose:
+            self._give_up(reason)
 
     def process(self, image: NDArray[np.uint8], index: int, time_s: float) -> Pose:
         """Pose and state of the next frame.
@@ -243,7 +267,7 @@ class TrackingSession:
         s.poor_frames = s.poor_frames + 1 if is_poor else 0
         if s.poor_frames >= o.lost_frames or (is_poor and not s.is_confirmed):
             recent = (s.recent_poses[0], s.recent_poses[1]) if len(s.recent_poses) == 2 else None
-            return self._give_up(diagnose_loss(image, estimate, recent, self.camera, self._views, is_possible))
+            return self._give_up(diagnose_loss(image, estimate, recent, self.camera, self.views, is_possible))
         if not is_poor:
             s.recent_poses = (*s.recent_poses[-1:], estimate.cam_from_model)
             is_supported = estimate.quality >= (o.critical_quality if s.is_supported else o.tracked_quality)
@@ -266,8 +290,8 @@ class TrackingSession:
 
     def _is_possible(self, estimate: Estimate) -> bool:
         """Whether the part is in front of the camera and not much nearer or farther than declared."""
-        center = apply(estimate.cam_from_model, self._views.center_in_model)
-        low, high = self._views.view_range.distance_mm
+        center = apply(estimate.cam_from_model, self.views.center_in_model)
+        low, high = self.views.view_range.distance_mm
         margin = self.options.distance_margin
         return bool(center[2] > 0 and low / margin < np.linalg.norm(center) < margin * high)
 
@@ -283,7 +307,9 @@ class TrackingSession:
             return self._align(image, self._guide)
         searches = self._plan(image)
         is_resting = searches == []
-        detections = self._detect_remembered(image) if is_resting else self._detect(image, searches)
+        searched = hide_specimens(image, self.elsewhere, self.views, self.camera)
+        detections = self._detect_remembered(searched) if is_resting else self._detect(searched, searches)
+        detections = [one for one in detections if not self._is_elsewhere(one.cam_from_model)]
         if detections:
             start = detections[0].cam_from_model
             s.hypotheses = HypothesisSet([invert(start) @ other for other in detections[0].alternatives])
@@ -293,6 +319,10 @@ class TrackingSession:
         if self._guide is not None and self.is_aligning:
             return self._align(image, self._guide)
         return None, s.reason
+
+    def _is_elsewhere(self, cam_from_model: Array) -> bool:
+        """Whether a pose (4,4) is that of another specimen."""
+        return any(is_same_specimen(cam_from_model, other, self.views) for other in self.elsewhere)
 
     def _initialize(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[Estimate | None, str]:
         """Find the part near the initial pose, which is used only once."""
@@ -399,7 +429,7 @@ class TrackingSession:
     def _diagnose(self, image: NDArray[np.uint8], rejected: RejectedHypothesis | None) -> str:
         """Why a search found nothing; of a lost part the loss says more than that nothing is in view."""
         s = self._state
-        reason = diagnose_search(image, self.camera, self._views, rejected)
+        reason = diagnose_search(image, self.camera, self.views, rejected)
         is_lost = s.state == TrackingState.LOST
         s.reason = s.loss_reason if is_lost and reason.startswith(NOTHING_IN_VIEW) else reason
         if is_lost and self.is_aligning:
