@@ -54,15 +54,14 @@ def moving(count: int) -> list[NDArray[np.uint8]]:
 
 def test_a_picture_in_which_nothing_changes_is_searched_completely_once_a_second() -> None:
     made = searches_of(still(70))
-    assert made == {1: [0], 2: [0], 6: [1], 9: [2], 12: [3], 42: [0, 1], 45: [2], 48: [3]}
+    assert made == {1: [0], 2: [0], 6: [1], 9: [2], 12: [3], 42: [1], 45: [2], 48: [3]}
 
 
-def test_a_picture_that_changes_is_searched_every_third_frame_and_thoroughly_ever_less_often() -> None:
+def test_a_picture_that_changes_is_searched_every_third_frame_and_now_and_then_thoroughly() -> None:
     made = searches_of(moving(60))
     assert list(made) == [1, 2, *range(5, 61, 3)]
-    thorough = {frame: searches[1:] for frame, searches in made.items() if len(searches) > 1}
-    assert thorough == {8: [1], 11: [2], 14: [3], 26: [1], 29: [2], 32: [3], 56: [1], 59: [2]}
-    assert all(searches[0] == 0 for searches in made.values())
+    thorough = {frame: searches for frame, searches in made.items() if searches != [0]}
+    assert thorough == {8: [1], 11: [2], 14: [3], 38: [1], 41: [2], 44: [3]}
 
 
 @pytest.mark.parametrize("changed_frame", [20, 21, 22])

@@ -59,7 +59,7 @@ class SessionOptions:
         critical_frames: critical frames in a row after which the part is lost.
         eager_frames: frames after a loss in each of which the part is searched for.
         search_every: later the part is searched for only so many frames after the last search.
-        max_thorough_frames: frames between two thorough searches for a part that has been lost for long.
+        thorough_every: frames from the end of one thorough search for a lost part to the next.
         thorough_parts: number of searches over which a thorough one is spread, so that no frame takes long.
         max_unchanged_frames: frames after which a picture in which nothing has changed is searched again.
         scene_change: what counts as a change of the picture.
@@ -85,7 +85,7 @@ class SessionOptions:
     critical_frames: int = 45
     eager_frames: int = 2
     search_every: int = 3
-    max_thorough_frames: int = 30
+    thorough_every: int = 24
     thorough_parts: int = 3
     max_unchanged_frames: int = 30
     scene_change: SceneChangeOptions = field(default_factory=SceneChangeOptions)
@@ -356,7 +356,7 @@ class TrackingSession:
         """The searches of the detector in this frame; None: all until one gives a sure result, empty: none.
 
         A lost part is not searched for soon after a search, nor where nothing has changed since. The thorough search
-        for it is spread over several frames and becomes ever rarer.
+        for it is spread over several frames.
         """
         o, s = self.options, self._state
         frame = s.frames_without_pose
@@ -372,7 +372,8 @@ class TrackingSession:
             s.searched_picture, s.parts_left = picture, o.thorough_parts
         searches = [] if is_known and frame > o.eager_frames else [0]
         if s.parts_left and (s.thorough_part or frame >= max(s.next_thorough_frame, 2 * o.search_every)):
-            searches += self._next_thorough_part()
+            # A wider search finds what the quick one would find.
+            searches = self._next_thorough_part() or searches
         if searches:
             s.last_search_frame = frame
         return searches
@@ -384,8 +385,7 @@ class TrackingSession:
         s.thorough_part = (s.thorough_part + 1) % o.thorough_parts
         s.parts_left -= 1
         if s.thorough_part == 0:
-            s.thorough_interval = min(2 * max(s.thorough_interval, 2 * o.search_every), o.max_thorough_frames)
-            s.next_thorough_frame = s.frames_without_pose + s.thorough_interval
+            s.next_thorough_frame = s.frames_without_pose + o.thorough_every
         return [int(k) for k in part]
 
     def _detect(self, image: NDArray[np.uint8], searches: list[int] | None) -> list[Detection]:

@@ -57,8 +57,7 @@ class SessionState:
         poor_frames: frames in a row with hardly any support of the pose.
         critical_frames: frames in a row with weak support of the pose.
         frames_without_pose: frames since the last pose, or since the start.
-        next_thorough_frame, thorough_interval: number of frames without a pose from which the next searches are
-            thorough, and the interval between the last two of these; 0: none since the loss.
+        next_thorough_frame: number of frames without a pose from which the next searches are thorough; 0 after a loss.
         thorough_part: number of parts already made of a thorough search that is spread over several frames.
         last_search_frame: number of frames without a pose at the last search.
         searched_picture: reduced picture in which the part was searched, and since which nothing has changed; None:
@@ -79,7 +78,6 @@ class SessionState:
     critical_frames: int = 0
     frames_without_pose: int = 0
     next_thorough_frame: int = 0
-    thorough_interval: int = 0
     thorough_part: int = 0
     last_search_frame: int = 0
     searched_picture: NDArray[np.uint8] | None = None
@@ -124,7 +122,7 @@ class SessionState:
         """Give the pose up, for a reason in words."""
         self.hypotheses = HypothesisSet([])
         self.poor_frames = self.critical_frames = self.frames_without_pose = 0
-        self.next_thorough_frame = self.thorough_interval = self.thorough_part = self.last_search_frame = 0
+        self.next_thorough_frame = self.thorough_part = self.last_search_frame = 0
         self.searched_picture, self.parts_left = None, 0
         self.is_confirmed = False
         self.reason = self.loss_reason = reason
