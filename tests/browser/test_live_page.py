@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ import pytest
 from PIL import Image as PilImage
 
 from arview.live.stream.stamp import Stamp, stamp_strip
+from arview.live.stream.subject import Subject
 from arview.overlay.guide import GUIDE_RGB
+from arview.pose import ComponentPresence, Identity, Pose, Presence, Visibility
 from arview.video import VideoSink
 from helpers import live_browser
 from helpers.live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
@@ -202,6 +205,55 @@ def test_station_camera(chromium: Any, inspection: Path, tmp_path: Path) -> None
         page.keyboard.press("g")
         page.wait_for_timeout(500)
         assert nearest_frame(difference_mask(ghosted, screenshot(page), 5), number) == number
+
+
+class Told:
+    """A session whose poses say something of the components."""
+
+    def __init__(self, session: Any, names: list[str], told: dict[str, Any]) -> None:
+        self._session, self._names, self._told = session, names, told
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._session, name)
+
+    def process(self, image: Any, index: int, time_s: float) -> Pose:
+        pose = self._session.process(image, index, time_s)
+        present = ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0)
+        components = {**dict.fromkeys(self._names, present), **self._told.get("components", {})}
+        return replace(pose, components=components if pose.cam_from_model is not None else {}, **self._told["more"])
+
+
+def test_labels_and_parts_say_what_is_seen(chromium: Any, inspection: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved = np.eye(4)
+    moved[1, 3] = 35.0
+    absent = ComponentPresence(Presence.MISSING, Visibility.VISIBLE, 0.01, 9, 40.0)
+    displaced = ComponentPresence(Presence.DISPLACED, Visibility.VISIBLE, 0.01, 9, 40.0, moved)
+    kinds = {"post_1": absent, "boss_1": ComponentPresence(), "bracket_1": displaced}
+    told: dict[str, Any] = {"components": kinds, "more": {}}
+    start = Subject.session
+    names = lambda subject: [one.name for one in subject.part.model.components]  # noqa: E731
+    monkeypatch.setattr(Subject, "session", lambda self, camera: Told(start(self, camera), names(self), told))
+    chosen = options(inspection=inspection, clients=1)
+    shown = "[...document.querySelectorAll('#labels .label:not(.off)')]"
+    with running(chosen, loader(chosen)) as server, opened(chromium, server, WATCH) as page:
+        until(page, f"{shown}.some((one) => one.textContent.includes('MISSING'))")
+        until(page, f"{shown}.some((one) => one.textContent.includes('DISPLACED'))")
+        texts = page.evaluate(f"{shown}.map((one) => [one.textContent, one.classList.contains('dimmed')])")
+        by_name = {name: text for text in texts for name in kinds if name in text[0]}
+        assert "changed since measured" in by_name["post_1"][0] and "mm" not in by_name["post_1"][0]
+        assert "≈ 35 mm away" in by_name["bracket_1"][0] and "PASS" not in by_name["bracket_1"][0]
+        rows = {row.get_attribute("data-name"): row.text_content() for row in page.locator("#components button").all()}
+        assert "MISSING" in rows["post_1"] and "FAIL" not in rows["post_1"]
+        assert "PASS, measured, not verified here" in rows["boss_1"]
+        assert page.inner_text("#labels .legend").count("\n") >= 2
+        assert "INCOMPLETE: 1 missing, 1 displaced" in page.locator("#tally").text_content()
+
+        told["more"] = {"identity": Identity.UNCONFIRMED, "identity_reason": "two plates are in view"}
+        until(page, "!document.querySelector('#labels .banner').hidden")
+        assert page.evaluate(f"{shown}.length") == 0
+        assert "two plates are in view" in page.inner_text("#labels .banner")
+        assert "PASS" not in page.locator("#parts").text_content()
+        assert " mm" not in page.locator("#components").text_content()
 
 
 def test_labels_and_parts_say_what_was_measured(chromium: Any, server: Running) -> None:

@@ -82,6 +82,13 @@ Pose::
      "state": "searching" | "tracked" | "critical" | "lost", "quality": 0 to 1, "reason": text,
      "remark": the reason, or of a tracked part what has not been seen yet,
      "mismatches": [words], "unverified": [components not seen yet], "ambiguous": how many other poses fit as well,
+     "completeness": "COMPLETE", "INCOMPLETE: 1 missing", "NOT YET CHECKED" or empty,
+     "withheld": {"title", "text"} | null,     of another specimen: nothing that was measured is shown
+     "legend": [{"kind": evidence, "text"}],   kinds of evidence that need an explanation
+     "labels": [{"index": of the component, "evidence": "seen" | "unverified" | "uncertain" | "missing" | "displaced",
+                 "value", "word": on the label instead of the verdict, "notes": [texts], "color": "#rrggbb",
+                 "is_dimmed": measured, but not seen so here, "is_urgent": bool,
+                 "model_from_nominal": [16] | null}],     only of components that differ from *Part*
      "cam_from_model": [16] | null, "guide_cam_from_model": [16] | null,      guide: while it waits to be aligned with
      "camera": {"width", "height", "fx", "fy", "cx", "cy", "dist": [5]},   intrinsics for the picture on the page
      "wait_ms": arrival to start of tracking, "track_ms": tracking, "server_ms": arrival to this response,

@@ -10,6 +10,7 @@ import numpy as np
 from arview.overlay import paint
 from arview.overlay.evidence import DIMMED_RGB, DISPLACED_RGB, MISSING_RGB, Evidence
 from arview.overlay.options import CONTEXT_RGB, Rgb
+from arview.pose import Pose
 
 _WHITE: Rgb = (240, 244, 248)
 _AMBER: Rgb = (255, 176, 32)
@@ -28,6 +29,11 @@ def legend_entries(evidence: Iterable[Evidence]) -> tuple[tuple[Evidence, str], 
     if Evidence.UNVERIFIED in present:
         present.discard(Evidence.UNCERTAIN)
     return tuple((kind, text) for kind, text in _ENTRIES.items() if kind in present)
+
+
+def withheld_title(pose: Pose) -> str:
+    """Title of the banner of a part whose labels are withheld."""
+    return f"Labels withheld: this is {pose.serial}" if pose.serial else "Labels withheld"
 
 
 @lru_cache(maxsize=32)

@@ -22,7 +22,7 @@ from arview.overlay.edges import Edges
 from arview.overlay.evidence import ComponentStyles, Evidence, component_styles, evidence_of, presence_of
 from arview.overlay.ghost import CELL_PX, NEAR_MM, Ghost, GhostView, blend, count_cells
 from arview.overlay.guide import GuideOutline
-from arview.overlay.legend import banner_sprite, legend_entries, legend_sprite
+from arview.overlay.legend import banner_sprite, legend_entries, legend_sprite, withheld_title
 from arview.overlay.mesh import anchor_in_model, topology
 from arview.overlay.options import OverlayOptions
 from arview.overlay.status import StatusLine
@@ -331,8 +331,8 @@ class OverlayRenderer:
 
     def _draw_banner(self, canvas: paint.Image, pose: Pose) -> None:
         margin = round(0.6 * self._size_px)
-        title = "Labels withheld" if not pose.serial else f"Labels withheld: this is {pose.serial}"
-        sprite = banner_sprite(title, pose.identity_reason, self._size_px, self.camera.width - 2 * margin)
+        width_px = self.camera.width - 2 * margin
+        sprite = banner_sprite(withheld_title(pose), pose.identity_reason, self._size_px, width_px)
         paint.put_sprite(canvas, sprite, (self.camera.width - sprite.width) // 2, margin)
 
     def _arrows_in_model(self, evidence: list[Evidence]) -> Array:

@@ -6,6 +6,10 @@ const PATHS = {
   undecided: '<path d="M12 1.8L23 21.5H1z"/><path class="ink" d="M9.6 11.2c.2-3 4.8-2.8 4.6 0-.1 1.6-2.2 1.7-2.2 3.6M12 17.9v.1"/>',
   not_measured: '<circle cx="12" cy="12" r="9" fill="none" stroke="currentColor" stroke-width="2.4" stroke-dasharray="3.5 3"/>' +
     '<path d="M8 12h8" stroke="currentColor" stroke-width="2.4"/>',
+  missing: '<g fill="none" stroke="currentColor" stroke-width="2.6"><rect x="2.5" y="2.5" width="19" height="19" stroke-dasharray="4 3"/>' +
+    '<path d="M7.5 7.5l9 9M16.5 7.5l-9 9"/></g>',
+  displaced: '<rect x="2" y="2" width="9" height="9" fill="none" stroke="currentColor" stroke-width="2.4" stroke-dasharray="3 2.4"/>' +
+    '<path d="M13 13h9v9h-9z"/><path d="M7 7l7 7" fill="none" stroke="currentColor" stroke-width="2.4"/>',
   none: '<circle cx="12" cy="12" r="4"/>',
   tracked: '<circle cx="12" cy="12" r="10"/><path class="ink" d="M7 12.5l3.4 3.4L17 9"/>',
   critical: '<path d="M12 1.8L23 21.5H1z"/><path class="ink" d="M12 8.5v6M12 17.9v.1"/>',

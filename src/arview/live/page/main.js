@@ -116,6 +116,7 @@ function draw() {
   const isSame = frame === drawn.frame && frame?.order === drawn.order && pose === drawn.pose && guide === drawn.guide;
   if (!isSame || stage.isChanged) {
     stage.draw(shown);
+    parts.setEvidence(pose);
     note(shown, isSame);
   }
   refreshState(shown);
@@ -159,7 +160,8 @@ function refreshState(shown = player?.shown) {
     lost: "the part is no longer found",
   }[answer.state];
   const reason = answer.remark || defaults;
-  bar.show(answer.state, [...(reason ? [reason] : []), ...answer.mismatches].join("; "));
+  const found = answer.completeness.startsWith("INCOMPLETE") ? ["INCOMPLETE"] : [];
+  bar.show(answer.state, [...found, ...(answer.withheld ? [answer.withheld.title] : []), ...(reason ? [reason] : []), ...answer.mismatches].join("; "));
 }
 
 const retryText = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);

@@ -5,6 +5,8 @@ import { icon, make } from "./icons.js";
 const ORDER = ["fail", "undecided", "not_measured", "pass"];
 const VERDICT_TEXTS = { fail: "FAIL", undecided: "UNDECIDED", not_measured: "NOT MEASURED", pass: "PASS" };
 
+const COMPLETENESS = { COMPLETE: "pass", INCOMPLETE: "fail", "NOT YET CHECKED": "undecided" };
+
 /** An age as text, such as "3 h ago", in the largest unit of which there are at least two. */
 export function ageText(seconds) {
   if (seconds < -60) return "in the future";
@@ -23,6 +25,20 @@ export class Parts {
     Object.assign(this, elements, { onPick });
     this.only = null;
     this.components = [];
+    this.seen = new Map();
+    this.withheld = null;
+  }
+
+  /** Take over what a pose says of the components: a verdict stands only beside what is seen now. */
+  setEvidence(pose) {
+    if (!pose?.cam_from_model) return;
+    const key = JSON.stringify([pose.labels, pose.withheld, pose.completeness]);
+    if (key === this.key) return;
+    this.key = key;
+    this.withheld = pose.withheld;
+    this.completeness = pose.completeness;
+    this.seen = new Map(pose.labels.map((one) => [this.names[one.index], one]));
+    this.#list();
   }
 
   /** Show a part document. */
@@ -34,9 +50,28 @@ export class Parts {
     this.name.replaceChildren(make("b", "", [part.name]), serial ? ` ${serial}` : "");
     const provenance = inspection ? `Inspected ${ageText(inspection.age_s)}${inspection.method ? `, ${inspection.method}` : ""}` : "Not inspected yet";
     this.provenance.replaceChildren(provenance);
-    this.tally.replaceChildren(...tally(components));
+    this.names = components.map((one) => one.name);
+    this.seen = new Map();
+    this.withheld = this.completeness = this.key = null;
+    this.#list();
+  }
+
+  #list() {
+    const counts = this.withheld ? [make("span", "count none", [this.withheld.title])] : tally(this.components);
+    if (this.completeness) counts.push(make("span", `count ${COMPLETENESS[this.completeness.split(":")[0]]}`, [this.completeness]));
+    this.tally.replaceChildren(...counts);
     this.list.replaceChildren(...this.components.map((one) => this.#row(one)));
-    this.show(components.some((one) => one.name === this.only) ? this.only : null);
+    this.show(this.components.some((one) => one.name === this.only) ? this.only : null);
+  }
+
+  /** Classes, value, U, word and notes of a component, by what was measured and what is seen. */
+  #state(one) {
+    if (this.withheld) return { kind: "none", value: "", u: null, word: "withheld", notes: [] };
+    const seen = this.seen.get(one.name);
+    const plain = { kind: one.verdict ?? "none", value: one.value_text || (one.missing ? "missing" : "–"), u: one.uncertainty_mm, word: one.verdict_text ?? "not inspected", notes: [] };
+    if (!seen || (one.verdict === null && seen.is_dimmed)) return plain;
+    if (!["missing", "displaced"].includes(seen.evidence)) return { ...plain, kind: `${plain.kind}${seen.is_dimmed ? " dimmed" : ""}`, notes: seen.notes };
+    return { kind: seen.evidence, value: seen.value, u: null, word: seen.word, notes: seen.notes };
   }
 
   /** Mark the isolated component and show its card; null for none. */
@@ -48,7 +83,7 @@ export class Parts {
     const component = this.components.find((one) => one.name === name);
     this.card.hidden = !component;
     this.card.replaceChildren(...(component ? this.#details(component) : []));
-    this.card.className = component?.verdict ?? "none";
+    this.card.className = component ? this.#state(component).kind : "none";
   }
 
   /** Name of the inspected component after (step 1) or before (step -1) the isolated one. */
@@ -59,12 +94,11 @@ export class Parts {
   }
 
   #row(one) {
-    const verdict = one.verdict ?? "none";
-    const value = make("span", "value", [one.value_text || (one.missing ? "missing" : "–")]);
-    if (one.uncertainty_mm !== null) value.append(make("small", "", [`U ${one.uncertainty_mm.toFixed(2)}`]));
-    const row = make("button", verdict, [
-      icon(verdict), make("span", "name", [one.name]), value,
-      make("span", "verdict", [one.verdict_text ?? "not inspected"]),
+    const { kind, value, u, word, notes } = this.#state(one);
+    const shown = make("span", "value", [value]);
+    if (u !== null) shown.append(make("small", "", [`U ${u.toFixed(2)}`]));
+    const row = make("button", kind, [
+      icon(kind.split(" ")[0]), make("span", "name", [one.name]), shown, make("span", "verdict", [[word, ...notes].join(", ")]),
     ], { "aria-pressed": "false" });
     row.dataset.name = one.name;
     row.addEventListener("click", () => this.onPick(this.only === one.name ? null : one.name));
@@ -79,11 +113,15 @@ export class Parts {
     };
     const forward = button("back", "Next component", () => this.onPick(this.neighbour(1)));
     forward.classList.add("forward");
+    const { kind, word, value, notes } = this.#state(one);
+    const remark = notes.length ? [make("p", "axes", [make("span", "", [notes.join(", ")])])] : [];
     const head = make("div", "head", [
       button("back", "Previous component", () => this.onPick(this.neighbour(-1))),
-      make("span", "title", [make("b", "", [one.name]), make("span", "verdict", [icon(one.verdict ?? "none"), one.verdict_text ?? "not inspected"])]),
+      make("span", "title", [make("b", "", [one.name]), make("span", "verdict", [icon(kind.split(" ")[0]), word])]),
       forward, button("close", "Show all components", () => this.onPick(null)),
     ]);
+    if (this.withheld) return [head, make("p", "rest", [this.withheld.text])];
+    if (["missing", "displaced"].includes(kind)) return [head, make("p", "big", [value || "missing"]), ...remark];
     if (one.distance_mm === null) {
       return [head, make("p", "big", [one.value_text || (one.verdict ? "not measured" : "not part of the inspection")])];
     }
@@ -97,7 +135,7 @@ export class Parts {
       return make("span", value !== null && Math.abs(value) <= u ? "small" : "", [`d${"xyz"[k]} ${text}`]);
     });
     const turn = one.detail_text.split("   ").filter((text) => text.startsWith("tilt") || text.startsWith("twist"));
-    return [head, numbers, ...gauge(one), make("p", "axes", [...axes, ...turn.map((text) => make("span", "", [text]))])];
+    return [head, numbers, ...remark, ...gauge(one), make("p", "axes", [...axes, ...turn.map((text) => make("span", "", [text]))])];
   }
 }
 

@@ -11,9 +11,13 @@ from arview.live.options import LiveOptions
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.notices import Notice
 from arview.live.stream.subject import OverlayStyle, Subject
-from arview.overlay.labels import arrow_scale, by_urgency, detail_text, value_text
+from arview.overlay.evidence import Evidence, evidence_of, presence_of
+from arview.overlay.labels import arrow_scale, by_urgency, detail_text, inspection_doubt, label_text, value_text
+from arview.overlay.legend import legend_entries, withheld_title
 from arview.overlay.mesh import anchor_in_model, topology
 from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, OverlayOptions
+from arview.overlay.status import completeness_text
+from arview.pose import Pose
 
 Document = dict[str, Any]
 
@@ -32,6 +36,7 @@ def pose_document(tracked: TrackedFrame, now_s: float) -> Document:
         "remark": pose.remark,
         "mismatches": list(pose.mismatches),
         "unverified": list(pose.unverified),
+        **evidence_document(pose, tracked.subject),
         "ambiguous": len(pose.alternatives),
         "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.ravel().tolist(),
         "guide_cam_from_model": None if guide is None else guide.ravel().tolist(),
@@ -42,6 +47,54 @@ def pose_document(tracked: TrackedFrame, now_s: float) -> Document:
         "dropped": tracked.dropped,
         "scale": round(tracked.frame.scale, 3),
     }
+
+
+def evidence_document(pose: Pose, subject: Subject | None) -> Document:
+    """What the pictures say of the components: of *Pose*, only those that are not drawn as *Part* has them."""
+    document: Document = {"completeness": "", "withheld": None, "legend": [], "labels": []}
+    if subject is None or pose.cam_from_model is None:
+        return document
+    components, inspection, options = subject.part.model.components, subject.inspection, subject.label_options
+    if len(components) > 1:
+        document["completeness"] = completeness_text(pose)
+    if pose.is_label_withheld:
+        document["withheld"] = {"title": withheld_title(pose), "text": pose.identity_reason}
+        document["legend"] = _legend([Evidence.WITHHELD])
+        return document
+    doubt = inspection_doubt(inspection, subject.serial, options) if inspection else ""
+    found = {one.name: one for one in inspection.components} if inspection else {}
+    shown = []
+    for index, component in enumerate(components):
+        presence, deviation = presence_of(pose, component.name, len(components)), found.get(component.name)
+        evidence = evidence_of(presence)
+        shown.append(evidence)
+        is_back = deviation is not None and deviation.finding is Finding.MISSING and presence is not None
+        if evidence is Evidence.SEEN and not is_back and not (doubt and deviation is not None):
+            continue
+        center = component.bounds_in_model.mean(axis=0)
+        text = label_text(
+            component.name, deviation, presence, options, center_in_model=center, doubt=doubt
+        )  # fmt: skip
+        moved = None if presence is None else presence.model_from_nominal
+        document["labels"].append(
+            {
+                "index": index,
+                "evidence": str(evidence),
+                "value": text.value,
+                "word": text.word,
+                "notes": list(text.notes),
+                "color": _hex(text.rgb),
+                "is_dimmed": text.is_dimmed,
+                "is_urgent": text.is_urgent,
+                "model_from_nominal": None if moved is None else moved.ravel().tolist(),
+            }
+        )
+    document["legend"] = _legend(shown)
+    return document
+
+
+def _legend(evidence: list[Evidence]) -> list[Document]:
+    return [{"kind": str(kind), "text": text} for kind, text in legend_entries(evidence)]
 
 
 def camera_document(camera: Camera) -> Document:

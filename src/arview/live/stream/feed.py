@@ -39,6 +39,7 @@ class TrackedFrame:
         dropped: number of frames that the feed had dropped by then.
         revision: revision of the part document.
         serial: number of the frame among the tracked frames of the feed; frame ids may wrap around or repeat.
+        subject: the part that is tracked, from which labels get their texts.
     """
 
     frame: DecodedFrame
@@ -50,6 +51,7 @@ class TrackedFrame:
     dropped: int
     revision: int
     serial: int
+    subject: Subject | None = None
 
     @cached_property
     def jpeg(self) -> bytes:
@@ -244,6 +246,7 @@ class Feed:
             dropped=self.dropped,
             revision=self._subject.revision,
             serial=self._serial,
+            subject=self._subject,
         )
 
     def _start_session(self, shape: tuple[int, int, int]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from arview.cad.part import Part
 from arview.camera import Camera
@@ -20,6 +21,7 @@ from arview.tracking import TrackingSession
 from arview.tracking.guide_pose import guide_pose
 from arview.tracking.self_calibration.session import SelfCalibratingSession
 
+_SECONDS_PER_DAY = 86400.0
 PHONE_FOV = "fov:66"
 """Camera assumed for phones: field of view along the longer side. Their main cameras have 65 to 72° (24 to 28 mm)."""
 
@@ -81,6 +83,12 @@ class Subject:
         if options.guide is not None:
             guide_pose(options.guide, part, views.view_range, guess_camera(options.width, options.height))
 
+    @cached_property
+    def label_options(self) -> OverlayOptions:
+        """Options of the texts on labels: the units, and from which age on an inspection is stale."""
+        max_age_s = self.options.max_age_s
+        return OverlayOptions(max_age_days=None if max_age_s is None else max_age_s / _SECONDS_PER_DAY)
+
     @property
     def inspection(self) -> Inspection | None:
         """The inspection that is currently shown."""
@@ -140,4 +148,5 @@ class Subject:
         if inspection is not None and style.only is not None:
             wanted = tuple(one for one in inspection.components if one.name == style.only)
             inspection = replace(inspection, components=wanted)
-        return OverlayRenderer(self.part.model, camera, inspection, style.overlay_options())
+        options = replace(style.overlay_options(), max_age_days=self.label_options.max_age_days)
+        return OverlayRenderer(self.part.model, camera, inspection, options, self.serial)

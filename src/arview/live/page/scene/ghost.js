@@ -4,7 +4,7 @@
 // the picture.
 
 import { SAMPLES } from "../graphics.js";
-import { distortionGrid, eyeInModel, glProjection, glView, toCam } from "./projection.js";
+import { distortionGrid, eyeInModel, glProjection, glView, multiplied, toCam } from "./projection.js";
 import { MeshEdges, welded } from "./mesh_edges.js";
 
 const THREE = globalThis.THREE;
@@ -29,11 +29,19 @@ const SURFACE_FRAGMENT = `
 precision highp float;
 in vec3 v_place;
 uniform vec4 color;
-uniform float dimming;
+uniform float dimming, width, pattern;
 out vec4 result;
+// Hatched ghosts: pattern 1 has stripes, pattern 2 crossed lines, and both are faint in between.
+float hatch() {
+  if (pattern < 0.5) return 1.0;
+  float period = max(6.0, 7.0 * width), u = mod(gl_FragCoord.x + gl_FragCoord.y, period);
+  float v = mod(gl_FragCoord.x - gl_FragCoord.y, period);
+  bool isOn = pattern < 1.5 ? u < 0.5 * period : u < 0.25 * period || v < 0.25 * period;
+  return isOn ? 1.0 : 0.2;
+}
 void main() {
   float facing = abs(dot(normalize(cross(dFdx(v_place), dFdy(v_place))), normalize(v_place)));
-  float alpha = min(1.0, color.a * dimming * (1.25 - 0.35 * facing));
+  float alpha = min(1.0, color.a * dimming * hatch() * (1.25 - 0.35 * facing));
   result = vec4(color.rgb * (0.45 + 0.55 * facing) * alpha, alpha);
 }`;
 // A line is a rectangle with the length of the edge and the given width on the screen plus one pixel, over which it
@@ -45,10 +53,10 @@ in vec2 corner;
 uniform mat4 view, projection;
 uniform vec2 viewport;
 uniform float width;
-out float v_aside;
+out float v_aside, v_steep;
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-  v_aside = 0.0;
+  v_aside = v_steep = 0.0;
   vec3 here = (view * vec4(position, 1.0)).xyz, there = (view * vec4(otherEnd, 1.0)).xyz;
   if (here.z > -1.0 && there.z > -1.0) return;
   if (here.z > -1.0) here = mix(there, here, (-1.0 - there.z) / (here.z - there.z));
@@ -58,16 +66,20 @@ void main() {
   float length_px = length(along);
   along = length_px > 1e-4 ? along / length_px : vec2(1.0, 0.0);
   v_aside = corner.y * 0.5 * (width + 1.0);
+  v_steep = abs(along.y) > abs(along.x) ? 1.0 : 0.0;
   vec2 offset_px = vec2(-along.y, along.x) * v_aside - along * corner.x * 0.25 * width;
   gl_Position = place + vec4(2.0 * offset_px / viewport * place.w, 0.0, 0.0);
 }`;
 const LINE_FRAGMENT = `
 precision highp float;
-in float v_aside;
+in float v_aside, v_steep;
 uniform vec4 color;
-uniform float dimming, width;
+uniform float dimming, width, dashed;
 out vec4 result;
 void main() {
+  // Dashes are counted along the major axis of the line, so that short pieces of a curve are dashed, too.
+  float along = v_steep > 0.5 ? gl_FragCoord.y : gl_FragCoord.x;
+  if (dashed > 0.5 && mod(floor(along / (2.0 + 3.0 * width)), 2.0) > 0.5) discard;
   float cover = clamp(0.5 * (width + 1.0) - abs(v_aside), 0.0, 1.0);
   result = vec4(color.rgb, 1.0) * color.a * dimming * cover;
 }`;
@@ -128,8 +140,12 @@ export class Ghost {
   async load(buffer, count) {
     const gltf = await new THREE.GLTFLoader().parseAsync(buffer, "");
     gltf.scene.updateMatrixWorld(true);
-    for (const { surface, lines, number } of this.components) {
+    for (const { surface, lines, number, moved } of this.components) {
       this.model.remove(surface, lines);
+      if (moved) {
+        this.model.remove(moved.surface, moved.lines);
+        moved.lines.geometry.dispose();
+      }
       this.numbers.remove(number);
       surface.geometry.dispose();
       lines.geometry.dispose();
@@ -142,10 +158,18 @@ export class Ghost {
     }
   }
 
-  /** Colours of every component: {ghost: [r, g, b, alpha], edges: [r, g, b, alpha], isShown}, values from 0 to 1. */
+  /**
+   * Appearance of every component: {ghost: [r, g, b, alpha], edges: [r, g, b, alpha], isShown, pattern, isDashed, place,
+   * placeAlpha}, colours from 0 to 1. The place, 16 numbers row-major, is where a displaced component is drawn, too; else
+   * null.
+   */
   style(styles) {
-    this.components.forEach(({ surface, lines, number }, i) => {
-      const { ghost, edges, isShown } = styles[i];
+    this.components.forEach((component, i) => {
+      const { surface, lines, number } = component;
+      const { ghost, edges, isShown, pattern, isDashed } = styles[i];
+      surface.material.uniforms.pattern.value = pattern;
+      lines.material.uniforms.dashed.value = isDashed ? 1 : 0;
+      this.#move(component, styles[i]);
       surface.material.uniforms.color.value.set(...ghost);
       lines.material.uniforms.color.value.set(...edges);
       surface.visible = number.visible = isShown;
@@ -178,6 +202,7 @@ export class Ghost {
       renderer.setRenderTarget(this.target);
       renderer.setClearColor(0x000000, 0);
       renderer.clear();
+      for (const { moved } of this.components) if (moved) moved.surface.visible = moved.lines.visible = Boolean(pose) && moved.isShown;
       if (pose) renderer.render(this.model, this.unusedCamera);
       else this.#drawGuide(lineWidth);
       renderer.setRenderTarget(null);
@@ -240,9 +265,9 @@ export class Ghost {
       this.layer.material.uniforms.image.value = this.target.texture;
     }
     let [near, far] = [Infinity, 0];
-    for (const { corners_in_model: corners } of this.components) {
+    for (const [place, corners] of this.#places(pose)) {
       for (const [x, y, z] of corners) {
-        const depth = pose[8] * x + pose[9] * y + pose[10] * z + pose[11];
+        const depth = place[8] * x + place[9] * y + place[10] * z + place[11];
         near = Math.min(near, depth);
         far = Math.max(far, depth);
       }
@@ -251,7 +276,13 @@ export class Ghost {
     this.shared.view.value.fromArray(glView(pose));
     this.shared.projection.value.fromArray(glProjection(camera, window, near, Math.max(1.05 * far, near + 1)));
     const eye = eyeInModel(pose);
-    for (const { lines, edges } of this.components) if (lines.visible) chooseLines(lines.geometry, edges, eye);
+    for (const { lines, edges, moved } of this.components) {
+      if (lines.visible) chooseLines(lines.geometry, edges, eye);
+      if (!moved?.isShown) continue;
+      const place = multiplied(pose, moved.place);
+      moved.view.value.fromArray(glView(place));
+      chooseLines(moved.lines.geometry, edges, eyeInModel(place));
+    }
     this.shared.viewport.value.set(width, height);
     this.shared.width.value = lineWidth;
   }
@@ -263,9 +294,9 @@ export class Ghost {
   #box(camera, pose, window, height, isDistorted) {
     const scale = height / window.height, reach = { left: Infinity, top: Infinity, right: -Infinity, bottom: -Infinity };
     const all = [0, 0, Math.ceil(window.width * scale), height];
-    for (const { corners_in_model: corners } of this.components) {
+    for (const [place, corners] of this.#places(pose)) {
       for (const corner of corners) {
-        const [x, y, z] = toCam(pose, corner);
+        const [x, y, z] = toCam(place, corner);
         const pixel = isDistorted ? camera.project([x, y, z]) : z > 1 && [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy];
         if (!pixel) return all;
         reach.left = Math.min(reach.left, pixel[0]);
@@ -282,6 +313,33 @@ export class Ghost {
     const top = clamp(Math.floor((reach.top - margin - window.top) * scale), height);
     const bottom = clamp(Math.ceil((reach.bottom + margin - window.top) * scale), height);
     return [left, height - bottom, right - left, bottom - top];
+  }
+
+  /** Pairs of a pose and the corners of a component that is drawn at it. */
+  *#places(pose) {
+    for (const { corners_in_model: corners, moved } of this.components) {
+      yield [pose, corners];
+      if (moved?.isShown) yield [multiplied(pose, moved.place), corners];
+    }
+  }
+
+  /** Draw a component at a second place, or no longer. */
+  #move(component, { ghost, edges, isShown, place, placeAlpha }) {
+    if (place && !component.moved) {
+      const view = { value: new THREE.Matrix4() }, surface = new THREE.Mesh(component.surface.geometry, this.#surfaceMaterial({ view }));
+      const lines = new THREE.Mesh(lineGeometry(component.edges), this.#lineMaterial([1, 1, 1, 1], { view }));
+      for (const mesh of [surface, lines]) mesh.frustumCulled = false;
+      this.model.add(surface, lines);
+      component.moved = { surface, lines, view };
+    }
+    const { moved } = component;
+    if (!moved) return;
+    moved.isShown = Boolean(place) && isShown;
+    if (!place) return;
+    moved.place = place;
+    moved.surface.material.uniforms.color.value.set(ghost[0], ghost[1], ghost[2], placeAlpha);
+    moved.surface.material.colorWrite = placeAlpha > 0;
+    moved.lines.material.uniforms.color.value.set(...edges);
   }
 
   #distortLike(camera) {
@@ -354,15 +412,15 @@ export class Ghost {
   }
 
   /** The foremost surface replaces those behind it, so that only one layer is visible. */
-  #surfaceMaterial() {
-    const uniforms = { ...this.shared, color: { value: new THREE.Vector4() } };
+  #surfaceMaterial(own = {}) {
+    const uniforms = { ...this.shared, color: { value: new THREE.Vector4() }, pattern: { value: 0 }, ...own };
     return this.#material(SURFACE_VERTEX, SURFACE_FRAGMENT, uniforms, {
       blending: THREE.NoBlending, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1,
     });
   }
 
-  #lineMaterial(color) {
-    const uniforms = { ...this.shared, color: { value: new THREE.Vector4(...color) } };
+  #lineMaterial(color, own = {}) {
+    const uniforms = { ...this.shared, color: { value: new THREE.Vector4(...color) }, dashed: { value: 0 }, ...own };
     return this.#material(LINE_VERTEX, LINE_FRAGMENT, uniforms, { ...OVER, depthWrite: false });
   }
 

@@ -9,12 +9,15 @@ const NARROW_PX = 560, MAX_NARROW_LABELS = 4; // on a phone in portrait more lab
 const LABEL_ROOM_PX = 55; // height of the area for each label
 const MIN_ROOM_PX = 200; // in a lower area only an isolated component has a label
 const CONTEXT_WEIGHT = 0.25; // cost of covering a component that was not inspected, relative to an inspected one
+const REFUTED = ["missing", "displaced"]; // evidence that a component is not at its nominal place
+const TAIL_LETTERS = 6; // end of a name that is never cut
+const EDGE_PX = 22; // distance of the tail of an arrow at the border of the picture
 const SVG = "http://www.w3.org/2000/svg";
 const STUB_PX = 10, SIGN_PX = 24, ARROW_HEAD_PX = 11;
 
 export class Labels {
   #layout = new LabelLayout();
-  #labels = new Map(); // name → {element, leader, dot, sign, width, height}
+  #labels = new Map(); // name → {element, leader, dot, sign, pointer, width, height, isShown, key}
   #arrows = new Map();
   #integral = null;
   #visible = null;
@@ -23,6 +26,10 @@ export class Labels {
   constructor(box, svg, onPick) {
     Object.assign(this, { box, svg, onPick });
     this.part = null;
+    this.banner = make("div", "banner", [], { role: "alert" });
+    this.legend = make("div", "legend");
+    this.banner.hidden = this.legend.hidden = true;
+    box.append(this.banner, this.legend);
   }
 
   /** Set the part document; all labels are created again. */
@@ -30,15 +37,30 @@ export class Labels {
     this.part = part;
     this.centers = centersInModel;
     this.clear();
-    for (const { element, leader, dot, sign } of this.#labels.values()) [element, leader, dot, sign].forEach((one) => one.remove());
+    for (const label of this.#labels.values()) {
+      [label.element, label.leader, label.dot, label.sign, label.pointer].forEach((one) => one.remove());
+    }
     for (const arrow of this.#arrows.values()) arrow.remove();
     this.#labels.clear();
     this.#arrows.clear();
-    this.inspected = part.components
-      .map((component, index) => ({ ...component, index }))
-      .filter((component) => component.rank !== null)
-      .sort((a, b) => a.rank - b.rank);
-    for (const component of this.inspected) this.#add(component);
+    this.all = part.components.map((component, index) => ({ ...component, index }));
+    for (const component of this.all) this.#add(component);
+    this.setEvidence({ labels: new Map(), withheld: null, legend: [] });
+  }
+
+  /** Set what the pictures say: {labels: by the number of the component, withheld, legend}, see Pose in the protocol. */
+  setEvidence({ labels, withheld, legend }) {
+    const rank = (component) => component.rank ?? Infinity;
+    const isRefuted = (component) => REFUTED.includes(labels.get(component.index)?.evidence);
+    this.seen = labels;
+    this.withheld = withheld;
+    this.inspected = this.all.filter((component) => component.rank !== null || isRefuted(component))
+      .sort((a, b) => isRefuted(b) - isRefuted(a) || rank(a) - rank(b));
+    for (const component of this.all) this.#fill(component);
+    this.banner.hidden = !withheld;
+    this.banner.replaceChildren(...(withheld ? [make("b", "", [withheld.title]), make("span", "", [withheld.text])] : []));
+    this.legend.hidden = !legend.length;
+    this.legend.replaceChildren(...legend.map(({ kind, text }) => make("span", "", [make("i", `swatch ${kind}`), text])));
   }
 
   /** Set the map of visible components (see Ghost.visibility). */
@@ -67,9 +89,11 @@ export class Labels {
   }
 
   hide() {
+    this.box.classList.add("empty");
     for (const label of this.#labels.values()) {
       show(label, false);
       label.sign.classList.add("off");
+      label.pointer.setAttribute("visibility", "hidden");
     }
     for (const arrow of this.#arrows.values()) arrow.setAttribute("visibility", "hidden");
   }
@@ -88,8 +112,16 @@ export class Labels {
       left: place.left, top: place.top, right: place.left + place.scale * pose.lens.width,
       bottom: place.top + place.scale * pose.lens.height,
     };
-    const wanted = this.inspected.filter((component) => !only || component.name === only);
-    this.#drawArrows(wanted, toScreen);
+    this.box.classList.remove("empty");
+    const wanted = this.withheld ? [] : this.inspected.filter((component) => !only || component.name === only);
+    this.#drawArrows(wanted.filter(({ index }) => !this.seen.has(index)), toScreen);
+    this.banner.style.top = `${Math.max(area.top, picture.top) + 8}px`;
+    if (!this.legend.hidden) {
+      this.legend.style.left = `${area.left}px`;
+      this.legend.style.maxWidth = `${area.width}px`;
+      this.legend.style.top = `${area.top + area.height - this.legend.offsetHeight}px`;
+      area = { ...area, height: Math.max(1, area.height - this.legend.offsetHeight - 6) };
+    }
     this.box.style.setProperty("--widest", `${Math.floor((area.width - 6) / 2)}px`);
     const isNarrow = area.width < NARROW_PX, isCramped = area.height < MIN_ROOM_PX && !only;
     if (this.box.classList.contains("narrow") !== isNarrow) {
@@ -98,12 +130,15 @@ export class Labels {
     }
     const maxLabels = isCramped ? 0 : isNarrow ? MAX_NARROW_LABELS : Math.min(MAX_LABELS, Math.floor(area.height / LABEL_ROOM_PX));
     const requests = [], signs = new Map();
+    for (const label of this.#labels.values()) label.pointer.setAttribute("visibility", "hidden");
     for (const component of labels ? wanted : []) {
-      const anchor = toScreen(component.anchor_in_model);
+      let anchor = toScreen(component.anchor_in_model);
+      const label = this.#labels.get(component.name), outside = anchor && !isInside(anchor, picture) && this.#isUrgent(component);
+      if (outside) anchor = this.#pointOut(label, anchor, picture);
+      this.#pointHere(label, component, outside, toScreen);
       if (!anchor || !isInside(anchor, picture) || !this.#isLabelled(component)) continue;
-      signs.set(component.name, anchor);
+      if (!outside) signs.set(component.name, anchor);
       if (requests.length === maxLabels) continue;
-      const label = this.#labels.get(component.name);
       if (!label.width) [label.width, label.height] = [label.element.offsetWidth, label.element.offsetHeight];
       requests.push({ key: component.name, width: label.width, height: label.height, x: anchor[0], y: anchor[1] });
     }
@@ -132,24 +167,15 @@ export class Labels {
   }
 
   #add(component) {
-    const value = component.value_text || (component.missing ? "missing" : ""), u = component.uncertainty_mm;
-    const isLong = component.verdict !== "pass" && component.detail_text, what = [make("span", "verdict", [component.verdict_text])];
-    if (u !== null && !isLong) what.unshift(make("span", "u", [`U ${u.toFixed(2)}`]));
-    if (value) what.unshift(make("span", "value", [value]));
-    const who = make("span", "who", [icon(component.verdict), make("b", "", [component.name])]);
-    const rows = [who, make("span", "what", what)];
-    if (isLong) rows.push(make("span", "detail", [component.detail_text]));
-    const element = make("button", `label ${component.verdict}`, rows, { tabindex: "-1" });
+    const element = make("button", "label", [], { tabindex: "-1" });
     element.addEventListener("click", () => this.onPick(component.name));
-    const leader = document.createElementNS(SVG, "path"), dot = document.createElementNS(SVG, "circle");
-    leader.classList.add("leader", component.verdict);
-    dot.classList.add("dot", component.verdict);
+    const [leader, dot, pointer] = ["path", "circle", "path"].map((tag) => document.createElementNS(SVG, tag));
     // Where there is no room for the label, its sign is shown on the component.
-    const sign = make("button", `sign off ${component.verdict}`, [icon(component.verdict)], { tabindex: "-1" });
+    const sign = make("button", "sign off", [], { tabindex: "-1" });
     sign.addEventListener("click", () => this.onPick(component.name));
     this.box.append(element, sign);
-    this.svg.append(leader, dot);
-    const label = { element, leader, dot, sign, width: 0, height: 0, isShown: true };
+    this.svg.append(leader, dot, pointer);
+    const label = { element, leader, dot, sign, pointer, width: 0, height: 0, isShown: true, key: null };
     show(label, false);
     this.#labels.set(component.name, label);
     const hasArrow = component.displacement_mm && component.distance_mm > (component.uncertainty_mm ?? 0);
@@ -161,9 +187,59 @@ export class Labels {
     }
   }
 
+  /** Write the texts of a label: those of the inspection, or what the pictures say instead. */
+  #fill(component) {
+    const seen = this.seen.get(component.index), label = this.#labels.get(component.name), key = JSON.stringify(seen ?? null);
+    if (label.key === key) return;
+    label.key = key;
+    label.width = 0;
+    const kind = REFUTED.includes(seen?.evidence) ? seen.evidence : component.verdict ?? "none";
+    const value = seen ? seen.value : component.value_text || (component.missing ? "missing" : "");
+    const u = kind === component.verdict ? component.uncertainty_mm : null;
+    const detail = seen ? seen.notes.join(", ") : component.verdict !== "pass" ? component.detail_text : "";
+    const what = [make("span", "verdict", [seen?.word ?? component.verdict_text ?? ""])];
+    if (u !== null && (seen || !detail)) what.unshift(make("span", "u", [`U ${u.toFixed(2)}`]));
+    if (value) what.unshift(make("span", "value", [value]));
+    const rows = [make("span", "who", [icon(kind), middled(component.name)]), make("span", "what", what)];
+    if (detail) rows.push(make("span", "detail", [detail]));
+    label.element.replaceChildren(...rows);
+    label.sign.replaceChildren(icon(kind));
+    for (const [element, name] of [[label.element, "label"], [label.leader, "leader"], [label.dot, "dot"], [label.sign, "sign"], [label.pointer, "pointer"]]) {
+      for (const one of [...element.classList]) if (!["off", "arrives"].includes(one)) element.classList.remove(one);
+      element.classList.add(name, kind);
+      element.classList.toggle("dimmed", Boolean(seen?.is_dimmed));
+      if (seen) element.style.setProperty("--tone", seen.color);
+      else element.style.removeProperty("--tone");
+    }
+  }
+
+  #isUrgent({ index, verdict }) {
+    return this.seen.get(index)?.is_urgent ?? (verdict === "fail" || verdict === "undecided");
+  }
+
+  /** Arrow at the border of the picture towards an anchor outside; returns its tail. */
+  #pointOut(label, [x, y], { left, top, right, bottom }) {
+    const tail = [clamp(x, left + EDGE_PX, right - EDGE_PX), clamp(y, top + EDGE_PX, bottom - EDGE_PX)];
+    const length = Math.hypot(x - tail[0], y - tail[1]) || 1;
+    const tip = [0, 1].map((k) => tail[k] + (0.85 * EDGE_PX * ([x, y][k] - tail[k])) / length);
+    label.pointer.setAttribute("visibility", "visible");
+    label.pointer.setAttribute("d", arrowPath(tail, tip));
+    return tail;
+  }
+
+  /** Arrow from the nominal place of a displaced component to where it is seen. */
+  #pointHere(label, { index }, outside, toScreen) {
+    const place = this.seen.get(index)?.model_from_nominal;
+    if (outside || !place) return;
+    const [from, to] = [this.centers[index], toCam(place, this.centers[index])].map(toScreen);
+    if (!from || !to || Math.hypot(to[0] - from[0], to[1] - from[1]) < 4) return;
+    label.pointer.setAttribute("visibility", "visible");
+    label.pointer.setAttribute("d", arrowPath(from, to));
+  }
+
   /** Whether a component has a label: one that passed only while it is visible, others always. */
-  #isLabelled({ index, verdict }) {
-    return verdict === "fail" || verdict === "undecided" || !this.#visible || (this.#visible.get(index) ?? 0) > 0;
+  #isLabelled(component) {
+    return this.#isUrgent(component) || !this.#visible || (this.#visible.get(component.index) ?? 0) > 0;
   }
 
   /** First and last column of the screen with a component that should not be covered. */
@@ -235,6 +311,12 @@ function arrowPath([x0, y0], [x1, y1]) {
   const at = (along, aside) => `${(x0 + along * ux - aside * uy).toFixed(1)} ${(y0 + along * uy + aside * ux).toFixed(1)}`;
   const neck = length - head;
   return `M${at(0, shaft)}L${at(neck, shaft)}L${at(neck, half)}L${at(length, 0)}L${at(neck, -half)}L${at(neck, -shaft)}L${at(0, -shaft)}Z`;
+}
+
+/** A name whose end stays whole where it is too long, so that it is shortened in its middle. */
+function middled(name) {
+  const letters = [...name], kept = Math.min(TAIL_LETTERS, letters.length >> 1);
+  return make("b", "", [make("span", "", [letters.slice(0, letters.length - kept).join("")]), make("span", "", [letters.slice(letters.length - kept).join("")])]);
 }
 
 function show(label, isShown) {

@@ -12,6 +12,14 @@ export function toCam(pose, [x, y, z]) {
   ];
 }
 
+/** Product of two rigid transforms, 16 numbers each, row-major. */
+export function multiplied(a, b) {
+  return Array.from({ length: 16 }, (_, at) => {
+    const row = 4 * Math.floor(at / 4), column = at % 4;
+    return a[row] * b[column] + a[row + 1] * b[4 + column] + a[row + 2] * b[8 + column] + a[row + 3] * b[12 + column];
+  });
+}
+
 /** Position of the camera in the model frame [3]. */
 export function eyeInModel(pose) {
   return [0, 1, 2].map((k) => -(pose[k] * pose[3] + pose[4 + k] * pose[7] + pose[8 + k] * pose[11]));

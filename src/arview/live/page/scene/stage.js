@@ -9,6 +9,9 @@ const VISIBILITY_EVERY_MS = 150;
 const LINE_CSS_PX = 1.7;
 const PASS_DIMMING = 0.65; // ghosts of components that passed are fainter, so that the others stand out
 const NEUTRAL = "#46c4ff", CONTEXT = "#e2e8f0", CONTEXT_ALPHA = 0.5;
+const HATCH_ALPHA = 0.75; // the lines of a hatched ghost cover little
+const DIMMED = 0.45; // factor of the opacity of ghosts that the pictures do not verify
+const PATTERNS = { missing: 2, displaced: 1 };
 const ROOMY = 0.8; // the picture avoids the bars if it keeps this fraction of its size
 const MARGIN_PX = 8;
 
@@ -81,6 +84,7 @@ export class Stage {
     const isReady = this.ghost?.components.length > 0 && this.part !== null;
     const ownPose = isReady && pose && !isAnnotated && frame.width === pose.lens.width && frame.height === pose.lens.height ? pose : null;
     const ownGuide = isReady && guide && frame.width === guide.lens.width ? guide : null;
+    if (ownPose) this.#takeEvidence(ownPose);
     if (!this.ghost) {
       this.context.drawImage(frame.canvas, 0, 0, this.canvas.width, this.canvas.height);
     } else {
@@ -102,24 +106,44 @@ export class Stage {
   }
 
   #drawn = null;
+  #evidence = { key: "", labels: new Map(), withheld: null };
+
+  /** Take over what a pose says of the components, where it has changed. */
+  #takeEvidence({ labels, withheld, legend }) {
+    const key = JSON.stringify([labels, withheld]);
+    if (key === this.#evidence.key) return;
+    this.#evidence = { key, withheld, legend, labels: new Map(labels.map((one) => [one.index, one])) };
+    this.ghost.style(this.#styles());
+    this.labelBoxes.setEvidence(this.#evidence);
+  }
 
   #arrange() {
     this.isChanged = true;
+    this.#evidence = { key: "", labels: new Map(), withheld: null };
     this.labelBoxes.setPart(this.part, this.ghost?.components.map((one) => one.center_in_model) ?? []);
     this.ghost?.style(this.#styles());
   }
 
   #styles() {
     const { ghost, edges, opacity, only } = this.style, isInspected = this.part.inspection !== null;
-    return this.part.components.map((one) => {
-      const isContext = isInspected && one.verdict === null;
-      const color = rgb(isContext ? CONTEXT : one.verdict_color ?? NEUTRAL);
-      const alpha = isContext || !ghost ? 0 : opacity * (one.verdict === "pass" ? PASS_DIMMING : 1);
-      const edgeAlpha = edges === "none" ? 0 : isContext ? CONTEXT_ALPHA : 1;
+    const { labels, withheld } = this.#evidence;
+    return this.part.components.map((one, index) => {
+      const seen = labels.get(index), pattern = PATTERNS[seen?.evidence] ?? 0;
+      const isContext = (isInspected && one.verdict === null && !pattern) || withheld;
+      const color = rgb(isContext ? CONTEXT : seen?.color ?? one.verdict_color ?? NEUTRAL);
+      let alpha = only === one.name || one.verdict !== "pass" ? opacity : opacity * PASS_DIMMING;
+      if (pattern) alpha = HATCH_ALPHA;
+      else if (seen?.is_dimmed) alpha *= DIMMED;
+      if (!ghost || withheld || (isContext && only !== one.name)) alpha = 0;
+      const edgeAlpha = edges === "none" ? 0 : isContext && !withheld ? CONTEXT_ALPHA : 1;
       return {
-        ghost: [...color, only === one.name && ghost ? opacity : alpha],
+        ghost: [...color, alpha],
         edges: [...color.map((value) => 0.75 * value + 0.25), edgeAlpha],
         isShown: !only || only === one.name,
+        pattern: withheld ? 0 : pattern,
+        isDashed: !withheld && ["unverified", "uncertain", "displaced"].includes(seen?.evidence),
+        place: withheld ? null : seen?.model_from_nominal ?? null,
+        placeAlpha: ghost ? opacity : 0,
       };
     });
   }
