@@ -21,6 +21,7 @@ from arview.core.checks import check_type
 from arview.detection.detector import Detection, Detector, DetectorOptions, RejectedHypothesis, local_search_for
 from arview.detection.search.local_search import LocalSearch
 from arview.errors import InputError, MismatchError
+from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import Array, apply, check_rigid, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
@@ -29,6 +30,7 @@ from arview.tracking.diagnosis import NOTHING_IN_VIEW, diagnose_loss, diagnose_p
 from arview.tracking.disambiguation import HypothesisSet
 from arview.tracking.estimate import Estimate
 from arview.tracking.guided_init import GuidedInit
+from arview.tracking.identity import IdentityMonitor, IdentityOptions
 from arview.tracking.pose_recheck import LocalSearchRecheck
 from arview.tracking.scene_change import SceneChange, SceneChangeOptions
 from arview.tracking.session_state import Event, SessionState
@@ -70,6 +72,7 @@ class SessionOptions:
         min_in_picture: share of the outline inside the picture below which no pose is kept.
         distance_margin: factor by which a pose may be nearer or farther than the declared range.
         detector: options of the detector; None chooses them by the declared range.
+        identity: of the monitoring of the identity.
     """
 
     use_region: bool = True
@@ -95,6 +98,7 @@ class SessionOptions:
     min_in_picture: float = 0.25
     distance_margin: float = 2.0
     detector: DetectorOptions | None = None
+    identity: IdentityOptions = field(default_factory=IdentityOptions)
 
     def __post_init__(self) -> None:
         if not 0 <= self.lost_quality <= self.critical_quality <= self.tracked_quality <= 1:
@@ -113,10 +117,13 @@ class TrackingSession:
         guide_cam_from_model: (4,4) mm, guide pose. The part is first found when it is brought near this pose, not by
             a search, and by both after it has been lost for a while.
         like: another session of the same guide views, camera and options, whose detector is shared.
+        serials: serial number of the part to which the labels belong, to be read from codes in the frames; None: codes
+            are not read.
 
     Attributes:
         views: guide views of the model.
         elsewhere: poses (4,4) of other specimens of the part, which are not taken for this one.
+        identity: says whether the specimen in view is the one that was followed.
 
     Raises:
         MismatchError: the guide views belong to another model.
@@ -133,6 +140,7 @@ class TrackingSession:
         initial_cam_from_model: Array | None = None,
         guide_cam_from_model: Array | None = None,
         like: TrackingSession | None = None,
+        serials: SerialNumbers | None = None,
     ) -> None:
         check_type(views, GuideViewSet, "TrackingSession: views")
         check_type(camera, Camera, "TrackingSession: camera")
@@ -162,6 +170,7 @@ class TrackingSession:
         self.components = AssemblyMonitor(views, camera, model)
         self.appearance_memory = AppearanceMemory(views, camera)
         self._scene = SceneChange(views, camera, o.scene_change)
+        self.identity = IdentityMonitor(views, camera, o.identity, serials)
         self._state = SessionState()
 
     def __repr__(self) -> str:
@@ -206,6 +215,11 @@ class TrackingSession:
     def reset(self) -> None:
         """Forget the part's pose and search again. The remembered appearance is kept."""
         self._state = SessionState()
+        self.identity.reset()
+
+    def confirm(self) -> None:
+        """Say that the specimen tracked now is the one to which the labels belong, see `Identity`."""
+        self.identity.confirm()
 
     def give_up(self, reason: str) -> None:
         """Give the pose up, for a reason in words, and search again."""
@@ -230,6 +244,9 @@ class TrackingSession:
             estimate, reason = self._disambiguate(image, estimate, reason)
             reason = self._check_components(image, estimate, reason)
             self._remember(image, estimate)
+        known = self.identity.update(image, estimate, index, time_s, self, self._state.is_confirmed)
+        if known.cam_from_model is not None and estimate is not None:
+            estimate = self._restart(image, known.cam_from_model)
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
             guide = self._guide if self.is_aligning else None
@@ -246,6 +263,9 @@ class TrackingSession:
             mismatches=self.components.mismatches,
             unverified=self.components.unverified,
             alternatives=tuple(self._state.hypotheses.poses(estimate.cam_from_model)),
+            identity=known.identity,
+            identity_reason=known.reason,
+            serial=known.serial,
         )
 
     def _check_image(self, image: NDArray[np.uint8], index: int) -> None:

@@ -1,0 +1,444 @@
+"""IdentityMonitor: follows one specimen through losses and jumps of its pose, and says when it may be another one.
+
+A specimen that is tracked from frame to frame stays the same. After a gap, or a jump, its pose is compared with the
+place at which the background says that it was. There it is the same specimen. Elsewhere it was moved, or it is another
+one: the last picture before the gap tells whether a part was already seen at that place, this picture whether two
+are in view, and the next frames whether the old place still shows one. Until that is settled labels are withheld.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.camera import Camera
+from arview.errors import InputError
+from arview.fiducials.serial_code import SerialCodeReader, SerialNumbers
+from arview.geometry import Array
+from arview.guideviews import GuideViewSet
+from arview.pose import Identity
+from arview.tracking.estimate import Estimate
+from arview.tracking.identity.background_motion import BackgroundMotion, reduced
+from arview.tracking.identity.options import IdentityOptions
+from arview.tracking.identity.part_outline import PartOutline, transfer
+from arview.tracking.identity.specimen_search import Finders, SpecimenSearch
+
+CHECKING = "checking that this is the part that was followed before"
+ANOTHER_IN_VIEW = "another part of this kind is in view; confirm that this is the one"
+MOVED = "this part is not where the last one was; confirm that this is the one"
+
+
+class Placement(Enum):
+    """Where a pose is, compared with the place at which the background says that the part was."""
+
+    SAME = "same"
+    AWAY = "away"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class IdentityResult:
+    """What a frame says of the identity.
+
+    Attributes:
+        identity: see `Identity`.
+        reason: why it is unconfirmed or another, or empty.
+        serial: read from a code on the part, or empty.
+        cam_from_model: (4,4) where the followed specimen was found instead, to be tracked from now on; None: go on.
+    """
+
+    identity: Identity = Identity.FOLLOWED
+    reason: str = ""
+    serial: str = ""
+    cam_from_model: Array | None = None
+
+
+@dataclass(frozen=True)
+class KeptView:
+    """The last picture in which the followed specimen was tracked without doubt.
+
+    Attributes:
+        image: (H,W,3) uint8 RGB.
+        cam_from_model: (4,4) its pose there.
+    """
+
+    image: NDArray[np.uint8]
+    cam_from_model: Array
+
+
+@dataclass
+class Doubt:
+    """An open question whether the tracked specimen is the followed one.
+
+    Attributes:
+        since_s: time stamp of the frame in which it arose.
+        next_check_s: time stamp from which the old place is checked again.
+        stage: checks done: 0 none, 1 the picture before, 2 this picture.
+        reason: what is known against it; empty while it is checked.
+        has_seen_place: whether the place of the tracked specimen was in the picture before and showed none.
+        is_placed: whether the background said where the followed specimen should be.
+    """
+
+    since_s: float
+    next_check_s: float
+    stage: int = 0
+    reason: str = ""
+    has_seen_place: bool = False
+    is_placed: bool = False
+
+
+class IdentityMonitor:
+    """Says of every pose of a session whether it is that of the specimen that was followed.
+
+    Args:
+        views: guide views of the part.
+        camera: intrinsics of the frames.
+        options: see `IdentityOptions`.
+        serials: serial number of the followed specimen, and which codes name one; None: codes are not read.
+    """
+
+    def __init__(
+        self,
+        views: GuideViewSet,
+        camera: Camera,
+        options: IdentityOptions | None = None,
+        serials: SerialNumbers | None = None,
+    ) -> None:
+        self.options = o = options or IdentityOptions()
+        self.outline = PartOutline(views, camera)
+        self._search = SpecimenSearch(self.outline, o)
+        self._motion = BackgroundMotion(self.outline, o.background)
+        self._serials = serials
+        self._reader = None if serials is None else SerialCodeReader(serials, o.code)
+        self._named_at: tuple[int, Array] | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the followed specimen; the next one that is tracked is it."""
+        self._known, self._known_reason, self._serial = Identity.FOLLOWED, "", ""
+        self._is_confirmed_by_user = False
+        self._kept: KeptView | None = None
+        self._kept_quality = 0.0
+        self._buffer: NDArray[np.uint8] | None = None
+        self._is_followed = False
+        self._others_before: list[Array] | None = None
+        self._doubt: Doubt | None = None
+        self._last_pose: Array | None = None
+        self._frames_unsure = 0
+        self._frame = 0
+
+    def confirm(self) -> None:
+        """The user says that the specimen tracked now is the one to which the labels belong."""
+        self._settle(Identity.CONFIRMED)
+        self._is_confirmed_by_user = True
+        self._named_at = None
+
+    def name_at(self, index: int, pixel: tuple[float, float]) -> None:
+        """The labels belong to the specimen at a pixel of the frame of an index; they are withheld until then.
+
+        Raises:
+            InputError: the pixel is outside the picture.
+        """
+        camera = self.outline.camera
+        x, y = pixel
+        if not (0 <= x < camera.width and 0 <= y < camera.height):
+            raise InputError(f"serial at {x:g},{y:g}: outside the picture of {camera.width} × {camera.height} px")
+        self._named_at = (index, np.array([x, y], dtype=np.float64))
+
+    def take_over(self, other: IdentityMonitor) -> None:
+        """Go on with what another monitor knows, when the camera of a session is replaced."""
+        self._known, self._known_reason, self._serial = other._known, other._known_reason, other._serial
+        self._is_confirmed_by_user, self._named_at = other._is_confirmed_by_user, other._named_at
+        self._doubt = other._doubt
+
+    def update(
+        self,
+        image: NDArray[np.uint8],
+        estimate: Estimate | None,
+        index: int,
+        time_s: float,
+        finders: Finders,
+        is_confirmed: bool = True,
+    ) -> IdentityResult:
+        """Identity of the specimen in a frame.
+
+        Args:
+            image: (H,W,3) uint8 RGB.
+            estimate: of the tracker; None without a pose.
+            index: of the frame.
+            time_s: time stamp of the frame.
+            finders: the searches of the session.
+            is_confirmed: whether the pose has been supported clearly since it was found.
+        """
+        if not self.options.is_used:
+            return IdentityResult()
+        self._frame += 1
+        moved_to = self._at_named_pixel(image, estimate, index, finders)
+        if moved_to is not None or estimate is None:
+            self._miss(image)
+            return self._result(moved_to)
+        pose = estimate.cam_from_model
+        is_sure = is_confirmed and estimate.quality >= self.options.min_quality and not estimate.is_restless
+        if self._doubt is None:
+            placement = self._placement(image, pose, is_sure)
+            self._follow(image, estimate, is_sure, placement, time_s)
+        else:
+            self._go_on_doubting(image, pose, self._doubt, time_s)
+        if self._doubt is not None:
+            moved_to = self._examine(image, pose, is_sure, self._doubt, time_s, finders)
+        self._read_code(image, pose, is_sure)
+        self._last_pose = pose
+        return self._result(moved_to)
+
+    # --- Follow -------------------------------------------------------------------------------------------
+
+    def _miss(self, image: NDArray[np.uint8]) -> None:
+        """A frame without a pose: the background is followed, and a new pose is compared with the last one."""
+        self._last_pose = None
+        self._frames_unsure += 1
+        if self._doubt is not None and not self._doubt.reason:
+            self._doubt = None
+        self._follow_background(image, None)
+
+    def _placement(self, image: NDArray[np.uint8], pose: Array, is_sure: bool) -> Placement:
+        """Whether the followed specimen would be at a pose (4,4) of this frame."""
+        if self._kept is None:
+            return Placement.SAME
+        if is_sure and self._frames_unsure == 0 and not self._is_jump(pose):
+            return Placement.SAME
+        self._follow_background(image, pose)
+        if self._last_pose is None or self._is_jump(pose):
+            self._motion.match(pose)
+        placement = self._compared(pose, self._motion.homography)
+        is_brief = self._frames_unsure <= self.options.max_unknown_frames
+        if placement is Placement.UNKNOWN and (is_brief or self._last_pose is not None):
+            near = self._kept.cam_from_model if self._last_pose is None else self._last_pose
+            if not self._is_shifted(near, pose):
+                return Placement.SAME
+        return placement
+
+    def _follow(
+        self, image: NDArray[np.uint8], estimate: Estimate, is_sure: bool, placement: Placement, time_s: float
+    ) -> None:
+        """Go on with the followed specimen, or begin to doubt that this is it."""
+        if placement is not Placement.SAME:
+            self._doubt = Doubt(time_s, time_s)
+            return
+        self._frames_unsure = 0 if is_sure else self._frames_unsure + 1
+        if is_sure:
+            self._keep(image, estimate.cam_from_model, estimate.quality)
+
+    def _keep(self, image: NDArray[np.uint8], pose: Array, quality: float) -> None:
+        """Keep this picture as the last one of the followed specimen."""
+        if self._buffer is None:
+            self._buffer = np.empty_like(image)
+        # Copied, because a source may use the memory of its frames again.
+        np.copyto(self._buffer, image)
+        self._kept = KeptView(self._buffer, pose)
+        self._kept_quality += self.options.quality_rate * (quality - self._kept_quality)
+        self._others_before = None
+        self._is_followed = False
+
+    def _follow_background(self, image: NDArray[np.uint8], pose: Array | None) -> None:
+        """Follow the background into this frame, with the part at a pose (4,4) if it is known."""
+        if self._kept is None:
+            return
+        if not self._is_followed:
+            picture = reduced(self._kept.image, self.options.background.max_side_px)
+            self._motion.start(picture, self._kept.cam_from_model)
+            self._is_followed = True
+        self._motion.follow(image, pose)
+
+    def _is_jump(self, pose: Array) -> bool:
+        """Whether a pose (4,4) is far from that of the frame before."""
+        return self._last_pose is not None and self._is_shifted(self._last_pose, pose)
+
+    def _is_shifted(self, before: Array, after: Array) -> bool:
+        a, b = self.outline.place(before), self.outline.place(after)
+        shift = np.linalg.norm(a.center_px - b.center_px) / max(a.diameter_px, b.diameter_px)
+        depth_mm = abs(a.distance_mm - b.distance_mm)
+        return bool(shift > self.options.max_jump or depth_mm > self._max_depth_mm(a.distance_mm))
+
+    def _compared(self, pose: Array, homography: Array | None) -> Placement:
+        """Where a pose (4,4) is, compared with the place to which a homography takes the followed specimen."""
+        if homography is None or self._kept is None:
+            return Placement.UNKNOWN
+        before, now = self.outline.place(self._kept.cam_from_model), self.outline.place(pose)
+        pixel, scale, _ = transfer(homography, before.center_px)
+        expected_mm = before.distance_mm / scale
+        diameter_px = max(now.diameter_px, before.diameter_px * scale)
+        is_aside = np.linalg.norm(pixel - now.center_px) > self.options.same_place * diameter_px
+        is_along = abs(now.distance_mm - expected_mm) > self._max_depth_mm(expected_mm)
+        return Placement.AWAY if is_aside or is_along else Placement.SAME
+
+    def _max_depth_mm(self, distance_mm: float) -> float:
+        """Difference in distance up to which two poses are in one place."""
+        o = self.options
+        return max(o.same_depth * self.outline.views.diameter_mm, o.same_depth_share * distance_mm)
+
+    # --- Doubt --------------------------------------------------------------------------------------------
+
+    def _go_on_doubting(self, image: NDArray[np.uint8], pose: Array, doubt: Doubt, time_s: float) -> None:
+        """Follow the old place in one more frame of a doubt; a pose found anew, or a jump, begins a doubt anew."""
+        is_new = self._last_pose is None or self._is_jump(pose)
+        if is_new:
+            self._doubt = Doubt(time_s, time_s, reason=doubt.reason)
+        elif time_s - doubt.since_s > self.options.return_s:
+            self._motion.homography = None
+            return
+        self._follow_background(image, pose)
+        if is_new:
+            self._motion.match(pose)
+
+    def _examine(
+        self,
+        image: NDArray[np.uint8],
+        pose: Array,
+        is_sure: bool,
+        doubt: Doubt,
+        time_s: float,
+        finders: Finders,
+    ) -> Array | None:
+        """One step to settle a doubt; a pose (4,4) where the followed specimen is seen instead, or None."""
+        o = self.options
+        placement = self._compared(pose, self._motion.homography)
+        if placement is Placement.SAME and is_sure:
+            self._settle(self._known)
+            return None
+        if not is_sure or self._kept is None:
+            return None
+        if not doubt.reason and doubt.stage < 2:
+            self._search_once(image, pose, doubt, finders)
+            return None
+        if self._motion.homography is not None and time_s >= doubt.next_check_s:
+            doubt.next_check_s = time_s + (o.return_every_s if doubt.reason else o.watch_every_s)
+            seen = self._seen_at_old_place(image, pose, finders)
+            if seen is not None:
+                doubt.reason = ANOTHER_IN_VIEW
+                return seen if self._compared(seen, self._motion.homography) is Placement.SAME else None
+        if not doubt.reason:
+            self._conclude(doubt, time_s)
+        return None
+
+    def _search_once(self, image: NDArray[np.uint8], pose: Array, doubt: Doubt, finders: Finders) -> None:
+        """Look for another specimen in the picture before the gap, and in a later frame in the present one."""
+        assert self._kept is not None
+        if doubt.stage == 0:
+            doubt.is_placed = self._motion.homography is not None
+            is_other = self._is_other_before(pose, doubt, finders)
+        else:
+            is_other = bool(self._search.others(image, pose, finders))
+        doubt.stage += 1
+        if is_other:
+            doubt.reason = ANOTHER_IN_VIEW
+
+    def _is_other_before(self, pose: Array, doubt: Doubt, finders: Finders) -> bool:
+        """Whether the last picture of the followed specimen shows another one too."""
+        kept = self._kept
+        assert kept is not None
+        homography = np.eye(3) if self._motion.homography is None else self._motion.homography
+        there = self.outline.moved(pose, np.asarray(np.linalg.inv(homography), dtype=np.float64))
+        if self.outline.is_in_picture(self.outline.place(there), self.options.min_room):
+            seen = self._search.at_place(kept.image, there, finders, is_turned=True)
+            if seen is not None and self._is_apart(seen, kept.cam_from_model):
+                return self._is_kept_right(kept, finders)
+            doubt.has_seen_place = True
+        if self._motion.homography is not None:
+            return False
+        if self._others_before is None:
+            self._others_before = self._search.others(kept.image, kept.cam_from_model, finders)
+        return bool(self._others_before) and self._is_kept_right(kept, finders)
+
+    def _is_kept_right(self, kept: KeptView, finders: Finders) -> bool:
+        """Whether the followed specimen is really there in its last picture; a wrong pose is no specimen."""
+        if self._kept_quality >= self.options.sure_quality:
+            return True
+        return self._search.at_place(kept.image, kept.cam_from_model, finders) is not None
+
+    def _seen_at_old_place(self, image: NDArray[np.uint8], pose: Array, finders: Finders) -> Array | None:
+        """The pose (4,4) of a specimen where the background says that the followed one was; None without one."""
+        if self._kept is None or self._motion.homography is None:
+            return None
+        guess = self.outline.moved(self._kept.cam_from_model, self._motion.homography)
+        place = self.outline.place(guess)
+        if not self.outline.is_in_picture(place, self.options.min_room):
+            return None
+        seen = self._search.at_place(image, guess, finders)
+        return seen if seen is not None and self._is_apart(seen, pose) else None
+
+    def _is_apart(self, a: Array, b: Array) -> bool:
+        """Whether two poses (4,4) of one picture are those of different specimens."""
+        return self._search.is_apart(self.outline.place(a), self.outline.place(b))
+
+    def _conclude(self, doubt: Doubt, time_s: float) -> None:
+        """Settle a doubt when all checks are done: no other specimen was seen, before or now."""
+        if not doubt.is_placed:
+            # Nothing is known of the scene, and only one part was in view before and is in view now.
+            self._settle(self._known)
+        elif not doubt.has_seen_place:
+            doubt.reason = MOVED
+        elif time_s - doubt.since_s >= self.options.watch_s:
+            self._settle(self._known)
+
+    def _settle(self, identity: Identity, reason: str = "") -> None:
+        """The identity is known again; the next sure frame is kept."""
+        self._known, self._known_reason = identity, reason
+        self._doubt = None
+        self._frames_unsure = 0
+        self._kept = None
+        self._kept_quality = 0.0
+
+    # --- What the user and codes say ----------------------------------------------------------------------
+
+    def _at_named_pixel(
+        self, image: NDArray[np.uint8], estimate: Estimate | None, index: int, finders: Finders
+    ) -> Array | None:
+        """Confirm the specimen at the named pixel; a pose (4,4) if it is another than the tracked one."""
+        if self._named_at is None or index < self._named_at[0] or estimate is None:
+            return None
+        first, pixel = self._named_at
+        if self.outline.contains(estimate.cam_from_model, pixel, 0.03):
+            self.confirm()
+            return None
+        self._named_at = None
+        for other in self._search.others(image, estimate.cam_from_model, finders, is_thorough=True):
+            if self.outline.contains(other, pixel, 0.03):
+                self.confirm()
+                return other
+        self._kept = None
+        reason = f"no part of this kind found at {pixel[0]:g},{pixel[1]:g} in frame {first}; confirm the part"
+        self._doubt = Doubt(math.inf, math.inf, reason=reason)
+        return None
+
+    def _read_code(self, image: NDArray[np.uint8], pose: Array, is_sure: bool) -> None:
+        """Read a serial code on the part, now and then."""
+        if self._reader is None or self._serials is None or not is_sure or self._is_confirmed_by_user:
+            return
+        is_settled = bool(self._serial) and self._doubt is None
+        if not self._reader.is_due(self._frame, is_settled):
+            return
+        hull = self.outline.hull_px(pose)
+        serial = self._reader.read(image, hull)
+        if not serial:
+            return
+        self._serial = serial
+        if not self._serials.serial:
+            return
+        if serial == self._serials.serial:
+            self._settle(Identity.CONFIRMED)
+        else:
+            self._settle(Identity.OTHER, f"the code on this part says {serial}, the inspection is of "
+                         f"{self._serials.serial}")  # fmt: skip
+
+    def _result(self, moved_to: Array | None) -> IdentityResult:
+        if self._named_at is not None:
+            index, (x, y) = self._named_at
+            reason = f"the labels belong to the part at {x:g},{y:g} in frame {index}"
+            return IdentityResult(Identity.UNCONFIRMED, reason, self._serial, moved_to)
+        if self._doubt is not None:
+            return IdentityResult(Identity.UNCONFIRMED, self._doubt.reason or CHECKING, self._serial, moved_to)
+        return IdentityResult(self._known, self._known_reason, self._serial, moved_to)

@@ -1,0 +1,109 @@
+"""Search for another specimen of the part in a picture, beside the one that is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.detection.detector import Detection
+from arview.geometry import Array, exp_so3, rigid
+from arview.tracking.guided_init import GuidedPose
+from arview.tracking.identity.options import IdentityOptions
+from arview.tracking.identity.part_outline import PartOutline, PartPlace
+from arview.tracking.specimens import hide_specimens
+
+
+class PictureFinder(Protocol):
+    """What finds the part in a whole picture: `arview.detection.detector.Detector`."""
+
+    def detect(
+        self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True, guesses: Sequence[Array] = ()
+    ) -> list[Detection]:
+        """Poses of the part in an image, best first."""
+        ...
+
+
+class NearFinder(Protocol):
+    """What finds the part near a pose: `arview.tracking.guided_init.GuidedInit`."""
+
+    def find(self, image: NDArray[np.uint8], cam_from_model: Array) -> GuidedPose | None:
+        """The best pose near a given one, whatever its quality; None outside the picture."""
+        ...
+
+
+class Finders(Protocol):
+    """The searches that are needed, made when they are first used: `arview.tracking.TrackingSession`."""
+
+    @property
+    def detector(self) -> PictureFinder:
+        """Search of a whole picture."""
+        ...
+
+    @property
+    def guided_init(self) -> NearFinder:
+        """Search around a pose."""
+        ...
+
+
+class SpecimenSearch:
+    """Finds other specimens.
+
+    Args:
+        outline: of the part.
+        options: see `IdentityOptions`.
+    """
+
+    def __init__(self, outline: PartOutline, options: IdentityOptions) -> None:
+        self._outline, self._options = outline, options
+
+    def others(
+        self, image: NDArray[np.uint8], known: Array, finders: Finders, is_thorough: bool = False
+    ) -> list[Array]:  # fmt: skip
+        """Poses (4,4) of the part in an image (H,W,3) uint8 RGB, apart from a known one (4,4)."""
+        place = self._outline.place(known)
+        picture = hide_specimens(image, [known], self._outline.views, self._outline.camera)
+        found = finders.detector.detect(picture, self._options.max_specimens, is_thorough)
+        return [one.cam_from_model for one in found if self.is_apart(self._outline.place(one.cam_from_model), place)]
+
+    def at_place(
+        self, image: NDArray[np.uint8], guess: Array, finders: Finders, is_turned: bool = False
+    ) -> Array | None:  # fmt: skip
+        """The pose (4,4) of a part at the place of a rough pose (4,4); None without one there.
+
+        Args:
+            image: (H,W,3) uint8 RGB.
+            guess: rough pose.
+            finders: the searches.
+            is_turned: whether the part may be turned far, as after a camera has gone round it.
+        """
+        wanted = self._outline.place(guess)
+        for start in self._turned(guess) if is_turned else [guess]:
+            found = finders.guided_init.find(image, start)
+            is_there = found is not None and found.quality >= self._options.found_quality
+            if found and is_there and not self.is_apart(self._outline.place(found.cam_from_model), wanted):
+                return found.cam_from_model
+        return None
+
+    def is_apart(self, a: PartPlace, b: PartPlace) -> bool:
+        """Whether two places are those of different specimens."""
+        o = self._options
+        aside = np.linalg.norm(a.center_px - b.center_px) / max(a.diameter_px, b.diameter_px)
+        along_mm = abs(a.distance_mm - b.distance_mm)
+        far_mm = max(o.same_depth * self._outline.views.diameter_mm, o.same_depth_share * b.distance_mm)
+        return bool(aside > o.apart or along_mm > 2.0 * far_mm)
+
+    def _turned(self, cam_from_model: Array) -> list[Array]:
+        """A pose (4,4), and poses with the part turned about its centre around the axes across the line of sight."""
+        turns = [np.eye(3)]
+        angle_rad = np.deg2rad(self._options.turn_deg)
+        for x, y in ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0)):
+            turns.append(exp_so3(angle_rad * np.array([x, y, 0.0])))
+        center = self._outline.center_in_cam(cam_from_model)
+        poses = []
+        for turn in turns:
+            rotation = turn @ cam_from_model[:3, :3]
+            poses.append(rigid(rotation, center - rotation @ self._outline.views.center_in_model))
+        return poses

@@ -1,0 +1,302 @@
+"""Identity: another specimen of the part never gets the labels of the followed one, and the followed one keeps them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from arview.detection.detector import Detection
+from arview.errors import InputError
+from arview.geometry import Array, apply, invert, rigid
+from arview.pose import Identity, Pose, TrackingState
+from arview.refinement.evidence import PoseEvidence
+from arview.tracking import Estimate, TrackingSession
+from arview.tracking.guided_init import GuidedPose
+from arview.tracking.identity import IdentityMonitor
+from arview.tracking.identity.background_motion import BackgroundMotion, reduced
+from arview.tracking.identity.monitor import ANOTHER_IN_VIEW, CHECKING, MOVED
+from arview.tracking.identity.part_outline import PartOutline, transfer
+from helpers.synthetic import assembly, assembly_views
+from helpers.turning_bench import CAMERA, LEFT, RIGHT, bench, covered, frame
+
+EVIDENCE = PoseEvidence(1.0, 1.0, 0.5, 0.8, 0.9, 0.5, 1.0, 0.2)
+
+
+@dataclass
+class FakeFinders:
+    """Searches that find the specimens of a list, in every picture."""
+
+    poses: list[Array] = field(default_factory=list)
+    searches: int = 0
+
+    @property
+    def detector(self) -> FakeFinders:
+        return self
+
+    @property
+    def guided_init(self) -> FakeFinders:
+        return self
+
+    def detect(
+        self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True, guesses: object = ()
+    ) -> list[Detection]:
+        self.searches += 1
+        return [Detection(pose, 0.9) for pose in self.poses]
+
+    def find(self, image: NDArray[np.uint8], cam_from_model: Array) -> GuidedPose | None:
+        self.searches += 1
+        for pose in self.poses:
+            if np.linalg.norm((pose - cam_from_model)[:3, 3]) < 60.0:
+                return GuidedPose(pose, EVIDENCE, 0.95)
+        return GuidedPose(cam_from_model, EVIDENCE, 0.2)
+
+
+def estimate(pose: Array, quality: float = 0.95) -> Estimate:
+    return Estimate(pose, np.eye(6), quality, EVIDENCE)
+
+
+def turned(yaw_deg: float, seed: int, pose: Array) -> tuple[NDArray[np.uint8], Array]:
+    """A frame of the bench with both specimens, and the pose (4,4) of one of them there."""
+    image, turn = frame(bench(True, True), yaw_deg, seed)
+    return image, turn @ pose
+
+
+def monitor_after(frames: int = 12) -> tuple[IdentityMonitor, FakeFinders]:
+    """A monitor that has followed the left specimen."""
+    monitor, finders = IdentityMonitor(assembly_views(), CAMERA), FakeFinders()
+    for i in range(frames):
+        image, pose = turned(0.3 * i, i, LEFT)
+        assert monitor.update(image, estimate(pose), i, i / 30.0, finders).identity is Identity.FOLLOWED
+    assert finders.searches == 0
+    return monitor, finders
+
+
+# --- Background ------------------------------------------------------------------------------------------
+
+
+def test_the_background_says_where_the_part_is_through_a_turn_of_the_camera() -> None:
+    outline = PartOutline(assembly_views(), CAMERA)
+    motion = BackgroundMotion(outline)
+    image, before = turned(0.0, 0, LEFT)
+    motion.start(reduced(image, 480), before)
+    pose = before
+    for i in range(1, 16):
+        image, pose = turned(1.0 * i, i, LEFT)
+        motion.follow(image, None)
+    assert motion.homography is not None
+    truth = outline.place(pose)
+    assert np.linalg.norm(truth.center_px - outline.place(before).center_px) > 150.0
+    pixel, scale, _ = transfer(motion.homography, outline.place(before).center_px)
+    assert np.linalg.norm(pixel - truth.center_px) < 4.0
+    assert scale == pytest.approx(1.0, abs=0.1)
+    guess = outline.moved(before, motion.homography)
+    assert np.linalg.norm(apply(guess, assembly().center_in_model) - apply(pose, assembly().center_in_model)) < 40.0
+
+
+def test_a_background_without_features_says_nothing() -> None:
+    motion = BackgroundMotion(PartOutline(assembly_views(), CAMERA))
+    image, pose = turned(0.0, 0, LEFT)
+    motion.start(reduced(image, 480), pose)
+    motion.follow(np.full_like(image, 90), None)
+    assert motion.homography is None
+    # The chain stays broken, until the pictures before and after the gap are matched.
+    image, pose = turned(4.0, 1, LEFT)
+    motion.follow(image, None)
+    assert motion.homography is None
+    motion.match(pose)
+    assert motion.homography is not None
+    outline = PartOutline(assembly_views(), CAMERA)
+    pixel, _, _ = transfer(motion.homography, outline.place(turned(0.0, 0, LEFT)[1]).center_px)
+    assert np.linalg.norm(pixel - outline.place(pose).center_px) < 8.0
+
+
+# --- Decisions, with searches whose results are known ----------------------------------------------------
+
+
+def test_a_part_found_again_at_its_place_is_followed_at_once() -> None:
+    monitor, finders = monitor_after()
+    for i in range(12, 40):
+        image, pose = turned(0.3 * i, i, LEFT)
+        monitor.update(image, None, i, i / 30.0, finders)
+    image, pose = turned(12.0, 40, LEFT)
+    assert monitor.update(image, estimate(pose), 40, 40 / 30.0, finders).identity is Identity.FOLLOWED
+    assert finders.searches == 0
+
+
+@pytest.mark.parametrize("gap", [0, 1, 5, 40])
+def test_a_pose_on_another_specimen_withholds_the_labels(gap: int) -> None:
+    monitor, finders = monitor_after()
+    for i in range(12, 12 + gap):
+        monitor.update(turned(3.6, i, LEFT)[0], None, i, i / 30.0, finders)
+    finders.poses = [turned(3.6, 0, LEFT)[1], turned(3.6, 0, RIGHT)[1]]
+    for i in range(12 + gap, 80 + gap):
+        image, pose = turned(3.6, i, RIGHT)
+        result = monitor.update(image, estimate(pose), i, i / 30.0, finders)
+        assert result.identity is Identity.UNCONFIRMED
+        assert result.reason == ANOTHER_IN_VIEW
+    # A weak pose on it changes nothing, and the user's word ends it.
+    assert monitor.update(image, estimate(pose, 0.3), 200, 200 / 30.0, finders).identity is Identity.UNCONFIRMED
+    monitor.confirm()
+    assert monitor.update(image, estimate(pose), 201, 201 / 30.0, finders).identity is Identity.CONFIRMED
+
+
+def test_the_session_goes_back_to_the_followed_specimen_when_it_is_seen_again() -> None:
+    monitor, finders = monitor_after()
+    finders.poses = [turned(3.6, 0, RIGHT)[1]]
+    back = None
+    for i in range(12, 60):
+        image, pose = turned(3.6, i, RIGHT)
+        if i == 30:
+            finders.poses.append(turned(3.6, 0, LEFT)[1])
+        result = monitor.update(image, estimate(pose), i, i / 30.0, finders)
+        assert result.identity is Identity.UNCONFIRMED
+        if result.cam_from_model is not None:
+            back = i
+            break
+    assert back is not None and 30 <= back <= 45
+    image, pose = turned(3.6, 60, LEFT)
+    assert monitor.update(image, estimate(pose), 60, 2.0, finders).identity is Identity.FOLLOWED
+
+
+def test_a_lone_part_that_was_moved_has_its_labels_back_within_a_second() -> None:
+    monitor, finders = monitor_after()
+    first = None
+    for i in range(12, 60):
+        image, pose = turned(3.6, i, RIGHT)
+        finders.poses = []
+        result = monitor.update(image, estimate(pose), i, i / 30.0, finders)
+        if i == 12:
+            assert (result.identity, result.reason) == (Identity.UNCONFIRMED, CHECKING)
+        if result.identity is Identity.FOLLOWED and first is None:
+            first = i
+    assert first is not None and first - 12 <= 30
+
+
+def test_a_part_whose_place_was_not_in_view_before_stays_unconfirmed() -> None:
+    monitor, finders = IdentityMonitor(assembly_views(), CAMERA), FakeFinders()
+    yaws = np.concatenate([np.full(10, 33.0), np.linspace(33.0, -10.0, 25)])
+    for i in range(10):
+        image, pose = turned(yaws[i], i, LEFT)
+        monitor.update(image, estimate(pose), i, i / 30.0, finders)
+    for i in range(10, 35):
+        monitor.update(turned(yaws[i], i, LEFT)[0], None, i, i / 30.0, finders)
+    for i in range(35, 80):
+        image, pose = turned(-10.0, i, RIGHT)
+        result = monitor.update(image, estimate(pose), i, i / 30.0, finders)
+    assert (result.identity, result.reason) == (Identity.UNCONFIRMED, MOVED)
+
+
+def test_without_a_background_a_lone_part_is_followed_and_one_of_two_is_not() -> None:
+    for others, expected in (([], Identity.FOLLOWED), ([RIGHT], Identity.UNCONFIRMED)):
+        monitor, finders = monitor_after()
+        blank = np.full((CAMERA.height, CAMERA.width, 3), 90, dtype=np.uint8)
+        for i in range(12, 30):
+            monitor.update(blank, None, i, i / 30.0, finders)
+        finders.poses = [turned(3.6, 0, pose)[1] for pose in others]
+        found = turned(3.6, 0, LEFT)[1].copy()
+        found[0, 3] += 250.0
+        for i in range(30, 40):
+            result = monitor.update(blank, estimate(found), i, i / 30.0, finders)
+        assert result.identity is expected
+
+
+def test_the_user_names_the_specimen_by_a_pixel() -> None:
+    monitor, finders = IdentityMonitor(assembly_views(), CAMERA), FakeFinders()
+    outline = PartOutline(assembly_views(), CAMERA)
+    image, left = turned(0.0, 0, LEFT)
+    right = turned(0.0, 0, RIGHT)[1]
+    x, y = outline.place(right).center_px
+    with pytest.raises(InputError, match="outside the picture of 960 × 480 px"):
+        monitor.name_at(4, (5000.0, 10.0))
+    monitor.name_at(4, (x, y))
+    finders.poses = [left, right]
+    for i in range(4):
+        result = monitor.update(image, estimate(left), i, i / 30.0, finders)
+        assert result.identity is Identity.UNCONFIRMED
+        assert "in frame 4" in result.reason
+    result = monitor.update(image, estimate(left), 4, 4 / 30.0, finders)
+    assert result.cam_from_model is not None
+    assert np.array_equal(result.cam_from_model, right)
+    result = monitor.update(image, estimate(right), 5, 5 / 30.0, finders)
+    assert result.identity is Identity.CONFIRMED
+    # Where no part is found the labels stay away.
+    monitor.reset()
+    monitor.name_at(0, (5.0, 5.0))
+    for i in range(3):
+        result = monitor.update(image, estimate(left), i, i / 30.0, finders)
+        assert result.identity is Identity.UNCONFIRMED
+        assert result.reason.startswith("no part of this kind found at 5,5 in frame 0")
+
+
+def test_an_outline_holds_its_centre_and_not_the_pixels_beside_it() -> None:
+    outline = PartOutline(assembly_views(), CAMERA)
+    pose = turned(0.0, 0, LEFT)[1]
+    place = outline.place(pose)
+    assert outline.contains(pose, place.center_px)
+    assert not outline.contains(pose, place.center_px + [place.diameter_px, 0.0])
+    assert len(outline.hull_px(invert(rigid(np.eye(3), [0.0, 0.0, 300.0])))) == 0
+    assert outline.is_in_picture(place, 0.7)
+    assert not outline.is_in_picture(place._replace(center_px=np.array([-50.0, 240.0])), 0.7)
+
+
+# --- Films -----------------------------------------------------------------------------------------------
+
+
+def film(cover: int, with_right: bool, moved: bool = False, count: int = 90) -> tuple[list[Pose], TrackingSession]:
+    """The left specimen is tracked and covered from frame 20 on; with ``moved`` it then is at the right place."""
+    start = frame(bench(True, False), 0.0, 0)[1] @ LEFT
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
+    results = []
+    for i in range(count):
+        wide = bench(not (moved and i >= 20 + cover), with_right or (moved and i >= 20 + cover))
+        if 20 <= i < 20 + cover:
+            wide = covered(wide, LEFT)
+        results.append(session.process(frame(wide, 3.0 * np.sin(i / 12.0), i)[0], i, i / 30.0))
+    return results, session
+
+
+def specimen(pose: Pose) -> str:
+    """``L`` or ``R``, or ``-`` without a pose."""
+    if pose.cam_from_model is None:
+        return "-"
+    turn = frame(bench(True, False), 3.0 * np.sin(pose.index / 12.0), 0)[1]
+    center = apply(pose.cam_from_model, assembly().center_in_model)
+    for name, truth in (("L", LEFT), ("R", RIGHT)):
+        if np.linalg.norm(apply(turn @ truth, assembly().center_in_model) - center) < 40.0:
+            return name
+    return "?"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cover", [5, 40])
+def test_labels_never_go_over_to_another_specimen(cover: int) -> None:
+    results, _ = film(cover, with_right=True)
+    assert [specimen(pose) for pose in results[5:20]] == ["L"] * 15
+    assert all(not pose.is_label_withheld for pose in results[:20])
+    labelled = {specimen(pose) for pose in results if pose.cam_from_model is not None and not pose.is_label_withheld}
+    assert "R" not in labelled
+    assert "R" in {specimen(pose) for pose in results}, "the session never took the other specimen"
+    said = {pose.identity_reason for pose in results if specimen(pose) == "R"}
+    assert ANOTHER_IN_VIEW in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cover", [5, 40])
+def test_a_lone_part_has_its_labels_back_within_a_second_of_each_lock(cover: int) -> None:
+    results, _ = film(cover, with_right=False)
+    assert TrackingState.LOST in {pose.state for pose in results}
+    assert specimen(results[-1]) == "L"
+    found = next(i for i in range(22, 90) if specimen(results[i]) == "L" and results[i - 1].cam_from_model is None)
+    assert all(not pose.is_label_withheld for pose in results[found + 30 :])
+    assert sum(pose.is_label_withheld for pose in results) <= 30
+
+
+@pytest.mark.slow
+def test_a_lone_part_that_was_carried_to_another_place_is_followed() -> None:
+    results, _ = film(10, with_right=False, moved=True)
+    found = next(i for i in range(30, 90) if specimen(results[i]) == "R")
+    assert all(pose.identity is Identity.FOLLOWED for pose in results[found + 30 :])
+    assert len(results[found + 30 :]) > 10
