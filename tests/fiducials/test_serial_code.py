@@ -35,7 +35,9 @@ def drawn(code: NDArray[np.uint8], side_px: float, center: tuple[float, float], 
     return image
 
 
-def worn(image: NDArray[np.uint8], blur_px: float = 0.8, noise: float = 6.0, contrast: float = 0.6) -> NDArray[np.uint8]:
+def worn(
+    image: NDArray[np.uint8], blur_px: float = 0.8, noise: float = 6.0, contrast: float = 0.6
+) -> NDArray[np.uint8]:
     """A picture with blur, noise and less contrast."""
     soft = cv2.GaussianBlur(image, (0, 0), blur_px).astype(np.float32)
     soft = 128 + contrast * (soft - 128) + np.random.default_rng(5).normal(0.0, noise, soft.shape)

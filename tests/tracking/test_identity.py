@@ -236,7 +236,7 @@ def test_an_outline_holds_its_centre_and_not_the_pixels_beside_it() -> None:
     pose = turned(0.0, 0, LEFT)[1]
     place = outline.place(pose)
     assert outline.contains(pose, place.center_px)
-    assert not outline.contains(pose, place.center_px + [place.diameter_px, 0.0])
+    assert not outline.contains(pose, place.center_px + np.array([place.diameter_px, 0.0]))
     assert len(outline.hull_px(invert(rigid(np.eye(3), [0.0, 0.0, 300.0])))) == 0
     assert outline.is_in_picture(place, 0.7)
     assert not outline.is_in_picture(place._replace(center_px=np.array([-50.0, 240.0])), 0.7)
