@@ -60,6 +60,11 @@ def _parse_moment(ctx: click.Context, parameter: click.Parameter, value: str | N
     return moment
 
 
+def _keep_for_drawing(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
+    """Keep a switch that only the options of the drawing need, see `_drawing_options`."""
+    ctx.meta[f"{__name__}.{parameter.name}"] = value
+
+
 @main.command(
     short_help="Track a part in a video and draw on it.",
     epilog="""\b
@@ -119,6 +124,8 @@ Ctrl-C ends the run and finishes the files.""",
               help="CAD edges to draw.")  # fmt: skip
 @click.option("--no-ghost", is_flag=True, help="Leave out the translucent components.")
 @click.option("--no-labels", is_flag=True, help="Leave out the labels.")
+@click.option("--no-legend", is_flag=True, expose_value=False, callback=_keep_for_drawing,
+              help="Leave out the legend of components that are not as measured.")  # fmt: skip
 @click.option("--opacity", type=click.FloatRange(0.0, 1.0), help="Opacity of the translucent components, 0 to 1.")
 @MODALITY
 @RENDERER
@@ -215,7 +222,7 @@ def _exit_if_interrupted(ctx: click.Context, summary: AnnotateSummary) -> None:
 def _overlay(part: Part, inspection: Inspection | None, options: OverlayOptions, camera: Camera) -> OverlayRenderer:
     from arview.overlay import OverlayRenderer
 
-    return OverlayRenderer(part.model, camera, inspection, options)
+    return OverlayRenderer(part.model, camera, inspection, options, part.serial)
 
 
 def _drawing_options(show_edges: str, no_ghost: bool, no_labels: bool, opacity: float | None) -> OverlayOptions:
@@ -224,6 +231,7 @@ def _drawing_options(show_edges: str, no_ghost: bool, no_labels: bool, opacity: 
     return OverlayOptions(
         show_ghost=not no_ghost,
         show_labels=not no_labels,
+        show_legend=not click.get_current_context().meta[f"{__name__}.no_legend"],
         show_edges=cast("EdgeMode", show_edges),
         opacity=OverlayOptions.opacity if opacity is None else opacity,
     )

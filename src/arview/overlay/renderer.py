@@ -44,7 +44,7 @@ _ARROW_RGB = (255, 255, 255)
 
 
 @dataclass(frozen=True)
-class _Scene:
+class _OverlayScene:
     """What is drawn of the components, as long as the evidence on them stays the same.
 
     Attributes:
@@ -115,7 +115,7 @@ class OverlayRenderer:
         self._bottom_px = bottom_px
         self._hidden_frames = np.zeros(len(self._names), dtype=np.int64)
         self._is_occluded = np.zeros(len(self._names), dtype=np.bool_)
-        self._scene: _Scene | None = None
+        self._scene: _OverlayScene | None = None
         self.laid_out = LaidOut()
 
     def draw(
@@ -182,7 +182,7 @@ class OverlayRenderer:
             return [None] * len(self._names)
         return [presence_of(pose, name, len(self._names)) for name in self._names]
 
-    def _scene_of(self, pose: Pose, presences: list[ComponentPresence | None], now: datetime | None) -> _Scene:
+    def _scene_of(self, pose: Pose, presences: list[ComponentPresence | None], now: datetime | None) -> _OverlayScene:
         """What is drawn of the components; computed again when the evidence changes."""
         is_withheld = pose.is_label_withheld and self.options.show_evidence
         evidence = tuple(evidence_of(presence, is_withheld) for presence in presences)
@@ -195,7 +195,7 @@ class OverlayRenderer:
             wanted = labels.text_urgency(self._names, self.inspection, by_name)
             order = tuple(index[name] for name in wanted) if self.options.show_labels and not is_withheld else ()
             arrows = self._arrows_in_model(list(evidence)) if self.options.show_arrows else np.zeros((0, 2, 3))
-            self._scene = _Scene(key, evidence, styles, order, arrows, {})
+            self._scene = _OverlayScene(key, evidence, styles, order, arrows, {})
         return self._scene
 
     def _draw_model(
@@ -203,7 +203,7 @@ class OverlayRenderer:
         canvas: paint.Image,
         view: GhostView,
         pose: Pose,
-        scene: _Scene,
+        scene: _OverlayScene,
         presences: list[ComponentPresence | None],
     ) -> None:
         assert pose.cam_from_model is not None
@@ -238,7 +238,7 @@ class OverlayRenderer:
         canvas: paint.Image,
         view: GhostView,
         pose: Pose,
-        scene: _Scene,
+        scene: _OverlayScene,
         presences: list[ComponentPresence | None],
     ) -> None:
         assert pose.cam_from_model is not None
@@ -257,7 +257,7 @@ class OverlayRenderer:
         self._annotations.draw_labels(canvas, self.laid_out)
 
     def _labelled(
-        self, view: GhostView, pose: Pose, scene: _Scene, presences: list[ComponentPresence | None]
+        self, view: GhostView, pose: Pose, scene: _OverlayScene, presences: list[ComponentPresence | None]
     ) -> tuple[list[LabelledComponent], NDArray[np.float32]]:
         """Components that may get a label, and the weighted covered area of each cell of the picture."""
         assert pose.cam_from_model is not None
@@ -276,7 +276,9 @@ class OverlayRenderer:
             result.append(LabelledComponent(text, anchors_px[index], anchors_in_cam[index], int(seen_px[index])))
         return result, cells
 
-    def _text(self, index: int, presence: ComponentPresence | None, scene: _Scene, note: str) -> labels.LabelText:
+    def _text(
+        self, index: int, presence: ComponentPresence | None, scene: _OverlayScene, note: str
+    ) -> labels.LabelText:
         """Texts of a component's label."""
         text = scene.texts.get((index, note))
         if text is None or scene.evidence[index] is Evidence.DISPLACED:
@@ -318,7 +320,7 @@ class OverlayRenderer:
         note = "one of two places" if count == 2 else f"one of {count} places"
         return {int(index): note for index in np.flatnonzero(apart)}
 
-    def _draw_legend(self, canvas: paint.Image, scene: _Scene) -> int:
+    def _draw_legend(self, canvas: paint.Image, scene: _OverlayScene) -> int:
         """Draw the legend above the status line if it is needed; returns the row above which labels must stay."""
         entries = legend_entries(scene.evidence) if self.options.show_legend else ()
         if not entries:
@@ -356,7 +358,11 @@ class OverlayRenderer:
             paint.arrow(canvas, tail_px, tip_px, _ARROW_RGB, 0.24 * self._size_px)
 
     def _draw_links(
-        self, canvas: paint.Image, cam_from_model: Array, scene: _Scene, presences: list[ComponentPresence | None]
+        self,
+        canvas: paint.Image,
+        cam_from_model: Array,
+        scene: _OverlayScene,
+        presences: list[ComponentPresence | None],
     ) -> None:
         """Arrows from the nominal places of displaced components to where they are seen."""
         links = [
