@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.assembly.edge_support import EdgeSupport
-from arview.assembly.log_odds import LogOddsOptions, fused_log_odds
 from arview.assembly.monitor import AssemblyMonitor, MonitorOptions
 from arview.assembly.observation import Observation
 from arview.cad.model import Model
@@ -60,9 +58,14 @@ def views_of(count: int, seed: int) -> list[Array]:
 def said(log_odds: Array, is_visible: NDArray[np.bool_] | None = None) -> Observation:
     """An observation with log odds (C,), without suspects."""
     none = np.zeros(len(log_odds), dtype=bool)
-    zeros = np.zeros(len(log_odds))
-    support = EdgeSupport(zeros, zeros, zeros, zeros, zeros, zeros)
-    return Observation(log_odds, none, none if is_visible is None else is_visible, support)
+    return Observation(
+        log_odds=log_odds,
+        is_suspect=none,
+        is_visible=none if is_visible is None else is_visible,
+        is_occluded=none,
+        alternative=np.full(len(log_odds), -np.inf),
+        shifts=np.zeros((len(log_odds), 3)),
+    )
 
 
 def about(pose: Array, seed: int) -> Array:
@@ -294,15 +297,3 @@ def test_a_session_never_calls_a_similar_part_tracked() -> None:
             assert mismatched(result.mismatches) == {"post_1"}
             assert result.state.value == "critical"
             assert "post_1 not seen where expected" in result.reason
-
-
-def test_an_occluded_component_is_suspect_only_where_the_network_is_sure() -> None:
-    by_edges, by_network = np.array([3.0, 3.0, 3.0, -3.0, -3.0]), np.array([3.5, 1.0, np.nan, np.nan, -2.0])
-    options = LogOddsOptions()
-    seen = fused_log_odds(by_edges, by_network, options)
-    hidden = fused_log_odds(by_edges, by_network, options, unoccluded=0.0)
-    assert seen[0] > hidden[0] > 1.0
-    assert seen[1] > 1.0 and hidden[1] < 0.0
-    assert seen[2] == pytest.approx(3.0 * options.edges_alone) and hidden[2] == 0.0
-    # Evidence for a component comes from what is visible: nothing occludes it.
-    assert np.all(seen[3:] == hidden[3:]) and seen[4] < -1.0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from arview.assembly.monitor import AssemblyMonitor
+from arview.assembly.placement_search import Alternatives
 from arview.assembly.placements import Placements, alternative_placements
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
@@ -130,11 +131,12 @@ def test_an_occluded_right_component_is_found_at_no_other_place(noise: float) ->
 def test_a_verified_component_is_not_searched_for(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def never(*of: object) -> np.ndarray:
+    def never(*of: object) -> Alternatives:
         asked.append(of[-1])
-        return np.full(len(walled().components), -np.inf)
+        count = len(walled().components)
+        return Alternatives(np.full(count, -np.inf), np.zeros((count, 3)))
 
-    monkeypatch.setattr(monitor()._observer._search, "log_odds", never)
+    monkeypatch.setattr(monitor()._observer._search, "search", never)
     image = picture(POSES[0], walled(), seed=1, noise=3.0)
     monitor().reset()
     for _ in range(4):

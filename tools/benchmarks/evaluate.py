@@ -48,6 +48,7 @@ from rows import ResultRow
 from suites.detection import DetectionSuite
 from suites.guided_init import guided_init_rows
 from suites.measurement import measurement_rows
+from suites.presence import PresenceSuite
 from suites.quality import quality_rows
 from suites.real_conditions import REAL_FRAMES, REAL_SHAPES, RealConditionsSuite
 from suites.reconstruction import reconstruction_rows
@@ -61,7 +62,7 @@ SEED = 7
 SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
     "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
-    "accepted", "scale",
+    "accepted", "scale", "presence",
 )  # fmt: skip
 
 
@@ -94,6 +95,7 @@ def main() -> None:
     parser.add_argument(
         "--real-frames", type=positive, default=REAL_FRAMES, help=f"of their sequences; default: {REAL_FRAMES}"
     )
+    parser.add_argument("--assemblies", type=positive, help="of presence: how many assemblies; default: all six")
     chosen = parser.parse_args()
     every = scenes(SEQUENCES)
     found = {name: scene for name, scene in every.items() if name in VIDEOS}
@@ -104,6 +106,7 @@ def main() -> None:
         details, chosen.sequences, chosen.conditions, chosen.real_shapes, chosen.real_frames, chosen.frames,
         chosen.backgrounds,
     )  # fmt: skip
+    presence = PresenceSuite(found, details, chosen.sequences, chosen.frames, chosen.assemblies, chosen.backgrounds)
     makers: tuple[Callable[[], list[ResultRow]], ...] = (
         lambda: tracking_rows(every, details),
         lambda: convergence_rows(found),
@@ -122,6 +125,7 @@ def main() -> None:
         lambda: quality_rows(every, real, details, chosen.frames),
         lambda: [row for name in PHOTO_SEQUENCES if name in every for row in acceptance_rows(every[name])],
         lambda: [row for name in SCALED if name in every for row in scale_rows(every[name], "truth", details)],
+        presence.rows,
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []

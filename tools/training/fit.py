@@ -48,6 +48,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))  # photos and recordings are shared
 
 from arview.errors import ArviewError, InputError
+from component_odds_examples import collect_component_odds
+from component_odds_fitting import fit_component_odds
 from composite_backgrounds import make_composites
 from confidence_fitting import fit_confidence
 from contour_examples import collect_contours
@@ -71,6 +73,7 @@ EXAMPLES: dict[str, Callable[[range, tuple[Path, ...], Path], None]] = {
     "contour-examples": collect_contours,
     "pair-examples": collect_pairs,
     "component-examples": collect_components,
+    "component-odds-examples": collect_component_odds,
 }
 """Steps that make examples of random solids."""
 NETWORKS: dict[str, Callable[[Path, int, bool], None]] = {
@@ -117,6 +120,8 @@ def parser() -> argparse.ArgumentParser:
         step.set_defaults(run=run_network, fit=fit)
     step = steps.add_parser("pair-comparator", parents=[epochs, folder], help="train this network")
     step.set_defaults(run=lambda chosen: fit_pair_comparator(chosen.folder, chosen.epochs))
+    step = steps.add_parser("component-odds", parents=[folder], help="fit the weights of the log odds of components")
+    step.set_defaults(run=lambda chosen: fit_component_odds(chosen.folder))
     step = steps.add_parser("confidence", parents=[solids], help="fit the weights of the confidence")
     step.set_defaults(run=lambda chosen: fit_confidence(seeds_of(chosen), fitting_photos(chosen.photos)))
     step = steps.add_parser("backgrounds", parents=[solids, folder], help="make backgrounds of things on photos")

@@ -105,9 +105,9 @@ def _component_crops(seed: int, photos: Sequence[Path]) -> Iterator[ComponentCro
         variant = VARIANTS[int(rng.integers(len(VARIANTS)))]
         options = SequenceOptions(variant, 1, int(rng.integers(1 << 30)), noise=rng.uniform(2.0, 14.0), motion=ANYWHERE)
         pose = trajectory(model, options)[0]
-        shown = _displaced(built, model, rng)
+        shown = slightly_displaced(built, model, rng)
         image = _picture(shown, model, pose, options, (occluder, *others), photos, rng)
-        cam_from_body = _perturbed(pose, rng) @ rigid(np.eye(3), model.center_in_model)
+        cam_from_body = perturbed_pose(pose, rng) @ rigid(np.eye(3), model.center_in_model)
         picture = PartImage(image, network.predict(image), intrinsics_of(CAMERA), cam_from_body)
         crops = component_crops(picture, surface, model.diameter_mm)
         is_wrong = [model.components[crop.index].name in changed for crop in crops]
@@ -186,7 +186,7 @@ def _depth_mm(component: Component, pose: Array) -> float:
     return float(apply(pose, np.mean(component.bounds_in_model, axis=0))[2])
 
 
-def _perturbed(pose: Array, rng: np.random.Generator) -> Array:
+def perturbed_pose(pose: Array, rng: np.random.Generator) -> Array:
     """A pose with the error of a tracker."""
     much = 2.0 if rng.random() < WORSE_SHARE else 1.0
     turn = exp_so3(np.deg2rad(rng.normal(0.0, much * ERROR_DEG, 3)))
@@ -227,7 +227,7 @@ def _reduced(model: Model, rng: np.random.Generator) -> tuple[Model, tuple[str, 
     return make_model(model.name, left), tuple(sorted(absent))
 
 
-def _displaced(built: Model, model: Model, rng: np.random.Generator) -> Model:
+def slightly_displaced(built: Model, model: Model, rng: np.random.Generator) -> Model:
     """An assembly whose components, except for the base, are slightly displaced."""
     base = _base(model).name
     spread_mm = ASSEMBLY_SHARE * model.diameter_mm

@@ -43,12 +43,18 @@ class DirectionEvidence:
         component_count: C.
         center_in_model: (3,) the part's centre, mm.
         options: see `DirectionOptions`.
+
+    Attributes:
+        observations: (C,) how many said anything of each component.
+        spreads_deg: (C,) largest angle between the directions of these.
     """
 
     def __init__(self, component_count: int, center_in_model: Array, options: DirectionOptions) -> None:
         self._options, self._center_in_model = options, center_in_model
         self._directions = np.zeros((0, 3))
         self._counts, self._sums = np.zeros((0, component_count)), np.zeros((0, component_count))
+        self.observations = np.zeros(component_count, dtype=np.int64)
+        self.spreads_deg = np.zeros(component_count)
 
     def add(self, cam_from_model: Array, log_odds: Array, is_mismatched: NDArray[np.bool_]) -> Array:
         """Add an observation from a pose.
@@ -71,8 +77,16 @@ class DirectionEvidence:
         counts, sums = self._counts[nearest], self._sums[nearest]
         before = self._combined(counts, sums, is_mismatched)
         counts += log_odds != 0.0
+        self.observations += log_odds != 0.0
+        self._widen_spreads(self._directions[nearest], log_odds != 0.0)
         sums += log_odds
         return self._combined(counts, sums, is_mismatched) - before
+
+    def _widen_spreads(self, direction: Array, is_observed: NDArray[np.bool_]) -> None:
+        """Take a new observation of some components into account in their spreads."""
+        angles_deg = np.rad2deg(np.arccos(np.clip(self._directions @ direction, -1.0, 1.0)))
+        spread = np.max(np.where(self._counts > 0, angles_deg[:, None], 0.0), axis=0)
+        self.spreads_deg = np.where(is_observed, np.maximum(self.spreads_deg, spread), self.spreads_deg)
 
     def observations_from(self, cam_from_model: Array) -> int:
         """How many observations of a component, at most, were made from about this direction; 0 for a new one."""

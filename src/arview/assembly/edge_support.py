@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.image_edges import EdgePicture, EdgePictures, find_thin_edges, mark_owners, strength_at
+from arview.assembly.image_edges import ALIGNED, EdgePicture, EdgePictures, find_thin_edges, mark_owners, strength_at
 from arview.assembly.visible_edges import VisibleEdges
 from arview.core.kernel import kernel
 from arview.geometry import Array
@@ -32,6 +32,8 @@ MAX_RUN_GAP_SQUARE = 144.0
 """Squared distance in px between a run's first and last point."""
 MAX_RUN_CONTRAST = 10.0
 """Colour change of a run, in standard deviations, above which it counts no more."""
+ACROSS = np.array([-1.0, 0.0, 1.0])
+"""Steps along a point's normal at which an edge is looked for."""
 FIRST_REACH_PX, REACH_GROWTH, MAX_REACH_PX = 16.0, 1.5, 130.0
 """Surrounding points are gathered within the first distance, which grows by the factor until there are enough."""
 
@@ -111,6 +113,14 @@ class EdgeSupport(NamedTuple):
     determined: Array
 
 
+class FoundPoints(NamedTuple):
+    """Edge points in a picture: pixels (N,2), whether each lies on an image edge (N,), at which shift (2,) in px."""
+
+    pixels: Array
+    is_found: NDArray[np.bool_]
+    shift: NDArray[np.int64]
+
+
 class Projection(NamedTuple):
     """Pose (4,4) and intrinsics (10,) of a picture, and the length in mm over which directions are projected."""
 
@@ -170,9 +180,48 @@ class EdgeSupportMeter:
         """
         picture = self._pictures.of(image)
         projection = Projection(cam_from_body, intrinsics, 0.01 * self._diameter_mm)
+        self._measured = picture, projection
         return EdgeSupport(
             *measure_edge_support(picture, edges, projection, self._shifts(px_per_mm), self.options.points)
         )
+
+    def found_points(self, edges: VisibleEdges, is_wanted: NDArray[np.bool_]) -> FoundPoints:
+        """Own edge points of some components (C,) in the picture measured last, at the best shift of all together.
+
+        Args:
+            edges: those that were measured.
+            is_wanted: (C,) the components.
+        """
+        points = self._points(edges, is_wanted[edges.component] & edges.is_own)
+        reach = int(np.ceil(self.options.pose_px)) + 1
+        hits = [(self._hits(points, shift), shift) for shift in _disc(0.0, reach, 1)]
+        is_found, shift = max(hits, key=lambda one: (np.count_nonzero(one[0]), -int(np.sum(one[1] ** 2))))
+        return FoundPoints(points.pixels, is_found, shift)
+
+    def found_behind(self, edges: VisibleEdges, shift: NDArray[np.int64]) -> FoundPoints:
+        """All points of other edges in the picture measured last, at a shift (2,) of `found_points`."""
+        points = self._points(edges, np.ones(len(edges.component), dtype=bool))
+        return FoundPoints(points.pixels, self._hits(points, shift), shift)
+
+    def _points(self, edges: VisibleEdges, is_wanted: NDArray[np.bool_]) -> _Projected:
+        """Those of some edge points (N,) that are inside the picture measured last."""
+        picture, (cam_from_body, intrinsics, step_mm) = self._measured
+        pixels, normals, depths = project_lines(
+            edges.points_in_body, edges.tangents, True, cam_from_body, intrinsics, step_mm
+        )
+        margin = int(np.ceil(self.options.pose_px)) + 3
+        size = np.array(picture.strength.shape[::-1])
+        kept = is_wanted & (depths > 0) & (pixels > margin).all(axis=1) & (pixels < size - 1 - margin).all(axis=1)
+        return _Projected(pixels[kept], normals[kept], depths[kept])
+
+    def _hits(self, points: _Projected, shift: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(N,) points on edges of their direction at a shift (2,), at most a pixel off along the normal."""
+        picture = self._measured[0]
+        places = np.round(points.pixels[:, None] + ACROSS[:, None] * points.normals[:, None] + shift).astype(np.intp)
+        u, v = places[..., 0], places[..., 1]
+        directions, normals = picture.directions[:, v, u].astype(np.int64), np.round(127.0 * points.normals)[:, None]
+        along = np.abs(directions[0] * normals[..., 0] + directions[1] * normals[..., 1])
+        return np.asarray(((picture.strength[v, u] > 0) & (along > ALIGNED)).any(axis=1))
 
     def _shifts(self, px_per_mm: float) -> Shifts:
         """Shifts within the allowed deviation, and those beyond it within the searched distance."""

@@ -1,8 +1,11 @@
-"""Log odds that a component is not at its nominal placement, by its edges and by the presence network.
+"""Log odds that a component is not at its nominal placement, by all that one picture shows of it.
 
-Two logistic models, of the edges alone and of edges and network together. Their weights were fitted to pictures of
-right and wrong assemblies and are stored in ``weights/component_log_odds.json``. Log odds are natural logarithms of the
-likelihood ratio of "not there" to "there".
+The picture shows the component, its place without it, or something before both, which says nothing. A multinomial
+logistic model (Böhning, 1992) gives the odds of the first two to the third; where something may be before the place
+they are limited by the mixture: log((1 + absent) / (1 + present)). A second model of the edges alone says for which
+components no more than these need to be measured. The weights were fitted to pictures of random assemblies and are
+stored in ``weights/component_log_odds.json``. Log odds are natural logarithms of the likelihood ratio of "not there"
+to "there".
 """
 
 from __future__ import annotations
@@ -13,9 +16,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from arview.assembly.bare_place import BarePlaces
 from arview.assembly.edge_support import EdgeSupport
 from arview.geometry import Array
 from arview.weights import load_weights
+
+FEATURES = (
+    "constant", "supported", "lead", "contrast", "determined", "determined_supported", "determined_lead",
+    "network_against", "network_for", "is_predicted", "bare", "is_bare_known", "bare_unsupported", "ring",
+    "is_ring_known", "around", "is_around_known", "base",
+    "behind", "is_behind_known", "bare_around", "against_around", "against_unsupported",
+)  # fmt: skip
+"""Inputs of the model of places, in order; see `evidence_features`."""
 
 
 class EdgeWeights(NamedTuple):
@@ -34,43 +46,61 @@ class EdgeWeights(NamedTuple):
     colour_contrast: float
 
 
-class FusionWeights(NamedTuple):
-    """Log odds by edges and network together: a constant, and weights of the three.
+class PlaceWeights(NamedTuple):
+    """Weights (F,) of `FEATURES` in the log odds of "absent" and of "present" to "something is before the place"."""
 
-    Attributes:
-        constant: added where the network has predicted.
-        edges: of the log odds by edges.
-        network_against: of the network's log odds where they are positive.
-        network_for: of the network's log odds where they are negative.
-    """
-
-    constant: float
-    edges: float
-    network_against: float
-    network_for: float
+    absent: Array
+    present: Array
 
 
 @dataclass(frozen=True)
 class LogOddsOptions:
-    """Bounds of the evidence, and how occlusion discounts it.
+    """Bounds of the measurements.
 
     Attributes:
         half_reliable_points: number of determined points (see `EdgeSupport.determined`) at which edges count half.
         typical_contrast: contrast that stands for components without an outline of their own.
         max_contrast: contrast above which it counts no more.
-        max_against: cap on what edges and network each count against a component.
-        occlusion_discount: subtracted from what the network counts against a component when nothing around it is
-            found: the network is not sure of components that a hand hides either.
-        edges_alone: share that counts of log odds by edges against a component too small for the network; its
-            surroundings and occluders leave its edges unsupported more often than where the weights were fitted.
+        max_network: bound on the network's log odds, in both directions.
     """
 
     half_reliable_points: float = 15.0
     typical_contrast: float = 5.0
     max_contrast: float = 6.0
-    max_against: float = 4.0
-    occlusion_discount: float = 2.4
-    edges_alone: float = 0.35
+    max_network: float = 5.0
+
+
+class Evidence(NamedTuple):
+    """Measurements of each component in one picture; of those that are not visible they mean nothing.
+
+    Attributes:
+        support: of the edges.
+        network: (C,) log odds against the nominal placement by the presence network, NaN where it has not predicted.
+        places: what is seen at the place; -1 where that was not measured.
+        base: share of the edge points of trusted components that lie on image edges.
+    """
+
+    support: EdgeSupport
+    network: Array
+    places: BarePlaces
+    base: float
+
+
+class PlaceOdds(NamedTuple):
+    """Log odds (C,) that a picture shows a place without its component, or with it, to something before the place."""
+
+    absent: Array
+    present: Array
+
+    @property
+    def log_odds(self) -> Array:
+        """(C,) of "not there" to "there"."""
+        return np.asarray(np.logaddexp(0.0, self.absent) - np.logaddexp(0.0, self.present))
+
+    @property
+    def occluded(self) -> Array:
+        """(C,) probability that something is before the place."""
+        return np.asarray(1.0 / (1.0 + np.exp(self.absent) + np.exp(self.present)))
 
 
 @cache
@@ -80,9 +110,11 @@ def edge_weights() -> EdgeWeights:
 
 
 @cache
-def fusion_weights() -> FusionWeights:
-    """The fitted weights of edges and network together."""
-    return FusionWeights(**load_weights("component_log_odds")["fusion"])
+def place_weights() -> PlaceWeights:
+    """The fitted weights of all measurements together."""
+    groups = load_weights("component_log_odds")
+    absent, present = (np.array([groups[name][f] for f in FEATURES]) for name in ("place_absent", "place_present"))
+    return PlaceWeights(absent, present)
 
 
 def edge_log_odds(support: EdgeSupport, options: LogOddsOptions) -> Array:
@@ -98,22 +130,30 @@ def edge_log_odds(support: EdgeSupport, options: LogOddsOptions) -> Array:
     return np.asarray(log_odds * determined / (determined + options.half_reliable_points))
 
 
-def fused_log_odds(
-    by_edges: Array, by_network: Array, options: LogOddsOptions, unoccluded: Array | float = 1.0
-) -> Array:
-    """Log odds (C,) by edges and network together.
+def place_odds(evidence: Evidence, options: LogOddsOptions) -> PlaceOdds:
+    """What the picture shows at each place, by all measurements."""
+    features, weights = evidence_features(evidence, options), place_weights()
+    return PlaceOdds(features @ weights.absent, features @ weights.present)
 
-    Args:
-        by_edges: (C,) log odds.
-        by_network: (C,) log odds, NaN where the network has not predicted.
-        options: see `LogOddsOptions`.
-        unoccluded: (C,) 1 where the edges around a component, or of the whole part, are found, 0 where none are:
-            something hides them, or the picture is blurred. Evidence for a component counts in full all the same.
-    """
-    o, w = options, fusion_weights()
-    alone = np.where(by_edges > 0.0, o.edges_alone * by_edges * unoccluded, by_edges)
-    edges = np.where(by_edges > 0.0, np.minimum(by_edges, o.max_against) * unoccluded, by_edges)
-    against = np.minimum(by_network, o.max_against) - o.occlusion_discount * (1.0 - np.asarray(unoccluded))
-    against = np.maximum(against, 0.0)
-    both = w.constant + w.edges * edges + w.network_against * against + w.network_for * np.minimum(by_network, 0.0)
-    return np.asarray(np.where(np.isnan(by_network), alone, both))
+
+def evidence_features(evidence: Evidence, options: LogOddsOptions) -> Array:
+    """Inputs (C,F) of the model of places, see `FEATURES`; measurements that are not known are 0."""
+    o, (support, network, places, base) = options, evidence
+    contrast = np.where(support.contrast < 0.0, o.typical_contrast, np.minimum(support.contrast, o.max_contrast))
+    determined = np.maximum(support.determined, 0.0)
+    reliable = determined / (determined + o.half_reliable_points)
+    lead = support.supported - support.displaced
+    is_predicted = ~np.isnan(network)
+    predicted = np.clip(np.where(is_predicted, network, 0.0), -o.max_network, o.max_network)
+    is_bare, is_ring, is_around = places.bare >= 0.0, places.ring >= 0.0, places.around >= 0.0
+    is_behind, around = places.behind >= 0.0, np.where(is_around, places.around, 0.0)
+    bare = np.where(is_bare, places.bare * places.coverage, 0.0)
+    columns = [
+        np.ones(len(network)), support.supported, lead, contrast / o.max_contrast, reliable,
+        reliable * support.supported, reliable * lead, np.maximum(predicted, 0.0), np.minimum(predicted, 0.0),
+        is_predicted, bare, np.where(is_bare, places.coverage, 0.0), bare * (1.0 - support.supported),
+        np.where(is_ring, places.ring, 0.0), is_ring, around, is_around,
+        np.full(len(network), base), np.where(is_behind, places.behind, 0.0), is_behind, bare * around,
+        np.maximum(predicted, 0.0) * around, np.maximum(predicted, 0.0) * (1.0 - support.supported),
+    ]  # fmt: skip
+    return np.stack([np.asarray(column, dtype=np.float64) for column in columns], axis=1)

@@ -1,36 +1,41 @@
-"""Is every component where the CAD has it? A similar part is tracked as well, though one component is wrong.
+"""Is every component where the CAD has it? Presence of each, by all pictures since the part was found.
 
-The base and all other components determine the pose, so a component that is missing, misplaced or replaced leaves its
-own edges unsupported. Observations of single pictures (`observation`) give log odds that each component is not at its
-nominal placement; here they add up over pictures from different directions until a threshold is passed, as in Wald's
-sequential test (1945). One set of fitted weights serves all parts.
+The base carries the pose; of the other components any number may be absent. Observations of single pictures
+(`observation`) give log odds that each component is not at its nominal placement; here they add up over pictures from
+different directions until a threshold is passed, as in Wald's sequential test (1945). One set of fitted weights serves
+all parts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.direction_evidence import DirectionEvidence, DirectionOptions
-from arview.assembly.observation import ComponentObserver, Observation, ObservationOptions
+from arview.assembly.observation import ComponentObserver, Known, Observation, ObservationOptions
 from arview.cad.model import Model
 from arview.camera import Camera
-from arview.geometry import Array
+from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewSet
+from arview.pose import ComponentPresence, Presence, Visibility
 
 
 @dataclass(frozen=True)
 class MonitorOptions:
-    """When components are called mismatched or verified, and how often frames are observed.
+    """When components are called missing or present, and how often frames are observed.
 
     Attributes:
         mismatch_log_odds: a component with more becomes mismatched.
         cleared_log_odds: a mismatched component with less is cleared; other components with more are uncertain.
         verified_log_odds: a component with less is verified: the odds that it is not there are below 1 to 50.
         open_log_odds: a component with more is open: it is observed sooner, and at alternative placements too.
+        settled_log_odds: a mismatched component with more is no reason to observe sooner.
         single_log_odds: a component with more in a single picture is a mismatch of that picture.
+        displaced_log_odds: a mismatched component is displaced if its alternative placement has more.
+        same_shift: alternative placements that differ by less than this share of the part's diameter are the same.
         max_added: cap on the log odds that one observation adds against a component, because one entering the view is
             at first only partly visible.
         max_log_odds: bound on the summed log odds, in both directions.
@@ -43,6 +48,7 @@ class MonitorOptions:
             directions; from a known direction the next longer interval is used.
         fresh_observations: observations from a direction before it counts as known while a component is suspect,
             because the first ones may have been blurred.
+        inside_share: share of the corners of a component's box that must be in the picture.
         observation: options of a single observation.
         directions: options of combining observations from one direction.
     """
@@ -51,7 +57,10 @@ class MonitorOptions:
     cleared_log_odds: float = 0.1
     verified_log_odds: float = -4.0
     open_log_odds: float = -1.0
+    settled_log_odds: float = 4.5
     single_log_odds: float = 1.8
+    displaced_log_odds: float = 2.4
+    same_shift: float = 0.05
     max_added: float = 2.3
     max_log_odds: float = 6.0
     forgetting: float = 0.01
@@ -60,6 +69,7 @@ class MonitorOptions:
     open_frames: int = 15
     rest_frames: int = 45
     fresh_observations: int = 6
+    inside_share: float = 0.5
     observation: ObservationOptions = field(default_factory=ObservationOptions)
     directions: DirectionOptions = field(default_factory=DirectionOptions)
 
@@ -74,6 +84,9 @@ class MonitorState:
         is_mismatched: (C,) mismatched.
         is_verified: (C,) confirmed at its nominal placement.
         was_visible: (C,) visible in the last observation.
+        was_occluded: (C,) behind something in the last observation.
+        alternative: (C,) summed log odds of "at an alternative placement".
+        shifts: (C,3) mm in the model frame to that placement.
         has_suspects: the last observation had suspects.
         observations: made so far.
         frames_since: frames since the last observation.
@@ -84,6 +97,9 @@ class MonitorState:
     is_mismatched: NDArray[np.bool_]
     is_verified: NDArray[np.bool_]
     was_visible: NDArray[np.bool_]
+    was_occluded: NDArray[np.bool_]
+    alternative: Array
+    shifts: Array
     has_suspects: bool = False
     observations: int = 0
     frames_since: int = 0
@@ -103,9 +119,12 @@ class AssemblyMonitor:
         self, views: GuideViewSet, camera: Camera, model: Model, options: MonitorOptions | None = None
     ) -> None:
         self.options = options or MonitorOptions()
-        self._views = views
+        self._views, self._camera = views, camera
         self._has_components = len(model.components) > 1
         self._observer = ComponentObserver(views, camera, model, self.options.observation)
+        boxes = np.array([one.bounds_in_model for one in model.components])
+        # (8,C,3) corners of the boxes.
+        self._corners = np.stack([np.stack([boxes[:, k >> a & 1, a] for a in range(3)], axis=1) for k in range(8)])
         self.reset()
 
     @property
@@ -116,8 +135,7 @@ class AssemblyMonitor:
     @property
     def uncertain(self) -> tuple[str, ...]:
         """Names of components that must be observed again before the part is called right."""
-        state = self._state
-        return self._names((state.log_odds > self.options.cleared_log_odds) & ~state.is_mismatched)
+        return self._names(self._is_uncertain())
 
     @property
     def unverified(self) -> tuple[str, ...]:
@@ -133,6 +151,9 @@ class AssemblyMonitor:
             is_mismatched=np.zeros(count, dtype=bool),
             is_verified=np.zeros(count, dtype=bool),
             was_visible=np.zeros(count, dtype=bool),
+            was_occluded=np.zeros(count, dtype=bool),
+            alternative=np.zeros(count),
+            shifts=np.zeros((count, 3)),
         )
 
     def update(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
@@ -146,30 +167,105 @@ class AssemblyMonitor:
         state.frames_since += 1
         if not self._has_components or not self._is_due(cam_from_model):
             return
-        observation = self.observe(image, cam_from_model, self._searched())
+        known = Known(state.is_verified, state.is_mismatched, self._searched())
+        observation = self.observe(image, cam_from_model, known)
         state.observations += 1
         state.frames_since = 0
-        state.has_suspects, state.was_visible = bool(observation.is_suspect.any()), observation.is_visible
+        state.has_suspects = bool((observation.is_suspect & ~self._is_settled()).any())
+        state.was_visible, state.was_occluded = observation.is_visible, observation.is_occluded
         capped = np.minimum(observation.log_odds, o.max_added)
         added = state.directions.add(cam_from_model, capped, state.is_mismatched)
         state.log_odds = np.clip((1.0 - o.forgetting) * state.log_odds + added, -o.max_log_odds, o.max_log_odds)
+        self._add_alternatives(observation)
         verified_below = np.where(state.is_verified, o.cleared_log_odds, o.verified_log_odds)
         state.is_verified = state.log_odds < verified_below
         if state.observations >= o.first_observations:
             mismatched_above = np.where(state.is_mismatched, o.cleared_log_odds, o.mismatch_log_odds)
             state.is_mismatched = state.log_odds > mismatched_above
 
-    def observe(
-        self, image: NDArray[np.uint8], cam_from_model: Array, is_searched: NDArray[np.bool_] | None = None
-    ) -> Observation:
-        """Observe all components in one picture, whatever was observed before; see `ComponentObserver.observe`."""
-        return self._observer.observe(image, cam_from_model, is_searched)
+    def presence(self, cam_from_model: Array, is_ambiguous: bool = False) -> Mapping[str, ComponentPresence]:
+        """Presence of each component by its name; empty for a part of one component.
+
+        Args:
+            cam_from_model: (4,4) mm pose of the present frame, for the visibility.
+            is_ambiguous: other poses fit as well, in which components other than the base would be elsewhere.
+        """
+        if not self._has_components:
+            return {}
+        state = self._state
+        visibilities = self._visibilities(cam_from_model)
+        presences = self._presences(is_ambiguous)
+        probabilities = 1.0 / (1.0 + np.exp(state.log_odds))
+        spreads_deg = state.directions.spreads_deg
+        return {
+            name: ComponentPresence(
+                presence=presences[c],
+                visibility=visibilities[c],
+                probability=0.5 if is_ambiguous and c != self._observer.base else float(probabilities[c]),
+                observations=int(state.directions.observations[c]),
+                spread_deg=float(spreads_deg[c]),
+                model_from_nominal=rigid(np.eye(3), state.shifts[c]) if presences[c] is Presence.DISPLACED else None,
+            )
+            for c, name in enumerate(self._views.component_names)
+        }
+
+    def observe(self, image: NDArray[np.uint8], cam_from_model: Array, known: Known | None = None) -> Observation:
+        """Observe all components in one picture, by default whatever was observed before; see `ComponentObserver`."""
+        return self._observer.observe(image, cam_from_model, known)
 
     def mismatches_in(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[str, ...]:
         """Mismatches by one picture alone; the state of the monitor is neither used nor changed."""
         if not self._has_components:
             return ()
         return self._messages(self.observe(image, cam_from_model).log_odds > self.options.single_log_odds)
+
+    def _presences(self, is_ambiguous: bool) -> list[Presence]:
+        """Presence of each component."""
+        o, state = self.options, self._state
+        is_displaced = state.is_mismatched & (state.alternative > o.displaced_log_odds)
+        is_uncertain = self._is_uncertain()
+        found = np.select(
+            [is_displaced, state.is_mismatched, state.is_verified, is_uncertain],
+            [Presence.DISPLACED, Presence.MISSING, Presence.PRESENT, Presence.UNCERTAIN],
+            Presence.UNVERIFIED,
+        )
+        if is_ambiguous:
+            found[np.arange(len(found)) != self._observer.base] = Presence.UNCERTAIN
+        return [Presence(one) for one in found]
+
+    def _visibilities(self, cam_from_model: Array) -> list[Visibility]:
+        """Visibility of each component in a frame."""
+        o, camera, state = self.options, self._camera, self._state
+        corners = self._corners.reshape(-1, 3) @ cam_from_model[:3, :3].T + cam_from_model[:3, 3]
+        pixels = np.nan_to_num(camera.project(corners), nan=-1e9)
+        size = np.array([camera.width, camera.height])
+        is_inside = ((pixels >= 0) & (pixels < size)).all(axis=1) & (corners[:, 2] > 0)
+        is_outside = is_inside.reshape(8, -1).mean(axis=0) < o.inside_share
+        is_shown = self._observer.visible_from(cam_from_model) & ~state.was_occluded
+        found = np.where(is_outside, Visibility.OUTSIDE, np.where(is_shown, Visibility.VISIBLE, Visibility.HIDDEN))
+        return [Visibility(one) for one in found]
+
+    def _is_uncertain(self) -> NDArray[np.bool_]:
+        """(C,) components against which there is some evidence, but not enough."""
+        state = self._state
+        return np.asarray((state.log_odds > self.options.cleared_log_odds) & ~state.is_mismatched)
+
+    def _is_settled(self) -> NDArray[np.bool_]:
+        """(C,) mismatched components of which no more evidence is needed soon."""
+        return self._state.is_mismatched & (self._state.log_odds > self.options.settled_log_odds)
+
+    def _add_alternatives(self, observation: Observation) -> None:
+        """Add the evidence of one observation for alternative placements, as long as these are the same."""
+        o, state = self.options, self._state
+        is_searched = np.isfinite(observation.alternative)
+        apart = np.linalg.norm(observation.shifts - state.shifts, axis=1)
+        is_same = apart < o.same_shift * self._views.diameter_mm
+        seen = np.where(is_searched, np.clip(observation.alternative, -o.max_added, o.max_added), 0.0)
+        before = np.where(is_same | ~is_searched, state.alternative, np.maximum(state.alternative - o.max_added, 0.0))
+        is_better = is_searched & (is_same | (seen > before))
+        state.shifts = np.where(is_better[:, None], observation.shifts, state.shifts)
+        total = np.where(is_same | ~is_searched, before + seen, np.maximum(before, seen))
+        state.alternative = np.clip(total, 0.0, o.max_log_odds)
 
     def _searched(self) -> NDArray[np.bool_]:
         """(C,) components to search for elsewhere: at first all that are open, then one after another."""
@@ -187,7 +283,7 @@ class AssemblyMonitor:
             return True
         if state.frames_since < o.suspect_frames:
             return False
-        highest = float(state.log_odds.max())
+        highest = float(np.where(self._is_settled(), 0.0, state.log_odds).max())
         waits = (o.suspect_frames, o.open_frames, o.rest_frames, o.rest_frames)
         step = 0 if state.has_suspects or highest > o.cleared_log_odds else 1 if highest > o.open_log_odds else 2
         if step == 1 and self._shows_new(cam_from_model):

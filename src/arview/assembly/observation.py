@@ -13,17 +13,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.edge_support import EdgeSupport, EdgeSupportMeter, EdgeSupportOptions
-from arview.assembly.log_odds import LogOddsOptions, edge_log_odds, fused_log_odds
-from arview.assembly.placement_search import PlacementSearch, PlacementSearchOptions
+from arview.assembly.bare_place import BarePlaceMeter, BarePlaceOptions
+from arview.assembly.edge_support import EdgeSupportMeter, EdgeSupportOptions
+from arview.assembly.log_odds import Evidence, LogOddsOptions, edge_log_odds, place_odds
+from arview.assembly.placement_search import Alternatives, PlacementSearch, PlacementSearchOptions
 from arview.assembly.placements import PlacementOptions, alternative_placements
 from arview.assembly.presence_net import PartImage, PresenceNet, component_crops
-from arview.assembly.visible_edges import VisibleEdgeCache, VisibleEdgeOptions
-from arview.cad.model import Model
+from arview.assembly.visible_edges import VisibleEdgeCache, VisibleEdgeOptions, VisibleEdges
+from arview.cad.model import Model, make_model
 from arview.camera import Camera
 from arview.detection.features.edge_net import EdgeNet
 from arview.geometry import Array, apply, rigid
 from arview.guideviews import GuideViewSet
+from arview.guideviews.surface import Surface
 from arview.refinement.projection import intrinsics_of
 
 
@@ -34,49 +36,74 @@ class ObservationOptions:
     Attributes:
         max_part_px: larger pictures of the part are shrunk to about this size.
         margin_px: border around the part that is cut out with it, after shrinking.
-        occluded_share: share of supported edge points around a component up to which it counts as occluded.
-        unoccluded_share: share from which on it counts as unoccluded; in between it counts in proportion.
         confirmed_log_odds: components with less by their edges are confirmed, and the network does not predict for
             them, because it is less certain on real pictures.
         nominal_edges: weight of edge evidence for the nominal placement in the log odds of an alternative one, which
             otherwise depend on the network alone.
-        suspect_log_odds: components with more are suspects; occlusion is not considered here.
-        expected_suspects: each suspect beyond this number halves the log odds against all components, because one
-            wrong component is more likely than many.
+        trusted_log_odds: components with less by their edges are taken to be there, like those seen in earlier
+            pictures: they are what is seen behind absent ones.
+        suspect_log_odds: components with more are suspects.
+        pose_found: share of the edge points of the base, and of others that are there, up to which the pose counts as
+            wrong, and from which on it counts as right.
+        occluded_probability: components with more are hidden by something before them.
         max_log_odds: bound on the log odds of one observation, in both directions.
-        visible_edges, edge_support, log_odds, placements, placement_search: options of these steps.
+        visible_edges, edge_support, bare_place, log_odds, placements, placement_search: options of these steps.
     """
 
     max_part_px: float = 400.0
     margin_px: float = 44.0
-    occluded_share: float = 0.42
-    unoccluded_share: float = 0.67
     confirmed_log_odds: float = -2.0
     nominal_edges: float = 0.8
+    trusted_log_odds: float = -2.0
     suspect_log_odds: float = 1.0
-    expected_suspects: int = 2
+    pose_found: tuple[float, float] = (0.4, 0.55)
+    occluded_probability: float = 0.5
     max_log_odds: float = 4.0
     visible_edges: VisibleEdgeOptions = field(default_factory=VisibleEdgeOptions)
     edge_support: EdgeSupportOptions = field(default_factory=EdgeSupportOptions)
+    bare_place: BarePlaceOptions = field(default_factory=BarePlaceOptions)
     log_odds: LogOddsOptions = field(default_factory=LogOddsOptions)
     placements: PlacementOptions = field(default_factory=PlacementOptions)
     placement_search: PlacementSearchOptions = field(default_factory=PlacementSearchOptions)
 
 
+class Known(NamedTuple):
+    """What earlier pictures have shown of the components; all (C,).
+
+    Attributes:
+        is_present: seen at their nominal placement.
+        is_absent: seen not to be there: they hide nothing.
+        is_searched: to be searched for at alternative placements.
+    """
+
+    is_present: NDArray[np.bool_]
+    is_absent: NDArray[np.bool_]
+    is_searched: NDArray[np.bool_]
+
+
+def nothing_known(count: int) -> Known:
+    """Nothing is known of C components, and all are searched for."""
+    return Known(np.zeros(count, dtype=bool), np.zeros(count, dtype=bool), np.ones(count, dtype=bool))
+
+
 class Observation(NamedTuple):
-    """Evidence of one picture about each component; all (C,).
+    """Evidence of one picture about each component; all (C,) but the shifts.
 
     Attributes:
         log_odds: of "not at its nominal placement" to "there"; 0 without evidence.
-        is_suspect: it may be missing or occluded, or is found at an alternative placement.
-        is_visible: enough of it is visible to measure its edges.
-        support: the measurements of its edges, -1 where it is not visible.
+        is_suspect: it may be missing, or is found at an alternative placement.
+        is_visible: enough of it is visible to measure its edges, if nothing is before it.
+        is_occluded: something is before it.
+        alternative: log odds of "at an alternative placement" to "at its nominal placement"; -inf without a search.
+        shifts: (C,3) mm in the model frame to the best alternative placement.
     """
 
     log_odds: Array
     is_suspect: NDArray[np.bool_]
     is_visible: NDArray[np.bool_]
-    support: EdgeSupport
+    is_occluded: NDArray[np.bool_]
+    alternative: Array
+    shifts: Array
 
 
 class PartCrop(NamedTuple):
@@ -109,6 +136,11 @@ class ComponentObserver:
         self._model_from_body = rigid(np.eye(3), views.center_in_model)
         self._visible_edges = VisibleEdgeCache(views, model, o.visible_edges)
         self._meter = EdgeSupportMeter(views.diameter_mm, o.edge_support)
+        self._shown: tuple[VisibleEdges, NDArray[np.bool_]] | None = None
+        self._count, self.base = len(views.component_names), base_of(model)
+        base = model.components[self.base]
+        self._base_edges = VisibleEdgeCache(views, make_model(base.name, (base,)), o.visible_edges)
+        self._places = BarePlaceMeter(views.surface, self._count, views.diameter_mm, o.bare_place)
         self._edge_net, self._presence_net = EdgeNet(), PresenceNet()
         placements = alternative_placements(model, o.placements)
         self._search = PlacementSearch(
@@ -117,74 +149,102 @@ class ComponentObserver:
         low, high = model.bounds_in_model
         self._corners_in_model = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
 
-    def observe(
-        self, image: NDArray[np.uint8], cam_from_model: Array, is_searched: NDArray[np.bool_] | None = None
-    ) -> Observation:
+    def observe(self, image: NDArray[np.uint8], cam_from_model: Array, known: Known | None = None) -> Observation:
         """Observe all components at a pose.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             cam_from_model: (4,4) mm, exact to a pixel or two.
-            is_searched: (C,) components that are also searched for at alternative placements; None: all.
+            known: what earlier pictures have shown; None: nothing, and all components are searched for.
         """
+        o = self._options
+        known = known or nothing_known(self._count)
+        evidence, picture = self.measure(image, cam_from_model, known)
+        is_visible = evidence.support.supported >= 0.0
+        odds = place_odds(evidence, o.log_odds)
+        by_place = np.where(is_visible, odds.log_odds, 0.0)
+        occluded = np.where(is_visible, odds.occluded, 0.0)
+        # The base carries the pose: where it is not seen, nothing is known.
+        by_place[self.base] = min(by_place[self.base], 0.0)
+        found = Alternatives(np.full(self._count, -np.inf), np.zeros((self._count, 3)))
+        if picture is not None and known.is_searched.any():
+            nominal = np.where(evidence.network > 0.0, (1.0 - occluded) * evidence.network, evidence.network)
+            found = self._search.search(picture, nominal, known.is_searched)
+        alternative = found.log_odds + o.nominal_edges * np.minimum(by_place, 0.0)
+        alternative = np.where(alternative > 0.0, (1.0 - occluded) * alternative, alternative)
+        log_odds = np.maximum(by_place, alternative)
+        # A wrong pose leaves the base's edges unsupported, too: nothing then counts against a component.
+        low, high = o.pose_found
+        is_right = float(np.clip((evidence.base - low) / (high - low), 0.0, 1.0))
+        log_odds = np.clip(np.where(log_odds > 0.0, is_right * log_odds, log_odds), -o.max_log_odds, o.max_log_odds)
+        return Observation(
+            log_odds=log_odds,
+            is_suspect=log_odds > o.suspect_log_odds,
+            is_visible=is_visible,
+            is_occluded=is_visible & (occluded > o.occluded_probability),
+            alternative=alternative,
+            shifts=found.shifts,
+        )
+
+    def measure(
+        self, image: NDArray[np.uint8], cam_from_model: Array, known: Known
+    ) -> tuple[Evidence, PartImage | None]:
+        """All measurements but the search for alternative placements, and the picture around the part for that."""
         o = self._options
         crop = self._part_crop(image, cam_from_model)
         edges = self._visible_edges.nearest(cam_from_model)
         support = self._meter.measure(crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm)
         is_visible = support.supported >= 0.0
-        is_searched = np.ones(len(is_visible), dtype=bool) if is_searched is None else is_searched
         by_edges = np.where(is_visible, edge_log_odds(support, o.log_odds), 0.0)
-        unoccluded = self._unoccluded(support)
-        is_predicted = is_visible & (by_edges > o.confirmed_log_odds)
-        by_network, alternative = self._network_log_odds(crop, is_predicted, is_searched, unoccluded)
-        alternative = alternative + o.nominal_edges * np.minimum(by_edges, 0.0)
-        alternative = unoccluded * np.maximum(alternative, 0.0) + np.minimum(alternative, 0.0)
-        plain = fused_log_odds(by_edges, by_network, o.log_odds)
-        is_suspect = is_visible & (plain > o.suspect_log_odds) | (alternative > o.suspect_log_odds)
-        fused = fused_log_odds(by_edges, by_network, o.log_odds, unoccluded)
-        log_odds = np.maximum(np.where(is_visible, fused, 0.0), alternative)
-        excess = max(0, int(np.count_nonzero(is_suspect)) - o.expected_suspects)
-        log_odds = np.where(log_odds > 0.0, log_odds * 0.5**excess, log_odds)
-        return Observation(np.clip(log_odds, -o.max_log_odds, o.max_log_odds), is_suspect, is_visible, support)
+        is_doubtful = is_visible & (by_edges > o.confirmed_log_odds)
+        is_trusted = known.is_present | (by_edges < o.trusted_log_odds)
+        is_trusted[self.base] = True
+        points = self._meter.found_points(edges, is_trusted)
+        is_doubtful[self.base] = False
+        places = self._places.measure(
+            crop.image, crop.cam_from_body, crop.intrinsics, is_doubtful, is_trusted, known.is_absent, points,
+            self._meter.found_behind(self._base_edges.nearest(cam_from_model), points.shift),
+        )  # fmt: skip
+        network, picture = np.full(self._count, np.nan), None
+        if (is_doubtful | known.is_searched).any():
+            picture = PartImage(crop.image, self._edge_net.predict(crop.image), crop.intrinsics, crop.cam_from_body)
+            network = self._network_log_odds(picture, known, is_doubtful)
+        base = float(np.mean(points.is_found)) if len(points.is_found) else 0.0
+        return Evidence(support, network, places, base), picture
 
     def visible_from(self, cam_from_model: Array) -> NDArray[np.bool_]:
         """(C,) components that show enough edge points of their own from about the direction of a pose."""
         edges = self._visible_edges.nearest(cam_from_model)
-        points = np.bincount(edges.component[edges.is_own], minlength=len(edges.starts) - 1)
-        return np.asarray(points >= self._options.edge_support.points.min_points)
+        if self._shown is None or self._shown[0] is not edges:
+            points = np.bincount(edges.component[edges.is_own], minlength=len(edges.starts) - 1)
+            self._shown = edges, np.asarray(points >= self._options.edge_support.points.min_points)
+        return self._shown[1]
 
-    def _unoccluded(self, support: EdgeSupport) -> Array:
-        """(C,) 1 where the edges around a component, and those of all others, are found; 0 where they are not."""
-        o = self._options
-        found = np.minimum(support.surroundings, support.others)
-        share = np.clip((found - o.occluded_share) / (o.unoccluded_share - o.occluded_share), 0.0, 1.0)
-        return np.where(support.supported >= 0.0, share, 1.0)
+    def _network_log_odds(self, picture: PartImage, known: Known, is_exact: NDArray[np.bool_]) -> Array:
+        """Log odds (C,) by the network against the nominal placements of some components, and of those searched for.
 
-    def _network_log_odds(
-        self, crop: PartCrop, is_predicted: NDArray[np.bool_], is_searched: NDArray[np.bool_], unoccluded: Array
-    ) -> tuple[Array, Array]:
-        """Log odds (C,) by the network against the nominal placements, and for alternative placements.
-
-        Args:
-            crop: around the part.
-            is_predicted: (C,) whose nominal placement is wanted; NaN for the others and those too small.
-            is_searched: (C,) whose alternative placements are wanted; -inf for the others.
-            unoccluded: (C,) discounts what counts against a nominal placement, see `fused_log_odds`.
+        NaN for the others and those too small. Components that are only searched for need no averaging over mirrored
+        crops.
         """
-        nominal, alternative = np.full(len(is_predicted), np.nan), np.full(len(is_predicted), -np.inf)
-        if not (is_predicted | is_searched).any():
-            return nominal, alternative
-        picture = PartImage(crop.image, self._edge_net.predict(crop.image), crop.intrinsics, crop.cam_from_body)
-        wanted = np.flatnonzero(is_predicted | is_searched).tolist()
-        crops = component_crops(picture, self._surface, self._diameter_mm, wanted)
-        # Components that are only searched for need no averaging over mirrored crops.
-        for is_exact in (True, False):
-            some = [one for one in crops if is_predicted[one.index] == is_exact]
-            nominal[[one.index for one in some]] = self._presence_net.log_odds(some, is_mirrored=is_exact)
-        if is_searched.any():
-            discounted = np.where(nominal > 0.0, unoccluded * nominal, nominal)
-            alternative = self._search.log_odds(picture, discounted, is_searched)
-        return np.where(is_predicted, nominal, np.nan), alternative
+        nominal = np.full(self._count, np.nan)
+        crops = []
+        for index in np.flatnonzero(is_exact | known.is_searched):
+            surface = self._surface_without(known.is_absent & (np.arange(self._count) != index))
+            crops += component_crops(picture, surface, self._diameter_mm, [int(index)])
+        for is_mirrored in (True, False):
+            some = [one for one in crops if is_exact[one.index] == is_mirrored]
+            nominal[[one.index for one in some]] = self._presence_net.log_odds(some, is_mirrored)
+        return nominal
+
+    def _surface_without(self, is_absent: NDArray[np.bool_]) -> Surface:
+        """The surface without some components."""
+        surface = self._surface
+        if not is_absent.any():
+            return surface
+        kept = ~is_absent[surface.component]
+        return surface._replace(
+            faces=surface.faces[kept], normals=surface.normals[kept], component=surface.component[kept]
+        )
 
     def _part_crop(self, image: NDArray[np.uint8], cam_from_model: Array) -> PartCrop:
         """The picture around the part, shrunk by a whole factor where it is large."""
@@ -203,3 +263,9 @@ class ComponentObserver:
             cut = np.asarray(cv2.resize(cut, (int(small[0]), int(small[1])), interpolation=cv2.INTER_AREA))
         cut_camera = camera.cropped(*low.tolist(), *(high - low).tolist()).scaled(*small.tolist())
         return PartCrop(cut, intrinsics_of(cut_camera), px_per_mm / shrink, cam_from_body)
+
+
+def base_of(model: Model) -> int:
+    """Index of the component with the box of the largest surface: it carries the others, and the pose."""
+    sides = np.array([np.ptp(one.bounds_in_model, axis=0) for one in model.components])
+    return int(np.argmax(sides[:, 0] * sides[:, 1] + sides[:, 1] * sides[:, 2] + sides[:, 2] * sides[:, 0]))

@@ -59,6 +59,18 @@ class PlacementSearchOptions:
     slope: float = 2.0
 
 
+class Alternatives(NamedTuple):
+    """The best alternative placement of each component.
+
+    Attributes:
+        log_odds: (C,) of "there" to "at the nominal placement"; -inf where nothing was searched for or visible.
+        shifts: (C,3) mm from nominal, in the model frame.
+    """
+
+    log_odds: Array
+    shifts: Array
+
+
 class _Placement(NamedTuple):
     """A component, its shift (3,) mm from nominal, and the component that is removed to make room, -1: none."""
 
@@ -97,16 +109,13 @@ class PlacementSearch:
         self._surface, self._starts = _by_component(surface, len(placements.shifts))
         self._options = options or PlacementSearchOptions()
 
-    def log_odds(self, picture: PartImage, nominal: Array, is_searched: NDArray[np.bool_]) -> Array:
-        """Log odds of "at an alternative placement" to "at the nominal placement".
+    def search(self, picture: PartImage, nominal: Array, is_searched: NDArray[np.bool_]) -> Alternatives:
+        """The best alternative placements.
 
         Args:
             picture: around the part.
             nominal: (C,) the network's log odds against the nominal placements, NaN where these are not visible.
             is_searched: (C,) components that are searched for.
-
-        Returns:
-            (C,), -inf where nothing was searched for or visible.
         """
         o = self._options
         nominal = np.where(np.isnan(nominal), o.hidden_nominal, np.minimum(nominal, o.max_nominal))
@@ -124,14 +133,18 @@ class PlacementSearch:
         alternative = np.full(len(nominal), -np.inf)
         components = [one.component for one in found]
         alternative[components] = nominal[components] - self._network_log_odds(found, picture)
+        shifts = np.zeros((len(nominal), 3))
+        for one in found:
+            shifts[one.component] = one.shift
         swaps = [swap for swap in self._placements.swaps if swap.first in searched and swap.second in searched]
         swap_log_odds = self._swap_log_odds(swaps, nominal, picture, is_mirrored=False)
         is_likely = swap_log_odds > o.choice_cost - o.swap_margin
         swaps = [swap for swap, likely in zip(swaps, is_likely, strict=True) if likely]
         for swap, log_odds in zip(swaps, self._swap_log_odds(swaps, nominal, picture), strict=True):
-            pair = [swap.first, swap.second]
-            alternative[pair] = np.maximum(alternative[pair], log_odds)
-        return np.asarray(o.slope * (alternative - o.choice_cost))
+            for component, shift in ((swap.first, swap.shift), (swap.second, -swap.shift)):
+                if log_odds > alternative[component]:
+                    alternative[component], shifts[component] = log_odds, shift
+        return Alternatives(np.asarray(o.slope * (alternative - o.choice_cost)), shifts)
 
     def _swap_log_odds(self, swaps: list[Swap], nominal: Array, picture: PartImage, is_mirrored: bool = True) -> Array:
         """Log odds (N,) that pairs of components are swapped: of each one in the other's place."""

@@ -266,6 +266,7 @@ class TrackingSession:
             identity=known.identity,
             identity_reason=known.reason,
             serial=known.serial,
+            components=self.components.presence(estimate.cam_from_model, bool(self._state.hypotheses)),
         )
 
     def _check_image(self, image: NDArray[np.uint8], index: int) -> None:

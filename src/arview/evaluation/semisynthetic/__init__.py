@@ -4,7 +4,7 @@ from arview.evaluation.semisynthetic.ambiguity import indistinguishable_poses, n
 from arview.evaluation.semisynthetic.backgrounds import photos_in
 from arview.evaluation.semisynthetic.conditions import CONDITIONS, Conditions
 from arview.evaluation.semisynthetic.curved_shapes import CURVED_SHAPES, curved_shape
-from arview.evaluation.semisynthetic.look_alikes import LookAlike, look_alikes
+from arview.evaluation.semisynthetic.look_alikes import LookAlike, look_alikes, with_absent
 from arview.evaluation.semisynthetic.make import (
     WALK_ROUND,
     Job,
@@ -61,4 +61,5 @@ __all__ = [
     "shape_job",
     "symmetries_of",
     "trajectory",
+    "with_absent",
 ]

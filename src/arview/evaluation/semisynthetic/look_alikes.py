@@ -82,6 +82,20 @@ def look_alikes(model: Model, moved_mm: float = MOVED_MM) -> tuple[LookAlike, ..
     return tuple(found)
 
 
+def with_absent(model: Model, count: int, rng: np.random.Generator) -> LookAlike:
+    """An assembly of which some components, chosen at random, are absent; never its base, which has the largest box.
+
+    Raises:
+        InputError: there are fewer components beside the base.
+    """
+    base = max(model.components, key=lambda c: float(np.prod(np.ptp(c.bounds_in_model, axis=0) + 1e-3)))
+    others = [component.name for component in model.components if component is not base]
+    if not 1 <= count <= len(others):
+        raise InputError(f"model {model.name!r} has {len(others)} components beside its base; {count} cannot be absent")
+    names = tuple(sorted(others[k] for k in rng.permutation(len(others))[:count]))
+    return LookAlike(f"absent_{count}", "missing", names, _with(model, dict.fromkeys(names)))
+
+
 def different_share(model: Model, other: Model, camera: Camera, cam_from_model: Array) -> float:
     """Share of the pixels of two models at a pose (4,4) that differ, in depth by over 1 mm or in outline."""
     one, two = (ZBufferRenderer(m, camera).render(cam_from_model).depth_mm for m in (model, other))

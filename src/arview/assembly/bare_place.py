@@ -1,0 +1,300 @@
+"""What one picture shows at the place of a component: the bare base, or something else.
+
+A component whose edges are not found is absent or occluded. Where it is absent, the picture shows what it would hide:
+the surface of the components that are known to be there, in the colours of the same faces beside it. A hand or a tool
+has other colours, and also interrupts the edges around.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.assembly.edge_support import FoundPoints
+from arview.geometry import Array
+from arview.guideviews.surface import Surface, draw_surface
+from arview.refinement.projection import project
+
+
+@dataclass(frozen=True)
+class BarePlaceOptions:
+    """Where colours and edges are compared, and how much they may differ.
+
+    Attributes:
+        border_px: pixels this near to a drawn edge are not compared, because the pose is not exact.
+        min_pixels: pixels of a place, or of a reference, with fewer of which it says nothing.
+        reach_px: smallest and largest distance from a place at which the same face is its reference.
+        normal_steps: steps per unit in which normals are rounded to group pixels into faces.
+        max_deviations: standard deviations up to which a pixel has the colour of its reference.
+        noise: smallest standard deviation in grey levels.
+        shading: the same as a share of the brightness.
+        max_noise: largest standard deviation; on a base with more texture few pixels match.
+        max_smoother: factor by which the brightness of a place may vary less than that of its reference.
+        min_behind: edge points behind a place with fewer of which nothing is known.
+        around_px: distance from a place up to which edge points are around it.
+        around_points: points around a place that count, the nearest.
+        min_around: with fewer of them nothing is known.
+    """
+
+    border_px: int = 2
+    min_pixels: int = 12
+    reach_px: tuple[float, float] = (10.0, 40.0)
+    normal_steps: float = 4.0
+    max_deviations: float = 3.0
+    noise: float = 3.0
+    shading: float = 0.04
+    max_noise: float = 16.0
+    max_smoother: float = 2.0
+    min_behind: int = 6
+    around_px: float = 60.0
+    around_points: int = 24
+    min_around: int = 8
+
+
+class BarePlaces(NamedTuple):
+    """What is seen at the place of each component; all (C,), -1 where too little can be compared.
+
+    Attributes:
+        bare: share of the pixels that have the colour of the surface that the component would hide.
+        coverage: share of the component's pixels that can be compared; the others have no such surface behind them.
+        ring: share of the reference pixels beside the place that have the colour of their face elsewhere.
+        around: share of trusted components' edge points near the place that lie on image edges.
+        behind: the same of the base's edge points that the component would hide.
+    """
+
+    bare: Array
+    coverage: Array
+    ring: Array
+    around: Array
+    behind: Array
+
+
+class _Colours(NamedTuple):
+    """Median and standard deviation (3,) of brightness and two colour differences of some pixels."""
+
+    median: Array
+    deviation: Array
+
+
+class _Drawing(NamedTuple):
+    """Component (H,W) that is seen, -1: none, a number for it and its normal (H,W), and the rounded normals (3,H,W)."""
+
+    owners: NDArray[np.int16]
+    faces: NDArray[np.int64]
+    normals: NDArray[np.int64]
+
+
+class BarePlaceMeter:
+    """Measures `BarePlaces` in pictures of one part.
+
+    Args:
+        surface: of the part, about its centre.
+        count: of its components.
+        diameter_mm: of the part.
+        options: see `BarePlaceOptions`.
+    """
+
+    def __init__(
+        self, surface: Surface, count: int, diameter_mm: float, options: BarePlaceOptions | None = None
+    ) -> None:
+        self.options = options or BarePlaceOptions()
+        self._surface, self._count, self._diameter_mm = surface, count, diameter_mm
+
+    def measure(
+        self,
+        image: NDArray[np.uint8],
+        cam_from_body: Array,
+        intrinsics: Array,
+        is_wanted: NDArray[np.bool_],
+        is_trusted: NDArray[np.bool_],
+        is_absent: NDArray[np.bool_],
+        edge_points: FoundPoints,
+        behind: FoundPoints,
+    ) -> BarePlaces:
+        """What is seen at the places of some components.
+
+        Args:
+            image: (H,W,3) RGB, the picture around the part.
+            cam_from_body: (4,4) pose about the model's centre.
+            intrinsics: (10,) of the picture; of its distortion only the shift of the part's centre is used.
+            is_wanted: (C,) components whose place is looked at.
+            is_trusted: (C,) components that are there.
+            is_absent: (C,) components that are not there: they hide nothing.
+            edge_points: of trusted components.
+            behind: of the base alone.
+        """
+        found = np.full((5, self._count), -1.0)
+        places = BarePlaces(found[0], found[1], found[2], found[3], found[4])
+        if not is_wanted.any():
+            return places
+        shape = image.shape[:2]
+        nominal = self._draw(cam_from_body, intrinsics, shape, ~is_absent | is_wanted)
+        bare = self._draw(cam_from_body, intrinsics, shape, is_trusted)
+        o = self.options
+        smooth = _opponent_colours(cv2.GaussianBlur(image, (3, 3), 0))
+        is_sure = (nominal.owners == bare.owners) & (bare.owners >= 0) & (nominal.faces == bare.faces)
+        is_sure &= _is_inner(nominal, o.border_px)
+        is_inner = _is_inner(bare, o.border_px)
+        colours = self._face_colours(smooth, bare.faces, is_sure)
+        for c in np.flatnonzero(is_wanted):
+            place = nominal.owners == c
+            rows, columns = np.flatnonzero(place.any(axis=1)), np.flatnonzero(place.any(axis=0))
+            if len(rows) == 0:
+                continue
+            margin = int(o.around_px)
+            low = np.maximum([rows[0] - margin, columns[0] - margin], 0)
+            window = np.s_[low[0] : rows[-1] + margin + 1, low[1] : columns[-1] + margin + 1]
+            distance = cv2.distanceTransform((~place[window]).astype(np.uint8), cv2.DIST_L2, 3)
+            places.around[c] = self._around(distance, edge_points, low[::-1])
+            places.behind[c] = self._behind(place, behind)
+            inside = cv2.erode(place[window].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            inside = inside if np.count_nonzero(inside) >= o.min_pixels else place[window]
+            compared = inside & is_inner[window] & (bare.owners[window] >= 0)
+            places.coverage[c] = np.count_nonzero(compared) / max(int(np.count_nonzero(inside)), 1)
+            if np.count_nonzero(compared) >= o.min_pixels:
+                places.bare[c], places.ring[c] = self._compare(
+                    smooth[window], bare.faces[window], compared, is_sure[window], distance, colours
+                )
+        return places
+
+    def _draw(
+        self, cam_from_body: Array, intrinsics: Array, shape: tuple[int, ...], is_drawn: NDArray[np.bool_]
+    ) -> _Drawing:
+        """The surface of some components."""
+        surface, (height, width) = self._surface, shape[:2]
+        if not is_drawn.all():
+            kept = is_drawn[surface.component]
+            surface = surface._replace(
+                faces=surface.faces[kept], normals=surface.normals[kept], component=surface.component[kept]
+            )
+        drawn = np.empty((4, height, width), dtype=np.float32)
+        face_ids = np.empty((height, width), dtype=np.int32)
+        x, y, z = cam_from_body[:3, 3].tolist()
+        origin = np.array(project(x, y, z, intrinsics))
+        draw_surface(surface, cam_from_body, intrinsics[:2], origin, self._diameter_mm, drawn, face_ids)
+        steps = self.options.normal_steps
+        rounded = np.round(steps * drawn[:3]).astype(np.int64) + 8
+        owners = np.where(face_ids >= 0, surface.component[face_ids], -1).astype(np.int16)
+        faces = ((owners.astype(np.int64) * 32 + rounded[0]) * 32 + rounded[1]) * 32 + rounded[2]
+        return _Drawing(owners, np.where(owners >= 0, faces, -1), rounded)
+
+    def _face_colours(
+        self, image: NDArray[np.float32], faces: NDArray[np.int64], is_sure: NDArray[np.bool_]
+    ) -> dict[int, _Colours]:
+        """Colours of each face of which enough is surely seen."""
+        if not is_sure.any():
+            return {}
+        numbers, pixels = faces[is_sure], image[is_sure]
+        order = np.argsort(numbers, kind="stable")
+        values, starts = np.unique(numbers[order], return_index=True)
+        groups = np.split(pixels[order], starts[1:])
+        enough = 3 * self.options.min_pixels
+        return {
+            int(value): self._colours(group)
+            for value, group in zip(values, groups, strict=True)
+            if len(group) >= enough
+        }
+
+    def _colours(self, pixels: NDArray[np.float32]) -> _Colours:
+        o = self.options
+        pixels = pixels[:: max(1, len(pixels) // 2000)]
+        median = np.median(pixels.astype(np.float64), axis=0)
+        deviation = 1.4826 * np.median(np.abs(pixels - median), axis=0)
+        return _Colours(median, np.clip(deviation, o.noise + o.shading * abs(float(median[0])), o.max_noise))
+
+    def _compare(
+        self,
+        image: NDArray[np.float32],
+        faces: NDArray[np.int64],
+        compared: NDArray[np.bool_],
+        is_sure: NDArray[np.bool_],
+        distance: NDArray[np.float32],
+        colours: dict[int, _Colours],
+    ) -> tuple[float, float]:
+        """Shares `bare` and `ring` of one place, weighted by the pixels of the faces behind it; -1 without reference.
+
+        Args:
+            image, faces, compared, is_sure, distance: (H,W) around the place: colours, faces behind it, its pixels,
+                pixels that surely show their face, distance from the place.
+            colours: of each face.
+        """
+        o = self.options
+        reach = float(np.clip(0.8 * np.sqrt(np.count_nonzero(compared)), *o.reach_px))
+        beside = is_sure & (distance > 2.0) & (distance < reach)
+        bare, ring, ringed, weight = 0.0, 0.0, 0.0, 0.0
+        values, counts = np.unique(faces[compared], return_counts=True)
+        for value, count in zip(values, counts, strict=True):
+            everywhere = colours.get(int(value))
+            if everywhere is None:
+                continue
+            near = image[beside & (faces == value)]
+            used = everywhere
+            if len(near) >= o.min_pixels:
+                ring += count * _share(near, everywhere, o.max_deviations)
+                ringed += count
+                local = self._colours(near)
+                apart = np.abs(local.median - everywhere.median) / everywhere.deviation
+                used = local if apart.max() < o.max_deviations else everywhere
+            pixels = image[compared & (faces == value)]
+            bare += count * _share(pixels, used, o.max_deviations) * self._texture_match(pixels, everywhere)
+            weight += count
+        if weight < max(o.min_pixels, 0.3 * np.count_nonzero(compared)):
+            return -1.0, -1.0
+        return bare / weight, ring / ringed if ringed > 0 else -1.0
+
+    def _texture_match(self, pixels: NDArray[np.float32], colours: _Colours) -> float:
+        """1 where the brightness of some pixels (N,3) varies like that of their face, less where it is smoother."""
+        o = self.options
+        deviation = 1.4826 * float(np.median(np.abs(pixels[:, 0] - np.median(pixels[:, 0])))) + 1.0
+        reference = float(colours.deviation[0])
+        if reference < 2.0 * o.noise:
+            return 1.0
+        return float(np.clip(o.max_smoother * deviation / reference, 0.0, 1.0))
+
+    def _behind(self, place: NDArray[np.bool_], points: FoundPoints) -> float:
+        """Share of edge points inside a place (H,W) that were found; -1 where there are too few."""
+        pixels = np.round(points.pixels).astype(np.intp)
+        is_inside = place[pixels[:, 1], pixels[:, 0]]
+        if np.count_nonzero(is_inside) < self.options.min_behind:
+            return -1.0
+        return float(np.mean(points.is_found[is_inside]))
+
+    def _around(self, distance: NDArray[np.float32], edge_points: FoundPoints, corner: NDArray[np.intp]) -> float:
+        """Share of the nearest trusted edge points that were found; -1 where there are too few."""
+        o = self.options
+        pixels, is_found = edge_points.pixels, edge_points.is_found
+        places = np.round(pixels).astype(np.intp) - corner
+        inside = ((places >= 0) & (places < distance.shape[::-1])).all(axis=1)
+        away = distance[places[inside, 1], places[inside, 0]]
+        near = away < o.around_px
+        if np.count_nonzero(near) < o.min_around:
+            return -1.0
+        nearest = np.argsort(away[near], kind="stable")[: o.around_points]
+        return float(np.mean(is_found[inside][near][nearest]))
+
+
+def _opponent_colours(image: NDArray[Any]) -> NDArray[np.float32]:
+    """(H,W,3) brightness, red less green and yellow less blue: a texture varies mostly in brightness."""
+    red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float32), 2, 0)
+    return np.stack([(red + green + blue) / 3.0, red - green, 0.5 * (red + green) - blue], axis=2)
+
+
+def _share(pixels: NDArray[np.float32], colours: _Colours, max_deviations: float) -> float:
+    """Share of some pixels (N,3) that have the colours."""
+    apart = np.max(np.abs(pixels - colours.median) / colours.deviation, axis=1)
+    return float(np.mean(apart < max_deviations))
+
+
+def _is_inner(drawing: _Drawing, border_px: int) -> NDArray[np.bool_]:
+    """Pixels (H,W) not near a border between components or an edge between faces."""
+    owners, normals = drawing.owners, drawing.normals
+    is_border = np.zeros(owners.shape, dtype=np.uint8)
+    for before, after in ((np.s_[..., :-1, :], np.s_[..., 1:, :]), (np.s_[..., :-1], np.s_[..., 1:])):
+        turn = np.abs(normals[before] - normals[after]).max(axis=0)
+        is_border[before] |= (owners[before] != owners[after]) | (turn > 1)
+    kernel = np.ones((2 * border_px + 1, 2 * border_px + 1), np.uint8)
+    return np.asarray(cv2.dilate(is_border, kernel) == 0)
