@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from functools import lru_cache
+
+from threadpoolctl import ThreadpoolController
 
 
 def thread_count() -> int:
@@ -16,3 +19,18 @@ def thread_count() -> int:
 def pool() -> ThreadPoolExecutor:
     """The shared pool. No job may wait for another job of the same pool, or both could wait forever."""
     return ThreadPoolExecutor(thread_count(), thread_name_prefix="search")
+
+
+def single_threaded_blas() -> AbstractContextManager[object]:
+    """Context in which numpy multiplies matrices in the calling thread.
+
+    For small matrices the threads of BLAS take longer to wait for each other than to multiply, and they keep the cores
+    busy meanwhile.
+    """
+    return _blas().limit(limits=1)
+
+
+@lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    """The loaded BLAS libraries; to find them takes milliseconds."""
+    return ThreadpoolController().select(user_api="blas")

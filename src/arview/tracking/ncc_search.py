@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
+from arview.core.parallel import single_threaded_blas
 from arview.errors import InputError
 from arview.geometry import Array, are_near, exp_so3, rigid, rolls_between, turns_to_rays
 from arview.tracking.view_crops import PART_PX, ViewCropper
@@ -168,9 +169,11 @@ class NccSearch:
             stored.templates[views, rolls], stored.weights[views, rolls], views, o.windows, o.views_per_window
         )
         pictures = self._scaled_pictures(image, distances_mm)
+        with single_threaded_blas():
+            found = [windows.find(picture) for picture in pictures]
         starts = []
-        for level, picture in enumerate(pictures):
-            for center, template in windows.find(picture):
+        for level, places in enumerate(found):
+            for center, template in places:
                 view, step = chosen[template]
                 roll = 2.0 * np.pi * step / o.roll_steps
                 starts.append(ViewPlacement(0.0, np.array([*center, roll, FINE_PART_PX / PART_PX]), level, int(view)))
