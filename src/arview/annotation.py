@@ -11,8 +11,8 @@ import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -78,6 +78,7 @@ class AnnotateSummary:
         seconds: from the start of the run to the finished files.
         states: frames by tracking state.
         reasons: frames by state and reason, of the frames that have a reason.
+        withheld_reasons: frames whose labels were withheld, by the reason, see `Pose.identity_reason`.
         never_verified: components that no frame has verified, see `Pose.unverified`; empty if no frame has a pose.
         ms: (F,) time of detection and tracking of each frame, milliseconds.
         ended_reason: why the source ended early, or empty.
@@ -93,6 +94,7 @@ class AnnotateSummary:
     ms: tuple[float, ...]
     ended_reason: str
     is_interrupted: bool
+    withheld_reasons: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def fps(self) -> float:
@@ -196,6 +198,7 @@ class _Counts:
         self.is_interrupted = False
         self._states: Counter[str] = Counter()
         self._reasons: dict[str, Counter[str]] = {}
+        self._withheld_reasons: Counter[str] = Counter()
         self._never_verified: tuple[str, ...] | None = None
 
     def add(self, pose: Pose) -> None:
@@ -204,6 +207,8 @@ class _Counts:
         self._states[str(pose.state)] += 1
         if pose.reason:
             self._reasons.setdefault(str(pose.state), Counter())[pose.reason] += 1
+        if pose.is_label_withheld:
+            self._withheld_reasons[pose.identity_reason] += 1
         if pose.cam_from_model is not None:
             before = self._never_verified
             self._never_verified = tuple(name for name in pose.unverified if before is None or name in before)
@@ -220,6 +225,7 @@ class _Counts:
             ms=tuple(self.ms),
             ended_reason=source.ended_reason,
             is_interrupted=self.is_interrupted,
+            withheld_reasons=dict(self._withheld_reasons),
         )
 
 
@@ -272,7 +278,7 @@ class _OutputFiles:
             self._poses.abort()
 
 
-def reasons_text(reasons: dict[str, int]) -> str:
+def reasons_text(reasons: Mapping[str, int]) -> str:
     """The most frequent reasons and their frames, e.g. ``too dark (80), only 8 to 12 % of the outline found (40)``.
 
     Reasons that differ only in their numbers are counted together, with the range of those numbers.

@@ -43,6 +43,7 @@ def test_everything_in_a_part_file_arrives(folder):
             """
 name = "demo"
 serial = "S-1"
+serial_pattern = "S-[0-9]+"
 [view_range]
 distance_mm = [400, 900.0]
 elevation_deg = [10, 80]
@@ -75,7 +76,7 @@ diameter_mm = 8
 """,
         )
     )
-    assert (part.name, part.serial) == ("demo", "S-1")
+    assert (part.name, part.serial, part.serial_pattern) == ("demo", "S-1", "S-[0-9]+")
     assert [c.name for c in part.model.components] == ["base_plate", "post_1", "post_2"]
     assert part.model.component("base_plate").color == (1.0, 128 / 255, 0.0)
     assert part.inspected == ("post_1", "post_2")
@@ -138,6 +139,7 @@ def test_a_folder_stands_for_its_part_file_and_unit_overrides(folder):
 BAD = [
     ('colour = "x"\n', r"\[part\] unknown key 'colour'.*allowed: name, cad, unit"),
     ('seriall = "x"\n', "did you mean 'serial'"),
+    ('serial_pattern = "("\n', r"\[part\] serial_pattern = '\(': expected a regular expression"),
     ("name = 5\n", r"\[part\] name = 5: expected text"),
     ("tol_linear_mm = 0\n", "tol_linear_mm = 0: expected a positive number"),
     ("[viewrange]\n", r"unknown key 'viewrange' \(did you mean 'view_range'\?\); allowed: part"),

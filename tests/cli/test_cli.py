@@ -372,7 +372,18 @@ def test_inputs_are_never_overwritten(room: Path) -> None:
     assert (room / "clip.mp4").read_bytes() == before
 
 
-@pytest.mark.parametrize("option", ["--start=x", "--end=-1", "--stride=0", "--modalities=edge,colour", "--opacity=2"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--start=x",
+        "--end=-1",
+        "--stride=0",
+        "--modalities=edge,colour",
+        "--opacity=2",
+        "--serial-at=5",
+        "--serial-at=1s:4,5",
+    ],
+)
 def test_bad_options(room: Path, option: str) -> None:
     result = run("annotate", "clip.mp4", *ANNOTATE, option)
     assert result.exit_code == 64

@@ -21,6 +21,7 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.camera.read import guess_camera
 from arview.errors import InputError, MismatchError
+from arview.fiducials.serial_code import SerialNumbers
 from arview.inspection import load_inspection, save_inspection
 from arview.live.options import RecordingOptions
 from arview.live.protocol import NOTICE_CODES
@@ -44,6 +45,16 @@ class Session:
 
     def __init__(self, subject: Scripted) -> None:
         self.subject = subject
+
+    @property
+    def identity(self) -> Session:
+        return self
+
+    def expect(self, serials: SerialNumbers | None) -> None:
+        self.subject.expected.append(serials)
+
+    def confirm(self) -> None:
+        self.subject.confirmed += 1
 
     def reset(self) -> None:
         self.subject.resets += 1
@@ -72,7 +83,9 @@ class Scripted:
     def __init__(self, pause_s: float = 0.0, fail_at: int | None = None) -> None:
         self.pause_s, self.fail_at = pause_s, fail_at
         self.revision = 1
-        self.resets = self.sessions = self.overlays = 0
+        self.resets = self.sessions = self.overlays = self.confirmed = 0
+        self.serial_numbers: SerialNumbers | None = None
+        self.expected: list[SerialNumbers | None] = []
         self.options = options()
 
     def camera(self, width: int, height: int, turns: int) -> Camera:
@@ -104,6 +117,21 @@ def closing() -> Iterator[Callable[[Feed], Feed]]:
     yield lambda feed: feeds.append(feed) or feed  # type: ignore[func-returns-value]
     for feed in feeds:
         feed.close()
+
+
+def test_a_confirmation_and_another_serial_number_reach_the_session(closing: Callable[[Feed], Feed]) -> None:
+    subject = Scripted()
+    feed = closing(feed_of(subject))
+    feed.put(frame(0))
+    assert wait(lambda: feed.newest is not None and feed.newest.frame.frame_id == 0)
+    assert (subject.confirmed, subject.expected) == (0, [None])
+    subject.serial_numbers = SerialNumbers("BP-0042")
+    feed.confirm()
+    for number in (1, 2):
+        feed.put(frame(number))
+        assert wait(lambda number=number: feed.newest.frame.frame_id == number)
+    assert subject.confirmed == 1
+    assert subject.expected == [None, SerialNumbers("BP-0042"), SerialNumbers("BP-0042")]
 
 
 @pytest.mark.slow

@@ -114,7 +114,7 @@ def test_control_changes_state_and_an_invalid_request_changes_nothing(page: Http
     for wrong in (
         {"mode": "sideways"}, {"mode": 3}, {"style": {"opacity": 7}}, {"style": {"opacity": True}}, {"unknown": 1},
         {"style": {"edges": "x"}}, {"style": {"only": "no_such"}}, {"style": []}, {"style": {"ghost": None}},
-        {"hold": -1}, {"hold": True}, {"hold": 1 << 20}, {"record": "yes"},
+        {"confirm": 1}, {"hold": -1}, {"hold": True}, {"hold": 1 << 20}, {"record": "yes"},
         {"mode": "poses", "style": {"ghost": "yes"}},
     ):  # fmt: skip
         status, refused = page.json("POST", path, wrong)
@@ -130,6 +130,15 @@ def test_reset_searches_again(page: Http) -> None:
     hub_feed = page.json("POST", f"/api/clients/{name}/control", {"reset": True})[0]
     answer = json.loads(send(page, name, COUNT - 1)[2])  # 45 mm away: not to be tracked from the pose before
     assert hub_feed == 200 and answer["state"] == "tracked" and errors(answer, truth()[COUNT - 1])[0] < 3.0
+
+
+@pytest.mark.slow
+def test_a_page_confirms_the_part_in_view(page: Http) -> None:
+    name = page.join()
+    assert json.loads(send(page, name, 0)[2])["withheld"] is None
+    assert page.json("POST", f"/api/clients/{name}/control", {"confirm": True})[0] == 200
+    answer = json.loads(send(page, name, 1)[2])
+    assert (answer["state"], answer["withheld"], answer["identity"]) == ("tracked", None, "confirmed")
 
 
 @pytest.mark.slow

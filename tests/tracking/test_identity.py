@@ -6,16 +6,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+import zxingcpp
 from numpy.typing import NDArray
 
 from arview.detection.detector import Detection
 from arview.errors import InputError
+from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import Array, apply, invert, rigid
 from arview.pose import Identity, Pose, TrackingState
 from arview.refinement.evidence import PoseEvidence
 from arview.tracking import Estimate, TrackingSession
 from arview.tracking.guided_init import GuidedPose
-from arview.tracking.identity import IdentityMonitor
+from arview.tracking.identity import IdentityMonitor, IdentityOptions
 from arview.tracking.identity.background_motion import BackgroundMotion, reduced
 from arview.tracking.identity.monitor import ANOTHER_IN_VIEW, CHECKING, MOVED
 from arview.tracking.identity.part_outline import PartOutline, transfer
@@ -229,6 +231,74 @@ def test_the_user_names_the_specimen_by_a_pixel() -> None:
         result = monitor.update(image, estimate(left), i, i / 30.0, finders)
         assert result.identity is Identity.UNCONFIRMED
         assert result.reason.startswith("no part of this kind found at 5,5 in frame 0")
+
+
+def labelled(text: str, seed: int) -> tuple[NDArray[np.uint8], Array]:
+    """A frame with a QR code on the left specimen, and its pose."""
+    image, pose = turned(0.0, seed, LEFT)
+    made = zxingcpp.create_barcode(text, zxingcpp.BarcodeFormat.QRCode)
+    code = np.array(made.to_image(scale=3, add_quiet_zones=True))
+    code = code[..., 0] if code.ndim == 3 else code
+    u, v = np.round(PartOutline(assembly_views(), CAMERA).place(pose).center_px).astype(int)
+    half = code.shape[0] // 2
+    image[v - half : v - half + code.shape[0], u - half : u - half + code.shape[1]] = code[..., None]
+    return image, pose
+
+
+def test_a_serial_code_confirms_the_part_or_withholds_its_labels() -> None:
+    for text, expected in (("BP-0042", Identity.CONFIRMED), ("BP-0043", Identity.OTHER), ("X", Identity.FOLLOWED)):
+        monitor = IdentityMonitor(assembly_views(), CAMERA, serials=SerialNumbers("BP-0042"))
+        for i in range(4):
+            image, pose = labelled(text, i)
+            result = monitor.update(image, estimate(pose), i, i / 30.0, FakeFinders())
+        assert result.identity is expected
+        assert result.serial == ("" if text == "X" else text)
+        if expected is Identity.OTHER:
+            assert result.reason == "the code on this part says BP-0043, the inspection is of BP-0042"
+            # Another inspection is shown, to which this part belongs.
+            monitor.expect(SerialNumbers("BP-0043"))
+            assert monitor.update(image, estimate(pose), 4, 0.2, FakeFinders()).identity is Identity.CONFIRMED
+            monitor.expect(SerialNumbers("BP-0044"))
+            assert monitor.update(image, estimate(pose), 5, 0.2, FakeFinders()).identity is Identity.OTHER
+
+
+def test_a_serial_code_settles_a_doubt() -> None:
+    monitor = IdentityMonitor(assembly_views(), CAMERA, serials=SerialNumbers("BP-0042"))
+    finders = FakeFinders()
+    for i in range(5):
+        image, pose = turned(0.0, i, RIGHT)
+        monitor.update(image, estimate(pose), i, i / 30.0, finders)
+    finders.poses = [turned(0.0, 0, LEFT)[1], turned(0.0, 0, RIGHT)[1]]
+    found = []
+    for i in range(5, 60):
+        image, pose = labelled("BP-0042", i)
+        found.append(monitor.update(image, estimate(pose), i, i / 30.0, finders).identity)
+    assert found[0] is Identity.UNCONFIRMED
+    assert found[-1] is Identity.CONFIRMED
+    assert found.count(Identity.UNCONFIRMED) <= 15
+
+
+def test_what_is_known_goes_over_to_the_session_of_another_camera() -> None:
+    monitor, finders = monitor_after()
+    finders.poses = [turned(3.6, 0, LEFT)[1], turned(3.6, 0, RIGHT)[1]]
+    image, pose = turned(3.6, 12, RIGHT)
+    assert monitor.update(image, estimate(pose), 12, 0.4, finders).reason == ANOTHER_IN_VIEW
+    other = IdentityMonitor(assembly_views(), CAMERA)
+    other.take_over(monitor)
+    for i in range(13, 50):
+        result = other.update(image, estimate(pose), i, i / 30.0, finders)
+        assert (result.identity, result.reason) == (Identity.UNCONFIRMED, ANOTHER_IN_VIEW)
+    other.confirm()
+    third = IdentityMonitor(assembly_views(), CAMERA)
+    third.take_over(other)
+    assert third.update(image, estimate(pose), 50, 2.0, finders).identity is Identity.CONFIRMED
+
+
+def test_without_the_monitoring_every_pose_is_followed() -> None:
+    monitor = IdentityMonitor(assembly_views(), CAMERA, IdentityOptions(is_used=False))
+    for i, specimen_pose in enumerate((LEFT, RIGHT, LEFT)):
+        image, pose = turned(0.0, i, specimen_pose)
+        assert monitor.update(image, estimate(pose), i, i / 30.0, FakeFinders()).identity is Identity.FOLLOWED
 
 
 def test_an_outline_holds_its_centre_and_not_the_pixels_beside_it() -> None:

@@ -88,6 +88,8 @@ class Part:
         datums: in order of precedence.
         guides: views of the part file.
         serial: serial number of the specimen, or None.
+        serial_pattern: regular expression that a code on the part must match to be a serial number; empty: the form of
+            the serial number, see `arview.fiducials.serial_code.SerialNumbers`.
         notes: remarks of the loader on renamed or empty components.
     """
 
@@ -101,6 +103,7 @@ class Part:
     datums: tuple[Datum, ...] = ()
     guides: tuple[Guide, ...] = ()
     serial: str | None = None
+    serial_pattern: str = ""
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:

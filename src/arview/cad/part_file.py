@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -41,6 +42,10 @@ cad = "bracket_plate.step"     # relative to this file
 tol_linear_mm = 0.1            # STEP: largest distance of the triangles from the true surface
 tol_angular_deg = 10.0         # STEP: largest angle between neighbouring triangles of a curved surface
 serial = "BP-0042"             # of the specimen at hand, shown in the overlay
+# DataMatrix and QR codes on the part whose text matches this regular expression are serial numbers; all others are
+# ignored. Default: texts of the form of the serial number, here BP- and four digits. An AprilTag's text is its family
+# and number, as in tag36h11-42.
+# serial_pattern = "BP-[0-9]{4}"
 
 # From where the camera may look at the middle of the part's bounding box. Azimuth runs from +X to +Y,
 # elevation from the XY plane to +Z, roll 0 has +Z up in the picture. All but distance_mm may be left out.
@@ -156,6 +161,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
     tol_linear_mm = head.positive("tol_linear_mm", 0.1)
     tol_angular_deg = head.positive("tol_angular_deg", 10.0)
     serial = head.text("serial", "") or None
+    serial_pattern = _read_pattern(head)
     head.finish()
     if not cad_path.is_file():
         raise InputError(f"{path}: [part] cad = {str(head.content['cad'])!r}: there is no file {cad_path}")
@@ -194,8 +200,18 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
         datums=datums,
         guides=guides,
         serial=serial,
+        serial_pattern=serial_pattern,
         notes=cad.notes,
     )
+
+
+def _read_pattern(table: TomlTable) -> str:
+    pattern = table.text("serial_pattern", "")
+    try:
+        re.compile(pattern)
+    except re.error as error:
+        table.fail("serial_pattern", pattern, f"a regular expression: {error}")
+    return pattern
 
 
 def _read_view_range(table: TomlTable) -> ViewRange:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -39,6 +40,10 @@ if TYPE_CHECKING:
     from arview.video import FrameSource
 
 
+NAMED_PART = f"{__name__}.named_part"
+"""Key of frame and pixel of --serial-at in the context of the command."""
+
+
 class _Outputs(NamedTuple):
     """Files that a run writes, where they were asked for."""
 
@@ -63,6 +68,16 @@ def _parse_moment(ctx: click.Context, parameter: click.Parameter, value: str | N
 def _keep_for_drawing(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
     """Keep a switch that only the options of the drawing need, see `_drawing_options`."""
     ctx.meta[f"{__name__}.{parameter.name}"] = value
+
+
+def _keep_named_part(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
+    """Keep frame and pixel of ``120:640,400`` for the session, see `_session`."""
+    if value is None:
+        return
+    match = re.fullmatch(r"(\d+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", value)
+    if match is None:
+        raise click.BadParameter(f"{value!r}: expected FRAME:X,Y like 120:640,400")
+    ctx.meta[NAMED_PART] = int(match[1]), (float(match[2]), float(match[3]))
 
 
 @main.command(
@@ -91,6 +106,14 @@ after a loss, every frame is first searched by them. --learned FILE reads such i
 finds the part sooner. They only suggest where to search: what is found must still fit the CAD.
 
 \b
+Which of several equal parts the inspection belongs to. Labels stay with the part that was tracked first. After a
+loss, or a jump, arview compares the place of what it finds with the scene: if it may be another part of the same
+kind, labels are withheld until the first one is seen again. --serial-at FRAME:X,Y names the part at pixel X,Y of
+frame FRAME (numbers as in the poses file): labels are withheld until then and belong to that part from then on. A
+DataMatrix or QR code (or AprilTag) on the part that holds the serial number of the inspection confirms the part; one
+that holds another serial number withholds the labels. See serial_pattern in the part file.
+
+\b
 CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt), fov:DEG
 (field of view along the longer side), exif, or profile:NAME (stored by `arview calibrate --profile`;
 profile alone takes the one that matches what the source says of its camera). Without it the focal length is
@@ -101,7 +124,8 @@ or always from the same side, do not tell the focal length; then the guess is ke
 \b
 Each line of a poses file is a JSON object: index, time_s, state, quality, cam_from_model (4x4 row-major,
 mm), covariance (6x6), ms, reason (why the part is not tracked), mismatches, unverified (components that have
-not been verified yet), alternatives (poses that fit as well), and camera where none was given.
+not been verified yet), alternatives (poses that fit as well), identity (followed, confirmed, unconfirmed or
+other) with identity_reason, serial (read from a code), and camera where none was given.
 Ctrl-C ends the run and finishes the files.""",
 )
 @click.argument("source")
@@ -116,6 +140,10 @@ Ctrl-C ends the run and finishes the files.""",
 @click.option(
     "--learned", "learned_path", metavar="FILE", help="Learned views: read if the file exists, written at the end."
 )
+@click.option(
+    "--serial-at", expose_value=False, callback=_keep_named_part, metavar="FRAME:X,Y",
+    help="Frame and pixel of the part that the inspection belongs to; see below.",
+)  # fmt: skip
 @click.option("--start", callback=_parse_moment, metavar="S", help="First frame: number, or seconds like 2.5s.")
 @click.option("--end", callback=_parse_moment, metavar="S", help="Frame to stop at: number, or seconds like 8s.")
 @click.option("--stride", type=click.IntRange(min=1), default=1, help="Take every N-th frame.", metavar="N")
@@ -182,7 +210,7 @@ def annotate(
     with open_source(source, start=wanted[0], end=wanted[1], stride=stride, fps=fps) as frames:
         camera = camera_for(frames, camera_spec, source)
         views, guide = _views_and_guide(part, camera, views_path, renderer, guide_name)
-        make_session = partial(_session, part, views, session_options(modalities), guide, first_pose)
+        make_session = partial(_session, part, inspection, views, session_options(modalities), guide, first_pose)
         keep = partial(report_estimate, profile=profile, source=source, turns=frames.quarter_turns_clockwise)
         is_guessed = camera_spec is None
         session, camera_of = _start(make_session, frames, camera, is_guessed, views, keep)
@@ -270,6 +298,7 @@ def _views_and_guide(
 
 def _session(
     part: Part,
+    inspection: Inspection | None,
     views: GuideViewSet,
     options: SessionOptions,
     guide: Array | None,
@@ -278,16 +307,22 @@ def _session(
     start: Array | None,
 ) -> TrackingSession:
     """A session with a camera, that goes on from a pose (4,4) or else begins as the command says."""
+    from arview.fiducials.serial_code import SerialNumbers
     from arview.tracking import TrackingSession
 
-    return TrackingSession(
+    serial = (inspection.serial if inspection else "") or part.serial or ""
+    session = TrackingSession(
         views,
         camera=camera,
         model=part.model,
         options=options,
         initial_cam_from_model=first_pose if start is None else start,
         guide_cam_from_model=guide,
+        serials=SerialNumbers(serial, part.serial_pattern) if serial or part.serial_pattern else None,
     )
+    if (named := click.get_current_context().meta.get(NAMED_PART)) is not None:
+        session.identity.name_at(*named)
+    return session
 
 
 def _start(
@@ -355,6 +390,9 @@ def _print_summary(summary: AnnotateSummary, written: list[Path]) -> None:
     )
     for state, reasons in sorted(summary.reasons.items()):
         click.echo(f"{state} {sum(reasons.values())} frames: {reasons_text(reasons)}")
+    if summary.withheld_reasons:
+        withheld = summary.withheld_reasons
+        click.echo(f"labels withheld in {sum(withheld.values())} frames: {reasons_text(withheld)}")
     if summary.never_verified:
         click.echo(f"not verified in any frame: {', '.join(summary.never_verified)}")
 

@@ -84,6 +84,8 @@ Pose::
      "mismatches": [words], "unverified": [components not seen yet], "ambiguous": how many other poses fit as well,
      "completeness": "COMPLETE", "INCOMPLETE: 1 missing", "NOT YET CHECKED" or empty,
      "withheld": {"title", "text"} | null,     of another specimen: nothing that was measured is shown
+     "identity": "followed" | "confirmed" | "unconfirmed" | "other",   is it the part that was followed, see Identity
+     "serial": read from a code on the part, or empty,
      "legend": [{"kind": evidence, "text"}],   kinds of evidence that need an explanation
      "labels": [{"index": of the component, "evidence": "seen" | "unverified" | "uncertain" | "missing" | "displaced",
                  "value", "word": on the label instead of the verdict, "notes": [texts], "color": "#rrggbb",
@@ -110,6 +112,7 @@ Control, every key and every key of ``style`` may be absent::
      "style": {"ghost": bool, "edges": "none" | "visible" | "all", "labels": bool, "opacity": 0 to 1,
                "only": name of the only component to draw | null, "status": bool},     for the server
      "reset": true,               search for the part again
+     "confirm": true,             the part in view is the one to which the labels belong: see withheld of *Pose*
      "hold": frame id | null,     keep this frame for a snapshot; 404 no_such_frame when it is no longer kept
      "record": bool}
 

@@ -140,6 +140,8 @@ function note({ frame, pose, guide, isAnnotated }, isSame) {
 function refreshState(shown = player?.shown) {
   const { phase, trouble, status, part } = state;
   const nowMs = performance.now();
+  const isLive = !player?.isFrozen && phase.name === "connected" && player.isAnswered(nowMs);
+  if (!isLive) find("confirm").hidden = true;
   if (player?.isFrozen) {
     const ago = Math.round((Date.now() - player.frozenAt) / 1000);
     return bar.show("frozen", `picture taken ${ago < 2 ? "just now" : `${ago} s ago`}; press Resume to continue`);
@@ -161,7 +163,9 @@ function refreshState(shown = player?.shown) {
   }[answer.state];
   const reason = answer.remark || defaults;
   const found = answer.completeness.startsWith("INCOMPLETE") ? ["INCOMPLETE"] : [];
-  bar.show(answer.state, [...found, ...(answer.withheld ? [answer.withheld.title] : []), ...(reason ? [reason] : []), ...answer.mismatches].join("; "));
+  const { withheld } = answer;
+  find("confirm").hidden = !withheld;
+  bar.show(answer.state, [...found, ...(withheld ? [`${withheld.title}: ${withheld.text}`] : []), ...(reason ? [reason] : []), ...answer.mismatches].join("; "));
 }
 
 const retryText = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);
@@ -328,6 +332,13 @@ find("opacity").addEventListener("input", (event) => {
 find("search-again").addEventListener("click", async () => {
   toast.show((await connection.ask({ reset: true })) || "Searching for the part again");
 });
+/** The user says that the part in view is the one to which the labels belong. */
+async function confirmPart() {
+  if (find("confirm").hidden) return;
+  toast.show((await connection.ask({ confirm: true })) || "Confirmed: the labels belong to this part");
+}
+
+find("confirm").addEventListener("click", confirmPart);
 find("transports").addEventListener("change", (event) => {
   connection.choose(event.target.value);
   if (player) player.mode = connection.mode;
@@ -343,7 +354,7 @@ document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const isTyping = ["INPUT", "SELECT"].includes(event.target.tagName), isButton = event.target.tagName === "BUTTON";
   const keys = {
-    s: snapshot, r: record, g: () => toggle("ghost"), e: () => toggle("edges"), l: () => toggle("labels"),
+    c: confirmPart, s: snapshot, r: record, g: () => toggle("ghost"), e: () => toggle("edges"), l: () => toggle("labels"),
     Escape: () => (document.body.dataset.side ? openSide("") : isolate(null)),
     ArrowRight: () => isolate(parts.neighbour(1)), ArrowLeft: () => isolate(parts.neighbour(-1)),
     " ": freeze,

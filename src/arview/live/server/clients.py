@@ -95,6 +95,7 @@ def check_control(control: dict[str, Any], style: OverlayStyle, components: tupl
             "mode": isinstance(value, str) and value in get_args(ViewMode),
             "style": isinstance(value, dict),
             "reset": isinstance(value, bool),
+            "confirm": isinstance(value, bool),
             "record": isinstance(value, bool),
             "hold": value is None or (type(value) is int and 0 <= value < FRAME_IDS),
         }.get(key, False)

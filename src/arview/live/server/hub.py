@@ -181,6 +181,8 @@ class Hub:
         client.mode = request.get("mode", client.mode)
         if request.get("reset"):
             client.feed.reset()
+        if request.get("confirm"):
+            client.feed.confirm()
         if "hold" in request:
             client.held = held
         if request.get("record") is True:

@@ -37,6 +37,8 @@ def pose_document(tracked: TrackedFrame, now_s: float) -> Document:
         "mismatches": list(pose.mismatches),
         "unverified": list(pose.unverified),
         **evidence_document(pose, tracked.subject),
+        "identity": str(pose.identity),
+        "serial": pose.serial,
         "ambiguous": len(pose.alternatives),
         "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.ravel().tolist(),
         "guide_cam_from_model": None if guide is None else guide.ravel().tolist(),

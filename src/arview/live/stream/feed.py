@@ -98,7 +98,7 @@ class Feed:
         self._kept: deque[TrackedFrame] = deque(maxlen=self.options.kept_frames)
         self._arrived_s: float | None = None
         self._session: TrackingSession | SelfCalibratingSession | None = None
-        self._wants_reset = False
+        self._wants_reset = self._wants_confirmation = False
         self._refused: Notice | None = None
         self._shape: tuple[int, int, int] | None = None
         self._unreadable_in_a_row = 0
@@ -125,6 +125,10 @@ class Feed:
     def reset(self) -> None:
         """Search for the part again, from the next frame on."""
         self._wants_reset = True
+
+    def confirm(self) -> None:
+        """The user says that the part in view is the one to which the labels belong, from the next frame on."""
+        self._wants_confirmation = True
 
     def find(self, frame_id: int) -> TrackedFrame | None:
         """The tracked frame with this id, if it is still kept."""
@@ -228,6 +232,8 @@ class Feed:
         if self._wants_reset and self._session is not None:
             self._wants_reset = False
             self._session.reset()
+        if self._session is not None:
+            self._identify(self._session)
         self._serial += 1
         if self._session is None:
             reason = self._refused.text if self._refused else ""
@@ -248,6 +254,13 @@ class Feed:
             serial=self._serial,
             subject=self._subject,
         )
+
+    def _identify(self, session: TrackingSession | SelfCalibratingSession) -> None:
+        """Tell a session of which serial number the labels are, and that the user has confirmed the part in view."""
+        session.identity.expect(self._subject.serial_numbers)
+        if self._wants_confirmation:
+            self._wants_confirmation = False
+            session.confirm()
 
     def _start_session(self, shape: tuple[int, int, int]) -> None:
         """Start a session for frames of another size or orientation, or note why there is none."""

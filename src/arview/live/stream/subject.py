@@ -9,6 +9,7 @@ from functools import cached_property
 from arview.cad.part import Part
 from arview.camera import Camera
 from arview.camera.read import guess_camera, load_camera
+from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.inspection import Inspection
@@ -95,6 +96,14 @@ class Subject:
         with self._lock:
             return self._file.inspection if self._file else None
 
+    @property
+    def serial_numbers(self) -> SerialNumbers | None:
+        """Serial number to which the labels belong, and which codes name one; None where there is neither."""
+        inspection = self.inspection
+        serial = (inspection.serial if inspection is not None else "") or self.serial or ""
+        pattern = self.part.serial_pattern
+        return SerialNumbers(serial, pattern) if serial or pattern else None
+
     def reload(self) -> bool:
         """Read the inspection again if its file has changed; returns whether another one is shown now."""
         if self._file is None or not self._file.reload():
@@ -135,7 +144,12 @@ class Subject:
 
         def make_session(camera: Camera, start: Array | None) -> TrackingSession:
             return TrackingSession(
-                self.views, camera, self.part.model, initial_cam_from_model=start, guide_cam_from_model=guide
+                self.views,
+                camera,
+                self.part.model,
+                initial_cam_from_model=start,
+                guide_cam_from_model=guide,
+                serials=self.serial_numbers,
             )
 
         if self.options.camera is not None:

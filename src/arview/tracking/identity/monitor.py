@@ -9,7 +9,7 @@ are in view, and the next frames whether the old place still shows one. Until th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -20,7 +20,7 @@ from arview.errors import InputError
 from arview.fiducials.serial_code import SerialCodeReader, SerialNumbers
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
-from arview.pose import Identity
+from arview.pose import Identity, Pose
 from arview.tracking.estimate import Estimate
 from arview.tracking.identity.background_motion import BackgroundMotion, reduced
 from arview.tracking.identity.options import IdentityOptions
@@ -153,7 +153,32 @@ class IdentityMonitor:
         """Go on with what another monitor knows, when the camera of a session is replaced."""
         self._known, self._known_reason, self._serial = other._known, other._known_reason, other._serial
         self._is_confirmed_by_user, self._named_at = other._is_confirmed_by_user, other._named_at
-        self._doubt = other._doubt
+        self._serials, self._reader = other._serials, other._reader
+        self._doubt = None
+        if other._doubt is not None:
+            # The views kept so far belong to the other camera: what is not settled by now the user must settle.
+            self._doubt = Doubt(math.inf, math.inf, reason=other._doubt.reason or MOVED)
+            self._kept = None
+
+    def stated(self, pose: Pose) -> Pose:
+        """A pose with the identity that is known now."""
+        known = self._result(None)
+        return replace(pose, identity=known.identity, identity_reason=known.reason, serial=known.serial)
+
+    def expect(self, serials: SerialNumbers | None) -> None:
+        """Read codes for another serial number from now on, as when another inspection is shown."""
+        if serials == self._serials:
+            return
+        self._serials = serials
+        self._reader = None if serials is None else SerialCodeReader(serials, self.options.code)
+        if not self._serial:
+            return
+        # What was read from the part is still true; what it means is not.
+        serial, self._serial = self._serial, ""
+        if self._known in (Identity.OTHER, Identity.CONFIRMED) and not self._is_confirmed_by_user:
+            self._known, self._known_reason = Identity.FOLLOWED, ""
+        if serials is not None and serials.is_serial(serial):
+            self._take_serial(serial, serials)
 
     def update(
         self,
@@ -423,16 +448,17 @@ class IdentityMonitor:
             return
         hull = self.outline.hull_px(pose)
         serial = self._reader.read(image, hull)
-        if not serial:
-            return
+        if serial:
+            self._take_serial(serial, self._serials)
+
+    def _take_serial(self, serial: str, serials: SerialNumbers) -> None:
+        """The part carries a serial number: it is the expected one or another."""
         self._serial = serial
-        if not self._serials.serial:
-            return
-        if serial == self._serials.serial:
+        if serial == serials.serial:
             self._settle(Identity.CONFIRMED)
-        else:
-            self._settle(Identity.OTHER, f"the code on this part says {serial}, the inspection is of "
-                         f"{self._serials.serial}")  # fmt: skip
+        elif serials.serial:
+            reason = f"the code on this part says {serial}, the inspection is of {serials.serial}"
+            self._settle(Identity.OTHER, reason)
 
     def _result(self, moved_to: Array | None) -> IdentityResult:
         if self._named_at is not None:

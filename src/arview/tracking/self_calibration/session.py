@@ -18,6 +18,7 @@ from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.refinement.view_model import PartView
+from arview.tracking.identity import IdentityMonitor
 from arview.tracking.self_calibration.estimator import FocalEstimate, FocalEstimator, FocalOptions, pose_seen_by
 from arview.tracking.session import TrackingSession
 
@@ -100,6 +101,15 @@ class SelfCalibratingSession:
         """Forget the part's pose and search again; the camera is kept."""
         self.session.reset()
 
+    @property
+    def identity(self) -> IdentityMonitor:
+        """Says whether the specimen in view is the one that was followed."""
+        return self.session.identity
+
+    def confirm(self) -> None:
+        """Say that the specimen tracked now is the one to which the labels belong, see `Identity`."""
+        self.session.confirm()
+
     def process(self, image: NDArray[np.uint8], index: int, time_s: float) -> Pose:
         """Pose and state of the next frame (H,W,3) uint8 RGB, see `TrackingSession.process`."""
         pose = self.session.process(image, index, time_s)
@@ -110,7 +120,9 @@ class SelfCalibratingSession:
             session = self._make_session(after, body @ self._part.body_from_model)
             again = session.process(image, index, time_s)
             if again.state in (TrackingState.TRACKED, TrackingState.CRITICAL):
-                self.session, pose = session, again
+                session.identity.take_over(self.session.identity)
+                pose = session.identity.stated(again)
+                self.session = session
                 self._cameras.append((index, after))
         self._collect(image, pose)
         return pose
