@@ -19,6 +19,7 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.detection.detector import Detection, Detector, DetectorOptions, RejectedHypothesis, local_search_for
+from arview.detection.scene_change import SceneChange, SceneChangeOptions
 from arview.detection.search.local_search import LocalSearch
 from arview.errors import InputError, MismatchError
 from arview.fiducials.serial_code import SerialNumbers
@@ -32,7 +33,6 @@ from arview.tracking.estimate import Estimate
 from arview.tracking.guided_init import GuidedInit
 from arview.tracking.identity import IdentityMonitor, IdentityOptions
 from arview.tracking.pose_recheck import LocalSearchRecheck
-from arview.tracking.scene_change import SceneChange, SceneChangeOptions
 from arview.tracking.session_state import Event, SessionState
 from arview.tracking.specimens import hide_specimens, is_same_specimen
 from arview.tracking.tracker import Tracker

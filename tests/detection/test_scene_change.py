@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from arview.cad.view_range import ViewRange
+from arview.detection.scene_change import SceneChange, SceneChangeOptions
 from arview.guideviews import GuideViewOptions, make_guide_views
-from arview.tracking.scene_change import SceneChange, SceneChangeOptions
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, picture, pose_from
 
 FARTHEST_MM = RANGE.distance_mm[1]
