@@ -25,6 +25,7 @@ class FakeSession:
         options: Any,
         initial_cam_from_model: Any = None,
         guide_cam_from_model: Any = None,
+        serials: Any = None,
     ) -> None:
         self.pose = POSE if initial_cam_from_model is None else initial_cam_from_model
         self.seconds = float(os.environ.get("FAKE_SESSION_S", "0"))
