@@ -1,4 +1,4 @@
-"""annotate: track a part through a video, and write the annotated video and the poses.
+"""annotate: track a part, or several, through a video, and write the annotated video and the poses.
 
 Source, tracking, drawing and encoding overlap in threads with short queues between them: frames are decoded in the
 source's thread, tracked in the caller's, drawn in one worker and encoded in the sink's.
@@ -14,12 +14,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.errors import OutputError
-from arview.pose import Pose
+from arview.pose import Completeness, Pose, Presence
 from arview.pose_file import PoseWriter
 from arview.tracking.self_calibration.estimator import FocalEstimate
 from arview.tracking.self_calibration.session import SelfCalibratingSession
@@ -34,18 +34,23 @@ FPS_WINDOW_S = 1.0
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
-class Session(Protocol):
-    """What tracks: `arview.tracking.TrackingSession`."""
+Result = TypeVar("Result", Pose, tuple[Pose, ...])
+ResultOut = TypeVar("ResultOut", Pose, tuple[Pose, ...], covariant=True)
+ResultIn = TypeVar("ResultIn", Pose, tuple[Pose, ...], contravariant=True)
 
-    def process(self, image: Image, index: int, time_s: float) -> Pose:
-        """Pose of the next frame."""
+
+class Session(Protocol[ResultOut]):
+    """What tracks: `arview.tracking.TrackingSession`, or `arview.tracking.several.SeveralSessions`."""
+
+    def process(self, image: Image, index: int, time_s: float) -> ResultOut:
+        """Pose of the next frame, or poses of all specimens in it."""
         ...
 
 
-class Overlay(Protocol):
-    """What draws: `arview.overlay.OverlayRenderer`."""
+class Overlay(Protocol[ResultIn]):
+    """What draws: `arview.overlay.OverlayRenderer`, or `arview.overlay.several.SeveralOverlay`."""
 
-    def draw(self, image: Image, pose: Pose, fps: float | None = None) -> Image:
+    def draw(self, image: Image, pose: ResultIn, fps: float | None = None) -> Image:
         """The annotated frame."""
         ...
 
@@ -69,6 +74,23 @@ class Sink(Protocol):
 
 
 @dataclass(frozen=True)
+class SpecimenSummary:
+    """What a run found of one specimen.
+
+    Attributes:
+        states: frames by tracking state.
+        completeness: by the last frame with a pose; None if there is none.
+        presence: of each component by that frame.
+        serial: read from a code on the specimen, or empty.
+    """
+
+    states: Mapping[str, int]
+    completeness: Completeness | None
+    presence: Mapping[str, Presence]
+    serial: str
+
+
+@dataclass(frozen=True)
 class AnnotateSummary:
     """Counts of one run.
 
@@ -83,6 +105,7 @@ class AnnotateSummary:
         ms: (F,) time of detection and tracking of each frame, milliseconds.
         ended_reason: why the source ended early, or empty.
         is_interrupted: stopped by Ctrl-C; the files hold what was done until then.
+        specimens: what is known of each specimen at the end, by `Pose.instance`; one without a name if there is one.
     """
 
     frames: int
@@ -95,6 +118,7 @@ class AnnotateSummary:
     ended_reason: str
     is_interrupted: bool
     withheld_reasons: Mapping[str, int] = field(default_factory=dict)
+    specimens: Mapping[str, SpecimenSummary] = field(default_factory=dict)
 
     @property
     def fps(self) -> float:
@@ -104,8 +128,8 @@ class AnnotateSummary:
 
 def annotate(
     source: FrameSource,
-    session: Session,
-    overlay: Overlay | None = None,
+    session: Session[Result],
+    overlay: Overlay[Result] | None = None,
     sink: Sink | None = None,
     poses_path: str | Path | None = None,
     *,
@@ -121,11 +145,11 @@ def annotate(
 
     Args:
         source: of the frames.
-        session: tracks.
-        overlay: draws; required with a sink.
+        session: tracks one part, or several.
+        overlay: draws what the session returns; required with a sink.
         sink: writes the annotated frames; it is closed (or aborted) here.
-        poses_path: file for one JSON line per frame, see `PoseWriter`.
-        progress: called after each frame with (frames done, pose).
+        poses_path: file for one JSON line per frame and specimen, see `PoseWriter`.
+        progress: called after each frame with (frames done, pose of the first specimen).
         start_s: time stamp of the source from which on frames are tracked.
         end_s: time stamp of the source at which to stop.
         camera_of: camera of the frame of an index, to be written beside its pose; None leaves it out.
@@ -138,7 +162,7 @@ def annotate(
     if sink is not None and overlay is None:
         raise ValueError("annotate: a sink needs an overlay")
     counts = _Counts()
-    outputs = _OutputFiles(sink)
+    outputs: _OutputFiles[Result] = _OutputFiles(sink)
     began = time.perf_counter()
     try:
         outputs.open(overlay, poses_path, camera_of)
@@ -148,11 +172,12 @@ def annotate(
                     continue
                 if end_s is not None and frame.time_s >= end_s:
                     break
-                pose = session.process(frame.image, frame.index, frame.time_s)
-                outputs.write(frame, pose)
-                counts.add(pose)
+                result = session.process(frame.image, frame.index, frame.time_s)
+                poses = (result,) if isinstance(result, Pose) else result
+                outputs.write(frame, result, poses)
+                counts.add(poses)
                 if progress:
-                    progress(len(counts.ms), pose)
+                    progress(len(counts.ms), poses[0])
         except KeyboardInterrupt:
             counts.is_interrupted = True
         outputs.finish_drawing()
@@ -200,10 +225,16 @@ class _Counts:
         self._reasons: dict[str, Counter[str]] = {}
         self._withheld_reasons: Counter[str] = Counter()
         self._never_verified: tuple[str, ...] | None = None
+        self._specimens: dict[str, _SpecimenCounts] = {}
 
-    def add(self, pose: Pose) -> None:
+    def add(self, poses: tuple[Pose, ...]) -> None:
         """Count a frame."""
-        self.ms.append(pose.ms)
+        self.ms.append(sum(pose.ms for pose in poses))
+        for pose in poses:
+            self._add(pose)
+            self._specimens.setdefault(pose.instance, _SpecimenCounts()).add(pose)
+
+    def _add(self, pose: Pose) -> None:
         self._states[str(pose.state)] += 1
         if pose.reason:
             self._reasons.setdefault(str(pose.state), Counter())[pose.reason] += 1
@@ -226,19 +257,43 @@ class _Counts:
             ended_reason=source.ended_reason,
             is_interrupted=self.is_interrupted,
             withheld_reasons=dict(self._withheld_reasons),
+            specimens={name: counts.summary() for name, counts in self._specimens.items()},
         )
 
 
-class _OutputFiles:
+class _SpecimenCounts:
+    """Counts of the frames of one specimen, and what was last known of it."""
+
+    def __init__(self) -> None:
+        self._states: Counter[str] = Counter()
+        self._last: Pose | None = None
+        self._serial = ""
+
+    def add(self, pose: Pose) -> None:
+        """Count a frame."""
+        self._states[str(pose.state)] += 1
+        self._serial = pose.serial or self._serial
+        if pose.cam_from_model is not None:
+            self._last = pose
+
+    def summary(self) -> SpecimenSummary:
+        """Summary of the specimen."""
+        last = self._last
+        presence = {} if last is None else {name: one.presence for name, one in last.components.items()}
+        completeness = None if last is None else last.completeness
+        return SpecimenSummary(dict(self._states), completeness, presence, self._serial)
+
+
+class _OutputFiles(Generic[Result]):
     """The files of one run: the annotated video and the poses, each or none."""
 
     def __init__(self, sink: Sink | None) -> None:
         self._sink = sink
-        self._drawer: _Drawer | None = None
+        self._drawer: _Drawer[Result] | None = None
         self._poses: PoseWriter | None = None
 
     def open(
-        self, overlay: Overlay | None, poses_path: str | Path | None, camera_of: Callable[[int], Camera] | None
+        self, overlay: Overlay[Result] | None, poses_path: str | Path | None, camera_of: Callable[[int], Camera] | None
     ) -> None:
         """Open the file of the poses and start drawing."""
         if poses_path is not None:
@@ -246,12 +301,13 @@ class _OutputFiles:
         if self._sink is not None and overlay is not None:
             self._drawer = _Drawer(overlay, self._sink)
 
-    def write(self, frame: Frame, pose: Pose) -> None:
-        """Add a frame to both files."""
+    def write(self, frame: Frame, result: Result, poses: tuple[Pose, ...]) -> None:
+        """Add a frame to both files: what the session returned, which holds some poses."""
         if self._drawer is not None:
-            self._drawer.put(frame, pose)
+            self._drawer.put(frame, result)
         if self._poses is not None:
-            self._poses.write(pose)
+            for pose in poses:
+                self._poses.write(pose)
 
     def finish_drawing(self) -> None:
         """Wait until all frames are drawn."""
@@ -299,22 +355,23 @@ def reasons_text(reasons: Mapping[str, int]) -> str:
     return ", ".join([*texts, f"other ({others})"] if others else texts)
 
 
-class _Drawer:
+class _Drawer(Generic[Result]):
     """A thread that draws frames in order and hands them to the sink."""
 
-    def __init__(self, overlay: Overlay, sink: Sink) -> None:
-        self._overlay, self._sink = overlay, sink
-        self._waiting: queue.Queue[tuple[Frame, Pose] | None] = queue.Queue(QUEUED_FRAMES)
+    def __init__(self, overlay: Overlay[Result], sink: Sink) -> None:
+        self._overlay: Overlay[Result] = overlay
+        self._sink = sink
+        self._waiting: queue.Queue[tuple[Frame, Result] | None] = queue.Queue(QUEUED_FRAMES)
         self._error: BaseException | None = None
         self._is_stopped = False
         self._thread = threading.Thread(target=self._run, name="arview-overlay", daemon=True)
         self._thread.start()
 
-    def put(self, frame: Frame, pose: Pose) -> None:
+    def put(self, frame: Frame, result: Result) -> None:
         """Queue a frame; raises the exception of an earlier one, if drawing or writing it failed."""
         if self._error is not None:
             raise self._error
-        self._waiting.put((frame, pose))
+        self._waiting.put((frame, result))
 
     def finish(self) -> None:
         """Wait until all queued frames are written; raises the exception of one that failed."""
@@ -332,12 +389,12 @@ class _Drawer:
 
     def _run(self) -> None:
         rate = _Rate()
-        for frame, pose in iter(self._waiting.get, None):
+        for frame, result in iter(self._waiting.get, None):
             # After an error the queue is still emptied, so that no caller waits for room in it.
             if self._error is not None or self._is_stopped:
                 continue
             try:
-                self._sink.write(self._overlay.draw(frame.image, pose, fps=rate.tick()), frame.time_s)
+                self._sink.write(self._overlay.draw(frame.image, result, fps=rate.tick()), frame.time_s)
             except BaseException as error:
                 self._error = error
 
@@ -360,7 +417,7 @@ class _Rate:
         return self._fps
 
 
-class FollowingOverlay:
+class FollowingOverlay(Generic[Result]):
     """Draws with the camera of each frame, where that is replaced while the frames are tracked.
 
     Args:
@@ -368,14 +425,15 @@ class FollowingOverlay:
         camera_of: camera of the frame of an index.
     """
 
-    def __init__(self, make: Callable[[Camera], Overlay], camera_of: Callable[[int], Camera]) -> None:
-        self._make, self._camera_of = make, camera_of
+    def __init__(self, make: Callable[[Camera], Overlay[Result]], camera_of: Callable[[int], Camera]) -> None:
+        self._make: Callable[[Camera], Overlay[Result]] = make
+        self._camera_of = camera_of
         self._camera: Camera | None = None
-        self._overlay: Overlay | None = None
+        self._overlay: Overlay[Result] | None = None
 
-    def draw(self, image: Image, pose: Pose, fps: float | None = None) -> Image:
+    def draw(self, image: Image, pose: Result, fps: float | None = None) -> Image:
         """The annotated frame."""
-        camera = self._camera_of(pose.index)
+        camera = self._camera_of(pose.index if isinstance(pose, Pose) else pose[0].index)
         if self._overlay is None or camera is not self._camera:
             self._camera, self._overlay = camera, self._make(camera)
         return self._overlay.draw(image, pose, fps=fps)

@@ -161,7 +161,7 @@ def evaluate_scene(
     options: SessionOptions | None = None,
     views: GuideViewSet | None = None,
     progress: StepProgress | None = None,
-    make_session: Callable[[GuideViewSet, Camera, Array | None], Session] | None = None,
+    make_session: Callable[[GuideViewSet, Camera, Array | None], Session[Pose]] | None = None,
 ) -> SceneResult:
     """Track the part through the scene.
 
@@ -193,7 +193,7 @@ def evaluate_scene(
     if init.startswith(GUIDE_PREFIX):
         guide = guide_pose(init.removeprefix(GUIDE_PREFIX), scene.part, views.view_range, scene.camera)
     if make_session is None:
-        session: Session = TrackingSession(
+        session: Session[Pose] = TrackingSession(
             views,
             scene.camera,
             model,
@@ -219,7 +219,7 @@ def evaluate_scene(
 
 
 def _track(
-    scene: Scene, frames: tuple[SceneFrame, ...], session: Session, meter: PoseMeter, has_pose: bool
+    scene: Scene, frames: tuple[SceneFrame, ...], session: Session[Pose], meter: PoseMeter, has_pose: bool
 ) -> Iterator[FrameResult]:
     for number, frame in enumerate(frames):
         pose = session.process(scene.image(frame), frame.index, number / 30.0)
