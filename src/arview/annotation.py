@@ -40,7 +40,7 @@ ResultIn = TypeVar("ResultIn", Pose, tuple[Pose, ...], contravariant=True)
 
 
 class Session(Protocol[ResultOut]):
-    """What tracks: `arview.tracking.TrackingSession`, or `arview.tracking.several.SeveralSessions`."""
+    """What tracks: `arview.tracking.TrackingSession`, or `arview.tracking.several.sessions.SeveralSessions`."""
 
     def process(self, image: Image, index: int, time_s: float) -> ResultOut:
         """Pose of the next frame, or poses of all specimens in it."""

@@ -17,8 +17,8 @@ from arview.pose import TrackingState
 from arview.refinement.evidence import PoseEvidence
 from arview.tracking import Estimate, SessionOptions, TrackingSession
 from arview.tracking.appearance_memory import AppearanceMemory, AppearanceMemoryOptions
-from arview.tracking.ncc_search import NccSearchOptions
-from arview.tracking.view_crops import CROP_PX, ViewCropper
+from arview.tracking.search.ncc_search import NccSearchOptions
+from arview.tracking.search.view_crops import CROP_PX, ViewCropper
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, bracket, error, path, picture, pose_from
 
 SIDES = [(azimuth, elevation) for azimuth in (-40, 0, 40) for elevation in (30, 55)]

@@ -15,8 +15,8 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose, TrackingState
 from arview.tracking import TrackingSession
-from arview.tracking.several import SeveralSessions
-from arview.tracking.specimens import hide_specimens, is_same_specimen
+from arview.tracking.several.sessions import SeveralSessions
+from arview.tracking.several.specimens import hide_specimens, is_same_specimen
 from arview.video import Image
 from helpers import two_specimens
 from helpers.live_sample import PART

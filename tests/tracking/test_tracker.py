@@ -18,7 +18,7 @@ from arview.pose import Pose, TrackingState
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.schedules import TRACK_STAGES
 from arview.tracking import Estimate, SessionOptions, Tracker, TrackerOptions, TrackingSession
-from arview.tracking.wide_search import WideSearch
+from arview.tracking.search.wide_search import WideSearch
 from helpers.synthetic import (
     CAMERA,
     assembly,

@@ -24,9 +24,10 @@ from arview.cli.common import (
 )
 from arview.cli.exit_codes import ExitCode
 from arview.cli.guessed_camera import check_profile, report_estimate
+from arview.errors import InputError
 
 if TYPE_CHECKING:
-    from arview.annotation import AnnotateSummary
+    from arview.annotation import AnnotateSummary, SpecimenSummary
     from arview.cad import Part
     from arview.camera import Camera
     from arview.geometry import Array
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
     from arview.tracking import SessionOptions, TrackingSession
     from arview.tracking.self_calibration.estimator import FocalEstimate
     from arview.tracking.self_calibration.session import MakeSession, SelfCalibratingSession
-    from arview.video import FrameSource
+    from arview.video import FrameSource, VideoSink
+    from arview.workflow.specimens import Specimen
 
 
 NAMED_PART = f"{__name__}.named_part"
@@ -50,6 +52,17 @@ class _Outputs(NamedTuple):
     video: Path | None
     poses: Path | None
     learned: Path | None
+
+
+class _Run(NamedTuple):
+    """What a run reads and writes: frames, video and poses, the time stamps between which it goes, and its camera."""
+
+    frames: FrameSource
+    sink: VideoSink | None
+    poses: Path | None
+    span_s: tuple[float | None, ...]
+    camera_of: Callable[[int], Camera]
+    is_guessed: bool
 
 
 def _parse_moment(ctx: click.Context, parameter: click.Parameter, value: str | None) -> int | float | None:
@@ -90,6 +103,9 @@ Examples:
   arview annotate rtsp://camera.local/1 --part part.toml --camera camera.json -o live.mp4
   arview annotate 0 --part part.toml --camera fov:65 --init guide:iso -o live.mp4
   arview annotate 0 --part part.toml --camera fov:65 --learned bracket.learned -o live.mp4
+  arview annotate clip.mp4 --part part.toml --camera camera.json --poses poses.jsonl --check-presence
+  arview annotate bench.mp4 --part a.toml --part b.toml --inspection a.json --inspection b.json -o out.mp4
+  arview annotate bench.mp4 --part part.toml --instances 2 --camera camera.json -o out.mp4
 
 \b
 Where tracking starts. Without --init the part is detected. --init POSE.json, {"cam_from_model": 4x4},
@@ -122,18 +138,32 @@ stream while it runs. --save-profile NAME keeps the estimate for --camera profil
 or always from the same side, do not tell the focal length; then the guess is kept.
 
 \b
+Several at once. --part may be given again, and --instances N tracks N specimens of each part. Each has its
+own labels, status line and lines in the poses file, told apart by "instance": the part's name, with #1, #2
+where several have the same. Inspections belong to the specimens in their order.
+
+\b
+Components. Each is present, missing, displaced, uncertain or unverified by what the frames have shown so far,
+whatever was measured before. --check-presence exits with 0 if all components of all parts are present at the
+end, 1 if one is missing or displaced, 2 if not all are known to be present, 3 if no part was found.
+
+\b
 Each line of a poses file is a JSON object: index, time_s, state, quality, cam_from_model (4x4 row-major,
 mm), covariance (6x6), ms, reason (why the part is not tracked), mismatches, unverified (components that have
-not been verified yet), alternatives (poses that fit as well), identity (followed, confirmed, unconfirmed or
-other) with identity_reason, serial (read from a code), and camera where none was given.
+not been verified yet), alternatives (poses that fit as well), presence (of each component) and
+presence_details, completeness, identity (followed, confirmed, unconfirmed or other) and identity_reason,
+serial (read from a code), instance, and camera where none was given.
 Ctrl-C ends the run and finishes the files.""",
 )
 @click.argument("source")
-@click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
+@click.option("--part", "part_paths", required=True, multiple=True, metavar="PART",
+              help="Part file or CAD file; again for further parts.")  # fmt: skip
+@click.option("--instances", type=click.IntRange(min=1), default=1, metavar="N", help="Specimens of each part in view.")
 @click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="See below; without it the camera is guessed.")
 @click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile; see below.")
-@click.option("--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are drawn.")
+@click.option("--inspection", "inspection_paths", multiple=True, metavar="FILE",
+              help="inspection.json whose values are drawn; again for further specimens, in their order.")  # fmt: skip
 @click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
 @click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
 @click.option("--init", metavar="WHERE", help="Pose of the first frame, or guide:NAME to align with; see below.")
@@ -154,6 +184,7 @@ Ctrl-C ends the run and finishes the files.""",
 @click.option("--no-labels", is_flag=True, help="Leave out the labels.")
 @click.option("--no-legend", is_flag=True, expose_value=False, callback=_keep_for_drawing,
               help="Leave out the legend of components that are not as measured.")  # fmt: skip
+@click.option("--check-presence", is_flag=True, help="Exit by whether all components were seen in place; see below.")
 @click.option("--opacity", type=click.FloatRange(0.0, 1.0), help="Opacity of the translucent components, 0 to 1.")
 @MODALITY
 @RENDERER
@@ -162,11 +193,12 @@ Ctrl-C ends the run and finishes the files.""",
 def annotate(
     ctx: click.Context,
     source: str,
-    part_path: str,
+    part_paths: tuple[str, ...],
+    instances: int,
     views_path: str | None,
     camera_spec: str | None,
     profile: str | None,
-    inspection_path: str | None,
+    inspection_paths: tuple[str, ...],
     output: str | None,
     poses_path: str | None,
     init: str | None,
@@ -178,6 +210,7 @@ def annotate(
     show_edges: str,
     no_ghost: bool,
     no_labels: bool,
+    check_presence: bool,
     opacity: float | None,
     modalities: tuple[str, ...],
     renderer: str,
@@ -187,58 +220,115 @@ def annotate(
 
     SOURCE is a video file, a picture, a folder or glob of pictures, a camera number or an RTSP/HTTP address.
     """
-    from arview import annotation
-    from arview.cad import load_part
-    from arview.inspection import load_inspection
     from arview.tracking.guide_pose import GUIDE_PREFIX
     from arview.tracking.self_calibration.session import SelfCalibratingSession
     from arview.video import VideoSink, open_source
+    from arview.workflow.specimens import load_specimens
 
     check_profile(profile, camera_spec)
     if output is None and poses_path is None:
         output = _default_output(source)
         say(f"no -o or --poses given: writing {output}")
-    part = load_part(part_path, unit)
+    specimens = load_specimens(part_paths, instances, inspection_paths, unit)
+    if len(specimens) > 1:
+        _refuse_for_several({"--init": init, "--learned": learned_path, "--guideviews": views_path})
+    part = specimens[0].part
     guide_name = init.removeprefix(GUIDE_PREFIX) if init and init.startswith(GUIDE_PREFIX) else None
     init_path = init if guide_name is None else None
     first_pose = load_pose(init_path) if init_path else None
-    inspection = load_inspection(inspection_path, part.model) if inspection_path else None
-    inputs = (source, part.path, part.cad_path, views_path, camera_spec, inspection_path, init_path)
-    outputs = _check_outputs(output, poses_path, learned_path, inputs)
+    files = [path for one in specimens for path in (one.part.path, one.part.cad_path)]
+    outputs = _check_outputs(
+        output, poses_path, learned_path, (source, *files, views_path, camera_spec, *inspection_paths, init_path)
+    )
     drawing = _drawing_options(show_edges, no_ghost, no_labels, opacity)
     wanted = [moment if isinstance(moment, int) else None for moment in (start, end)]
     with open_source(source, start=wanted[0], end=wanted[1], stride=stride, fps=fps) as frames:
         camera = camera_for(frames, camera_spec, source)
         views, guide = _views_and_guide(part, camera, views_path, renderer, guide_name)
-        make_session = partial(_session, part, inspection, views, session_options(modalities), guide, first_pose)
+        make_session = partial(_session, specimens[0], views, session_options(modalities), guide, first_pose)
         keep = partial(report_estimate, profile=profile, source=source, turns=frames.quarter_turns_clockwise)
-        is_guessed = camera_spec is None
-        session, camera_of = _start(make_session, frames, camera, is_guessed, views, keep)
+        session, camera_of = _start(make_session, frames, camera, camera_spec is None, views, keep)
         _load_learned(session, outputs.learned)
-        overlay = sink = None
+        sink = None
         if outputs.video is not None:
-            make = partial(_overlay, part, inspection, drawing)
-            overlay = annotation.FollowingOverlay(make, camera_of)
             sink = VideoSink(outputs.video, frames.width, frames.height, frames.fps, frames)
-        with progress_bar("frames", frames.frame_count) as progress:
-            summary = annotation.annotate(
-                frames,
-                session,
-                overlay,
-                sink,
-                outputs.poses,
-                progress=lambda done, pose: progress(done, frames.frame_count or 0),
-                start_s=start if isinstance(start, float) else None,
-                end_s=end if isinstance(end, float) else None,
-                camera_of=camera_of if is_guessed else None,
-            )
-        if isinstance(session, SelfCalibratingSession):
+        span = tuple(moment if isinstance(moment, float) else None for moment in (start, end))
+        run = _Run(frames, sink, outputs.poses, span, camera_of, camera_spec is None)
+        if len(specimens) > 1:
+            summary = _annotate_several(run, specimens, views, session_options(modalities), drawing, renderer)
+        else:
+            summary = _annotate_one(run, session, partial(_overlay, part, specimens[0].inspection, drawing))
+        if isinstance(session, SelfCalibratingSession) and len(specimens) == 1:
             keep(session.finish())
     if sink is not None and sink.audio_note:
         say(f"warning: {sink.audio_note}")
     _print_summary(summary, [path for path in (outputs.video, outputs.poses) if path is not None])
     _save_learned(session, outputs.learned)
     _exit_if_interrupted(ctx, summary)
+    if check_presence:
+        ctx.exit(presence_exit_code(summary))
+
+
+def _refuse_for_several(options: dict[str, str | None]) -> None:
+    """Refuse options, by their names, that are of one specimen."""
+    for name, value in options.items():
+        if value:
+            raise InputError(f"{name} is for one part; leave it out, or give one --part without --instances")
+
+
+def presence_exit_code(summary: AnnotateSummary) -> ExitCode:
+    """Exit code by the presence of all components of all specimens at the end of a run."""
+    from arview.pose import Completeness
+
+    found = {one.completeness for one in summary.specimens.values()}
+    if Completeness.INCOMPLETE in found:
+        return ExitCode.FAIL
+    if not found or found == {None}:
+        return ExitCode.CANNOT_MEASURE
+    return ExitCode.DONE if found == {Completeness.COMPLETE} else ExitCode.UNDECIDED
+
+
+def _annotate_one(
+    run: _Run, session: TrackingSession | SelfCalibratingSession, make: Callable[[Camera], OverlayRenderer]
+) -> AnnotateSummary:
+    """Track and draw one specimen."""
+    from arview import annotation
+
+    overlay = None if run.sink is None else annotation.FollowingOverlay(make, run.camera_of)
+    with progress_bar("frames", run.frames.frame_count) as progress:
+        return annotation.annotate(
+            run.frames, session, overlay, run.sink, run.poses,
+            progress=lambda done, pose: progress(done, run.frames.frame_count or 0),
+            start_s=run.span_s[0], end_s=run.span_s[1], camera_of=run.camera_of if run.is_guessed else None,
+        )  # fmt: skip
+
+
+def _annotate_several(
+    run: _Run,
+    specimens: Sequence[Specimen],
+    views: GuideViewSet,
+    options: SessionOptions,
+    drawing: OverlayOptions,
+    renderer: str,
+) -> AnnotateSummary:
+    """Track and draw several specimens; guide views of the first part are given."""
+    from arview import annotation
+    from arview.workflow.specimens import make_overlay, make_sessions
+
+    camera = run.camera_of(0)
+
+    def views_of(part: Part) -> GuideViewSet:
+        is_first = part.model.source_hash == specimens[0].part.model.source_hash
+        return views if is_first else _views_and_guide(part, camera, None, renderer, None)[0]
+
+    sessions = make_sessions(specimens, views_of, camera, options)
+    overlay = None if run.sink is None else make_overlay(specimens, drawing, camera)
+    with progress_bar("frames", run.frames.frame_count) as progress:
+        return annotation.annotate(
+            run.frames, sessions, overlay, run.sink, run.poses,
+            progress=lambda done, pose: progress(done, run.frames.frame_count or 0),
+            start_s=run.span_s[0], end_s=run.span_s[1], camera_of=run.camera_of if run.is_guessed else None,
+        )  # fmt: skip
 
 
 def _exit_if_interrupted(ctx: click.Context, summary: AnnotateSummary) -> None:
@@ -297,8 +387,7 @@ def _views_and_guide(
 
 
 def _session(
-    part: Part,
-    inspection: Inspection | None,
+    specimen: Specimen,
     views: GuideViewSet,
     options: SessionOptions,
     guide: Array | None,
@@ -307,18 +396,16 @@ def _session(
     start: Array | None,
 ) -> TrackingSession:
     """A session with a camera, that goes on from a pose (4,4) or else begins as the command says."""
-    from arview.fiducials.serial_code import SerialNumbers
     from arview.tracking import TrackingSession
 
-    serial = (inspection.serial if inspection else "") or part.serial or ""
     session = TrackingSession(
         views,
         camera=camera,
-        model=part.model,
+        model=specimen.part.model,
         options=options,
         initial_cam_from_model=first_pose if start is None else start,
         guide_cam_from_model=guide,
-        serials=SerialNumbers(serial, part.serial_pattern) if serial or part.serial_pattern else None,
+        serials=specimen.serials,
     )
     if (named := click.get_current_context().meta.get(NAMED_PART)) is not None:
         session.identity.name_at(*named)
@@ -393,8 +480,27 @@ def _print_summary(summary: AnnotateSummary, written: list[Path]) -> None:
     if summary.withheld_reasons:
         withheld = summary.withheld_reasons
         click.echo(f"labels withheld in {sum(withheld.values())} frames: {reasons_text(withheld)}")
+    for name, specimen in summary.specimens.items():
+        _print_specimen(name, specimen)
     if summary.never_verified:
         click.echo(f"not verified in any frame: {', '.join(summary.never_verified)}")
+
+
+def _print_specimen(name: str, specimen: SpecimenSummary) -> None:
+    """What was found of one specimen: its states where it has a name, and its components where it has several."""
+    title = f"{name}: " if name else ""
+    if name:
+        click.echo(title + ", ".join(f"{count} {state}" for state, count in sorted(specimen.states.items())))
+    if not specimen.presence or specimen.completeness is None:
+        return
+    names: dict[str, list[str]] = {}
+    for component, presence in specimen.presence.items():
+        names.setdefault(str(presence), []).append(component)
+    few = [
+        f"{len(found)} {presence}" + (f" ({', '.join(found)})" if presence in ("missing", "displaced") else "")
+        for presence, found in names.items()
+    ]
+    click.echo(f"{title}components {specimen.completeness}: {', '.join(few)}")
 
 
 def _default_output(source: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime
 from types import NoneType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ _ARROW_RGB = (255, 255, 255)
 
 
 @dataclass(frozen=True)
-class _OverlayScene:
+class _PartLook:
     """What is drawn of the components, as long as the evidence on them stays the same.
 
     Attributes:
@@ -62,6 +63,24 @@ class _OverlayScene:
     order: tuple[int, ...]
     arrows: Array
     texts: dict[tuple[int, str], labels.LabelText]
+
+
+class _PartInPicture(NamedTuple):
+    """What was drawn of the part in this picture: its view, the presence of its components, and their appearance."""
+
+    view: GhostView
+    presences: list[ComponentPresence | None]
+    scene: _PartLook
+
+
+class WantedLabels(NamedTuple):
+    """Components of a part that may get a label, the most urgent first; the columns of the image that the part covers;
+    and the weighted covered area, px², of each cell of the image.
+    """
+
+    components: list[LabelledComponent]
+    part_px: tuple[float, float]
+    cells: NDArray[np.float32]
 
 
 class OverlayRenderer:
@@ -115,8 +134,24 @@ class OverlayRenderer:
         self._bottom_px = bottom_px
         self._hidden_frames = np.zeros(len(self._names), dtype=np.int64)
         self._is_occluded = np.zeros(len(self._names), dtype=np.bool_)
-        self._scene: _OverlayScene | None = None
+        self._scene: _PartLook | None = None
         self.laid_out = LaidOut()
+        self._drawn: _PartInPicture | None = None
+
+    @property
+    def status_height_px(self) -> int:
+        """Height of the status line; 0 without one."""
+        return self._status.height_px if self.options.show_status else 0
+
+    def stack(self, status_bottom_px: int, bottom_px: int) -> None:
+        """Leave room for the status lines of other parts.
+
+        Args:
+            status_bottom_px: row at which the own status line ends.
+            bottom_px: row above which everything else must stay.
+        """
+        self._status.bottom_px = status_bottom_px
+        self._bottom_px = bottom_px
 
     def draw(
         self,
@@ -139,26 +174,92 @@ class OverlayRenderer:
         Raises:
             MismatchError: the image is not of the camera's size.
         """
-        expected = (self.camera.height, self.camera.width, 3)
-        if image.shape != expected or image.dtype != np.uint8:
-            raise MismatchError(f"overlay: image is {image.dtype} {image.shape}, the camera expects uint8 {expected}")
         canvas = image if in_place else np.array(image, order="C")
+        self.draw_part(canvas, pose, now)
+        self.draw_texts(canvas, pose, fps, now)
+        return canvas
+
+    def draw_part(self, canvas: paint.Image, pose: Pose, now: datetime | None = None) -> None:
+        """Draw ghosts and edges on a picture in place; `draw_texts` follows.
+
+        Raises:
+            MismatchError: the picture is not of the camera's size.
+        """
+        expected = (self.camera.height, self.camera.width, 3)
+        if canvas.shape != expected or canvas.dtype != np.uint8:
+            raise MismatchError(f"overlay: image is {canvas.dtype} {canvas.shape}, the camera expects uint8 {expected}")
         view = self._ghost.view(pose.cam_from_model) if pose.cam_from_model is not None else None
-        self.laid_out = LaidOut()
-        if pose.cam_from_model is None or view is None:
-            self._annotations.reset()
-            if pose.guide_cam_from_model is not None:
-                self._guide.draw(canvas, pose.guide_cam_from_model)
-        else:
+        self._drawn = None
+        if view is not None:
             presences = self._presences(pose)
-            scene = self._scene_of(pose, presences, now)
-            self._draw_model(canvas, view, pose, scene, presences)
-            self._draw_annotations(canvas, view, pose, scene, presences)
+            self._drawn = _PartInPicture(view, presences, self._scene_of(pose, presences, now))
+            self._draw_model(canvas, self._drawn.view, pose, self._drawn.scene, presences)
+
+    def draw_texts(
+        self,
+        canvas: paint.Image,
+        pose: Pose,
+        fps: float | None = None,
+        now: datetime | None = None,
+    ) -> None:
+        """Draw labels, arrows, legend and status line on a picture in place, after `draw_part` of the same pose.
+
+        Args:
+            canvas: (H,W,3) uint8 RGB.
+            pose: of this frame.
+            fps: frame rate to show; None: not shown.
+            now: time from which the age of the inspection is computed; None: the current time.
+        """
+        self.laid_out = LaidOut()
+        bottom_px = self.draw_legend(canvas)
+        wanted = self.wanted_labels(pose)
+        if wanted is None:
+            self._annotations.reset()
+        else:
+            self.laid_out = self._annotations.lay_out(*wanted, bottom_px)
+            seen = {one.text.name: one.seen_px for one in wanted.components}
+            self._annotations.draw_leaders(canvas, self.laid_out, seen)
+        self.draw_arrows(canvas, pose)
+        if wanted is not None:
+            self._annotations.draw_labels(canvas, self.laid_out)
+        self.draw_state(canvas, pose, fps, now)
+
+    def wanted_labels(self, pose: Pose) -> WantedLabels | None:
+        """Labels of the part that `draw_part` has drawn; None where it has none."""
+        if self._drawn is None or not self._drawn.scene.order:
+            return None
+        view, presences, scene = self._drawn
+        components, cells = self._labelled(view, pose, scene, presences)
+        return WantedLabels(components, (float(view.u0), float(view.u0 + view.face_ids.shape[1])), cells)
+
+    def draw_legend(self, canvas: paint.Image) -> int:
+        """Draw the legend above the status line if it is needed; returns the row above which labels must stay."""
+        entries = legend_entries(self._drawn.scene.evidence) if self._drawn and self.options.show_legend else ()
+        if not entries:
+            return self._bottom_px
+        margin = round(0.4 * self._size_px)
+        sprite = legend_sprite(entries, self._size_px, self.camera.width - 2 * margin)
+        top = self._bottom_px - margin - sprite.height
+        paint.put_sprite(canvas, sprite, margin, top)
+        return top
+
+    def draw_arrows(self, canvas: paint.Image, pose: Pose) -> None:
+        """Draw the arrows of measured displacements, and those to where displaced components are seen."""
+        if self._drawn is not None and pose.cam_from_model is not None:
+            _, presences, scene = self._drawn
+            self._draw_displacements(canvas, pose.cam_from_model, scene.arrows)
+            self._draw_links(canvas, pose.cam_from_model, scene, presences)
+
+    def draw_state(
+        self, canvas: paint.Image, pose: Pose, fps: float | None = None, now: datetime | None = None
+    ) -> None:
+        """Draw the status line, why labels are withheld, and the outline of the guide pose."""
+        if pose.cam_from_model is None and pose.guide_cam_from_model is not None:
+            self._guide.draw(canvas, pose.guide_cam_from_model)
         if pose.is_label_withheld and self.options.show_evidence:
             self._draw_banner(canvas, pose)
         if self.options.show_status:
             self._status.draw(canvas, pose, fps, now)
-        return canvas
 
     def _make_status(self) -> StatusLine:
         arrows = self._arrows_in_model([Evidence.SEEN] * len(self._names))
@@ -182,7 +283,7 @@ class OverlayRenderer:
             return [None] * len(self._names)
         return [presence_of(pose, name, len(self._names)) for name in self._names]
 
-    def _scene_of(self, pose: Pose, presences: list[ComponentPresence | None], now: datetime | None) -> _OverlayScene:
+    def _scene_of(self, pose: Pose, presences: list[ComponentPresence | None], now: datetime | None) -> _PartLook:
         """What is drawn of the components; computed again when the evidence changes."""
         is_withheld = pose.is_label_withheld and self.options.show_evidence
         evidence = tuple(evidence_of(presence, is_withheld) for presence in presences)
@@ -195,7 +296,7 @@ class OverlayRenderer:
             wanted = labels.text_urgency(self._names, self.inspection, by_name)
             order = tuple(index[name] for name in wanted) if self.options.show_labels and not is_withheld else ()
             arrows = self._arrows_in_model(list(evidence)) if self.options.show_arrows else np.zeros((0, 2, 3))
-            self._scene = _OverlayScene(key, evidence, styles, order, arrows, {})
+            self._scene = _PartLook(key, evidence, styles, order, arrows, {})
         return self._scene
 
     def _draw_model(
@@ -203,7 +304,7 @@ class OverlayRenderer:
         canvas: paint.Image,
         view: GhostView,
         pose: Pose,
-        scene: _OverlayScene,
+        scene: _PartLook,
         presences: list[ComponentPresence | None],
     ) -> None:
         assert pose.cam_from_model is not None
@@ -233,31 +334,8 @@ class OverlayRenderer:
     def _hatch_px(self) -> int:
         return max(6, round(_HATCH * self._line_px))
 
-    def _draw_annotations(
-        self,
-        canvas: paint.Image,
-        view: GhostView,
-        pose: Pose,
-        scene: _OverlayScene,
-        presences: list[ComponentPresence | None],
-    ) -> None:
-        assert pose.cam_from_model is not None
-        bottom_px = self._draw_legend(canvas, scene)
-        seen: dict[str, int] = {}
-        if scene.order:
-            components, cells = self._labelled(view, pose, scene, presences)
-            part_px = (float(view.u0), float(view.u0 + view.face_ids.shape[1]))
-            self.laid_out = self._annotations.lay_out(components, part_px, cells, bottom_px)
-            seen = {one.text.name: one.seen_px for one in components}
-            self._annotations.draw_leaders(canvas, self.laid_out, seen)
-        else:
-            self._annotations.reset()
-        self._draw_arrows(canvas, pose.cam_from_model, scene.arrows)
-        self._draw_links(canvas, pose.cam_from_model, scene, presences)
-        self._annotations.draw_labels(canvas, self.laid_out)
-
     def _labelled(
-        self, view: GhostView, pose: Pose, scene: _OverlayScene, presences: list[ComponentPresence | None]
+        self, view: GhostView, pose: Pose, scene: _PartLook, presences: list[ComponentPresence | None]
     ) -> tuple[list[LabelledComponent], NDArray[np.float32]]:
         """Components that may get a label, and the weighted covered area of each cell of the picture."""
         assert pose.cam_from_model is not None
@@ -276,9 +354,7 @@ class OverlayRenderer:
             result.append(LabelledComponent(text, anchors_px[index], anchors_in_cam[index], int(seen_px[index])))
         return result, cells
 
-    def _text(
-        self, index: int, presence: ComponentPresence | None, scene: _OverlayScene, note: str
-    ) -> labels.LabelText:
+    def _text(self, index: int, presence: ComponentPresence | None, scene: _PartLook, note: str) -> labels.LabelText:
         """Texts of a component's label."""
         text = scene.texts.get((index, note))
         if text is None or scene.evidence[index] is Evidence.DISPLACED:
@@ -320,17 +396,6 @@ class OverlayRenderer:
         note = "one of two places" if count == 2 else f"one of {count} places"
         return {int(index): note for index in np.flatnonzero(apart)}
 
-    def _draw_legend(self, canvas: paint.Image, scene: _OverlayScene) -> int:
-        """Draw the legend above the status line if it is needed; returns the row above which labels must stay."""
-        entries = legend_entries(scene.evidence) if self.options.show_legend else ()
-        if not entries:
-            return self._bottom_px
-        margin = round(0.4 * self._size_px)
-        sprite = legend_sprite(entries, self._size_px, self.camera.width - 2 * margin)
-        top = self._bottom_px - margin - sprite.height
-        paint.put_sprite(canvas, sprite, margin, top)
-        return top
-
     def _draw_banner(self, canvas: paint.Image, pose: Pose) -> None:
         margin = round(0.6 * self._size_px)
         width_px = self.camera.width - 2 * margin
@@ -353,7 +418,7 @@ class OverlayRenderer:
                 arrows.append(np.stack([tail, tail + self._arrow_scale * np.array(displacement)]))
         return np.stack(arrows) if arrows else np.zeros((0, 2, 3))
 
-    def _draw_arrows(self, canvas: paint.Image, cam_from_model: Array, arrows: Array) -> None:
+    def _draw_displacements(self, canvas: paint.Image, cam_from_model: Array, arrows: Array) -> None:
         for tail_px, tip_px in self._projected(cam_from_model, arrows):
             paint.arrow(canvas, tail_px, tip_px, _ARROW_RGB, 0.24 * self._size_px)
 
@@ -361,7 +426,7 @@ class OverlayRenderer:
         self,
         canvas: paint.Image,
         cam_from_model: Array,
-        scene: _OverlayScene,
+        scene: _PartLook,
         presences: list[ComponentPresence | None],
     ) -> None:
         """Arrows from the nominal places of displaced components to where they are seen."""

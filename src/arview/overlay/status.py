@@ -52,7 +52,12 @@ def completeness_text(pose: Pose) -> str:
 
 
 class StatusLine:
-    """A bar at the lower border of the image, of more rows if one is too short."""
+    """A bar at the lower border of the image, of more rows if one is too short.
+
+    Attributes:
+        rows, height_px: its size.
+        bottom_px: row of the image at which it ends; above the border where another bar is below it.
+    """
 
     def __init__(
         self,
@@ -64,7 +69,8 @@ class StatusLine:
         with_completeness: bool = False,
     ) -> None:
         """``with_completeness`` keeps room for the completeness of a part of several components."""
-        self._width, self._height, self._size = width, height, size_px
+        self._width, self._size = width, size_px
+        self.bottom_px = height
         self._inspection, self._scale = inspection, scale
         self._row_px = round(1.75 * size_px)
         self._pad = round(0.7 * size_px)
@@ -83,7 +89,7 @@ class StatusLine:
 
     def draw(self, image: paint.Image, pose: Pose, fps: float | None, now: datetime | None) -> None:
         """Draw the bar on the image in place."""
-        top = self._height - self.height_px
+        top = self.bottom_px - self.height_px
         paint.put_sprite(image, self._panel, 0, top)
         about_part = self._inspection_items(now or datetime.now(UTC), pose.is_label_withheld)
         # Of a tracked part the remark gives way to the inspection; else it says why the part is not tracked.
@@ -125,8 +131,9 @@ class StatusLine:
         return rows
 
     def _tracking_items(self, pose: Pose, fps: float | None, taken_px: int) -> list[tuple[str, Rgb]]:
-        """State, quality, frame rate, and a remark if there is room beside ``taken_px``."""
-        items = [(pose.state.value.upper(), _STATE_RGB[pose.state])]
+        """Specimen, state, quality, frame rate, and a remark if there is room beside ``taken_px``."""
+        items = [(pose.instance, _WHITE)] if pose.instance else []
+        items.append((pose.state.value.upper(), _STATE_RGB[pose.state]))
         if pose.cam_from_model is not None:
             items.append((f"quality {pose.quality:.2f}", _WHITE))
         if fps is not None:

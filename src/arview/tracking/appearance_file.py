@@ -14,7 +14,7 @@ from arview.core.atomic import replacing
 from arview.errors import InputError, MismatchError, OutputError
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
-from arview.tracking.view_crops import CHANNELS, CROP_PX
+from arview.tracking.search.view_crops import CHANNELS, CROP_PX
 
 FORMAT_VERSION = 1
 

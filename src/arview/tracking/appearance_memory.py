@@ -18,7 +18,7 @@ from arview.geometry import Array, rolls_between
 from arview.guideviews import GuideViewSet
 from arview.tracking.appearance_file import SavedViews, load_views, save_views
 from arview.tracking.estimate import Estimate
-from arview.tracking.ncc_search import (
+from arview.tracking.search.ncc_search import (
     NEIGHBOUR_STEPS,
     AppearanceMatch,
     NccSearch,
@@ -26,8 +26,8 @@ from arview.tracking.ncc_search import (
     StoredViews,
     pattern_search,
 )
-from arview.tracking.view_crops import CHANNELS, CROP_PX, ViewCrop, ViewCropper
-from arview.tracking.window_search import WINDOW_PX, rolled_templates
+from arview.tracking.search.view_crops import CHANNELS, CROP_PX, ViewCrop, ViewCropper
+from arview.tracking.search.window_search import WINDOW_PX, rolled_templates
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from arview.tracking.guided_init import GuidedInit
 from arview.tracking.identity import IdentityMonitor, IdentityOptions
 from arview.tracking.pose_recheck import LocalSearchRecheck
 from arview.tracking.session_state import Event, SessionState
-from arview.tracking.specimens import hide_specimens, is_same_specimen
+from arview.tracking.several.specimens import hide_specimens, is_same_specimen
 from arview.tracking.tracker import Tracker
 from arview.tracking.tracker_options import TrackerOptions
 
@@ -122,7 +122,7 @@ class TrackingSession:
 
     Attributes:
         views: guide views of the model.
-        elsewhere: poses (4,4) of other specimens of the part, which are not taken for this one.
+        others: poses (4,4) of other specimens of the part, which are not taken for this one.
         identity: says whether the specimen in view is the one that was followed.
 
     Raises:
@@ -153,7 +153,7 @@ class TrackingSession:
             )
         self.camera = camera
         self.views = views
-        self.elsewhere: tuple[Array, ...] = ()
+        self.others: tuple[Array, ...] = ()
         self._local: LocalSearch = local_search_for(views, camera, o.detector) if like is None else like._local
         self.tracker = Tracker(
             views,
@@ -328,9 +328,9 @@ class TrackingSession:
             return self._align(image, self._guide)
         searches = self._plan(image)
         is_resting = searches == []
-        searched = hide_specimens(image, self.elsewhere, self.views, self.camera)
+        searched = hide_specimens(image, self.others, self.views, self.camera)
         detections = self._detect_remembered(searched) if is_resting else self._detect(searched, searches)
-        detections = [one for one in detections if not self._is_elsewhere(one.cam_from_model)]
+        detections = [one for one in detections if not self._is_other(one.cam_from_model)]
         if detections:
             start = detections[0].cam_from_model
             s.hypotheses = HypothesisSet([invert(start) @ other for other in detections[0].alternatives])
@@ -341,9 +341,9 @@ class TrackingSession:
             return self._align(image, self._guide)
         return None, s.reason
 
-    def _is_elsewhere(self, cam_from_model: Array) -> bool:
+    def _is_other(self, cam_from_model: Array) -> bool:
         """Whether a pose (4,4) is that of another specimen."""
-        return any(is_same_specimen(cam_from_model, other, self.views) for other in self.elsewhere)
+        return any(is_same_specimen(cam_from_model, other, self.views) for other in self.others)
 
     def _initialize(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[Estimate | None, str]:
         """Find the part near the initial pose, which is used only once."""

@@ -33,9 +33,9 @@ from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES
 from arview.refinement.view_model import PartView
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import innovation, normalised_covariance, squared_motion_distance
+from arview.tracking.search.wide_search import WideSearch
 from arview.tracking.tracker_options import TrackerOptions
 from arview.tracking.tracker_state import FrameContext, Proposal, RefinedPose, TrackerState
-from arview.tracking.wide_search import WideSearch
 
 
 class PoseRecheck(Protocol):

@@ -18,8 +18,8 @@ from arview.core.kernel import kernel
 from arview.core.parallel import single_threaded_blas
 from arview.errors import InputError
 from arview.geometry import Array, are_near, exp_so3, rigid, rolls_between, turns_to_rays
-from arview.tracking.view_crops import PART_PX, ViewCropper
-from arview.tracking.window_search import FINE_PART_PX, NOISE, WindowSearch
+from arview.tracking.search.view_crops import PART_PX, ViewCropper
+from arview.tracking.search.window_search import FINE_PART_PX, NOISE, WindowSearch
 
 FINE_PAD = 6
 """Margin around the pictures of the refinement, px."""

@@ -17,7 +17,7 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.pose import Pose
 from arview.tracking.session import TrackingSession
-from arview.tracking.specimens import is_same_specimen
+from arview.tracking.several.specimens import is_same_specimen
 
 
 class SeveralSessions:
@@ -59,7 +59,7 @@ class SeveralSessions:
         # What is tracked comes first, because it is hidden from the search.
         for name in (*(one for one in self.sessions if one not in self._without_pose()), *searching):
             session = self.sessions[name]
-            session.elsewhere = self._elsewhere(name)
+            session.others = self._others(name)
             self._poses[name] = replace(session.process(image, index, time_s), instance=name)
         for name in self._without_pose():
             if name not in searching:
@@ -87,7 +87,7 @@ class SeveralSessions:
         reason = self._poses[name].reason if name in self._poses else "another part is searched for first"
         return Pose(None, None, 0.0, session.state, time_s, index, reason=reason, instance=name)
 
-    def _elsewhere(self, name: str) -> tuple[Array, ...]:
+    def _others(self, name: str) -> tuple[Array, ...]:
         """Poses (4,4) of the other specimens of the same part."""
         own = self.sessions[name].views
         poses = (self._poses.get(other) for other, one in self.sessions.items() if other != name and one.views is own)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import Array
-from arview.tracking.view_crops import CROP_PX, PART_PX
+from arview.tracking.search.view_crops import CROP_PX, PART_PX
 
 WINDOW_PX, WINDOW_PART_PX = 8, 8.0
 """Side of the windows, and diameter of the part in them."""

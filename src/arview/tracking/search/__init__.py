@@ -1,0 +1,1 @@
+"""Searches for the part around a known or remembered pose."""

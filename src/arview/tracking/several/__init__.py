@@ -1,0 +1,1 @@
+"""Several parts, or specimens of one, in one stream."""

@@ -1,0 +1,111 @@
+"""The parts and specimens that are tracked in one stream: which they are, their sessions and their drawing."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from arview.errors import InputError
+
+if TYPE_CHECKING:
+    from arview.cad import Part
+    from arview.camera import Camera
+    from arview.fiducials.serial_code import SerialNumbers
+    from arview.guideviews import GuideViewSet
+    from arview.inspection import Inspection
+    from arview.overlay import OverlayOptions
+    from arview.overlay.several import SeveralOverlay
+    from arview.tracking import SessionOptions
+    from arview.tracking.several.sessions import SeveralSessions
+
+
+class Specimen(NamedTuple):
+    """One specimen to be tracked, with its inspection if there is one."""
+
+    name: str
+    part: Part
+    inspection: Inspection | None
+
+    @property
+    def serials(self) -> SerialNumbers | None:
+        """Serial number that a code on the specimen must hold; None where neither part nor inspection says one."""
+        from arview.fiducials.serial_code import SerialNumbers
+
+        serial = (self.inspection.serial if self.inspection else "") or self.part.serial or ""
+        pattern = self.part.serial_pattern
+        return SerialNumbers(serial, pattern) if serial or pattern else None
+
+
+def load_specimens(
+    part_paths: Sequence[str], instances: int, inspection_paths: Sequence[str], unit: str | None
+) -> list[Specimen]:
+    """The specimens of a command line, in the order of the parts.
+
+    Args:
+        part_paths: part files or CAD files, one for each part.
+        instances: specimens of each part.
+        inspection_paths: inspections of the first specimens, in their order.
+        unit: of CAD files without one.
+
+    Raises:
+        InputError: more inspections than specimens, or a file that cannot be read.
+    """
+    from arview.cad import load_part
+    from arview.inspection import load_inspection
+
+    parts = [part for path in part_paths for part in [load_part(path, unit)] * instances]
+    if len(inspection_paths) > len(parts):
+        raise InputError(
+            f"--inspection: {len(inspection_paths)} given for {len(parts)} specimen{'s' if len(parts) > 1 else ''}; "
+            f"give one for each --part, or with --instances one for each specimen"
+        )
+    found = [load_inspection(path, part.model) for path, part in zip(inspection_paths, parts, strict=False)]
+    inspections = [*found, *[None] * (len(parts) - len(found))]
+    names = specimen_names([part.name for part in parts])
+    return [Specimen(*of) for of in zip(names, parts, inspections, strict=True)]
+
+
+def specimen_names(part_names: Sequence[str]) -> list[str]:
+    """Names of specimens: that of the part, with a number where several have the same: ``plate#1``, ``plate#2``."""
+    total, seen = Counter(part_names), Counter[str]()
+    names = []
+    for name in part_names:
+        seen[name] += 1
+        names.append(f"{name}#{seen[name]}" if total[name] > 1 else name)
+    return names
+
+
+def make_sessions(
+    specimens: Sequence[Specimen],
+    views_of: Callable[[Part], GuideViewSet],
+    camera: Camera,
+    options: SessionOptions,
+) -> SeveralSessions:
+    """A session for each specimen; those of one part share guide views and detector."""
+    from arview.tracking import TrackingSession
+    from arview.tracking.several.sessions import SeveralSessions
+
+    first: dict[str, TrackingSession] = {}
+    sessions = {}
+    for specimen in specimens:
+        part = specimen.part
+        like = first.get(part.model.source_hash)
+        views = views_of(part) if like is None else like.views
+        session = TrackingSession(views, camera, part.model, options, like=like, serials=specimen.serials)
+        first.setdefault(part.model.source_hash, session)
+        sessions[specimen.name] = session
+    return SeveralSessions(sessions)
+
+
+def make_overlay(specimens: Sequence[Specimen], options: OverlayOptions, camera: Camera) -> SeveralOverlay:
+    """The drawing of all specimens in one picture."""
+    from arview.overlay import OverlayRenderer
+    from arview.overlay.several import SeveralOverlay
+
+    return SeveralOverlay(
+        {
+            name: OverlayRenderer(part.model, camera, inspection, options, part.serial)
+            for name, part, inspection in specimens
+        }
+    )
