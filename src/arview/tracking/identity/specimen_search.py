@@ -13,7 +13,7 @@ from arview.geometry import Array, exp_so3, rigid
 from arview.tracking.guided_init import GuidedPose
 from arview.tracking.identity.options import IdentityOptions
 from arview.tracking.identity.part_outline import PartOutline, PartPlace
-from arview.tracking.specimens import hide_specimens
+from arview.tracking.several.specimens import hide_specimens
 
 
 class PictureFinder(Protocol):
