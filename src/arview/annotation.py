@@ -355,6 +355,45 @@ def reasons_text(reasons: Mapping[str, int]) -> str:
     return ", ".join([*texts, f"other ({others})"] if others else texts)
 
 
+def summary_lines(summary: AnnotateSummary) -> list[str]:
+    """A run in words: speed, states with their reasons, specimens, and what was withheld or not verified."""
+    states = _listed(summary.states)
+    skipped = f", {summary.skipped} broken frames skipped" if summary.skipped else ""
+    tracking_ms = sorted(summary.ms)[len(summary.ms) // 2]
+    lines = [
+        f"{summary.frames} frames in {summary.seconds:.1f} s ({summary.fps:.1f} fps end to end, tracking "
+        f"{tracking_ms:.1f} ms a frame): {states}{skipped}"
+    ]
+    for state, reasons in sorted(summary.reasons.items()):
+        lines.append(f"{state} {sum(reasons.values())} frames: {reasons_text(reasons)}")
+    if summary.withheld_reasons:
+        withheld = summary.withheld_reasons
+        lines.append(f"labels withheld in {sum(withheld.values())} frames: {reasons_text(withheld)}")
+    for name, specimen in summary.specimens.items():
+        lines += _specimen_lines(name, specimen)
+    if summary.never_verified:
+        lines.append(f"not verified in any frame: {', '.join(summary.never_verified)}")
+    return lines
+
+
+def _specimen_lines(name: str, specimen: SpecimenSummary) -> list[str]:
+    """What was found of one specimen: its states where it has a name, and its components where it has several."""
+    title = f"{name}: " if name else ""
+    lines = [title + _listed(specimen.states)] if name else []
+    if not specimen.presence or specimen.completeness is None:
+        return lines
+    names: dict[Presence, list[str]] = {}
+    for component, presence in specimen.presence.items():
+        names.setdefault(presence, []).append(component)
+    named = (Presence.MISSING, Presence.DISPLACED)
+    found = [f"{len(some)} {one}" + (f" ({', '.join(some)})" if one in named else "") for one, some in names.items()]
+    return [*lines, f"{title}components {specimen.completeness}: {', '.join(found)}"]
+
+
+def _listed(states: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
+
+
 class _Drawer(Generic[Result]):
     """A thread that draws frames in order and hands them to the sink."""
 

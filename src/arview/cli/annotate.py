@@ -27,7 +27,7 @@ from arview.cli.guessed_camera import check_profile, report_estimate
 from arview.errors import InputError
 
 if TYPE_CHECKING:
-    from arview.annotation import AnnotateSummary, SpecimenSummary
+    from arview.annotation import AnnotateSummary
     from arview.cad import Part
     from arview.camera import Camera
     from arview.geometry import Array
@@ -459,48 +459,15 @@ def _tracking(session: TrackingSession | SelfCalibratingSession) -> TrackingSess
 
 
 def _print_summary(summary: AnnotateSummary, written: list[Path]) -> None:
-    from arview.annotation import reasons_text
+    from arview.annotation import summary_lines
 
     if summary.ended_reason:
         say(f"warning: {summary.ended_reason}")
     if summary.frames == 0:
         click.echo("no frame was processed; nothing is written")
         return
-    for path in written:
-        click.echo(f"wrote {path}")
-    states = ", ".join(f"{count} {state}" for state, count in sorted(summary.states.items()))
-    skipped = f", {summary.skipped} broken frames skipped" if summary.skipped else ""
-    tracking_ms = sorted(summary.ms)[len(summary.ms) // 2]
-    click.echo(
-        f"{summary.frames} frames in {summary.seconds:.1f} s ({summary.fps:.1f} fps end to end, tracking "
-        f"{tracking_ms:.1f} ms a frame): {states}{skipped}"
-    )
-    for state, reasons in sorted(summary.reasons.items()):
-        click.echo(f"{state} {sum(reasons.values())} frames: {reasons_text(reasons)}")
-    if summary.withheld_reasons:
-        withheld = summary.withheld_reasons
-        click.echo(f"labels withheld in {sum(withheld.values())} frames: {reasons_text(withheld)}")
-    for name, specimen in summary.specimens.items():
-        _print_specimen(name, specimen)
-    if summary.never_verified:
-        click.echo(f"not verified in any frame: {', '.join(summary.never_verified)}")
-
-
-def _print_specimen(name: str, specimen: SpecimenSummary) -> None:
-    """What was found of one specimen: its states where it has a name, and its components where it has several."""
-    title = f"{name}: " if name else ""
-    if name:
-        click.echo(title + ", ".join(f"{count} {state}" for state, count in sorted(specimen.states.items())))
-    if not specimen.presence or specimen.completeness is None:
-        return
-    names: dict[str, list[str]] = {}
-    for component, presence in specimen.presence.items():
-        names.setdefault(str(presence), []).append(component)
-    few = [
-        f"{len(found)} {presence}" + (f" ({', '.join(found)})" if presence in ("missing", "displaced") else "")
-        for presence, found in names.items()
-    ]
-    click.echo(f"{title}components {specimen.completeness}: {', '.join(few)}")
+    for line in [*(f"wrote {path}" for path in written), *summary_lines(summary)]:
+        click.echo(line)
 
 
 def _default_output(source: str) -> str:
