@@ -14,7 +14,6 @@ from arview.cad.view_range import ViewRange
 from arview.detection import Detector, DetectorOptions
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.search.global_search import (
-    DOMAIN_DIRECTION,
     GRADIENTS_ONLY,
     QUICK,
     UNTRIMMED,
@@ -23,11 +22,11 @@ from arview.detection.search.global_search import (
     GlobalSearchOptions,
     PoseCandidate,
     SearchBudget,
-    in_fundamental_domain,
     search_distances_mm,
 )
 from arview.detection.search.hypothesis import Hypothesis
 from arview.detection.search.local_search import LocalSearchOptions
+from arview.detection.search.template_bank import DOMAIN_DIRECTION, in_fundamental_domain
 from arview.detection.symmetry import edge_margin, find_rotational_symmetries
 from arview.errors import InputError
 from arview.geometry import apply, are_near, exp_so3, rigid, turned

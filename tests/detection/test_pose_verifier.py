@@ -206,10 +206,15 @@ def test_a_pose_cut_by_the_border_scores_above_wrong_ones(aside_mm: float, seed:
     crop = crop_at(seen, cut)
     is_beyond = crop.pixels[..., 3] == 0
     assert 0.2 < np.mean(is_beyond[crop.drawn[0] < 0.0]) < 0.6
-    others = scores(seen, turned_about(cut, 30.0, 60))
-    assert scores(seen, cut[None])[0] > others.max() + 1.0
     empty = ImagePyramid(background(seed), CAMERA, 12, edge_net())
-    assert scores(empty, cut[None])[0] < -3.0 < 0.0 < scores(seen, cut[None])[0]
+    poses = np.concatenate([cut[None], turned_about(cut, 30.0, 60)])
+    known = np.tile(KNOWN, (len(poses), 1))
+    of_large = PoseVerifier(PART, cut_fill=0.0)
+    true, *others = of_large.scores(seen, poses, known)
+    assert true > max(others) + 1.0
+    assert of_large.scores(empty, poses[:1], known[:1])[0] < -3.0 < 0.0 < true
+    of_none = PoseVerifier(PART, cut_fill=10.0)
+    assert of_none.scores(seen, poses[:1], known[:1])[0] < 0.0
 
 
 def test_nothing_is_expected_beyond_the_border() -> None:

@@ -34,6 +34,9 @@ class ConfidenceOptions:
         full_inner_share, full_inner_support: share of design edges inside the outline from which they must be seen,
             too, and support with which they are.
         min_outline: outline score below which the outline alone confirms no pose.
+        max_cut_loss: log odds that a pose of which the picture shows nothing would lose; one that is partly cut by the
+            picture's border loses its share of them where its outline score is 0, and nothing from ``min_outline`` on,
+            because a part of an outline fits clutter more often than a whole one.
     """
 
     min_verifier_score: float = -4.0
@@ -47,6 +50,7 @@ class ConfidenceOptions:
     full_inner_share: float = 0.5
     full_inner_support: float = 0.25
     min_outline: float = 0.15
+    max_cut_loss: float = 8.0
 
 
 CONFIDENCE = ConfidenceOptions()
@@ -280,12 +284,22 @@ def confidence_terms(
     )
 
 
-def pose_probability(terms: ConfidenceTerms, options: ConfidenceOptions = CONFIDENCE) -> float:
-    """Probability that the best hypothesis of an image is right: that of the surer of both regressions."""
+def pose_probability(
+    terms: ConfidenceTerms, options: ConfidenceOptions = CONFIDENCE, share_outside: float = 0.0
+) -> float:
+    """Probability that the best hypothesis of an image is right: that of the surer of both regressions.
+
+    Args:
+        terms: of the hypothesis.
+        options: bounds of the terms.
+        share_outside: of the outline, cut off by the picture's border.
+    """
     weights = confidence_weights()
     total = weights.probability_bias + _weighted(weights.probability, terms)
     if terms.outline >= options.min_outline:
         total = max(total, weights.by_outline_bias + _weighted(weights.by_outline, terms))
+    is_unclear = 1.0 - min(max(terms.outline, 0.0) / options.min_outline, 1.0)
+    total -= options.max_cut_loss * share_outside * is_unclear
     return 1.0 / (1.0 + math.exp(-min(max(total, -50.0), 50.0)))
 
 

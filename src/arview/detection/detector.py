@@ -272,7 +272,12 @@ class Detector:
 
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right; see `pose_probability`."""
-        return [pose_probability(self.terms(h, hypotheses[k + 1 :])) for k, h in enumerate(hypotheses)]
+        return [
+            pose_probability(
+                self.terms(h, hypotheses[k + 1 :]), self.options.confidence, 1.0 - h.evidence.points_in_picture
+            )
+            for k, h in enumerate(hypotheses)
+        ]
 
     def terms(self, best: Hypothesis, others: list[Hypothesis]) -> ConfidenceTerms:
         """Terms of the probability of a hypothesis that competes with others."""

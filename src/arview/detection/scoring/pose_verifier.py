@@ -36,10 +36,12 @@ class PoseVerifier:
 
     Args:
         part: of the poses.
+        cut_fill: the part's diameter, as a share of the picture's shorter side, from which nothing is expected of what
+            the picture's border cuts off; smaller cut poses often fit clutter by chance.
     """
 
-    def __init__(self, part: PartView) -> None:
-        self._part = part
+    def __init__(self, part: PartView, cut_fill: float = 0.7) -> None:
+        self._part, self._cut_fill = part, cut_fill
         self._network = ScoreNet("pose_verifier.onnx")
 
     def scores(self, pyramid: ImagePyramid, poses: Array, known: Array) -> Array:
@@ -54,7 +56,9 @@ class PoseVerifier:
         list(pool().map(pyramid.level, set(steps_to(CROP_RADIUS_PX, radii_px).tolist())))
 
         def network_input(pose: Array, radius_px: float, of_pose: Array) -> NetworkInput:
-            crop = without_outside(pose_crop(pyramid, self._part, pose, radius_px))
+            crop = pose_crop(pyramid, self._part, pose, radius_px)
+            if 2.0 * radius_px >= self._cut_fill * min(pyramid.image.shape[:2]):
+                crop = without_outside(crop)
             plain, contrast = normalise_colours(crop.pixels, crop.drawn)
             channels, explained = append_gradients(plain)
             scalars = pose_scalars(radius_px, contrast, of_pose, explained)

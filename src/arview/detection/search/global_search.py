@@ -8,6 +8,7 @@ This keeps search in clutter affordable on a CPU. A profile ranker orders what r
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -15,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.view_range import ViewRange
 from arview.camera import Camera
 from arview.core.parallel import pool
 from arview.detection.features.image_pyramid import (
@@ -29,18 +29,15 @@ from arview.detection.search.pattern_search import search_outlines
 from arview.detection.search.template_bank import (
     GROUPS,
     OutlineOptions,
+    in_fundamental_domain,
     make_bank,
     make_outlines,
     outlines_near_icosphere,
 )
-from arview.detection.search.template_matching import decimate, match_templates
+from arview.detection.search.template_matching import TYPICAL_SHARE, decimate, decimate_with_border, match_templates
 from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
 from arview.refinement.view_model import PartView
-
-DOMAIN_DIRECTION = np.array([0.36, 0.48, 0.8])
-"""Direction that chooses one of several symmetric views; it lies on no axis or plane of a likely symmetry."""
-
 
 @dataclass(frozen=True)
 class RefinementStep:
@@ -81,6 +78,9 @@ class GlobalSearchOptions:
         response_weight: weight of the mean response beside the profile score when candidates are ranked.
         max_octaves: a wider range of sizes is searched in two parts, so that the usual sizes take no longer.
         core_fill: the part's diameter in the picture, as shares of its longer side, in the first of these parts.
+        cut_fill: the part's diameter, as a share of the picture's shorter side, from which it is also searched where the
+            picture's border cuts it.
+        cut_margin: distance that its templates may reach out of the response maps, as a share of ``radius_px``.
         min_map_px: side of a response map, without its border, below which nothing is searched.
     """
 
@@ -107,6 +107,8 @@ class GlobalSearchOptions:
     response_weight: float = 20.0
     max_octaves: float = 2.6
     core_fill: tuple[float, float] = (0.18, 0.85)
+    cut_fill: float = 0.7
+    cut_margin: float = 0.4
     min_map_px: int = 16
 
 
@@ -216,31 +218,6 @@ def _concatenated(parts: list[TemplateMatches]) -> TemplateMatches:
     )
 
 
-def in_fundamental_domain(
-    directions: Array, turns: Array, view_range: ViewRange, margin_deg: float = 14.0
-) -> NDArray[np.bool_]:
-    """Which of the directions to the camera represent all those that symmetries make equal.
-
-    The fundamental domain is the part of the sphere that is closer to `DOMAIN_DIRECTION` than to its images under the
-    symmetries. Images outside the declared range are ignored, and so are all symmetries where the rolls are limited.
-
-    Args:
-        directions: (V,3) unit vectors.
-        turns: (R,3,3) rotations of the part onto itself.
-        view_range: declared range.
-        margin_deg: width by which the domain is extended, because templates on both sides of its border matter.
-    """
-    is_inside = np.ones(len(directions), dtype=np.bool_)
-    low, high = view_range.roll_deg
-    if high - low < 360.0:
-        return is_inside
-    for turn in turns:
-        across = turn @ DOMAIN_DIRECTION - DOMAIN_DIRECTION
-        is_farther = directions @ across > np.sin(np.deg2rad(margin_deg)) * np.linalg.norm(across)
-        is_inside &= ~(is_farther & view_range.contains_direction(directions @ turn))
-    return is_inside
-
-
 def search_distances_mm(
     views: GuideViewSet, camera: Camera, nearest: float = 0.85, farthest: float = 1.18
 ) -> tuple[float, float]:
@@ -258,6 +235,11 @@ def search_distances_mm(
 def weight_by_lines(scores: Array, view_lines: Array) -> Array:
     """Scores that compare across views: a view that shows few distinct lines often fits by chance."""
     return np.asarray(scores * view_lines**0.25)
+
+
+def _typical_response(maps: NDArray[np.uint8], stride: int = 4) -> float:
+    """Response 0–1 that an outline has by chance in response maps (8,H,W), from every few of their pixels."""
+    return TYPICAL_SHARE * float(maps[:, ::stride, ::stride].mean()) / 255.0
 
 
 class GlobalSearch:
@@ -367,7 +349,7 @@ class GlobalSearch:
             return self._no_matches()
         scales = steps[:: budget.scale_stride]
         pyramid.make_maps(scales)
-        phases = list(pool().map(lambda step: decimate(pyramid.maps(step)[0], o.grid_px), scales))
+        phases = list(pool().map(lambda step: self._phases(pyramid, step), scales))
         count = len(next(iter(self.banks.values())).bins)
         halves = [0, count // 2, count]
         votes = {step: np.zeros((GROUPS, 1024), dtype=np.int64) for step in scales}
@@ -377,6 +359,26 @@ class GlobalSearch:
         jobs = [(*level, first, last) for level in levels for first, last in pairwise(halves)]
         found = pool().map(lambda job: self._match(votes[job[0]], kept, budget.is_trimmed, pyramid, *job), jobs)
         return self._without_duplicates(_concatenated([self._no_matches(), *found]), budget.matches)
+
+    def _cut_margin_px(self, step: int) -> int:
+        """Border added to the response maps at a scale step, on which outlines cut by the picture's border match."""
+        o = self.options
+        if o.radius_px < self._min_cut_px(step):
+            return 0
+        return o.grid_px * math.ceil(o.cut_margin * o.radius_px / o.grid_px)
+
+    def _min_cut_px(self, step: int) -> float:
+        """Half diameter at a scale step from which the part is searched where the picture's border cuts it."""
+        shorter_px = min(self.camera.width, self.camera.height) * 2.0 ** (step / STEPS_PER_OCTAVE)
+        return 0.5 * self.options.cut_fill * shorter_px
+
+    def _phases(self, pyramid: ImagePyramid, step: int) -> NDArray[np.uint8]:
+        """The decimated response maps at a scale step."""
+        maps, _ = pyramid.maps(step)
+        margin_px = self._cut_margin_px(step)
+        if margin_px == 0:
+            return decimate(maps, self.options.grid_px)
+        return decimate_with_border(maps, self.options.grid_px, pyramid.pad_px, margin_px)
 
     @staticmethod
     def _no_matches() -> TemplateMatches:
@@ -409,7 +411,7 @@ class GlobalSearch:
             views=bank.views[templates],
             rolls=bank.rolls[templates],
             radii_px=np.full(len(keys), self.options.radius_px),
-            places=places + bank.origins[templates] - pyramid.pad_px,
+            places=places + bank.origins[templates] - pyramid.pad_px - self._cut_margin_px(step),
         )
 
     def _posed(self, matches: TemplateMatches) -> tuple[Array, Array]:
@@ -482,7 +484,7 @@ class GlobalSearch:
             scores, views, rolls, radii_px, places = search_outlines(
                 maps, outlines.points, outlines.angles, around.views, around.rolls, some.views, some.rolls,
                 some.radii_px * scale, places, focal_px, refinement.roll_step_rad, refinement.stretch_step, o.rounds,
-                o.shift_px, o.shift_px, is_trimmed,
+                o.shift_px, o.shift_px, is_trimmed, pyramid.pad_px, self._min_cut_px(step), _typical_response(maps),
             )  # fmt: skip
             keys = weight_by_lines(scores, outlines.view_lines[views])
             steps = np.full(len(keys), step)

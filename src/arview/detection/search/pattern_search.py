@@ -19,8 +19,13 @@ from arview.detection.search.template_bank import (
     min_adjacent_pair,
     sector_of,
 )
+from arview.detection.search.template_matching import visible_score
 from arview.refinement.kernels import nearest_view
 from arview.refinement.projection import ViewArrays
+
+
+MAX_OUTLINE_REACH = 1.4
+"""Half diameters from the part's centre within which its outline lies in the image; near parts reach beyond 1."""
 
 
 @kernel
@@ -125,8 +130,8 @@ def search_poses(
 @kernel
 def outline_score(
     maps: NDArray[np.uint8], points: NDArray[np.float32], angles: NDArray[np.uint8], roll: float, radius_px: float,
-    nearness: float, x0: float, y0: float, shift_px: int, shift_step: int, is_trimmed: bool,
-    buffer: NDArray[np.int64], sums: NDArray[np.int32], sectors: NDArray[np.int64]
+    nearness: float, x0: float, y0: float, shift_px: int, shift_step: int, is_trimmed: bool, pad_px: int,
+    min_cut_px: float, floor: float, buffer: NDArray[np.int64], sums: NDArray[np.int32], sectors: NDArray[np.int64]
 ) -> tuple[float, int, int]:  # fmt: skip
     """Mean response 0–1 of an outline at a roll, size and place, and the best shift dx, dy in px.
 
@@ -139,6 +144,9 @@ def outline_score(
         x0, y0: place of the part's centre in the maps.
         shift_px, shift_step: range and step of the shifts.
         is_trimmed: see `match_templates`.
+        pad_px: empty border of the maps.
+        min_cut_px: half diameter from which an outline that reaches into that border is scored by its points inside.
+        floor: typical response, see `visible_score`.
         buffer, sums, sectors: work buffers (3,N) int64, (S,S) int32 and (SECTORS,) int64.
     """
     a, b = np.float32(radius_px * np.cos(roll)), np.float32(radius_px * np.sin(roll))
@@ -152,9 +160,18 @@ def outline_score(
         buffer[2, i] = ((angles[i] + turn) >> 5) & 7
     count = points.shape[0]
     best, dx, dy = best_shift(maps, buffer, count, shift_px, shift_step, sums)
-    if not is_trimmed:
-        return best / (255.0 * count), dx, dy
-    return _trimmed_sum(maps, buffer, count, dx, dy, sectors) / (255.0 * count * (1.0 - TRIMMED_SHARE)), dx, dy
+    counted = count * (1.0 - TRIMMED_SHARE) if is_trimmed else 1.0 * count
+    total = 1.0 * (_trimmed_sum(maps, buffer, count, dx, dy, sectors) if is_trimmed else best)
+    score = total / (255.0 * counted)
+    height, width = maps.shape[1], maps.shape[2]
+    reach = radius_px * MAX_OUTLINE_REACH + pad_px
+    if radius_px < min_cut_px or (reach <= x0 < width - reach and reach <= y0 < height - reach):
+        return score, dx, dy
+    shown = 0
+    for i in range(count):
+        x, y = buffer[0, i] + dx, buffer[1, i] + dy
+        shown += int(pad_px <= x < width - pad_px and pad_px <= y < height - pad_px)
+    return visible_score(score, min(shown / counted, 1.0), floor), dx, dy
 
 
 @kernel
@@ -176,7 +193,7 @@ def search_outlines(
     maps: NDArray[np.uint8], points: NDArray[np.float32], angles: NDArray[np.uint8], neighbours: NDArray[np.int32],
     turns: NDArray[np.float64], views: NDArray[np.int32], rolls: NDArray[np.float64], radii_px: NDArray[np.float64],
     places: NDArray[np.float64], focal_px: float, roll_step_rad: float, stretch_step: float, rounds: int,
-    shift_px: int, shift_step: int, is_trimmed: bool
+    shift_px: int, shift_step: int, is_trimmed: bool, pad_px: int, min_cut_px: float, floor: float
 ) -> tuple[
     NDArray[np.float64], NDArray[np.int32], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
 ]:  # fmt: skip
@@ -194,6 +211,7 @@ def search_outlines(
         rounds: maximum number of passes over all steps.
         shift_px, shift_step: range and step of the shifts.
         is_trimmed: see `match_templates`.
+        pad_px, min_cut_px, floor: see `outline_score`.
 
     Returns:
         Scores (M,) 0–1, views (M,), rolls (M,), radii_px (M,) and places (M,2).
@@ -209,7 +227,7 @@ def search_outlines(
         view, roll, radius = views[n], rolls[n], radii_px[n]
         best, dx, dy = outline_score(
             maps, points[view], angles[view], roll, radius, radius / focal_px, places[n, 0], places[n, 1],
-            shift_px, shift_step, is_trimmed, buffer, sums, sectors,
+            shift_px, shift_step, is_trimmed, pad_px, min_cut_px, floor, buffer, sums, sectors,
         )  # fmt: skip
         x, y = places[n, 0] + dx, places[n, 1] + dy
         for _ in range(rounds):
@@ -225,7 +243,7 @@ def search_outlines(
                     r += turns[view, step - 4]
                 score, dx, dy = outline_score(
                     maps, points[v], angles[v], r, s, s / focal_px, x, y,
-                    shift_px, shift_step, is_trimmed, buffer, sums, sectors,
+                    shift_px, shift_step, is_trimmed, pad_px, min_cut_px, floor, buffer, sums, sectors,
                 )  # fmt: skip
                 if score > best:
                     best = score

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from arview.cad.view_range import ViewRange
 from arview.core.kernel import kernel
 from arview.detection.features.response_maps import orientation_bins
 from arview.errors import InputError
@@ -33,6 +34,8 @@ TRIMMED_SHARE = 2.0 / SECTORS
 """Share of the outline that a trimmed score leaves out: the two adjacent sectors with the lowest responses."""
 GROUPS = 42
 """Number of groups of similar views: directions of an icosphere with one subdivision, about 35° apart."""
+DOMAIN_DIRECTION = np.array([0.36, 0.48, 0.8])
+"""Direction that chooses one of several symmetric views; it lies on no axis or plane of a likely symmetry."""
 
 
 @dataclass(frozen=True)
@@ -245,6 +248,31 @@ def outlines_near_icosphere(views: GuideViewSet, outlines: ViewOutlines, subdivi
     """Indices of the outlines nearest to the directions of an icosphere of some icosahedron level."""
     wanted = np.stack([views.view(int(i)).cam_from_model[2, :3] for i in _nearest_views(views, subdivisions)])
     return np.unique(np.argmax(wanted @ outlines.rotations[:, 2].T, axis=1))
+
+
+def in_fundamental_domain(
+    directions: Array, turns: Array, view_range: ViewRange, margin_deg: float = 14.0
+) -> NDArray[np.bool_]:
+    """Which of the directions to the camera represent all those that symmetries make equal.
+
+    The fundamental domain is the part of the sphere that is closer to `DOMAIN_DIRECTION` than to its images under the
+    symmetries. Images outside the declared range are ignored, and so are all symmetries where the rolls are limited.
+
+    Args:
+        directions: (V,3) unit vectors.
+        turns: (R,3,3) rotations of the part onto itself.
+        view_range: declared range.
+        margin_deg: width by which the domain is extended, because templates on both sides of its border matter.
+    """
+    is_inside = np.ones(len(directions), dtype=np.bool_)
+    low, high = view_range.roll_deg
+    if high - low < 360.0:
+        return is_inside
+    for turn in turns:
+        across = turn @ DOMAIN_DIRECTION - DOMAIN_DIRECTION
+        is_farther = directions @ across > np.sin(np.deg2rad(margin_deg)) * np.linalg.norm(across)
+        is_inside &= ~(is_farther & view_range.contains_direction(directions @ turn))
+    return is_inside
 
 
 def make_bank(

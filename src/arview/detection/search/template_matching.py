@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
+from arview.detection.features.response_maps import ORIENTATIONS
 from arview.detection.search.template_bank import (
     FIRST_POINTS,
     SECTORS,
@@ -35,6 +36,8 @@ BLOCK = 64
 """Places skipped together where none reaches the threshold."""
 KEY_STEP = 0.005
 """Width of the bins in which keys are counted."""
+MIN_INSIDE = 0.4
+"""Share of an outline inside the picture below which it matches nowhere; few points fit anything."""
 
 
 def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
@@ -52,6 +55,23 @@ def decimate(maps: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
     padded = np.zeros((count, rows * step, columns * step), dtype=np.uint8)
     np.right_shift(maps, 2, out=padded[:, :height, :width])
     return np.ascontiguousarray(padded.reshape(count, rows, step, columns, step).transpose(0, 2, 4, 1, 3))
+
+
+def decimate_with_border(maps: NDArray[np.uint8], step: int, pad_px: int, margin_px: int) -> NDArray[np.uint8]:
+    """Response maps as `decimate` splits them, with a wider border and a ninth plane that is 1 inside the picture.
+
+    Args:
+        maps: (8,H,W) uint8.
+        step: spacing of the grid.
+        pad_px: empty border of the maps.
+        margin_px: empty border added to it.
+    """
+    count, height, width = maps.shape
+    wide = np.zeros((count + 1, height + 2 * margin_px, width + 2 * margin_px), dtype=np.uint8)
+    wide[:-1, margin_px : margin_px + height, margin_px : margin_px + width] = maps
+    border = pad_px + margin_px
+    wide[-1, border:-border, border:-border] = 4  # 1 after `decimate`
+    return decimate(wide, step)
 
 
 @kernel
@@ -140,8 +160,17 @@ def _sum_first_points(
 
 
 @kernel(inline=True)
-def _typical_score(total: Any, span: Any, full: Any) -> Any:
-    """Mean score of the first points over sampled places, times `TYPICAL_SHARE`; ``full`` is the largest sum."""
+def _sum_at(flat: Any, source: Any, shift: Any, k: Any, sums: Any, is_trimmed: Any) -> Any:
+    """Sum under all points at place ``k``, without the lowest adjacent pair of sectors if trimmed."""
+    sums[:] = 0
+    for i in range(source.shape[0]):
+        sums[sector_of(i)] += np.int64(flat[source[i], shift[i] + k])
+    return np.sum(sums) - (min_adjacent_pair(sums) if is_trimmed else 0)
+
+
+@kernel(inline=True)
+def _sampled_mean(total: Any, span: Any) -> Any:
+    """Mean over sampled places."""
     count = 0
     sampled = np.uint64(0)
     for start in range(0, span, SAMPLE_EVERY):
@@ -149,7 +178,49 @@ def _typical_score(total: Any, span: Any, full: Any) -> Any:
         for k in range(start, start + size):
             sampled += np.uint64(total[k])
         count += size
-    return TYPICAL_SHARE * sampled / (count * full)
+    return sampled / count
+
+
+@kernel
+def visible_score(score: float, share: float, floor: float) -> float:
+    """Mean response under an outline of which only a share is inside the picture.
+
+    What it exceeds a typical response by shrinks with the square root of the share, as the standard error of a mean
+    grows: fewer points fit by chance more often.
+
+    Args:
+        score: sum of the responses over the number of all points, 0–1; those outside the picture add nothing.
+        share: of the points that are inside.
+        floor: typical response.
+    """
+    if share >= 1.0:
+        return score
+    if share < MIN_INSIDE:
+        return 0.0
+    root = np.sqrt(share)
+    return score / root + floor * (1.0 - root)
+
+
+@kernel(inline=True)
+def _add_inside(inside: Any, flat: Any, source: Any, shift: Any, span: Any) -> Any:
+    """Write how many of the first points are inside the picture at ``span`` places."""
+    for start in range(0, span, TILE):
+        size = min(TILE, span - start)
+        inside[start : start + size] = 0
+        _add_points(inside[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
+
+
+@kernel(inline=True)
+def _make_visible(total: Any, inside: Any, span: Any, counted: Any, floor: Any, full: Any) -> Any:
+    """Replace the sums at ``span`` places by those of `visible_score`; ``counted`` of the first points count."""
+    factors, offsets = np.zeros(FIRST_POINTS + 1), np.zeros(FIRST_POINTS + 1)
+    for n in range(FIRST_POINTS + 1):
+        offsets[n] = full * visible_score(0.0, min(n / counted, 1.0), floor)
+        factors[n] = visible_score(1.0, min(n / counted, 1.0), floor) - offsets[n] / full
+    for k in range(span):
+        n = inside[k]
+        if n < counted:
+            total[k] = np.uint16(factors[n] * total[k] + offsets[n])
 
 
 @kernel(inline=True)
@@ -197,7 +268,8 @@ def match_templates(
     """Matches that stand out most, of each group of templates.
 
     Args:
-        phases: decimated response maps of `decimate`.
+        phases: decimated response maps of `decimate` or `decimate_with_border`. With the latter, an outline cut by the
+            picture's border is scored by its points inside, see `visible_score`.
         offsets, bins, gains, groups: see `TemplateBank`.
         first_template, last_template: range of the templates that are matched.
         kept: approximate number of matches returned for each group over all calls that share ``votes``; some more are
@@ -207,7 +279,7 @@ def match_templates(
         is_trimmed: leave out the two adjacent sectors with the lowest responses, which may be occluded.
 
     Returns:
-        keys (M,) by which matches compare, templates (M,), and places (M,2) of the offsets' origin in full pixels.
+        keys (M,), templates (M,), and places (M,2) of the offsets' origin in full pixels.
     """
     step = phases.shape[1]
     rows, columns = phases.shape[3], phases.shape[4]
@@ -219,8 +291,10 @@ def match_templates(
     keys = np.empty(room)
     templates, cells = np.empty(room, dtype=np.int32), np.empty(room, dtype=np.int32)
     found = 0
+    has_border = phases.shape[0] > ORIENTATIONS
+    inside = np.empty(rows * columns + BLOCK if has_border else 1, dtype=np.uint16)
     own, lowest = np.empty((SECTORS, TILE), dtype=np.uint16), np.empty(TILE, dtype=np.uint16)
-    sums = np.empty(SECTORS, dtype=np.int64)
+    mask, sums = source, np.empty(SECTORS, dtype=np.int64)
     counted = 1.0 - TRIMMED_SHARE if is_trimmed else 1.0
     full, first_full = 63.0 * points * counted, 63.0 * FIRST_POINTS * counted
     for t in range(first_template, last_template):
@@ -231,7 +305,12 @@ def match_templates(
             continue
         span = (last_row - 1) * columns + last_column
         _sum_first_points(total, own, lowest, flat, source, shift, span, is_trimmed)
-        typical = _typical_score(total, span, first_full)
+        typical = TYPICAL_SHARE * _sampled_mean(total, span) / first_full
+        if has_border:
+            mask = source % (step * step) + ORIENTATIONS * step * step
+            _add_inside(inside, flat, mask, shift, span)
+            typical *= FIRST_POINTS / max(_sampled_mean(inside, span), 1.0)
+            _make_visible(total, inside, span, counted * FIRST_POINTS, typical, first_full)
         required = max(min_score, typical + _threshold(votes[groups[t]], kept) / gains[t])
         if required > 1.0:
             continue
@@ -246,16 +325,10 @@ def match_templates(
             for k in range(start, stop):
                 if total[k] < limit or k % columns >= last_column or not _is_peak(total, k, span, columns):
                     continue
-                if is_trimmed:
-                    sums[:] = 0
-                    for i in range(points):
-                        sums[sector_of(i)] += np.int64(flat[source[i], shift[i] + k])
-                    sum_all = np.sum(sums) - min_adjacent_pair(sums)
-                else:
-                    sum_all = np.int64(total[k])
-                    for i in range(FIRST_POINTS, points):
-                        sum_all += np.int64(flat[source[i], shift[i] + k])
-                share = sum_all / full
+                share = _sum_at(flat, source, shift, k, sums, is_trimmed) / full
+                if has_border:
+                    shown = _sum_at(flat, mask, shift, k, sums, False) / (counted * points)
+                    share = visible_score(share, min(shown, 1.0), typical)
                 if share < required:
                     continue
                 if found == room:
