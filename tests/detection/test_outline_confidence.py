@@ -76,3 +76,14 @@ def test_a_cut_outline_counts_less() -> None:
     cut = replace(CLEAR, points_in_picture=0.5)
     whole = outline_score(CLEAR, CLEAR, 1.0)
     assert outline_score(cut, cut, 1.0) == pytest.approx(0.5 * whole)
+
+
+def test_a_cut_pose_must_show_a_clear_outline_that_the_contour_verifier_confirms() -> None:
+    clear = terms(0.3)._replace(contour=2.0, appearance=3.0)
+    whole, cut = pose_probability(clear), pose_probability(clear, share_outside=0.5)
+    assert whole > 0.9 and cut > whole - 0.05
+    for doubtful in (clear._replace(outline=0.0), clear._replace(contour=-3.0)):
+        cut, whole = pose_probability(doubtful, share_outside=0.5), pose_probability(doubtful)
+        assert cut / (1.0 - cut) < 0.1 * whole / (1.0 - whole)
+    by_share = [pose_probability(clear._replace(outline=0.05), share_outside=share) for share in (0.0, 0.2, 0.4, 0.6)]
+    assert by_share == sorted(by_share, reverse=True) and by_share[0] > by_share[-1]

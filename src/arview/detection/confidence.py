@@ -34,9 +34,11 @@ class ConfidenceOptions:
         full_inner_share, full_inner_support: share of design edges inside the outline from which they must be seen,
             too, and support with which they are.
         min_outline: outline score below which the outline alone confirms no pose.
-        max_cut_loss: log odds that a pose of which the picture shows nothing would lose; one that is partly cut by the
-            picture's border loses its share of them where its outline score is 0, and nothing from ``min_outline`` on,
-            because a part of an outline fits clutter more often than a whole one.
+        max_cut_loss: log odds that a pose entirely outside the picture would lose. A pose cut by the picture's border
+            loses its share of them unless the outline score reaches ``min_outline`` and the contour verifier confirms
+            what is left, because a part of an outline fits clutter more often than a whole one.
+        cut_contour, cut_slope: score of the contour verifier at which a cut pose counts as half confirmed, and slope
+            of the logistic function around it.
     """
 
     min_verifier_score: float = -4.0
@@ -51,6 +53,8 @@ class ConfidenceOptions:
     full_inner_support: float = 0.25
     min_outline: float = 0.15
     max_cut_loss: float = 8.0
+    cut_contour: float = -0.1
+    cut_slope: float = 3.0
 
 
 CONFIDENCE = ConfidenceOptions()
@@ -298,8 +302,10 @@ def pose_probability(
     total = weights.probability_bias + _weighted(weights.probability, terms)
     if terms.outline >= options.min_outline:
         total = max(total, weights.by_outline_bias + _weighted(weights.by_outline, terms))
-    is_unclear = 1.0 - min(max(terms.outline, 0.0) / options.min_outline, 1.0)
-    total -= options.max_cut_loss * share_outside * is_unclear
+    o = options
+    is_confirmed = 1.0 / (1.0 + math.exp(-o.cut_slope * (terms.contour - o.cut_contour)))
+    is_clear = min(max(terms.outline, 0.0) / o.min_outline, 1.0) * is_confirmed
+    total -= o.max_cut_loss * share_outside * (1.0 - is_clear)
     return 1.0 / (1.0 + math.exp(-min(max(total, -50.0), 50.0)))
 
 
