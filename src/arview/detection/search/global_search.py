@@ -39,6 +39,7 @@ from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
 from arview.refinement.view_model import PartView
 
+
 @dataclass(frozen=True)
 class RefinementStep:
     """One round in which matches are improved as outlines on larger maps.
