@@ -79,8 +79,8 @@ class GlobalSearchOptions:
         response_weight: weight of the mean response beside the profile score when candidates are ranked.
         max_octaves: a wider range of sizes is searched in two parts, so that the usual sizes take no longer.
         core_fill: the part's diameter in the picture, as shares of its longer side, in the first of these parts.
-        cut_fill: the part's diameter, as a share of the picture's shorter side, from which it is also searched where the
-            picture's border cuts it.
+        cut_fill: the part's diameter, as a share of the picture's shorter side, from which it is also searched where
+            the picture's border cuts it.
         cut_margin: distance that its templates may reach out of the response maps, as a share of ``radius_px``.
         min_map_px: side of a response map, without its border, below which nothing is searched.
     """
