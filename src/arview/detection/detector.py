@@ -273,11 +273,17 @@ class Detector:
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right; see `pose_probability`."""
         return [
-            pose_probability(
-                self.terms(h, hypotheses[k + 1 :]), self.options.confidence, 1.0 - h.evidence.points_in_picture
-            )
+            pose_probability(self.terms(h, hypotheses[k + 1 :]), self.options.confidence, self._share_cut_off(h))
             for k, h in enumerate(hypotheses)
         ]
+
+    def _share_cut_off(self, hypothesis: Hypothesis) -> float:
+        """Share of the outline that the picture's border cuts off a part so large that cut poses of it are searched."""
+        camera = self.local.reduced_camera
+        distance_mm = float(np.linalg.norm(hypothesis.cam_from_body[:3, 3]))
+        span_px = 0.5 * (camera.fx + camera.fy) * self.views.diameter_mm / distance_mm
+        is_large = span_px >= self.options.global_search.cut_fill * min(camera.width, camera.height)
+        return 1.0 - hypothesis.evidence.points_in_picture if is_large else 0.0
 
     def terms(self, best: Hypothesis, others: list[Hypothesis]) -> ConfidenceTerms:
         """Terms of the probability of a hypothesis that competes with others."""
