@@ -24,7 +24,7 @@ from arview.pose import Identity, Pose
 from arview.tracking.estimate import Estimate
 from arview.tracking.identity.background_motion import BackgroundMotion, reduced
 from arview.tracking.identity.options import IdentityOptions
-from arview.tracking.identity.part_outline import PartOutline, transfer
+from arview.tracking.identity.part_outline import PartOutline, PartPlace, transfer
 from arview.tracking.identity.specimen_search import Finders, SpecimenSearch
 
 CHECKING = "checking that this is the part that was followed before"
@@ -127,7 +127,7 @@ class IdentityMonitor:
         self._is_followed = False
         self._others_before: list[Array] | None = None
         self._doubt: Doubt | None = None
-        self._last_pose: Array | None = None
+        self._last_place: PartPlace | None = None
         self._frames_unsure = 0
         self._frame = 0
 
@@ -207,6 +207,7 @@ class IdentityMonitor:
             self._miss(image)
             return self._result(moved_to)
         pose = estimate.cam_from_model
+        self._place = self.outline.place(pose)
         is_sure = is_confirmed and estimate.quality >= self.options.min_quality and not estimate.is_restless
         if self._doubt is None:
             placement = self._placement(image, pose, is_sure)
@@ -216,14 +217,14 @@ class IdentityMonitor:
         if self._doubt is not None:
             moved_to = self._examine(image, pose, is_sure, self._doubt, time_s, finders)
         self._read_code(image, pose, is_sure)
-        self._last_pose = pose
+        self._last_place = self._place
         return self._result(moved_to)
 
     # --- Follow -------------------------------------------------------------------------------------------
 
     def _miss(self, image: NDArray[np.uint8]) -> None:
         """A frame without a pose: the background is followed, and a new pose is compared with the last one."""
-        self._last_pose = None
+        self._last_place = None
         self._frames_unsure += 1
         if self._doubt is not None and not self._doubt.reason:
             self._doubt = None
@@ -233,16 +234,16 @@ class IdentityMonitor:
         """Whether the followed specimen would be at a pose (4,4) of this frame."""
         if self._kept is None:
             return Placement.SAME
-        if is_sure and self._frames_unsure == 0 and not self._is_jump(pose):
+        if is_sure and self._frames_unsure == 0 and not self._is_jump():
             return Placement.SAME
         self._follow_background(image, pose)
-        if self._last_pose is None or self._is_jump(pose):
+        if self._last_place is None or self._is_jump():
             self._motion.match(pose)
         placement = self._compared(pose, self._motion.homography)
         is_brief = self._frames_unsure <= self.options.max_unknown_frames
-        if placement is Placement.UNKNOWN and (is_brief or self._last_pose is not None):
-            near = self._kept.cam_from_model if self._last_pose is None else self._last_pose
-            if not self._is_shifted(near, pose):
+        if placement is Placement.UNKNOWN and (is_brief or self._last_place is not None):
+            near = self._last_place or self.outline.place(self._kept.cam_from_model)
+            if not self._is_shifted(near, self._place):
                 return Placement.SAME
         return placement
 
@@ -278,12 +279,12 @@ class IdentityMonitor:
             self._is_followed = True
         self._motion.follow(image, pose)
 
-    def _is_jump(self, pose: Array) -> bool:
-        """Whether a pose (4,4) is far from that of the frame before."""
-        return self._last_pose is not None and self._is_shifted(self._last_pose, pose)
+    def _is_jump(self) -> bool:
+        """Whether the pose of this frame is far from that of the frame before."""
+        return self._last_place is not None and self._is_shifted(self._last_place, self._place)
 
-    def _is_shifted(self, before: Array, after: Array) -> bool:
-        a, b = self.outline.place(before), self.outline.place(after)
+    def _is_shifted(self, a: PartPlace, b: PartPlace) -> bool:
+        """Whether two places are farther apart than a part moves between two frames."""
         shift = np.linalg.norm(a.center_px - b.center_px) / max(a.diameter_px, b.diameter_px)
         depth_mm = abs(a.distance_mm - b.distance_mm)
         return bool(shift > self.options.max_jump or depth_mm > self._max_depth_mm(a.distance_mm))
@@ -309,7 +310,7 @@ class IdentityMonitor:
 
     def _go_on_doubting(self, image: NDArray[np.uint8], pose: Array, doubt: Doubt, time_s: float) -> None:
         """Follow the old place in one more frame of a doubt; a pose found anew, or a jump, begins a doubt anew."""
-        is_new = self._last_pose is None or self._is_jump(pose)
+        is_new = self._last_place is None or self._is_jump()
         if is_new:
             self._doubt = Doubt(time_s, time_s, reason=doubt.reason)
         elif time_s - doubt.since_s > self.options.return_s:
