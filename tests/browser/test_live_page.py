@@ -273,6 +273,37 @@ def test_labels_and_parts_say_what_is_seen(chromium: Any, inspection: Path, monk
         assert " mm" not in page.locator("#components").text_content()
 
 
+def test_the_user_confirms_the_part(chromium: Any, inspection: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reason = "another part of this kind is in view; confirm that this is the one"
+    asked: list[str] = []
+
+    def confirm(self: Told) -> None:
+        asked.append("confirm")
+        TOLD["more"] = {"identity": Identity.CONFIRMED}
+
+    monkeypatch.setattr(Told, "confirm", confirm, raising=False)
+    chosen = options(inspection=inspection, clients=1)
+    shown = "[...document.querySelectorAll('#labels .label:not(.off)')]"
+    with running(chosen, loader(chosen)) as one, opened(chromium, one) as page:
+        until(page, "document.getElementById('state-name').textContent === 'Tracked'")
+        assert page.locator("#confirm").is_hidden()
+        page.keyboard.press("c")
+        try:
+            for ask in (lambda: page.click("#confirm"), lambda: page.keyboard.press("c")):
+                asked.clear()
+                TOLD["more"] = {"identity": Identity.UNCONFIRMED, "identity_reason": reason}
+                until(page, lambda: page.locator("#confirm").is_visible())
+                until(page, lambda: reason in page.inner_text("#state"))
+                assert not asked
+                assert page.evaluate(f"{shown}.length") == 0
+                ask()
+                until(page, lambda: page.locator("#confirm").is_hidden())
+                assert asked == ["confirm"]
+                until(page, f"{shown}.length > 0")
+        finally:
+            TOLD["more"] = {}
+
+
 def test_labels_and_parts_say_what_was_measured(chromium: Any, server: Running) -> None:
     record = {one["name"]: one for one in json.loads(INSPECTION.read_text())["components"]}
     words = {"pass": "PASS", "fail": "FAIL", "undecided": "UNDECIDED"}
