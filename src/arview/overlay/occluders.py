@@ -1,0 +1,251 @@
+"""Occluders: what lies before the part, as a hand or a tool, found by its colour against the appearance expected.
+
+The colour of the surface is learned while the part is tracked, in cells of a grid that is fixed to the model. A pixel
+whose colour differs clearly from that of its cell, after the exposure of the frame is accounted for, belongs to an
+occluder if most of its neighbours do. It follows the background subtraction of Stauffer and Grimson ("Adaptive
+background mixture models for real-time tracking", CVPR 1999), with one mode for each cell and the surface of the part
+as background. Occluders that were there before the surface was seen, or of its colour, are not found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.model import Model
+from arview.camera import Camera
+from arview.core.kernel import kernel
+from arview.geometry import Array, invert
+from arview.overlay.ghost import GhostView
+from arview.overlay.paint import Image
+
+
+_COLUMNS, _COUNT = 6, 5
+"""Columns of the table of cells, and the one of the number of observations."""
+_DARK = 12.0
+"""Grey level of darker colours, which say nothing about the exposure."""
+_MAX_CHANGE = 0.25
+"""Logarithm of the largest change of exposure between two frames."""
+_MIN_AGREEING = 0.1
+"""Share of the samples that must agree on the exposure; with fewer it is taken to be as before."""
+
+
+@dataclass(frozen=True)
+class OccluderOptions:
+    """How occluders are found.
+
+    Attributes:
+        cells: of the grid along the longest side of the part.
+        samples: pixels that are compared in a frame, about.
+        min_observations: frames in which a cell was seen before it is compared.
+        hue_noise: standard deviation, in grey levels, of a colour of the same brightness, apart from what a cell shows.
+        noise: the same of the brightness.
+        shade, shine: factors of the brightness between which shading, shadows and reflections explain a difference.
+        max_variance: of hue and brightness in a cell, squared grey levels; more would make it blind.
+        min_score: squared normalised difference of colours from which on a pixel looks like an occluder.
+        min_share: share of neighbours that must look so, too.
+        min_samples: samples of an occluder, at least.
+        rate: weight of a new colour in a cell that was seen often.
+        occluded_rate: the same where an occluder was found: what stays is learned in the end.
+    """
+
+    cells: int = 72
+    samples: int = 5000
+    min_observations: int = 6
+    hue_noise: float = 5.0
+    noise: float = 10.0
+    shade: float = 0.75
+    shine: float = 1.4
+    max_variance: float = 150.0
+    min_score: float = 6.0
+    min_share: float = 0.55
+    min_samples: int = 10
+    rate: float = 0.04
+    occluded_rate: float = 0.002
+
+
+class OccluderFinder:
+    """Finds occluders in the frames of one video; see the module."""
+
+    def __init__(self, model: Model, camera: Camera, options: OccluderOptions | None = None) -> None:
+        self._options = options or OccluderOptions()
+        low, high = model.bounds_in_model
+        self._cell_mm = float((high - low).max()) / self._options.cells
+        self._origin = low - 0.5 * self._cell_mm
+        shape = np.ceil((high - low) / self._cell_mm).astype(np.int64) + 2
+        # Mean red, green and blue, variances of hue and brightness, and the number of observations.
+        self._cells = np.zeros((*shape, _COLUMNS), dtype=np.float32)
+        self._camera = camera
+        self._gain = np.ones(3, dtype=np.float32)
+        self._rays: dict[int, Array] = {}
+
+    def find(self, image: Image, view: GhostView, cam_from_model: Array, learns: bool) -> NDArray[np.bool_] | None:
+        """Pixels (h,w) of the view's window that an occluder hides; None if there is none.
+
+        Args:
+            image: (H,W,3) uint8 RGB without overlay.
+            view: the model at its pose.
+            cam_from_model: (4,4) mm.
+            learns: whether the pose is sure enough for the colours to be learned.
+        """
+        options = self._options
+        step = max(2, round(float(np.sqrt(view.face_ids.size / options.samples))))
+        rays = self._ray_grid(step)
+        cells, observed = _sample(
+            image, view.u0, view.v0, view.face_ids, view.inverse_depth, rays, step, invert(cam_from_model),
+            self._origin, self._cell_mm, np.array(self._cells.shape[:3]),
+        )  # fmt: skip
+        table = self._cells.reshape(-1, _COLUMNS)
+        known = (cells >= 0) & (table[cells, _COUNT] >= options.min_observations)
+        mask = strange = np.zeros(cells.shape, dtype=np.uint8)
+        gain = self._gain
+        if known.sum() > 4 * options.min_samples:
+            gain = self._gain = _exposure(observed[known], table[cells[known], :3], self._gain)
+            strange, mask = self._occluded(cells, observed, known, gain)
+        if learns:
+            rates = np.array([options.rate, options.occluded_rate, options.max_variance], dtype=np.float32)
+            _learn(table, cells, observed, gain, mask | strange, rates)
+        if not mask.any():
+            return None
+        height, width = view.face_ids.shape
+        # Samples lie at the multiples of the step in the image, not in the window.
+        large = cv2.resize(mask, (mask.shape[1] * step, mask.shape[0] * step), interpolation=cv2.INTER_NEAREST)
+        top, left = view.v0 % step, view.u0 % step
+        return np.asarray(large[top : top + height, left : left + width] > 0)
+
+    def _ray_grid(self, step: int) -> Array:
+        """Rays (h,w,2), x and y at z = 1, through the middles of squares of ``step`` pixels of the image."""
+        if step not in self._rays:
+            if len(self._rays) > 4:
+                self._rays.clear()
+            u = np.arange(0, self._camera.width + step, step) + 0.5 * (step - 1)
+            v = np.arange(0, self._camera.height + step, step) + 0.5 * (step - 1)
+            with np.errstate(all="ignore"):
+                rays = self._camera.unproject(np.stack(np.meshgrid(u, v), axis=-1))
+            self._rays[step] = np.ascontiguousarray(rays[..., :2])
+        return self._rays[step]
+
+    def _occluded(
+        self,
+        cells: NDArray[np.int64],
+        observed: NDArray[np.float32],
+        known: NDArray[np.bool_],
+        gain: NDArray[np.float32],
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Samples that look like an occluder by themselves, and those that belong to one."""
+        options, table = self._options, self._cells.reshape(-1, _COLUMNS)
+        expected = table[cells[known]]
+        colors = gain * expected[:, :3]
+        light = np.sum(observed[known] * colors, axis=1) / np.maximum(np.sum(colors * colors, axis=1), 1.0)
+        hue = np.mean((observed[known] - light[:, None] * colors) ** 2, axis=1)
+        brightness = ((light - np.clip(light, options.shade, options.shine)) * colors.mean(axis=1)) ** 2
+        # What the frame as a whole differs by, as under another light, is not an occluder. Most of the part may be
+        # hidden, so this is judged by the samples that agree best.
+        common = 2.0 * float(np.quantile(hue, 0.2))
+        hue_score = hue / (options.hue_noise**2 + 2.0 * expected[:, 3] + common)
+        score = np.maximum(hue_score, brightness / (options.noise**2 + 2.0 * expected[:, 4]))
+        strange = np.zeros(cells.shape, dtype=np.float32)
+        strange[known] = score > options.min_score
+        near = cv2.blur(strange, (3, 3)) / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), 1e-3)
+        candidate = ((near >= options.min_share) & (cells >= 0)).astype(np.uint8)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(candidate, connectivity=8)
+        kept = np.zeros(count, dtype=np.uint8)
+        kept[1:] = stats[1:, cv2.CC_STAT_AREA] >= options.min_samples
+        found = kept[labels]
+        if found.any():
+            # The border of an occluder is mixed with what is behind it.
+            found = cv2.dilate(found, np.ones((3, 3), dtype=np.uint8)) & (cells >= 0)
+        return strange.astype(np.uint8), np.asarray(found, dtype=np.uint8)
+
+
+def _exposure(
+    observed: NDArray[np.float32], expected: NDArray[np.float32], before: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Gain (3,) of the frame: median ratio of observed to expected colours of samples whose ratio is as it was before."""
+    ratio = observed / np.maximum(expected, 1.0) / before
+    agrees = (expected.min(axis=1) > _DARK) & (np.abs(np.log(np.maximum(ratio, 1e-3))).max(axis=1) < _MAX_CHANGE)
+    if agrees.sum() < _MIN_AGREEING * len(observed):
+        return before
+    return np.asarray(before * np.median(ratio[agrees], axis=0), dtype=np.float32)
+
+
+@kernel
+def _sample(
+    image: NDArray[np.uint8], u0: int, v0: int, face_ids: NDArray[np.int32], inverse_depth: NDArray[np.float64],
+    rays: NDArray[np.float64], step: int, model_from_cam: NDArray[np.float64], origin: NDArray[np.float64],
+    cell_mm: float, shape: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:  # fmt: skip
+    """Cell (R,C) of the model grid that each sample shows, -1 for none, and its mean colour (R,C,3)."""
+    height, width = face_ids.shape
+    first_row, first_column = v0 // step, u0 // step
+    rows = (v0 + height - 1) // step - first_row + 1
+    columns = (u0 + width - 1) // step - first_column + 1
+    cells = np.full((rows, columns), -1, dtype=np.int64)
+    colors = np.zeros((rows, columns, 3), dtype=np.float32)
+    for row in range(rows):
+        for column in range(columns):
+            v = (first_row + row) * step + step // 2
+            u = (first_column + column) * step + step // 2
+            i, j = v - v0, u - u0
+            if i < 0 or j < 0 or i >= height or j >= width or face_ids[i, j] < 0:
+                continue
+            depth = 1.0 / inverse_depth[i, j]
+            x = rays[first_row + row, first_column + column, 0] * depth
+            y = rays[first_row + row, first_column + column, 1] * depth
+            index = 0
+            is_inside = True
+            for axis in range(3):
+                place = model_from_cam[axis, 0] * x + model_from_cam[axis, 1] * y + model_from_cam[axis, 2] * depth
+                number = int(np.floor((place + model_from_cam[axis, 3] - origin[axis]) / cell_mm))
+                if not 0 <= number < shape[axis]:
+                    is_inside = False
+                index = index * shape[axis] + number
+            if not is_inside:
+                continue
+            cells[row, column] = index
+            total = 0
+            for r in range(max(0, v - 1), min(image.shape[0], v + 2)):
+                for c in range(max(0, u - 1), min(image.shape[1], u + 2)):
+                    for k in range(3):
+                        colors[row, column, k] += image[r, c, k]
+                    total += 1
+            for k in range(3):
+                colors[row, column, k] /= total
+    return cells, colors
+
+
+@kernel
+def _learn(
+    table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], gain: NDArray[np.float32],
+    occluded: NDArray[np.uint8], rates: NDArray[np.float32]
+) -> None:  # fmt: skip
+    """Update means, variances and counts of the cells, at the exposure that they have.
+
+    ``rates``: weight of a new colour in a cell that was seen often, the same of an occluder, and the largest variance.
+    """
+    for row in range(cells.shape[0]):
+        for column in range(cells.shape[1]):
+            cell = cells[row, column]
+            if cell < 0:
+                continue
+            count = table[cell, 5]
+            weight = rates[1]
+            if not occluded[row, column]:
+                weight = max(rates[0], np.float32(1.0) / (count + np.float32(1.0)))
+                table[cell, 5] = count + np.float32(1.0)
+            total, along, length = np.float32(0.0), np.float32(0.0), np.float32(1.0)
+            for k in range(3):
+                color = observed[row, column, k] / gain[k]
+                difference = color - table[cell, k]
+                total += difference * difference
+                along += difference * table[cell, k]
+                length += table[cell, k] * table[cell, k]
+                table[cell, k] += weight * difference
+            if count > 0:
+                bright = along * along / length / np.float32(3.0)
+                hue = max(total / np.float32(3.0) - bright, np.float32(0.0))
+                table[cell, 3] += weight * (min(hue, rates[2]) - table[cell, 3])
+                table[cell, 4] += weight * (min(bright, rates[2]) - table[cell, 4])
