@@ -182,6 +182,8 @@ Ctrl-C ends the run and finishes the files.""",
               help="CAD edges to draw.")  # fmt: skip
 @click.option("--no-ghost", is_flag=True, help="Leave out the translucent components.")
 @click.option("--no-labels", is_flag=True, help="Leave out the labels.")
+@click.option("--no-occlusion", is_flag=True, expose_value=False, callback=_keep_for_drawing,
+              help="Draw over hands and tools before the part, too.")  # fmt: skip
 @click.option("--no-legend", is_flag=True, expose_value=False, callback=_keep_for_drawing,
               help="Leave out the legend of components that are not as measured.")  # fmt: skip
 @click.option("--check-presence", is_flag=True, help="Exit by whether all components were seen in place; see below.")
@@ -346,10 +348,12 @@ def _overlay(part: Part, inspection: Inspection | None, options: OverlayOptions,
 def _drawing_options(show_edges: str, no_ghost: bool, no_labels: bool, opacity: float | None) -> OverlayOptions:
     from arview.overlay import OverlayOptions
 
+    switches = click.get_current_context().meta
     return OverlayOptions(
         show_ghost=not no_ghost,
         show_labels=not no_labels,
-        show_legend=not click.get_current_context().meta[f"{__name__}.no_legend"],
+        show_legend=not switches[f"{__name__}.no_legend"],
+        show_occlusion=not switches[f"{__name__}.no_occlusion"],
         show_edges=cast("EdgeMode", show_edges),
         opacity=OverlayOptions.opacity if opacity is None else opacity,
     )

@@ -9,6 +9,7 @@ as background. Occluders that were there before the surface was seen, or of its 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -21,10 +22,20 @@ from arview.core.kernel import kernel
 from arview.geometry import Array, invert
 from arview.overlay.ghost import GhostView
 from arview.overlay.paint import Image
-
+from arview.pose import ComponentPresence, Visibility
 
 _COLUMNS, _COUNT = 6, 5
 """Columns of the table of cells, and the one of the number of observations."""
+_HIDDEN_FRAMES = 5
+"""Frames after which a hidden component is called so, and after which it is not any longer."""
+_HIDDEN_PX = 60
+"""Visible pixels of a component's ghost from which on only something before the part can hide it."""
+_HIDDEN_SHARE = 0.6
+"""Share of these pixels that an occluder of a hidden component covers."""
+_STEPS = (2, 3, 4, 6, 8, 12, 16)
+"""Distances of the samples, px."""
+_BORDER_LEVEL = np.uint8(250)
+"""Level of an occluder between whose samples and others the border is interpolated, at a level of 30."""
 _DARK = 12.0
 """Grey level of darker colours, which say nothing about the exposure."""
 _MAX_CHANGE = 0.25
@@ -53,7 +64,7 @@ class OccluderOptions:
     """
 
     cells: int = 72
-    samples: int = 5000
+    samples: int = 3500
     min_observations: int = 6
     hue_noise: float = 5.0
     noise: float = 10.0
@@ -79,10 +90,18 @@ class OccluderFinder:
         # Mean red, green and blue, variances of hue and brightness, and the number of observations.
         self._cells = np.zeros((*shape, _COLUMNS), dtype=np.float32)
         self._camera = camera
+        self._components = len(model.components)
         self._gain = np.ones(3, dtype=np.float32)
         self._rays: dict[int, Array] = {}
 
-    def find(self, image: Image, view: GhostView, cam_from_model: Array, learns: bool) -> NDArray[np.bool_] | None:
+    def find(
+        self,
+        image: Image,
+        view: GhostView,
+        cam_from_model: Array,
+        learns: bool,
+        skipped: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.bool_] | None:
         """Pixels (h,w) of the view's window that an occluder hides; None if there is none.
 
         Args:
@@ -90,17 +109,21 @@ class OccluderFinder:
             view: the model at its pose.
             cam_from_model: (4,4) mm.
             learns: whether the pose is sure enough for the colours to be learned.
+            skipped: (C,) components that are not there, so that nothing can lie before them.
         """
         options = self._options
-        step = max(2, round(float(np.sqrt(view.face_ids.size / options.samples))))
+        finest = float(np.sqrt(view.face_ids.size / options.samples))
+        step = next((one for one in _STEPS if one >= finest), _STEPS[-1])
         rays = self._ray_grid(step)
+        skipped = np.zeros(self._components, dtype=np.bool_) if skipped is None else skipped
         cells, observed = _sample(
-            image, view.u0, view.v0, view.face_ids, view.inverse_depth, rays, step, invert(cam_from_model),
-            self._origin, self._cell_mm, np.array(self._cells.shape[:3]),
+            image, view.u0, view.v0, view.face_ids, view.components, skipped, view.inverse_depth, rays, step,
+            invert(cam_from_model), self._origin, self._cell_mm, np.array(self._cells.shape[:3]),
         )  # fmt: skip
         table = self._cells.reshape(-1, _COLUMNS)
         known = (cells >= 0) & (table[cells, _COUNT] >= options.min_observations)
-        mask = strange = np.zeros(cells.shape, dtype=np.uint8)
+        rows, columns = cells.shape[0], cells.shape[1]
+        mask = strange = np.zeros((rows, columns), dtype=np.uint8)
         gain = self._gain
         if known.sum() > 4 * options.min_samples:
             gain = self._gain = _exposure(observed[known], table[cells[known], :3], self._gain)
@@ -112,15 +135,16 @@ class OccluderFinder:
             return None
         height, width = view.face_ids.shape
         # Samples lie at the multiples of the step in the image, not in the window.
-        large = cv2.resize(mask, (mask.shape[1] * step, mask.shape[0] * step), interpolation=cv2.INTER_NEAREST)
+        size = columns * step, rows * step
+        # Edges on the outline of the part lie half beside it.
+        mask |= cv2.dilate(mask, np.ones((3, 3), dtype=np.uint8)) & (cells < 0)
+        large = cv2.resize(_BORDER_LEVEL * mask, size, interpolation=cv2.INTER_LINEAR)
         top, left = view.v0 % step, view.u0 % step
-        return np.asarray(large[top : top + height, left : left + width] > 0)
+        return np.asarray(large[top : top + height, left : left + width] >= 30)
 
     def _ray_grid(self, step: int) -> Array:
         """Rays (h,w,2), x and y at z = 1, through the middles of squares of ``step`` pixels of the image."""
         if step not in self._rays:
-            if len(self._rays) > 4:
-                self._rays.clear()
             u = np.arange(0, self._camera.width + step, step) + 0.5 * (step - 1)
             v = np.arange(0, self._camera.height + step, step) + 0.5 * (step - 1)
             with np.errstate(all="ignore"):
@@ -137,34 +161,63 @@ class OccluderFinder:
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Samples that look like an occluder by themselves, and those that belong to one."""
         options, table = self._options, self._cells.reshape(-1, _COLUMNS)
-        expected = table[cells[known]]
-        colors = gain * expected[:, :3]
-        light = np.sum(observed[known] * colors, axis=1) / np.maximum(np.sum(colors * colors, axis=1), 1.0)
-        hue = np.mean((observed[known] - light[:, None] * colors) ** 2, axis=1)
-        brightness = ((light - np.clip(light, options.shade, options.shine)) * colors.mean(axis=1)) ** 2
+        noise = np.array([options.hue_noise, options.noise, options.shade, options.shine], dtype=np.float32)
+        hue, hue_variance, brightness_score = _differences(table, cells, observed, known, gain, noise)
         # What the frame as a whole differs by, as under another light, is not an occluder. Most of the part may be
         # hidden, so this is judged by the samples that agree best.
-        common = 2.0 * float(np.quantile(hue, 0.2))
-        hue_score = hue / (options.hue_noise**2 + 2.0 * expected[:, 3] + common)
-        score = np.maximum(hue_score, brightness / (options.noise**2 + 2.0 * expected[:, 4]))
-        strange = np.zeros(cells.shape, dtype=np.float32)
-        strange[known] = score > options.min_score
+        seen = hue[known]
+        common = 2.0 * float(np.partition(seen, len(seen) // 5)[len(seen) // 5])
+        score = np.maximum(hue / (hue_variance + common), brightness_score)
+        strange = (known & (score > options.min_score)).astype(np.float32)
         near = cv2.blur(strange, (3, 3)) / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), 1e-3)
         candidate = ((near >= options.min_share) & (cells >= 0)).astype(np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(candidate, connectivity=8)
         kept = np.zeros(count, dtype=np.uint8)
         kept[1:] = stats[1:, cv2.CC_STAT_AREA] >= options.min_samples
         found = kept[labels]
-        if found.any():
-            # The border of an occluder is mixed with what is behind it.
-            found = cv2.dilate(found, np.ones((3, 3), dtype=np.uint8)) & (cells >= 0)
         return strange.astype(np.uint8), np.asarray(found, dtype=np.uint8)
+
+
+class HiddenComponents:
+    """Which components something before the part hides, steady over some frames.
+
+    Attributes:
+        flags: (C,) bool.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.flags = np.zeros(count, dtype=np.bool_)
+        self._frames = np.zeros(count, dtype=np.int64)
+
+    def update(
+        self, view: GhostView, occluder: NDArray[np.bool_] | None, presences: Sequence[ComponentPresence | None]
+    ) -> None:
+        """Count a frame: its occluder, and what the pose says of components that the model by itself leaves visible."""
+        hidden = [
+            index
+            for index, presence in enumerate(presences)
+            if presence is not None and presence.observations > 0 and presence.visibility is Visibility.HIDDEN
+        ]
+        if not hidden and occluder is None and not self._frames.any():
+            return
+        count = len(presences)
+        shown = np.bincount(view.components[view.face_ids[view.face_ids >= 0]], minlength=count)
+        covered = np.zeros(count, dtype=np.int64)
+        if occluder is not None:
+            faces = view.face_ids[occluder & (view.face_ids >= 0)]
+            covered = np.bincount(view.components[faces], minlength=count)
+        is_hidden = covered >= _HIDDEN_SHARE * shown
+        is_hidden[hidden] = True
+        step = np.where(is_hidden & (shown >= _HIDDEN_PX), 1, -1)
+        self._frames = np.clip(self._frames + step, 0, _HIDDEN_FRAMES)
+        self.flags |= self._frames == _HIDDEN_FRAMES
+        self.flags &= self._frames > 0
 
 
 def _exposure(
     observed: NDArray[np.float32], expected: NDArray[np.float32], before: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Gain (3,) of the frame: median ratio of observed to expected colours of samples whose ratio is as it was before."""
+    """Gain (3,) of the frame: median ratio of observed to expected colours, where it is about as before."""
     ratio = observed / np.maximum(expected, 1.0) / before
     agrees = (expected.min(axis=1) > _DARK) & (np.abs(np.log(np.maximum(ratio, 1e-3))).max(axis=1) < _MAX_CHANGE)
     if agrees.sum() < _MIN_AGREEING * len(observed):
@@ -174,9 +227,9 @@ def _exposure(
 
 @kernel
 def _sample(
-    image: NDArray[np.uint8], u0: int, v0: int, face_ids: NDArray[np.int32], inverse_depth: NDArray[np.float64],
-    rays: NDArray[np.float64], step: int, model_from_cam: NDArray[np.float64], origin: NDArray[np.float64],
-    cell_mm: float, shape: NDArray[np.int64]
+    image: NDArray[np.uint8], u0: int, v0: int, face_ids: NDArray[np.int32], components: NDArray[np.int32],
+    skipped: NDArray[np.bool_], inverse_depth: NDArray[np.float64], rays: NDArray[np.float64], step: int,
+    model_from_cam: NDArray[np.float64], origin: NDArray[np.float64], cell_mm: float, shape: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:  # fmt: skip
     """Cell (R,C) of the model grid that each sample shows, -1 for none, and its mean colour (R,C,3)."""
     height, width = face_ids.shape
@@ -191,6 +244,8 @@ def _sample(
             u = (first_column + column) * step + step // 2
             i, j = v - v0, u - u0
             if i < 0 or j < 0 or i >= height or j >= width or face_ids[i, j] < 0:
+                continue
+            if skipped[components[face_ids[i, j]]]:
                 continue
             depth = 1.0 / inverse_depth[i, j]
             x = rays[first_row + row, first_column + column, 0] * depth
@@ -215,6 +270,41 @@ def _sample(
             for k in range(3):
                 colors[row, column, k] /= total
     return cells, colors
+
+
+@kernel
+def _differences(
+    table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], known: NDArray[np.bool_],
+    gain: NDArray[np.float32], noise: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    """Squared difference (R,C) of the hue of each sample from its cell, its variance, and the score of the brightness.
+
+    The hue is what is left of the colour at the same brightness. ``noise``: of hue and brightness, and the factors
+    between which a brightness is explained by the light.
+    """
+    rows, columns = cells.shape
+    hue = np.zeros((rows, columns), dtype=np.float32)
+    variance = np.ones((rows, columns), dtype=np.float32)
+    score = np.zeros((rows, columns), dtype=np.float32)
+    for row in range(rows):
+        for column in range(columns):
+            if not known[row, column]:
+                continue
+            cell = cells[row, column]
+            along, length, mean = np.float32(0.0), np.float32(1.0), np.float32(0.0)
+            for k in range(3):
+                color = gain[k] * table[cell, k]
+                along += observed[row, column, k] * color
+                length += color * color
+                mean += color / np.float32(3.0)
+            light = along / length
+            for k in range(3):
+                left = observed[row, column, k] - light * gain[k] * table[cell, k]
+                hue[row, column] += left * left / np.float32(3.0)
+            variance[row, column] = noise[0] * noise[0] + np.float32(2.0) * table[cell, 3]
+            excess = (light - min(max(light, noise[2]), noise[3])) * mean
+            score[row, column] = excess * excess / (noise[1] * noise[1] + np.float32(2.0) * table[cell, 4])
+    return hue, variance, score
 
 
 @kernel

@@ -46,6 +46,7 @@ class OverlayOptions:
         show_status: draw the status line.
         show_evidence: draw components by what the pictures say of them, see `arview.pose.Presence`; without it all are
             drawn as measured, for pictures that document a measurement.
+        show_occlusion: leave ghost and edges out where something is before the part, see `arview.overlay.occluders`.
         show_legend: explain the kinds of evidence that are in the picture.
         unit: of the numbers on labels.
         decimals: of the numbers on labels, 0–4.
@@ -64,6 +65,7 @@ class OverlayOptions:
     show_arrows: bool = True
     show_status: bool = True
     show_evidence: bool = True
+    show_occlusion: bool = True
     show_legend: bool = True
     unit: Unit = "mm"
     decimals: int = 2

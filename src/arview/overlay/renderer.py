@@ -25,9 +25,10 @@ from arview.overlay.ghost import CELL_PX, NEAR_MM, Ghost, GhostView, blend, coun
 from arview.overlay.guide import GuideOutline
 from arview.overlay.legend import banner_sprite, legend_entries, legend_sprite, withheld_title
 from arview.overlay.mesh import anchor_in_model, topology
+from arview.overlay.occluders import HiddenComponents, OccluderFinder
 from arview.overlay.options import OverlayOptions
 from arview.overlay.status import StatusLine
-from arview.pose import ComponentPresence, Pose, TrackingState, Visibility
+from arview.pose import ComponentPresence, Pose, TrackingState
 
 _SAME_PLACE = 0.02
 """Distance in diameters within which a component is at one place in all ambiguous poses."""
@@ -37,10 +38,8 @@ _PIECES = 16
 """Pieces per diameter of the part into which edges are cut for a distorting lens: exact to about 0.2 px."""
 _HATCH = 7.0
 """Distance of the lines of a hatched ghost, in widths of an edge."""
-_OCCLUDED_FRAMES = 5
-"""Frames after which a component that something hides is labelled so, and after which it is not any longer."""
-_OCCLUDED_PX = 60
-"""Visible pixels of a component's ghost from which on only something before the part can hide it."""
+_LEARNING_QUALITY = 0.5
+"""Quality of a pose from which on the colours of the part are learned."""
 _ARROW_RGB = (255, 255, 255)
 
 
@@ -132,8 +131,8 @@ class OverlayRenderer:
         bottom_px = camera.height - (self._status.height_px if self.options.show_status else 0)
         self._annotations = self._make_annotations(bottom_px)
         self._bottom_px = bottom_px
-        self._hidden_frames = np.zeros(len(self._names), dtype=np.int64)
-        self._is_occluded = np.zeros(len(self._names), dtype=np.bool_)
+        self._occluders = OccluderFinder(model, camera) if self.options.show_occlusion else None
+        self._hidden = HiddenComponents(len(self._names))
         self._scene: _PartLook | None = None
         self.laid_out = LaidOut()
         self._drawn: _PartInPicture | None = None
@@ -192,8 +191,11 @@ class OverlayRenderer:
         self._drawn = None
         if view is not None:
             presences = self._presences(pose)
-            self._drawn = _PartInPicture(view, presences, self._scene_of(pose, presences, now))
-            self._draw_model(canvas, self._drawn.view, pose, self._drawn.scene, presences)
+            scene = self._scene_of(pose, presences, now)
+            self._drawn = _PartInPicture(view, presences, scene)
+            occluder = self._find_occluder(canvas, view, pose, scene)
+            self._hidden.update(view, occluder, presences)
+            self._draw_model(canvas, view, pose, scene, presences, occluder)
 
     def draw_texts(
         self,
@@ -306,6 +308,7 @@ class OverlayRenderer:
         pose: Pose,
         scene: _PartLook,
         presences: list[ComponentPresence | None],
+        occluder: NDArray[np.bool_] | None,
     ) -> None:
         assert pose.cam_from_model is not None
         options, styles = self.options, scene.styles
@@ -316,10 +319,14 @@ class OverlayRenderer:
             cover, owner = self._edges.draw(
                 self._ghost, view, pose.cam_from_model, self._line_px, options.show_edges == "all", styles.dashed
             )
+        face_ids = view.face_ids
+        if occluder is not None:
+            face_ids = np.where(occluder, np.int32(-1), face_ids)
+            cover[occluder] = 0
         is_critical = pose.state is TrackingState.CRITICAL
         dimming = np.array([1, 1, 1, _CRITICAL_DIMMING if is_critical else 1], dtype=np.float32)
         blend(
-            canvas, view.u0, view.v0, view.face_ids, view.shade, view.components,
+            canvas, view.u0, view.v0, face_ids, view.shade, view.components,
             styles.ghost * dimming, cover, owner, styles.edges * dimming, styles.patterns, self._hatch_px,
         )  # fmt: skip
         for index, seen in enumerate(scene.evidence):
@@ -345,11 +352,10 @@ class OverlayRenderer:
         count_cells(view.u0, view.v0, view.face_ids, view.components, scene.styles.weight, cells, seen_px)
         anchors_in_cam = apply(pose.cam_from_model, self._anchors_in_model)
         anchors_px = self._ghost.project(anchors_in_cam)
-        self._count_occluded(presences, seen_px)
         notes = self._open_notes(pose)
         result = []
         for index in scene.order:
-            note = notes.get(index) or (labels.OCCLUDED if self._is_occluded[index] else "")
+            note = notes.get(index) or (labels.OCCLUDED if self._hidden.flags[index] else "")
             text = self._text(index, presences[index], scene, note)
             result.append(LabelledComponent(text, anchors_px[index], anchors_in_cam[index], int(seen_px[index])))
         return result, cells
@@ -370,20 +376,15 @@ class OverlayRenderer:
             scene.texts[index, note] = text
         return text
 
-    def _count_occluded(self, presences: list[ComponentPresence | None], seen_px: NDArray[np.int64]) -> None:
-        """Tell, after some frames and for some frames, which components something before the part hides."""
-        hidden = [
-            index
-            for index, presence in enumerate(presences)
-            if presence is not None and presence.observations > 0 and presence.visibility is Visibility.HIDDEN
-        ]
-        if not hidden and not self._hidden_frames.any():
-            return
-        step = np.full(len(presences), -1)
-        step[hidden] = np.where(seen_px[hidden] >= _OCCLUDED_PX, 1, -1)
-        self._hidden_frames = np.clip(self._hidden_frames + step, 0, _OCCLUDED_FRAMES)
-        self._is_occluded |= self._hidden_frames == _OCCLUDED_FRAMES
-        self._is_occluded &= self._hidden_frames > 0
+    def _find_occluder(
+        self, canvas: paint.Image, view: GhostView, pose: Pose, scene: _PartLook
+    ) -> NDArray[np.bool_] | None:
+        """Pixels (h,w) of the view that something before the part covers; None if there is nothing."""
+        if self._occluders is None or pose.cam_from_model is None:
+            return None
+        learns = pose.state is TrackingState.TRACKED and pose.quality >= _LEARNING_QUALITY
+        absent = np.array([seen.is_refuted for seen in scene.evidence])
+        return self._occluders.find(canvas, view, pose.cam_from_model, learns, absent)
 
     def _open_notes(self, pose: Pose) -> dict[int, str]:
         """Notes on the components, by index, whose place depends on which of the ambiguous poses is right."""

@@ -131,7 +131,7 @@ def overview(inspection: Inspection, model: Model, sparse: SparseModel | None = 
     The overlay is drawn over the photo that shows the part best, or, without a readable photo, on a plain background
     from the upper right.
     """
-    options = OverlayOptions(show_status=False, show_evidence=False, max_labels=10)
+    options = OverlayOptions(show_status=False, show_evidence=False, show_occlusion=False, max_labels=10)
     for photo in _whole_views(model, sparse.photos if sparse is not None else ()):
         try:
             image = read_photo(photo.path)
@@ -264,7 +264,12 @@ def _component_crop(
         scale = float(max((s for s in _ROUND_SCALES if s * length_mm <= longest_mm), default=1))
     alone = replace(inspection, components=(deviation,), foreign_objects=())
     drawn = OverlayOptions(
-        opacity=0.3, show_labels=False, show_status=False, show_evidence=False, arrow_scale=scale or 1.0
+        opacity=0.3,
+        show_labels=False,
+        show_status=False,
+        show_evidence=False,
+        show_occlusion=False,
+        arrow_scale=scale or 1.0,
     )
     pose = Pose(photo.cam_from_scan, None, 1.0, TrackingState.TRACKED, 0.0, 0)
     picture = OverlayRenderer(model, camera, alone, drawn).draw(crop, pose)
