@@ -16,7 +16,7 @@ from arview.geometry import apply, rigid
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
 from arview.overlay import OverlayOptions, OverlayRenderer, labels
 from arview.overlay.annotations import LaidOutLabel
-from arview.overlay.evidence import DISPLACED_RGB, Evidence
+from arview.overlay.evidence import DISPLACED_RGB, DrawnEvidence
 from arview.overlay.legend import legend_entries
 from arview.overlay.status import completeness_text
 from arview.pose import ComponentPresence, Identity, Pose, Presence, Visibility
@@ -214,9 +214,11 @@ def test_a_component_that_something_hides_says_so(model: Model, record: Inspecti
 
 
 def test_the_legend_explains_only_what_is_in_the_picture(model: Model, record: Inspection) -> None:
-    assert legend_entries([Evidence.SEEN] * 3) == ()
-    entries = legend_entries([Evidence.SEEN, Evidence.MISSING, Evidence.UNVERIFIED, Evidence.UNCERTAIN])
-    assert [kind for kind, _ in entries] == [Evidence.MISSING, Evidence.UNVERIFIED]
+    assert legend_entries([DrawnEvidence.SEEN] * 3) == ()
+    entries = legend_entries(
+        [DrawnEvidence.SEEN, DrawnEvidence.MISSING, DrawnEvidence.UNVERIFIED, DrawnEvidence.UNCERTAIN]
+    )
+    assert [kind for kind, _ in entries] == [DrawnEvidence.MISSING, DrawnEvidence.UNVERIFIED]
     pictures = {}
     for shown in (True, False):
         renderer = OverlayRenderer(model, CAMERA, record, OverlayOptions(show_legend=shown))

@@ -38,7 +38,7 @@ _HATCH_OPACITY = 0.75
 """Opacity of the lines of a hatched ghost: higher than of a plain one, because they cover little."""
 
 
-class Evidence(StrEnum):
+class DrawnEvidence(StrEnum):
     """How a component is drawn."""
 
     SEEN = "seen"
@@ -53,28 +53,28 @@ class Evidence(StrEnum):
     @property
     def is_open(self) -> bool:
         """Whether the pictures neither verify nor refute the measured state."""
-        return self in (Evidence.UNVERIFIED, Evidence.UNCERTAIN)
+        return self in (DrawnEvidence.UNVERIFIED, DrawnEvidence.UNCERTAIN)
 
     @property
     def is_refuted(self) -> bool:
         """Whether the component was seen not to be at its nominal place."""
-        return self in (Evidence.MISSING, Evidence.DISPLACED)
+        return self in (DrawnEvidence.MISSING, DrawnEvidence.DISPLACED)
 
 
 _EVIDENCE = {
-    Presence.UNVERIFIED: Evidence.UNVERIFIED,
-    Presence.UNCERTAIN: Evidence.UNCERTAIN,
-    Presence.PRESENT: Evidence.SEEN,
-    Presence.MISSING: Evidence.MISSING,
-    Presence.DISPLACED: Evidence.DISPLACED,
+    Presence.UNVERIFIED: DrawnEvidence.UNVERIFIED,
+    Presence.UNCERTAIN: DrawnEvidence.UNCERTAIN,
+    Presence.PRESENT: DrawnEvidence.SEEN,
+    Presence.MISSING: DrawnEvidence.MISSING,
+    Presence.DISPLACED: DrawnEvidence.DISPLACED,
 }
 
 
-def evidence_of(presence: ComponentPresence | None, is_withheld: bool = False) -> Evidence:
-    """Evidence on a component; a presence of None is not checked."""
+def evidence_of(presence: ComponentPresence | None, is_withheld: bool = False) -> DrawnEvidence:
+    """DrawnEvidence on a component; a presence of None is not checked."""
     if is_withheld:
-        return Evidence.WITHHELD
-    return Evidence.SEEN if presence is None else _EVIDENCE[presence.presence]
+        return DrawnEvidence.WITHHELD
+    return DrawnEvidence.SEEN if presence is None else _EVIDENCE[presence.presence]
 
 
 def presence_of(pose: Pose, name: str, count: int) -> ComponentPresence | None:
@@ -114,7 +114,7 @@ def component_styles(
     model: Model,
     inspection: Inspection | None,
     options: OverlayOptions,
-    evidence: tuple[Evidence, ...],
+    evidence: tuple[DrawnEvidence, ...],
     is_doubtful: bool,
 ) -> ComponentStyles:
     """Styles for the evidence on each component; ``is_doubtful`` dims all verdicts of a stale or other inspection."""
@@ -128,13 +128,13 @@ def component_styles(
         elif inspection is not None:
             color, opacity, edge_alpha, cost = CONTEXT_RGB, 0.0, _CONTEXT_EDGE_ALPHA, _CONTEXT_WEIGHT
         pattern = PLAIN
-        if seen is Evidence.WITHHELD:
+        if seen is DrawnEvidence.WITHHELD:
             color, opacity, edge_alpha = CONTEXT_RGB, 0.0, 1.0
         elif seen.is_refuted:
             color, opacity = (
-                (MISSING_RGB, _HATCH_OPACITY) if seen is Evidence.MISSING else (DISPLACED_RGB, _HATCH_OPACITY)
+                (MISSING_RGB, _HATCH_OPACITY) if seen is DrawnEvidence.MISSING else (DISPLACED_RGB, _HATCH_OPACITY)
             )
-            pattern = CROSSES if seen is Evidence.MISSING else STRIPES
+            pattern = CROSSES if seen is DrawnEvidence.MISSING else STRIPES
             edge_alpha, cost = 1.0, 1.0
         elif (seen.is_open or is_doubtful) and deviation is not None:
             color, opacity = dimmed(color), opacity * _DIMMED_OPACITY
@@ -144,7 +144,7 @@ def component_styles(
         edges.append([*(0.75 * np.array(color) + 0.25 * 255), edge_alpha])
         weight.append(cost)
         patterns.append(pattern)
-        is_dashed.append(seen.is_open or seen is Evidence.DISPLACED)
+        is_dashed.append(seen.is_open or seen is DrawnEvidence.DISPLACED)
     return ComponentStyles(
         np.array(ghost, dtype=np.float32),
         np.array(edges, dtype=np.float32),

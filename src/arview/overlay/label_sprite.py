@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arview.overlay import paint
-from arview.overlay.evidence import CROSSES, PLAIN, STRIPES, Evidence
+from arview.overlay.evidence import CROSSES, PLAIN, STRIPES, DrawnEvidence
 from arview.overlay.labels import LabelText
 from arview.overlay.options import PANEL_RGB, Rgb
 
@@ -149,7 +149,7 @@ def _draw_bar(sprite: paint.Sprite, width: int, text: LabelText, size: int) -> N
     v, u = np.mgrid[0 : sprite.height, 0:width]
     period = max(4, round(0.5 * size))
     on = np.ones(v.shape, dtype=np.bool_)
-    pattern = {Evidence.MISSING: CROSSES, Evidence.DISPLACED: STRIPES}.get(text.evidence, PLAIN)
+    pattern = {DrawnEvidence.MISSING: CROSSES, DrawnEvidence.DISPLACED: STRIPES}.get(text.evidence, PLAIN)
     if pattern != PLAIN:
         on = (u + v) % period < (period + 1) // 2
     elif text.is_dimmed:

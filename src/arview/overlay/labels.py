@@ -16,7 +16,7 @@ import numpy as np
 
 from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
-from arview.overlay.evidence import DISPLACED_RGB, MISSING_RGB, Evidence, dimmed, evidence_of
+from arview.overlay.evidence import DISPLACED_RGB, MISSING_RGB, DrawnEvidence, dimmed, evidence_of
 from arview.overlay.options import NEUTRAL_RGB, VERDICT_RGB, VERDICT_WORD, OverlayOptions, Rgb
 from arview.pose import ComponentPresence
 
@@ -136,15 +136,15 @@ class LabelText:
     notes: tuple[str, ...] = ()
     details: tuple[str, ...] = ()
     verdict: Verdict | None = None
-    evidence: Evidence = Evidence.SEEN
+    evidence: DrawnEvidence = DrawnEvidence.SEEN
     is_dimmed: bool = False
 
     @cached_property
     def rgb(self) -> Rgb:
         """Colour of label and leader."""
-        if self.evidence is Evidence.MISSING:
+        if self.evidence is DrawnEvidence.MISSING:
             return MISSING_RGB
-        if self.evidence is Evidence.DISPLACED:
+        if self.evidence is DrawnEvidence.DISPLACED:
             return DISPLACED_RGB
         color = NEUTRAL_RGB if self.verdict is None else VERDICT_RGB[self.verdict]
         return dimmed(color) if self.is_dimmed else color
@@ -199,27 +199,27 @@ def label_text(
         note: a further remark, e.g. that the place depends on which pose is right.
     """
     evidence = evidence_of(presence, is_withheld)
-    if evidence is Evidence.WITHHELD:
+    if evidence is DrawnEvidence.WITHHELD:
         return LabelText(name, "", "WITHHELD", evidence=evidence, is_dimmed=True)
     was_missing = deviation is not None and deviation.finding is Finding.MISSING
     was_measured = deviation is not None and deviation.distance_mm is not None
-    if evidence is Evidence.MISSING:
+    if evidence is DrawnEvidence.MISSING:
         notes = _with((), CHANGED if was_measured else "as measured" if was_missing else "")
         return LabelText(name, "", "MISSING", _with(notes, note), evidence=evidence)
-    if evidence is Evidence.DISPLACED:
+    if evidence is DrawnEvidence.DISPLACED:
         assert presence is not None
         away, turned = displacement_texts(presence, center_in_model, options)
         is_new = was_missing or (was_measured and not _is_as_measured(deviation, presence, center_in_model))
         notes = _with(turned, CHANGED if is_new else "", note)
         return LabelText(name, away, "DISPLACED", notes, evidence=evidence)
     if deviation is None:
-        word = {Evidence.UNVERIFIED: "NOT VERIFIED", Evidence.UNCERTAIN: "UNCERTAIN"}.get(evidence, "SEEN")
+        word = {DrawnEvidence.UNVERIFIED: "NOT VERIFIED", DrawnEvidence.UNCERTAIN: "UNCERTAIN"}.get(evidence, "SEEN")
         return LabelText(name, "", word, _with((), note), evidence=evidence, is_dimmed=evidence.is_open)
     value, word, verdict = value_text(deviation, options), VERDICT_WORD[deviation.verdict], deviation.verdict
     is_measured = verdict is not Verdict.NOT_MEASURED
     remark = ""
     if evidence.is_open:
-        remark = UNVERIFIED if evidence is Evidence.UNVERIFIED else UNCERTAIN
+        remark = UNVERIFIED if evidence is DrawnEvidence.UNVERIFIED else UNCERTAIN
         remark = f"measured, {remark}" if is_measured else remark
     elif was_missing and presence is not None:
         remark = f"seen now: {CHANGED}"
@@ -260,12 +260,14 @@ def _with(notes: tuple[str, ...], *more: str) -> tuple[str, ...]:
     return (*notes, *(one for one in more if one))
 
 
-def text_urgency(names: tuple[str, ...], inspection: Inspection | None, evidence: Mapping[str, Evidence]) -> list[str]:
+def text_urgency(
+    names: tuple[str, ...], inspection: Inspection | None, evidence: Mapping[str, DrawnEvidence]
+) -> list[str]:
     """Components that deserve a label, the most urgent first: missing or displaced ones, then by `by_urgency`."""
     measured = [deviation.name for deviation in by_urgency(inspection)] if inspection else []
     refuted = [name for name in names if evidence[name].is_refuted]
     rank = {name: index for index, name in enumerate(measured)}
-    refuted.sort(key=lambda name: (evidence[name] is Evidence.DISPLACED, rank.get(name, len(rank)), name))
+    refuted.sort(key=lambda name: (evidence[name] is DrawnEvidence.DISPLACED, rank.get(name, len(rank)), name))
     return [*refuted, *(name for name in measured if name in evidence and not evidence[name].is_refuted)]
 
 

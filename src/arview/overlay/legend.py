@@ -8,26 +8,26 @@ from functools import lru_cache
 import numpy as np
 
 from arview.overlay import paint
-from arview.overlay.evidence import DIMMED_RGB, DISPLACED_RGB, MISSING_RGB, Evidence
+from arview.overlay.evidence import DIMMED_RGB, DISPLACED_RGB, MISSING_RGB, DrawnEvidence
 from arview.overlay.options import CONTEXT_RGB, Rgb
 from arview.pose import Pose
 
 _WHITE: Rgb = (240, 244, 248)
 _AMBER: Rgb = (255, 176, 32)
-_ENTRIES: dict[Evidence, str] = {
-    Evidence.MISSING: "missing here",
-    Evidence.DISPLACED: "displaced: CAD place and where it is",
-    Evidence.UNVERIFIED: "not verified here",
-    Evidence.UNCERTAIN: "not verified here",
-    Evidence.WITHHELD: "another specimen: nothing measured is shown",
+_ENTRIES: dict[DrawnEvidence, str] = {
+    DrawnEvidence.MISSING: "missing here",
+    DrawnEvidence.DISPLACED: "displaced: CAD place and where it is",
+    DrawnEvidence.UNVERIFIED: "not verified here",
+    DrawnEvidence.UNCERTAIN: "not verified here",
+    DrawnEvidence.WITHHELD: "another specimen: nothing measured is shown",
 }
 
 
-def legend_entries(evidence: Iterable[Evidence]) -> tuple[tuple[Evidence, str], ...]:
+def legend_entries(evidence: Iterable[DrawnEvidence]) -> tuple[tuple[DrawnEvidence, str], ...]:
     """Kinds of evidence that need an explanation, each with its text; none where all is as measured."""
     present = set(evidence)
-    if Evidence.UNVERIFIED in present:
-        present.discard(Evidence.UNCERTAIN)
+    if DrawnEvidence.UNVERIFIED in present:
+        present.discard(DrawnEvidence.UNCERTAIN)
     return tuple((kind, text) for kind, text in _ENTRIES.items() if kind in present)
 
 
@@ -37,7 +37,7 @@ def withheld_title(pose: Pose) -> str:
 
 
 @lru_cache(maxsize=32)
-def legend_sprite(entries: tuple[tuple[Evidence, str], ...], size_px: int, width_px: int) -> paint.Sprite:
+def legend_sprite(entries: tuple[tuple[DrawnEvidence, str], ...], size_px: int, width_px: int) -> paint.Sprite:
     """Panel with a swatch and a text for each entry, in as many rows as the width requires."""
     small = max(9, round(0.86 * size_px))
     pad, gap, swatch = round(0.6 * small), round(0.5 * small), round(1.9 * small)
@@ -66,7 +66,7 @@ def legend_sprite(entries: tuple[tuple[Evidence, str], ...], size_px: int, width
     return sprite
 
 
-def _draw_swatch(sprite: paint.Sprite, kind: Evidence, x: int, y: int, width: int, height: int) -> None:
+def _draw_swatch(sprite: paint.Sprite, kind: DrawnEvidence, x: int, y: int, width: int, height: int) -> None:
     """A small picture of how a kind of evidence is drawn."""
     v, u = np.mgrid[0:height, 0:width]
     period = max(4, height // 2)
@@ -74,14 +74,14 @@ def _draw_swatch(sprite: paint.Sprite, kind: Evidence, x: int, y: int, width: in
     rim[[0, -1], :] = rim[:, [0, -1]] = True
     dash = (u + v) % (2 * max(2, period // 2)) < max(2, period // 2)
     color: Rgb = DIMMED_RGB
-    if kind is Evidence.MISSING:
+    if kind is DrawnEvidence.MISSING:
         color, on = MISSING_RGB, rim | ((u + v) % period < 1) | ((u - v) % period < 1)
-    elif kind is Evidence.DISPLACED:
+    elif kind is DrawnEvidence.DISPLACED:
         # The nominal place hatched, the other one plain, with a link between them.
         color, third = DISPLACED_RGB, width // 3
         left = (u < third) & (((u + v) % period < (period + 1) // 2) | rim)
         on = left | (u >= width - third) | ((v == height // 2) & (u >= third))
-    elif kind is Evidence.WITHHELD:
+    elif kind is DrawnEvidence.WITHHELD:
         color, on = CONTEXT_RGB, rim
     else:
         on = rim & dash

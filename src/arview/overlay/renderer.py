@@ -20,7 +20,7 @@ from arview.overlay import labels, paint
 from arview.overlay.annotations import Annotations, LabelledComponent, LaidOut
 from arview.overlay.displaced import DisplacedGhosts
 from arview.overlay.edges import Edges
-from arview.overlay.evidence import ComponentStyles, Evidence, component_styles, evidence_of, presence_of
+from arview.overlay.evidence import ComponentStyles, DrawnEvidence, component_styles, evidence_of, presence_of
 from arview.overlay.ghost import CELL_PX, NEAR_MM, Ghost, GhostView, blend, count_cells
 from arview.overlay.guide import GuideOutline
 from arview.overlay.legend import banner_sprite, legend_entries, legend_sprite, withheld_title
@@ -56,8 +56,8 @@ class _PartLook:
         texts: of the labels, by component and note; those of displaced components change from frame to frame.
     """
 
-    key: tuple[tuple[Evidence, ...], str]
-    evidence: tuple[Evidence, ...]
+    key: tuple[tuple[DrawnEvidence, ...], str]
+    evidence: tuple[DrawnEvidence, ...]
     styles: ComponentStyles
     order: tuple[int, ...]
     arrows: Array
@@ -264,7 +264,7 @@ class OverlayRenderer:
             self._status.draw(canvas, pose, fps, now)
 
     def _make_status(self) -> StatusLine:
-        arrows = self._arrows_in_model([Evidence.SEEN] * len(self._names))
+        arrows = self._arrows_in_model([DrawnEvidence.SEEN] * len(self._names))
         return StatusLine(
             self.camera.width, self.camera.height, round(0.95 * self._size_px), self.inspection,
             self._arrow_scale if self.options.show_arrows and len(arrows) else None,
@@ -331,7 +331,7 @@ class OverlayRenderer:
         )  # fmt: skip
         for index, seen in enumerate(scene.evidence):
             presence = presences[index]
-            if seen is Evidence.DISPLACED and presence is not None and presence.model_from_nominal is not None:
+            if seen is DrawnEvidence.DISPLACED and presence is not None and presence.model_from_nominal is not None:
                 moved = pose.cam_from_model @ presence.model_from_nominal
                 opacity = float(dimming[3]) * (options.opacity if options.show_ghost else 0.0)
                 line_px = 0.0 if options.show_edges == "none" else self._line_px
@@ -363,7 +363,7 @@ class OverlayRenderer:
     def _text(self, index: int, presence: ComponentPresence | None, scene: _PartLook, note: str) -> labels.LabelText:
         """Texts of a component's label."""
         text = scene.texts.get((index, note))
-        if text is None or scene.evidence[index] is Evidence.DISPLACED:
+        if text is None or scene.evidence[index] is DrawnEvidence.DISPLACED:
             text = labels.label_text(
                 self._names[index],
                 self._deviations[index],
@@ -403,7 +403,7 @@ class OverlayRenderer:
         sprite = banner_sprite(withheld_title(pose), pose.identity_reason, self._size_px, width_px)
         paint.put_sprite(canvas, sprite, (self.camera.width - sprite.width) // 2, margin)
 
-    def _arrows_in_model(self, evidence: list[Evidence]) -> Array:
+    def _arrows_in_model(self, evidence: list[DrawnEvidence]) -> Array:
         """Tail and exaggerated tip (A,2,3) of the arrows in the model frame, mm, the most urgent last.
 
         Components have none that were seen to be elsewhere, are not verified, or whose measurement is withheld.
@@ -413,7 +413,7 @@ class OverlayRenderer:
         urgent: list[ComponentDeviation] = labels.by_urgency(self.inspection) if self.inspection else []
         for deviation in reversed(urgent):
             displacement = labels.arrow_in_model(deviation)
-            is_shown = seen.get(deviation.name) is Evidence.SEEN and deviation.verdict is not Verdict.PASS
+            is_shown = seen.get(deviation.name) is DrawnEvidence.SEEN and deviation.verdict is not Verdict.PASS
             if displacement is not None and is_shown:
                 tail = self.model.component(deviation.name).bounds_in_model.mean(axis=0)
                 arrows.append(np.stack([tail, tail + self._arrow_scale * np.array(displacement)]))
@@ -434,7 +434,7 @@ class OverlayRenderer:
         links = [
             np.stack([center, apply(presence.model_from_nominal, center[None])[0]])
             for center, presence, seen in zip(self._centers_in_model, presences, scene.evidence, strict=True)
-            if seen is Evidence.DISPLACED and presence is not None and presence.model_from_nominal is not None
+            if seen is DrawnEvidence.DISPLACED and presence is not None and presence.model_from_nominal is not None
         ]
         if links:
             for tail_px, tip_px in self._projected(cam_from_model, np.stack(links)):

@@ -11,7 +11,7 @@ from arview.live.options import LiveOptions
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.notices import Notice
 from arview.live.stream.subject import OverlayStyle, Subject
-from arview.overlay.evidence import Evidence, evidence_of, presence_of
+from arview.overlay.evidence import DrawnEvidence, evidence_of, presence_of
 from arview.overlay.labels import arrow_scale, by_urgency, detail_text, inspection_doubt, label_text, value_text
 from arview.overlay.legend import legend_entries, withheld_title
 from arview.overlay.mesh import anchor_in_model, topology
@@ -61,7 +61,7 @@ def evidence_document(pose: Pose, subject: Subject | None) -> Document:
         document["completeness"] = completeness_text(pose)
     if pose.is_label_withheld:
         document["withheld"] = {"title": withheld_title(pose), "text": pose.identity_reason}
-        document["legend"] = _legend([Evidence.WITHHELD])
+        document["legend"] = _legend([DrawnEvidence.WITHHELD])
         return document
     doubt = inspection_doubt(inspection, subject.serial, options) if inspection else ""
     found = {one.name: one for one in inspection.components} if inspection else {}
@@ -71,7 +71,7 @@ def evidence_document(pose: Pose, subject: Subject | None) -> Document:
         evidence = evidence_of(presence)
         shown.append(evidence)
         is_back = deviation is not None and deviation.finding is Finding.MISSING and presence is not None
-        if evidence is Evidence.SEEN and not is_back and not (doubt and deviation is not None):
+        if evidence is DrawnEvidence.SEEN and not is_back and not (doubt and deviation is not None):
             continue
         center = component.bounds_in_model.mean(axis=0)
         text = label_text(
@@ -95,7 +95,7 @@ def evidence_document(pose: Pose, subject: Subject | None) -> Document:
     return document
 
 
-def _legend(evidence: list[Evidence]) -> list[Document]:
+def _legend(evidence: list[DrawnEvidence]) -> list[Document]:
     return [{"kind": str(kind), "text": text} for kind, text in legend_entries(evidence)]
 
 
