@@ -95,6 +95,12 @@ def _keep_named_part(ctx: click.Context, parameter: click.Parameter, value: str 
 
 @main.command(
     short_help="Track a part in a video and draw on it.",
+    exit_codes={
+        ExitCode.DONE: "done; with --check-presence: all components are present",
+        ExitCode.FAIL: "--check-presence: a component is missing or displaced",
+        ExitCode.UNDECIDED: "--check-presence: not all components are known to be present",
+        ExitCode.CANNOT_MEASURE: "--check-presence: no part was found",
+    },
     epilog="""\b
 Examples:
   arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json -o out.mp4
@@ -144,8 +150,7 @@ where several have the same. Inspections belong to the specimens in their order.
 
 \b
 Components. Each is present, missing, displaced, uncertain or unverified by what the frames have shown so far,
-whatever was measured before. --check-presence exits with 0 if all components of all parts are present at the
-end, 1 if one is missing or displaced, 2 if not all are known to be present, 3 if no part was found.
+whatever was measured before. --check-presence exits by what is known of all components at the end.
 
 \b
 Each line of a poses file is a JSON object: index, time_s, state, quality, cam_from_model (4x4 row-major,
