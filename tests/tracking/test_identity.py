@@ -33,6 +33,7 @@ class FakeFinders:
 
     poses: list[Array] = field(default_factory=list)
     searches: int = 0
+    others: tuple[Array, ...] = ()
 
     @property
     def detector(self) -> FakeFinders:
@@ -203,6 +204,32 @@ def test_without_a_background_a_lone_part_is_followed_and_one_of_two_is_not() ->
         for i in range(30, 40):
             result = monitor.update(blank, estimate(found), i, i / 30.0, finders)
         assert result.identity is expected
+
+
+def test_a_specimen_that_another_session_tracks_is_not_taken_for_this_one() -> None:
+    for is_tracked, expected in ((True, Identity.FOLLOWED), (False, Identity.UNCONFIRMED)):
+        monitor, finders = IdentityMonitor(assembly_views(), CAMERA), FakeFinders()
+        image, left = turned(0.0, 0, LEFT)
+        right = turned(0.0, 0, RIGHT)[1]
+        finders.others = (right,) if is_tracked else ()
+        for i in range(12):
+            monitor.update(image, estimate(left), i, i / 30.0, finders)
+        blank = np.full_like(image, 90)
+        for i in range(12, 30):
+            monitor.update(blank, None, i, i / 30.0, finders)
+        finders.poses = [right]
+        moved = left.copy()
+        moved[0, 3] -= 250.0
+        for i in range(30, 40):
+            result = monitor.update(blank, estimate(moved), i, i / 30.0, finders)
+        assert result.identity is expected
+    # But this session does not take over the place of the other one.
+    finders.others = (right,)
+    monitor.reset()
+    for i in range(12):
+        monitor.update(image, estimate(left), i, i / 30.0, finders)
+    finders.others = ()
+    assert monitor.update(image, estimate(right), 12, 0.4, finders).reason == ANOTHER_IN_VIEW
 
 
 def test_the_user_names_the_specimen_by_a_pixel() -> None:

@@ -64,10 +64,12 @@ class KeptView:
     Attributes:
         image: (H,W,3) uint8 RGB.
         cam_from_model: (4,4) its pose there.
+        others: poses (4,4) of specimens that other sessions tracked there.
     """
 
     image: NDArray[np.uint8]
     cam_from_model: Array
+    others: tuple[Array, ...] = ()
 
 
 @dataclass
@@ -211,7 +213,7 @@ class IdentityMonitor:
         is_sure = is_confirmed and estimate.quality >= self.options.min_quality and not estimate.is_restless
         if self._doubt is None:
             placement = self._placement(image, pose, is_sure)
-            self._follow(image, estimate, is_sure, placement, time_s)
+            self._follow(image, estimate, is_sure, placement, time_s, finders.others)
         else:
             self._go_on_doubting(image, pose, self._doubt, time_s)
         if self._doubt is not None:
@@ -248,7 +250,13 @@ class IdentityMonitor:
         return placement
 
     def _follow(
-        self, image: NDArray[np.uint8], estimate: Estimate, is_sure: bool, placement: Placement, time_s: float
+        self,
+        image: NDArray[np.uint8],
+        estimate: Estimate,
+        is_sure: bool,
+        placement: Placement,
+        time_s: float,
+        others: tuple[Array, ...],
     ) -> None:
         """Go on with the followed specimen, or begin to doubt that this is it."""
         if placement is not Placement.SAME:
@@ -256,15 +264,15 @@ class IdentityMonitor:
             return
         self._frames_unsure = 0 if is_sure else self._frames_unsure + 1
         if is_sure:
-            self._keep(image, estimate.cam_from_model, estimate.quality)
+            self._keep(image, estimate.cam_from_model, estimate.quality, others)
 
-    def _keep(self, image: NDArray[np.uint8], pose: Array, quality: float) -> None:
+    def _keep(self, image: NDArray[np.uint8], pose: Array, quality: float, others: tuple[Array, ...]) -> None:
         """Keep this picture as the last one of the followed specimen."""
         if self._buffer is None:
             self._buffer = np.empty_like(image)
         # Copied, because a source may use the memory of its frames again.
         np.copyto(self._buffer, image)
-        self._kept = KeptView(self._buffer, pose)
+        self._kept = KeptView(self._buffer, pose, others)
         self._kept_quality += self.options.quality_rate * (quality - self._kept_quality)
         self._others_before = None
         self._is_followed = False
@@ -357,7 +365,7 @@ class IdentityMonitor:
             doubt.is_placed = self._motion.homography is not None
             is_other = self._is_other_before(pose, doubt, finders)
         else:
-            is_other = bool(self._search.others(image, pose, finders))
+            is_other = self._is_any_new(self._search.others(image, pose, finders), finders.others)
         doubt.stage += 1
         if is_other:
             doubt.reason = ANOTHER_IN_VIEW
@@ -377,7 +385,13 @@ class IdentityMonitor:
             return False
         if self._others_before is None:
             self._others_before = self._search.others(kept.image, kept.cam_from_model, finders)
-        return bool(self._others_before) and self._is_kept_right(kept, finders)
+        # A specimen that another session tracked and still tracks is not this one.
+        tracked = kept.others if len(finders.others) >= len(kept.others) else ()
+        return self._is_any_new(self._others_before, tracked) and self._is_kept_right(kept, finders)
+
+    def _is_any_new(self, found: list[Array], tracked: tuple[Array, ...]) -> bool:
+        """Whether any pose (4,4) found is none of those of specimens that other sessions track."""
+        return any(all(self._is_apart(pose, other) for other in tracked) for pose in found)
 
     def _is_kept_right(self, kept: KeptView, finders: Finders) -> bool:
         """Whether the followed specimen is really there in its last picture; a wrong pose is no specimen."""

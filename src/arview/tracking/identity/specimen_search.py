@@ -37,6 +37,9 @@ class NearFinder(Protocol):
 class Finders(Protocol):
     """The searches that are needed, made when they are first used: `arview.tracking.TrackingSession`."""
 
+    others: tuple[Array, ...]
+    """Poses (4,4) of other specimens that are tracked by sessions of their own."""
+
     @property
     def detector(self) -> PictureFinder:
         """Search of a whole picture."""
