@@ -12,7 +12,7 @@ from arview.camera import Camera
 from arview.geometry import Array
 from arview.overlay import paint
 from arview.overlay.label_sprite import LabelSprite, label_sprite
-from arview.overlay.labels import LabelText
+from arview.overlay.labels import OCCLUDED, LabelText
 from arview.overlay.layout import LabelLayout, LabelRequest, PlacedLabel
 from arview.overlay.options import Rgb
 
@@ -168,7 +168,7 @@ class Annotations:
             is_bold = label.text.is_urgent and not label.text.is_dimmed and self._size_px > 13
             paint.line(canvas, points, label.text.rgb, 2 if is_bold else 1)
             if label.box.key not in outside:
-                is_hollow = seen_px.get(label.box.key, 0) == 0
+                is_hollow = seen_px.get(label.box.key, 0) == 0 or OCCLUDED in label.text.notes
                 paint.dot(canvas, points[-1], label.text.rgb, 0.2 * self._size_px, is_hollow)
         for pointer in laid_out.pointers:
             tail, tip = np.array(pointer.tail_px), np.array(pointer.tip_px)

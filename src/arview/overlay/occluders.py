@@ -40,6 +40,8 @@ _DARK = 12.0
 """Grey level of darker colours, which say nothing about the exposure."""
 _MAX_CHANGE = 0.25
 """Logarithm of the largest change of exposure between two frames."""
+_EXPOSURE_STRIDE = 5
+"""Every so many samples are used for the exposure."""
 _MIN_AGREEING = 0.1
 """Share of the samples that must agree on the exposure; with fewer it is taken to be as before."""
 
@@ -125,8 +127,11 @@ class OccluderFinder:
         rows, columns = cells.shape[0], cells.shape[1]
         mask = strange = np.zeros((rows, columns), dtype=np.uint8)
         gain = self._gain
-        if known.sum() > 4 * options.min_samples:
-            gain = self._gain = _exposure(observed[known], table[cells[known], :3], self._gain)
+        compared = np.flatnonzero(known)
+        if len(compared) > 4 * options.min_samples:
+            # A part of the samples is enough for the exposure.
+            few = compared[::_EXPOSURE_STRIDE]
+            gain = self._gain = _exposure(observed.reshape(-1, 3)[few], table[cells.ravel()[few], :3], self._gain)
             strange, mask = self._occluded(cells, observed, known, gain)
         if learns:
             rates = np.array([options.rate, options.occluded_rate, options.max_variance], dtype=np.float32)

@@ -324,7 +324,10 @@ class OverlayRenderer:
             face_ids = np.where(occluder, np.int32(-1), face_ids)
             cover[occluder] = 0
         is_critical = pose.state is TrackingState.CRITICAL
-        dimming = np.array([1, 1, 1, _CRITICAL_DIMMING if is_critical else 1], dtype=np.float32)
+        dimming = np.ones((len(scene.evidence), 4), dtype=np.float32)
+        if is_critical:
+            # What was seen to be missing or displaced is shown in full, because it may be why the pose is critical.
+            dimming[[not seen.is_refuted for seen in scene.evidence], 3] = _CRITICAL_DIMMING
         blend(
             canvas, view.u0, view.v0, face_ids, view.shade, view.components,
             styles.ghost * dimming, cover, owner, styles.edges * dimming, styles.patterns, self._hatch_px,
@@ -333,7 +336,7 @@ class OverlayRenderer:
             presence = presences[index]
             if seen is DrawnEvidence.DISPLACED and presence is not None and presence.model_from_nominal is not None:
                 moved = pose.cam_from_model @ presence.model_from_nominal
-                opacity = float(dimming[3]) * (options.opacity if options.show_ghost else 0.0)
+                opacity = options.opacity if options.show_ghost else 0.0
                 line_px = 0.0 if options.show_edges == "none" else self._line_px
                 self._displaced.draw(canvas, view, index, moved, opacity, line_px)
 
