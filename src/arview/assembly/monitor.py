@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from arview.assembly.direction_evidence import DirectionEvidence, DirectionOptions
 from arview.assembly.observation import ComponentObserver, Known, Observation, ObservationOptions
+from arview.assembly.present_lines import PresentLines
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import ComponentPresence, Presence, Visibility
+from arview.refinement.view_model import PartView
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ class MonitorOptions:
         mismatch_log_odds: a component with more becomes mismatched.
         cleared_log_odds: a mismatched component with less is cleared; other components with more are uncertain.
         verified_log_odds: a component with less is verified: the odds that it is not there are below 1 to 50.
+        suspect_log_odds: a component with more probably is not where the CAD has it.
         open_log_odds: a component with more is open: it is observed sooner, and at alternative placements too.
         settled_log_odds: a mismatched component with more is no reason to observe sooner.
         single_log_odds: a component with more in a single picture is a mismatch of that picture.
@@ -42,6 +45,8 @@ class MonitorOptions:
         forgetting: share of the summed log odds that is lost with each observation.
         first_observations: frames after a lock that are all observed. No component is called mismatched before the
             last of them, because noise differs between frames.
+        incomplete_quality: poses of lower quality are observed at once while components are suspect.
+        urgent_frames: frames between these observations.
         suspect_frames: frames between observations while a component is suspect, or while an open one becomes visible.
         open_frames: frames between observations while a component is open.
         rest_frames: frames between observations while all components are as expected. All three are for new
@@ -56,6 +61,7 @@ class MonitorOptions:
     mismatch_log_odds: float = 2.4
     cleared_log_odds: float = 0.1
     verified_log_odds: float = -4.0
+    suspect_log_odds: float = 1.0
     open_log_odds: float = -1.0
     settled_log_odds: float = 4.5
     single_log_odds: float = 1.8
@@ -65,6 +71,8 @@ class MonitorOptions:
     max_log_odds: float = 6.0
     forgetting: float = 0.01
     first_observations: int = 2
+    incomplete_quality: float = 0.85
+    urgent_frames: int = 2
     suspect_frames: int = 6
     open_frames: int = 15
     rest_frames: int = 45
@@ -119,7 +127,8 @@ class AssemblyMonitor:
         self, views: GuideViewSet, camera: Camera, model: Model, options: MonitorOptions | None = None
     ) -> None:
         self.options = options or MonitorOptions()
-        self._views, self._camera = views, camera
+        self._views, self._camera, self._model = views, camera, model
+        self._lines: PresentLines | None = None
         self._has_components = len(model.components) > 1
         self._observer = ComponentObserver(views, camera, model, self.options.observation)
         boxes = np.array([one.bounds_in_model for one in model.components])
@@ -156,16 +165,24 @@ class AssemblyMonitor:
             shifts=np.zeros((count, 3)),
         )
 
-    def update(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
-        """Process a frame with a good pose; it is observed only if it may add evidence.
+    def update(
+        self, image: NDArray[np.uint8], cam_from_model: Array, quality: float = 1.0, is_supported: bool = True
+    ) -> None:
+        """Process a frame; it is observed only if its pose is good and it may add evidence.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             cam_from_model: (4,4) mm.
+            quality: of the pose; if it is low, perhaps further components are absent.
+            is_supported: the pose is sure.
         """
         o, state = self.options, self._state
         state.frames_since += 1
-        if not self._has_components or not self._is_due(cam_from_model):
+        # From a new direction the lines of absent components that were not seen before are missed.
+        is_urgent = quality < o.incomplete_quality and bool(self._is_suspect().any())
+        if not self._has_components or not (is_supported or is_urgent):
+            return
+        if not self._is_due(cam_from_model) and not (is_urgent and state.frames_since >= o.urgent_frames):
             return
         known = Known(state.is_verified, state.is_mismatched, self._searched())
         observation = self.observe(image, cam_from_model, known)
@@ -182,6 +199,16 @@ class AssemblyMonitor:
         if state.observations >= o.first_observations:
             mismatched_above = np.where(state.is_mismatched, o.cleared_log_odds, o.mismatch_log_odds)
             state.is_mismatched = state.log_odds > mismatched_above
+
+    def present_lines(self, part: PartView, cam_from_model: Array) -> PartView:
+        """The guide views of the part without the lines of components that probably are not where the CAD has them.
+
+        Args:
+            part: all guide views, always the same.
+            cam_from_model: (4,4) mm pose of the present frame.
+        """
+        self._lines = self._lines or PresentLines(self._model, part)
+        return self._lines.update(self._is_suspect(), self._state.is_verified, cam_from_model)
 
     def presence(self, cam_from_model: Array, is_ambiguous: bool = False) -> Mapping[str, ComponentPresence]:
         """Presence of each component by its name; empty for a part of one component.
@@ -249,6 +276,10 @@ class AssemblyMonitor:
         """(C,) components against which there is some evidence, but not enough."""
         state = self._state
         return np.asarray((state.log_odds > self.options.cleared_log_odds) & ~state.is_mismatched)
+
+    def _is_suspect(self) -> NDArray[np.bool_]:
+        """(C,) components that probably are not where the CAD has them."""
+        return self._state.is_mismatched | (self._state.log_odds > self.options.suspect_log_odds)
 
     def _is_settled(self) -> NDArray[np.bool_]:
         """(C,) mismatched components of which no more evidence is needed soon."""

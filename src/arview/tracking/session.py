@@ -481,12 +481,11 @@ class TrackingSession:
         """Check that the components are where the CAD has them; a part with a wrong one is never ``tracked``."""
         s = self._state
         s.is_supported = s.state == TrackingState.TRACKED
-        if s.is_supported:
-            self.components.update(image, estimate.cam_from_model)
+        self.components.update(image, estimate.cam_from_model, estimate.quality, s.is_supported)
+        self.tracker.refiner.part = self.components.present_lines(self._local.refiner.part, estimate.cam_from_model)
         reasons = [reason, *self.components.mismatches] if reason else [*self.components.mismatches]
-        uncertain = self.components.uncertain
-        if uncertain and not reasons:
-            reasons = [f"in doubt: {', '.join(uncertain)}"]
+        if self.components.uncertain and not reasons:
+            reasons = [f"in doubt: {', '.join(self.components.uncertain)}"]
         if reasons:
             s.apply(Event.CONTRADICTED)
         return "; ".join(reasons)

@@ -1,0 +1,131 @@
+"""The guide views of a part without the lines of components that are absent.
+
+The outline and the edges of absent components are not in the picture; a tracker that expects them loses its evidence,
+and in the end the part. Their points are therefore replaced by points of the other components in the same view, so
+that the arrays keep their sizes. Only views near the present direction are changed, when they are first needed.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from arview.cad.model import Model
+from arview.cad.samples import sample_surface
+from arview.geometry import Array, invert
+from arview.refinement.view_model import PartView
+
+
+@dataclass(frozen=True)
+class PresentLinesOptions:
+    """Which points are replaced.
+
+    Attributes:
+        spacing_share: distance of samples of an absent component's surface, in diameters of the part.
+        near_share: points nearer to such a sample, in diameters of the part, are the component's.
+        max_samples: largest number of samples of a component.
+        min_left: share of a view's points that must be left; of other views none is replaced.
+        reach_deg: angle between the present direction and those of views that are changed.
+    """
+
+    spacing_share: float = 0.01
+    near_share: float = 0.008
+    max_samples: int = 4000
+    min_left: float = 0.15
+    reach_deg: float = 9.0
+
+
+class PresentLines:
+    """Keeps the lines of a part up to date with what is known to be absent.
+
+    Args:
+        model: of the part.
+        part: its guide views; they are not changed.
+        options: see `PresentLinesOptions`.
+    """
+
+    def __init__(self, model: Model, part: PartView, options: PresentLinesOptions | None = None) -> None:
+        self._options = options or PresentLinesOptions()
+        self._model, self._whole = model, part
+        self._reduced: PartView | None = None
+        self._is_absent = np.zeros(len(model.components), dtype=bool)
+        self._tree: cKDTree | None = None
+        self._changed: set[int] = set()
+
+    def update(self, is_missing: NDArray[np.bool_], is_present: NDArray[np.bool_], cam_from_model: Array) -> PartView:
+        """The guide views to be used at a pose.
+
+        A component that was missing stays left out until it is seen, whatever becomes of the track in between.
+
+        Args:
+            is_missing, is_present: (C,) components that are known not to be there, and to be there.
+            cam_from_model: (4,4) mm.
+        """
+        is_absent = (self._is_absent | is_missing) & ~is_present
+        if not np.array_equal(is_absent, self._is_absent):
+            self._is_absent = is_absent
+            self._restore()
+        if self._tree is None:
+            return self._whole
+        if self._reduced is None:
+            self._reduced = copy.copy(self._whole)
+            copies = {name: array.copy() for name, array in self._whole.arrays._asdict().items()}
+            self._reduced.arrays = self._whole.arrays._replace(**copies)
+        center = self._whole.model_from_body[:3, 3]
+        direction = invert(cam_from_model)[:3, 3] - center
+        cosines = self._whole.arrays.directions @ (direction / np.linalg.norm(direction))
+        near = np.flatnonzero(cosines > np.cos(np.deg2rad(self._options.reach_deg))).tolist()
+        self._change([view for view in near if view not in self._changed])
+        return self._reduced
+
+    def _restore(self) -> None:
+        """Take all points back, and sample the surfaces of the components that are now absent."""
+        if self._reduced is not None:
+            whole, reduced = self._whole.arrays, self._reduced.arrays
+            for view in self._changed:
+                for starts, names in _LINES:
+                    first, last = getattr(whole, starts)[view : view + 2]
+                    for name in names:
+                        getattr(reduced, name)[first:last] = getattr(whole, name)[first:last]
+        self._changed.clear()
+        self._tree = None
+        if self._is_absent.any():
+            o, model = self._options, self._model
+            spacing_mm = o.spacing_share * model.diameter_mm
+            samples = [
+                sample_surface(model.components[c], spacing_mm, o.max_samples).points
+                for c in np.flatnonzero(self._is_absent)
+            ]
+            self._tree = cKDTree(np.concatenate(samples) - self._whole.model_from_body[:3, 3])
+
+    def _change(self, views: Sequence[int]) -> None:
+        """Replace the points of absent components in some views."""
+        assert self._tree is not None and self._reduced is not None
+        o, whole, reduced = self._options, self._whole.arrays, self._reduced.arrays
+        near_mm = o.near_share * self._model.diameter_mm
+        for view in views:
+            self._changed.add(view)
+            for starts, names in _LINES:
+                first, last = (int(place) for place in getattr(whole, starts)[view : view + 2])
+                points = getattr(whole, names[0])[first:last]
+                if last == first:
+                    continue
+                distance = self._tree.query(points, distance_upper_bound=near_mm)[0]
+                left = np.flatnonzero(np.isinf(distance))
+                if len(left) == len(points) or len(left) < o.min_left * len(points):
+                    continue
+                chosen = first + left[np.arange(len(points)) * len(left) // len(points)]
+                for name in names:
+                    getattr(reduced, name)[first:last] = getattr(whole, name)[chosen]
+
+
+_LINES = (
+    ("contour_starts", ("contour_points", "contour_normals", "contour_runs_mm")),
+    ("edge_starts", ("edge_points", "edge_tangents", "edge_kinds")),
+)
+"""Arrays of a `ViewArrays` by point, the points first, and where those of each view start."""
