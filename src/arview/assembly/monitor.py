@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.direction_evidence import DirectionEvidence, DirectionOptions
-from arview.assembly.observation import ComponentObserver, Known, Observation, ObservationOptions
+from arview.assembly.observation import ComponentObserver, Known, Observation, ObservationOptions, base_of
 from arview.assembly.present_lines import PresentLines
+from arview.assembly.turned_poses import TurnedPoseOptions, TurnedPoses
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.geometry import Array, rigid
@@ -30,7 +31,9 @@ class MonitorOptions:
     """When components are called missing or present, and how often frames are observed.
 
     Attributes:
-        mismatch_log_odds: a component with more becomes mismatched.
+        mismatch_log_odds: a component with more becomes mismatched: it is named, and the pose is no longer sure.
+        missing_log_odds: a mismatched component with more becomes missing, or displaced. Observations from one
+            direction do not reach it soon: a pose that is a little wrong looks the same for a while.
         cleared_log_odds: a mismatched component with less is cleared; other components with more are uncertain.
         verified_log_odds: a component with less is verified: the odds that it is not there are below 1 to 50.
         suspect_log_odds: a component with more probably is not where the CAD has it.
@@ -55,16 +58,18 @@ class MonitorOptions:
             because the first ones may have been blurred.
         inside_share: share of the corners of a component's box that must be in the picture.
         observation: options of a single observation.
+        turned_poses: options of the comparison with poses in which the base looks the same.
         directions: options of combining observations from one direction.
     """
 
-    mismatch_log_odds: float = 2.4
+    mismatch_log_odds: float = 2.0
+    missing_log_odds: float = 4.0
     cleared_log_odds: float = 0.1
     verified_log_odds: float = -4.0
     suspect_log_odds: float = 1.0
     open_log_odds: float = -1.0
     settled_log_odds: float = 4.5
-    single_log_odds: float = 1.8
+    single_log_odds: float = 1.5
     displaced_log_odds: float = 2.4
     same_shift: float = 0.05
     max_added: float = 2.3
@@ -79,6 +84,7 @@ class MonitorOptions:
     fresh_observations: int = 6
     inside_share: float = 0.5
     observation: ObservationOptions = field(default_factory=ObservationOptions)
+    turned_poses: TurnedPoseOptions = field(default_factory=TurnedPoseOptions)
     directions: DirectionOptions = field(default_factory=DirectionOptions)
 
 
@@ -90,6 +96,7 @@ class MonitorState:
         log_odds: (C,) summed log odds that each is not at its nominal placement.
         directions: evidence added from each direction.
         is_mismatched: (C,) mismatched.
+        is_missing: (C,) mismatched, and surely so.
         is_verified: (C,) confirmed at its nominal placement.
         was_visible: (C,) visible in the last observation.
         was_occluded: (C,) behind something in the last observation.
@@ -103,6 +110,7 @@ class MonitorState:
     log_odds: Array
     directions: DirectionEvidence
     is_mismatched: NDArray[np.bool_]
+    is_missing: NDArray[np.bool_]
     is_verified: NDArray[np.bool_]
     was_visible: NDArray[np.bool_]
     was_occluded: NDArray[np.bool_]
@@ -129,6 +137,7 @@ class AssemblyMonitor:
         self.options = options or MonitorOptions()
         self._views, self._camera, self._model = views, camera, model
         self._lines: PresentLines | None = None
+        self._turned = TurnedPoses(model.components[base_of(model)], self.options.turned_poses)
         self._has_components = len(model.components) > 1
         self._observer = ComponentObserver(views, camera, model, self.options.observation)
         boxes = np.array([one.bounds_in_model for one in model.components])
@@ -151,13 +160,24 @@ class AssemblyMonitor:
         """Names of components not yet confirmed at their nominal placement; none of a part of one component."""
         return self._names(~self._state.is_verified) if self._has_components else ()
 
+    @property
+    def better_turn(self) -> Array | None:
+        """(4,4) from the pose, on the model's side, to one that fits clearly better; None: no other does."""
+        return self._turned.better
+
+    def other_poses(self, cam_from_model: Array) -> tuple[Array, ...]:
+        """Poses (4,4) in which the base looks the same, and of which nothing has yet shown that they are wrong."""
+        return self._turned.poses(cam_from_model) if self._is_suspect().any() else ()
+
     def reset(self) -> None:
         """Forget all observations: another part may be in view."""
+        self._turned.reset()
         count = len(self._views.component_names)
         self._state = MonitorState(
             log_odds=np.zeros(count),
             directions=DirectionEvidence(count, self._views.center_in_model, self.options.directions),
             is_mismatched=np.zeros(count, dtype=bool),
+            is_missing=np.zeros(count, dtype=bool),
             is_verified=np.zeros(count, dtype=bool),
             was_visible=np.zeros(count, dtype=bool),
             was_occluded=np.zeros(count, dtype=bool),
@@ -199,6 +219,9 @@ class AssemblyMonitor:
         if state.observations >= o.first_observations:
             mismatched_above = np.where(state.is_mismatched, o.cleared_log_odds, o.mismatch_log_odds)
             state.is_mismatched = state.log_odds > mismatched_above
+        if self._is_suspect().any() and is_supported:
+            self._turned.compare(cam_from_model, lambda pose: self._observer.pose_evidence(image, pose))
+        state.is_missing = state.is_mismatched & (state.is_missing | (state.log_odds > o.missing_log_odds))
 
     def present_lines(self, part: PartView, cam_from_model: Array) -> PartView:
         """The guide views of the part without the lines of components that probably are not where the CAD has them.
@@ -249,10 +272,11 @@ class AssemblyMonitor:
     def _presences(self, is_ambiguous: bool) -> list[Presence]:
         """Presence of each component."""
         o, state = self.options, self._state
-        is_displaced = state.is_mismatched & (state.alternative > o.displaced_log_odds)
-        is_uncertain = self._is_uncertain()
+        is_missing = state.is_missing & (not self._turned.is_open)
+        is_displaced = is_missing & (state.alternative > o.displaced_log_odds)
+        is_uncertain = self._is_uncertain() | state.is_mismatched
         found = np.select(
-            [is_displaced, state.is_mismatched, state.is_verified, is_uncertain],
+            [is_displaced, is_missing, state.is_verified, is_uncertain],
             [Presence.DISPLACED, Presence.MISSING, Presence.PRESENT, Presence.UNCERTAIN],
             Presence.UNVERIFIED,
         )

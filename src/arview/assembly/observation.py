@@ -19,6 +19,7 @@ from arview.assembly.log_odds import Evidence, LogOddsOptions, edge_log_odds, pl
 from arview.assembly.placement_search import Alternatives, PlacementSearch, PlacementSearchOptions
 from arview.assembly.placements import PlacementOptions, alternative_placements
 from arview.assembly.presence_net import PartImage, PresenceNet, component_crops
+from arview.assembly.turned_poses import PoseEvidence
 from arview.assembly.visible_edges import VisibleEdgeCache, VisibleEdgeOptions, VisibleEdges
 from arview.cad.model import Model, make_model
 from arview.camera import Camera
@@ -46,6 +47,7 @@ class ObservationOptions:
         pose_found: share of the edge points of the base, and of others that are there, up to which the pose counts as
             wrong, and from which on it counts as right.
         occluded_probability: components with more are hidden by something before them.
+        max_seen: bound on the log odds for a component in the comparison of poses.
         max_log_odds: bound on the log odds of one observation, in both directions.
         visible_edges, edge_support, bare_place, log_odds, placements, placement_search: options of these steps.
     """
@@ -58,6 +60,7 @@ class ObservationOptions:
     suspect_log_odds: float = 1.0
     pose_found: tuple[float, float] = (0.4, 0.55)
     occluded_probability: float = 0.5
+    max_seen: float = 3.0
     max_log_odds: float = 4.0
     visible_edges: VisibleEdgeOptions = field(default_factory=VisibleEdgeOptions)
     edge_support: EdgeSupportOptions = field(default_factory=EdgeSupportOptions)
@@ -211,6 +214,18 @@ class ComponentObserver:
             network = self._network_log_odds(picture, known, is_doubtful)
         base = float(np.mean(points.is_found)) if len(points.is_found) else 0.0
         return Evidence(support, network, places, base), picture
+
+    def pose_evidence(self, image: NDArray[np.uint8], cam_from_model: Array) -> PoseEvidence:
+        """How much of the base, and of components at their nominal placements, a picture shows at a pose."""
+        o = self._options
+        crop = self._part_crop(image, cam_from_model)
+        edges = self._visible_edges.nearest(cam_from_model)
+        support = self._meter.measure(crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm)
+        by_edges = np.where(support.supported >= 0.0, edge_log_odds(support, o.log_odds), 0.0)
+        is_base = np.arange(self._count) == self.base
+        points = self._meter.found_points(edges, is_base)
+        seen = np.clip(-by_edges[~is_base], 0.0, o.max_seen)
+        return PoseEvidence(float(seen.sum()), float(np.mean(points.is_found)) if len(points.is_found) else 0.0)
 
     def visible_from(self, cam_from_model: Array) -> NDArray[np.bool_]:
         """(C,) components that show enough edge points of their own from about the direction of a pose."""

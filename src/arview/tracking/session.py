@@ -251,8 +251,9 @@ class TrackingSession:
         if estimate is None:
             guide = self._guide if self.is_aligning else None
             return Pose(None, None, 0.0, self.state, time_s, index, ms, reason, guide_cam_from_model=guide)
+        pose = estimate.cam_from_model
         return Pose(
-            cam_from_model=estimate.cam_from_model,
+            cam_from_model=pose,
             covariance=self.tracker.covariance(estimate),
             quality=estimate.quality,
             state=self.state,
@@ -262,11 +263,11 @@ class TrackingSession:
             reason=reason,
             mismatches=self.components.mismatches,
             unverified=self.components.unverified,
-            alternatives=tuple(self._state.hypotheses.poses(estimate.cam_from_model)),
+            alternatives=(*self._state.hypotheses.poses(pose), *self.components.other_poses(pose)),
             identity=known.identity,
             identity_reason=known.reason,
             serial=known.serial,
-            components=self.components.presence(estimate.cam_from_model, bool(self._state.hypotheses)),
+            components=self.components.presence(pose, bool(self._state.hypotheses)),
         )
 
     def _check_image(self, image: NDArray[np.uint8], index: int) -> None:
@@ -462,19 +463,19 @@ class TrackingSession:
     def _disambiguate(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> tuple[Estimate, str]:
         """Compare an ambiguous pose with its alternatives until the frames decide between them."""
         s = self._state
+        if (turn := self.components.better_turn) is not None:
+            return self._restart(image, estimate.cam_from_model @ turn), reason
         if not s.hypotheses:
             return estimate, reason
         others = s.hypotheses.poses(estimate.cam_from_model)
         score, *other_scores = self.tracker.scores_near(image, [estimate.cam_from_model, *others])
-        better = s.hypotheses.update(score, other_scores)
-        if better is not None:
+        if (better := s.hypotheses.update(score, other_scores)) is not None:
             s.hypotheses = HypothesisSet([])
             return self._restart(image, estimate.cam_from_model @ better), reason
-        count = len(s.hypotheses)
-        if count == 0 or reason:
+        if not s.hypotheses or reason:
             return estimate, reason
         s.apply(Event.CONTRADICTED)
-        poses = "another pose fits" if count == 1 else f"{count} other poses fit"
+        poses = "another pose fits" if len(s.hypotheses) == 1 else f"{len(s.hypotheses)} other poses fit"
         return estimate, f"ambiguous: {poses} as well; show another side"
 
     def _check_components(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:

@@ -1,0 +1,95 @@
+"""Poses in which the base looks the same: found, told apart by what is seen, and left open where nothing says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from arview.assembly.monitor import AssemblyMonitor
+from arview.assembly.turned_poses import PoseEvidence, TurnedPoses, base_symmetries
+from arview.geometry import Array, apply
+from arview.pose import Presence
+from arview.tracking import TrackingSession
+from helpers.cad_files import box
+from helpers.synthetic import CAMERA, assembly, assembly_views, changed, component, picture, pose_from, wrong
+
+NAMES = tuple(one.name for one in assembly().components)
+PLATE = assembly().components[0]
+HALF_TURN = base_symmetries(PLATE)
+
+
+def upright_turn() -> Array:
+    """The half turn about the plate's normal."""
+    return next(turn for turn in HALF_TURN if turn[2, 2] > 0.9)
+
+
+def test_the_symmetries_of_a_base_leave_it_where_it_is() -> None:
+    assert len(HALF_TURN) == 3
+    corners = PLATE.vertices_in_model
+    for turn in HALF_TURN:
+        turned = apply(turn, corners)
+        assert np.allclose(np.sort(turned, axis=0), np.sort(corners, axis=0), atol=1e-6)
+        assert not np.allclose(turned, corners, atol=1.0)
+    square = component("square", box((0, 0, 0), (50, 50, 10)), (0.5, 0.5, 0.5))
+    assert len(base_symmetries(square)) == 5
+    stepped = component("stepped", box((0, 0, 0), (80, 50, 20)), (0.5, 0.5, 0.5))
+    uneven = np.array(stepped.vertices_in_model)
+    uneven[(uneven[:, 0] > 40) & (uneven[:, 2] > 10)] += [0.0, 0.0, 12.0]
+    assert base_symmetries(component("uneven", (uneven, stepped.faces), (0.5, 0.5, 0.5))) == []
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "is_better", "is_open"),
+    [
+        (PoseEvidence(0.0, 0.8), PoseEvidence(9.0, 0.8), True, True),
+        (PoseEvidence(9.0, 0.8), PoseEvidence(0.0, 0.8), False, False),
+        (PoseEvidence(0.0, 0.8), PoseEvidence(0.5, 0.8), False, True),
+        (PoseEvidence(0.0, 0.5), PoseEvidence(0.0, 0.8), True, True),
+    ],
+)
+def test_what_is_seen_decides_between_poses(
+    here: PoseEvidence, there: PoseEvidence, is_better: bool, is_open: bool
+) -> None:
+    turned = TurnedPoses(PLATE)
+    assert not turned.is_open and turned.better is None and turned.poses(np.eye(4)) == ()
+    pose = pose_from(0, 45, 520)
+    for _ in range(2):
+        turned.compare(pose, lambda at: here if at is pose else there)
+    assert (turned.better is not None) == is_better
+    assert turned.is_open == is_open
+    turned.reset()
+    assert not turned.is_open
+
+
+@pytest.mark.slow
+def test_nothing_is_missing_while_the_part_may_be_turned() -> None:
+    left = ("plate", "post_1")
+    model = changed(assembly(), **dict.fromkeys(name for name in NAMES if name not in left))
+    seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
+    for k in range(3):
+        pose = pose_from(-60 + 20 * k, 45, 520)
+        seen.update(picture(pose, model, seed=k, scene=k, noise=3.0), pose @ upright_turn())
+        said = seen.presence(pose)
+        assert not any(one.presence is Presence.MISSING for one in said.values())
+        if seen.better_turn is not None:
+            break
+    assert seen.better_turn is not None
+    assert np.allclose(pose @ upright_turn() @ seen.better_turn, pose, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_session_started_turned_turns_back() -> None:
+    left = ("plate", "post_1", "block_1")
+    model = changed(assembly(), **dict.fromkeys(name for name in NAMES if name not in left))
+    poses = [pose_from(-40 + 3 * k, 45, 520) for k in range(20)]
+    start = wrong(poses[0] @ upright_turn(), np.random.default_rng(0), 0.3, 0.5)
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
+    for k, pose in enumerate(poses):
+        result = session.process(picture(pose, model, seed=k, scene=3, noise=3.0), k, k / 30)
+        assert not any(result.components[name].presence is Presence.MISSING for name in left if result.components)
+    assert result.cam_from_model is not None
+    off = apply(result.cam_from_model, PLATE.vertices_in_model) - apply(pose, PLATE.vertices_in_model)
+    assert np.abs(off).max() < 3.0
+    present = {name for name, one in result.components.items() if one.presence is Presence.PRESENT}
+    missing = {name for name, one in result.components.items() if one.presence is Presence.MISSING}
+    assert present == set(left) and missing == set(NAMES) - set(left)
