@@ -55,11 +55,14 @@ class BackgroundMotion:
 
     Attributes:
         homography: (3,3) from the first picture to the last, px of the frame; None where it is not known.
+        is_chained: whether an unbroken chain of frames gave it. One matched over a gap says where the part is, but not
+            where it is not, because the view may have changed so much that the scene is no plane any more.
     """
 
     def __init__(self, outline: PartOutline, options: BackgroundMotionOptions | None = None) -> None:
         self.options = options or BackgroundMotionOptions()
         self.homography: Array | None = None
+        self.is_chained = False
         self._outline = outline
         self._first: ReducedPicture | None = None
         self._first_pose: Array | None = None
@@ -72,6 +75,7 @@ class BackgroundMotion:
         self._first_pose = cam_from_model
         self._features = None
         self.homography = np.eye(3)
+        self.is_chained = True
 
     def follow(self, image: NDArray[np.uint8], cam_from_model: Array | None) -> None:
         """Follow the background into the next frame (H,W,3) uint8 RGB with the part at a pose (4,4), if it is known."""
@@ -81,6 +85,7 @@ class BackgroundMotion:
         if self.homography is not None:
             link = self._link(before, self._last, cam_from_model)
             self.homography = None if link is None else self._checked(link @ self.homography)
+            self.is_chained = self.is_chained and self.homography is not None
 
     def match(self, cam_from_model: Array | None) -> None:
         """Match the last frame, with the part at a pose (4,4), with the first picture, where no chain links them."""

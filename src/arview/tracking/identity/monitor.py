@@ -362,7 +362,7 @@ class IdentityMonitor:
         """Look for another specimen in the picture before the gap, and in a later frame in the present one."""
         assert self._kept is not None
         if doubt.stage == 0:
-            doubt.is_placed = self._motion.homography is not None
+            doubt.is_placed = self._motion.homography is not None and self._motion.is_chained
             is_other = self._is_other_before(pose, doubt, finders)
         else:
             is_other = self._is_any_new(self._search.others(image, pose, finders), finders.others)
@@ -381,7 +381,7 @@ class IdentityMonitor:
             if seen is not None and self._is_apart(seen, kept.cam_from_model):
                 return self._is_kept_right(kept, finders)
             doubt.has_seen_place = True
-        if self._motion.homography is not None:
+        if doubt.is_placed:
             return False
         if self._others_before is None:
             self._others_before = self._search.others(kept.image, kept.cam_from_model, finders)

@@ -86,17 +86,23 @@ class SpecimenSearch:
         for start in self._turned(guess) if is_turned else [guess]:
             found = finders.guided_init.find(image, start)
             is_there = found is not None and found.quality >= self._options.found_quality
-            if found and is_there and not self.is_apart(self._outline.place(found.cam_from_model), wanted):
+            if found and is_there and self._is_near(self._outline.place(found.cam_from_model), wanted):
                 return found.cam_from_model
         return None
 
     def is_apart(self, a: PartPlace, b: PartPlace) -> bool:
-        """Whether two places are those of different specimens."""
+        """Whether two places in a picture are those of different specimens.
+
+        Of two poses before each other one is wrong, because a specimen would hide the other.
+        """
+        aside_px = float(np.linalg.norm(a.center_px - b.center_px))
+        return aside_px > self._options.apart * max(a.diameter_px, b.diameter_px)
+
+    def _is_near(self, a: PartPlace, b: PartPlace) -> bool:
+        """Whether a place is about another one, also along the line of sight."""
         o = self._options
-        aside = np.linalg.norm(a.center_px - b.center_px) / max(a.diameter_px, b.diameter_px)
-        along_mm = abs(a.distance_mm - b.distance_mm)
-        far_mm = max(o.same_depth * self._outline.views.diameter_mm, o.same_depth_share * b.distance_mm)
-        return bool(aside > o.apart or along_mm > 2.0 * far_mm)
+        far_mm = 2.0 * max(o.same_depth * self._outline.views.diameter_mm, o.same_depth_share * b.distance_mm)
+        return not self.is_apart(a, b) and abs(a.distance_mm - b.distance_mm) <= far_mm
 
     def _turned(self, cam_from_model: Array) -> list[Array]:
         """A pose (4,4), and poses with the part turned about its centre around the axes across the line of sight."""
