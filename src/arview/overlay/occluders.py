@@ -68,10 +68,10 @@ class OccluderOptions:
     cells: int = 72
     samples: int = 3500
     min_observations: int = 6
-    hue_noise: float = 5.0
-    noise: float = 10.0
-    shade: float = 0.75
-    shine: float = 1.4
+    hue_noise: float = 4.0
+    noise: float = 8.0
+    shade: float = 0.85
+    shine: float = 1.25
     max_variance: float = 150.0
     min_score: float = 6.0
     min_share: float = 0.55
