@@ -1,7 +1,8 @@
 // Layout of the labels in two columns beside the part (boundary labelling, Bekos et al. 2007). Within a column the labels
 // have the order of their anchors, and their rows minimise, by dynamic programming, the covered area, the distance to the
 // component and the movement. Old and new rows do not overlap and have the same order, so labels that all move by the
-// same fraction do not overlap either. When the order of a column changes, its labels jump.
+// same fraction do not overlap either. When the order of a column changes, its labels jump. Two neighbours whose leaders
+// cross for a while change places: straight leaders from one column of ports to the exchanged anchors do not cross.
 
 const STEP_PX = 6; // spacing of the candidate rows
 const COVER_COST = 60; // cost of a label that covers components entirely; an offset of a tenth of the area's height costs 1
@@ -9,13 +10,19 @@ const REACH_COST = 10, FULLNESS_COST = 3; // cost of a leader across the whole a
 const STAY_GAIN = 1.5; // reward for staying in a column
 const GLIDE = 0.2; // fraction of the remaining path that labels move in each call
 const GAP_PX = 6;
+const PORT_PX = 17; // height of a leader's beginning below the top of its label
+const CROSSED_CALLS = 8; // calls for which leaders cross before their labels change places
 
 export class LabelLayout {
   #columns = { left: [], right: [] }; // {key, y}
   #edges = null;
+  #exchanged = new Set(); // "upper>lower" for neighbours that are not in the order of their anchors
+  #crossed = { left: new Map(), right: new Map() }; // calls for which the leaders of "upper>lower" have crossed
 
   reset() {
     this.#columns = { left: [], right: [] };
+    this.#exchanged.clear();
+    this.#crossed = { left: new Map(), right: new Map() };
     this.#edges = null;
   }
 
@@ -71,7 +78,7 @@ export class LabelLayout {
 
   #column(side, area, requests, covered, step) {
     const old = this.#columns[side];
-    const order = sorted(requests, old);
+    const order = sorted(requests, old, this.#exchanged);
     const isSameOrder = order.length === old.length && order.every((one, i) => one.key === old[i].key);
     const lefts = order.map((one) => (side === "left" ? this.#edges.left - one.width : this.#edges.right));
     const limited = lefts.map((x, i) => Math.min(Math.max(x, area.left), area.left + area.width - order[i].width));
@@ -93,12 +100,36 @@ export class LabelLayout {
       low = one.y + one.height + GAP_PX;
     }
     this.#columns[side] = placed;
+    this.#exchange(side, order, placed);
     return placed.map(({ key, y, isNew }, i) => ({ key, left: limited[i], top: y, side, isNew }));
+  }
+
+  /** Let neighbours of a column change places whose leaders have crossed for a while. */
+  #exchange(side, order, placed) {
+    const line = (i) => [this.#edges[side], placed[i].y + Math.min(placed[i].height / 2, PORT_PX), order[i].x, order[i].y];
+    const crossed = new Map();
+    for (let i = 0; i + 1 < order.length; i++) {
+      if (!cross(line(i), line(i + 1))) continue;
+      const [upper, lower] = [order[i].key, order[i + 1].key], key = `${upper}>${lower}`;
+      const calls = (this.#crossed[side].get(key) ?? 0) + 1;
+      if (calls < CROSSED_CALLS) crossed.set(key, calls);
+      else if (!this.#exchanged.delete(key)) this.#exchanged.add(`${lower}>${upper}`);
+    }
+    this.#crossed[side] = crossed;
   }
 }
 
-/** Requests from top to bottom; two previous neighbours swap only when their anchors clearly require it. */
-function sorted(requests, old) {
+/** Whether two segments [x0, y0, x1, y1] cross. */
+function cross(one, other) {
+  const side = ([x0, y0, x1, y1], x, y) => (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0);
+  return side(one, other[0], other[1]) * side(one, other[2], other[3]) < 0 && side(other, one[0], one[1]) * side(other, one[2], one[3]) < 0;
+}
+
+/**
+ * Requests from top to bottom; two previous neighbours swap only when their anchors clearly require it, or their leaders
+ * would cross.
+ */
+function sorted(requests, old, exchanged) {
   const rank = new Map(old.map((one, i) => [one.key, i]));
   const order = [...requests].sort((a, b) => a.y - b.y || (a.key < b.key ? -1 : 1));
   for (let again = true, guard = 0; again && guard < 50; guard++) {
@@ -111,6 +142,9 @@ function sorted(requests, old) {
         again = true;
       }
     }
+  }
+  for (let i = 0; i + 1 < order.length; i++) {
+    if (exchanged.has(`${order[i + 1].key}>${order[i].key}`)) [order[i], order[i + 1]] = [order[i + 1], order[i]];
   }
   return order;
 }
