@@ -54,6 +54,7 @@ from suites.real_conditions import REAL_FRAMES, REAL_SHAPES, RealConditionsSuite
 from suites.reconstruction import reconstruction_rows
 from suites.relocalization import relocalization_rows
 from suites.scale import SCALED, acceptance_rows, scale_rows
+from suites.several import SeveralSuite
 from suites.single_photos import evaluate_photos, photo_rows
 
 TRUSTED = (TrackingState.TRACKED, TrackingState.CRITICAL)
@@ -62,7 +63,7 @@ SEED = 7
 SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
     "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
-    "accepted", "scale", "presence",
+    "accepted", "scale", "presence", "several",
 )  # fmt: skip
 
 
@@ -126,6 +127,7 @@ def main() -> None:
         lambda: [row for name in PHOTO_SEQUENCES if name in every for row in acceptance_rows(every[name])],
         lambda: [row for name in SCALED if name in every for row in scale_rows(every[name], "truth", details)],
         presence.rows,
+        lambda: SeveralSuite(found, details, chosen.frames).rows(),
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []
