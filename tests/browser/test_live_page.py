@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -20,12 +19,13 @@ from arview.camera import Camera
 from arview.live.stream.stamp import Stamp, stamp_strip
 from arview.live.stream.subject import Subject
 from arview.overlay.guide import GUIDE_RGB
-from arview.pose import ComponentPresence, Identity, Pose, Presence, Visibility
+from arview.pose import ComponentPresence, Identity, Presence, Visibility
 from arview.video import VideoSink
 from helpers import live_browser
 from helpers.live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
 from helpers.live_client import Running, running
 from helpers.live_sample import INSPECTION, loader, options
+from helpers.told_session import TOLD, Told
 
 WIDTH, HEIGHT, FPS = 640, 360, 5
 COLOUR_GAP_PX = 7
@@ -37,26 +37,6 @@ VIEWPORT = {"width": 680, "height": 640}
 """Here the picture is shown a little larger than it is."""
 MEDIAN_PX, MAX_PX = 1.5, 4.0
 """Of the ghost's outline; of the part itself nothing may be further off in nineteen of twenty places."""
-
-
-class Told:
-    """A session whose poses say something of the components."""
-
-    def __init__(self, session: Any, names: list[str]) -> None:
-        self._session, self._names = session, names
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._session, name)
-
-    def process(self, image: Any, index: int, time_s: float) -> Pose:
-        pose = self._session.process(image, index, time_s)
-        present = ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0)
-        components = {**dict.fromkeys(self._names, present), **TOLD["components"]}
-        return replace(pose, components=components if pose.cam_from_model is not None else {}, **TOLD["more"])
-
-
-TOLD: dict[str, dict[str, Any]] = {"components": {}, "more": {}}
-"""What all sessions say: of components that are not present, and more fields of the pose."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -503,34 +483,8 @@ def test_modules_agree_with_the_server(chromium: Any, server: Running) -> None:
         assert np.allclose(np.array(pixels)[:, 2:], lens.without_distortion().project(points), atol=1e-6)
 
 
-LAYOUTS = """async () => {
-  const { LabelLayout } = await import("/static/scene/layout.js");
-  const side = ([x0, y0, x1, y1], x, y) => (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0);
-  const parts = (a, b) => side(a, b[0], b[1]) * side(a, b[2], b[3]) < 0;
-  const cross = (a, b) => parts(a, b) && parts(b, a);
-  let seed = 1, counts = { first: 0, last: 0, labels: 0 };
-  const random = () => (seed = (seed * 16807) % 2147483647) / 2147483647;
-  for (let trial = 0; trial < 40; trial++) {
-    const layout = new LabelLayout(), area = { left: 0, top: 0, width: 1000, height: 640 };
-    const requests = Array.from({ length: 12 }, (_, i) => (
-      { key: `k${i}`, width: 150, height: 34 + 16 * (i % 2), x: 350 + 300 * random(), y: 120 + 400 * random() }));
-    for (let call = 0; call < 80; call++) {
-      const placed = layout.place(area, requests, { left: 340, right: 660 }, () => 0, true);
-      const lines = placed.map((one) => {
-        const request = requests.find(({ key }) => key === one.key);
-        return [one.side === "left" ? one.left + request.width : one.left, one.top + 17, request.x, request.y];
-      });
-      const crossings = lines.flatMap((a, i) => lines.slice(i + 1).filter((b) => cross(a, b))).length;
-      if (call === 0) counts.first += crossings;
-      if (call === 79) { counts.last += crossings; counts.labels += placed.length; }
-    }
-  }
-  return counts;
-}"""
-
-
 def test_leaders_on_the_page_do_not_cross(chromium: Any, server: Running) -> None:
     with opened(chromium, server) as page:
-        counts = page.evaluate(LAYOUTS)
+        counts = page.evaluate((Path(__file__).parent / "leader_crossings.js").read_text())
     assert counts["labels"] == 40 * 12
     assert counts["first"] > 0 and counts["last"] == 0
