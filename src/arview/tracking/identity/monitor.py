@@ -441,14 +441,14 @@ class IdentityMonitor:
         if self._named_at is None or index < self._named_at[0] or estimate is None:
             return None
         first, pixel = self._named_at
-        if self.outline.contains(estimate.cam_from_model, pixel, 0.03):
+        if self.outline.contains(estimate.cam_from_model, pixel, self.options.pixel_margin):
             self.confirm()
             return None
         self._named_at = None
-        for other in self._search.others(image, estimate.cam_from_model, finders, is_thorough=True):
-            if self.outline.contains(other, pixel, 0.03):
-                self.confirm()
-                return other
+        other = self._search.at_pixel(image, estimate.cam_from_model, pixel, finders)
+        if other is not None:
+            self.confirm()
+            return other
         self._kept = None
         reason = f"no part of this kind found at {pixel[0]:g},{pixel[1]:g} in frame {first}; confirm the part"
         self._doubt = Doubt(math.inf, math.inf, reason=reason)

@@ -63,6 +63,9 @@ class IdentityOptions:
             the motion of the background is not known.
         apart: shift in diameters from which a second detection is another specimen.
         max_specimens: specimens looked for in one picture.
+        pixel_turns_deg, pixel_distances: rotations about the vertical axis of the picture, and distances relative to
+            that of the tracked part, that are tried first for a part at a named pixel.
+        pixel_margin: distance from the outline, in diameters, at which a named pixel still lies on a part.
         watch_s: time for which the old place is watched before a part that was found elsewhere has its labels back.
         watch_every_s: time between two checks of the old place.
         min_room: share of the part's box that must lie in the picture for its place to count as seen.
@@ -85,6 +88,9 @@ class IdentityOptions:
     max_unknown_frames: int = 5
     apart: float = 0.5
     max_specimens: int = 3
+    pixel_turns_deg: tuple[float, ...] = (0.0, 25.0, -25.0, 50.0, -50.0)
+    pixel_distances: tuple[float, ...] = (1.0, 0.8, 1.25, 0.64, 1.56)
+    pixel_margin: float = 0.03
     watch_s: float = 0.75
     watch_every_s: float = 0.25
     min_room: float = 0.7

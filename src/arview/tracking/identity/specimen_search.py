@@ -90,6 +90,29 @@ class SpecimenSearch:
                 return found.cam_from_model
         return None
 
+    def at_pixel(self, image: NDArray[np.uint8], known: Array, pixel: Array, finders: Finders) -> Array | None:
+        """The pose (4,4) of the part at a pixel (2,) that lies on it, beside a known one (4,4); None without one there.
+
+        Parts on one bench are seen from about the same side, so those of the known pose are tried before all others.
+        """
+        o = self._options
+        shift = np.eye(3)
+        shift[:2, 2] = pixel - self._outline.place(known).center_px
+        start = self._outline.moved(known, shift)
+        guesses = []
+        for turn_deg in o.pixel_turns_deg:
+            turned = self._turned_by(start, exp_so3([0.0, np.deg2rad(turn_deg), 0.0]))
+            guesses += [self._farther(turned, factor) for factor in o.pixel_distances]
+        for guess in guesses:
+            found = finders.guided_init.find(image, guess)
+            is_good = found is not None and found.quality >= o.found_quality
+            if found and is_good and self._outline.contains(found.cam_from_model, pixel, o.pixel_margin):
+                return found.cam_from_model
+        for other in self.others(image, known, finders, is_thorough=True):
+            if self._outline.contains(other, pixel, o.pixel_margin):
+                return other
+        return None
+
     def is_apart(self, a: PartPlace, b: PartPlace) -> bool:
         """Whether two places in a picture are those of different specimens.
 
@@ -110,9 +133,15 @@ class SpecimenSearch:
         angle_rad = np.deg2rad(self._options.turn_deg)
         for x, y in ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0)):
             turns.append(exp_so3(angle_rad * np.array([x, y, 0.0])))
+        return [self._turned_by(cam_from_model, turn) for turn in turns]
+
+    def _turned_by(self, cam_from_model: Array, turn: Array) -> Array:
+        """A pose (4,4) with the part turned about its centre by a rotation (3,3) of the camera frame."""
+        rotation = turn @ cam_from_model[:3, :3]
         center = self._outline.center_in_cam(cam_from_model)
-        poses = []
-        for turn in turns:
-            rotation = turn @ cam_from_model[:3, :3]
-            poses.append(rigid(rotation, center - rotation @ self._outline.views.center_in_model))
-        return poses
+        return rigid(rotation, center - rotation @ self._outline.views.center_in_model)
+
+    def _farther(self, cam_from_model: Array, factor: float) -> Array:
+        """A pose (4,4) whose centre is farther away by a factor."""
+        center = self._outline.center_in_cam(cam_from_model)
+        return rigid(cam_from_model[:3, :3], cam_from_model[:3, 3] + (factor - 1.0) * center)
