@@ -27,21 +27,23 @@ class SeveralSessions:
         sessions: by the names of the specimens, which are the `Pose.instance` of their poses. Sessions of the same
             guide views track specimens of the same part.
         search_every: while any of them is tracked, the others search only in every n-th frame.
+        eager_frames: frames without a pose in which they may search in every frame all the same.
 
     Raises:
         InputError: no session, or sessions of different cameras.
     """
 
-    def __init__(self, sessions: Mapping[str, TrackingSession], search_every: int = 3) -> None:
+    def __init__(self, sessions: Mapping[str, TrackingSession], search_every: int = 3, eager_frames: int = 15) -> None:
         if not sessions:
             raise InputError("several parts: no session given")
         first = next(iter(sessions.values()))
         if any(one.camera != first.camera for one in sessions.values()):
             raise InputError("several parts: the sessions have different cameras; make them all for the same camera")
         self.sessions = dict(sessions)
-        self._search_every = search_every
+        self._search_every, self._eager_frames = search_every, eager_frames
         self._poses: dict[str, Pose] = {}
         self._age = dict.fromkeys(self.sessions, 0)
+        self._missing = dict.fromkeys(self.sessions, 0)
         self._turn = self._frames = 0
 
     def process(self, image: NDArray[np.uint8], index: int, time_s: float) -> tuple[Pose, ...]:
@@ -66,7 +68,9 @@ class SeveralSessions:
                 self._poses[name] = self._waiting(name, index, time_s)
         self._separate()
         for name, pose in self._poses.items():
-            self._age[name] = self._age[name] + 1 if pose.cam_from_model is not None else 0
+            is_followed = pose.cam_from_model is not None
+            self._age[name] = self._age[name] + 1 if is_followed else 0
+            self._missing[name] = 0 if is_followed else self._missing[name] + 1
         return tuple(self._poses[name] for name in self.sessions)
 
     def _without_pose(self) -> list[str]:
@@ -76,7 +80,9 @@ class SeveralSessions:
         """The session without a pose whose turn it is to search in this frame; none if all have one."""
         waiting = self._without_pose()
         self._frames += 1
-        if not waiting or (len(waiting) < len(self.sessions) and self._frames % self._search_every):
+        if len(waiting) < len(self.sessions) and self._frames % self._search_every:
+            waiting = [name for name in waiting if self._missing[name] < self._eager_frames]
+        if not waiting:
             return []
         self._turn += 1
         return [waiting[(self._turn - 1) % len(waiting)]]
