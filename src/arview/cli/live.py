@@ -80,6 +80,11 @@ page says so, until the focal length has been estimated from views of the part f
 sides. --save-profile NAME keeps the estimate at the end, for --camera profile:NAME.
 
 \b
+When another part of the same kind is in view and it is not certain which one is tracked, labels are
+withheld until the followed one is seen again, a code on the part gives the serial number, or the button
+"This is the part" (key C) is pressed.
+
+\b
 The page reloads inspection.json when it changes, and warns when it is older than --max-age or has another
 serial number than the part file (or --serial). Recordings made from the page are put in the folder of
 --record, or in the current one. Ctrl-C ends the run and finishes the files.""",
