@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from arview.assembly.monitor import AssemblyMonitor
-from arview.assembly.turned_poses import PoseEvidence, TurnedPoses, base_symmetries
+from arview.assembly.turned_poses import TurnEvidence, TurnedPoses, base_symmetries
 from arview.geometry import Array, apply
 from arview.pose import Presence
 from arview.tracking import TrackingSession
@@ -41,14 +41,14 @@ def test_the_symmetries_of_a_base_leave_it_where_it_is() -> None:
 @pytest.mark.parametrize(
     ("here", "there", "is_better", "is_open"),
     [
-        (PoseEvidence(0.0, 0.8), PoseEvidence(9.0, 0.8), True, True),
-        (PoseEvidence(9.0, 0.8), PoseEvidence(0.0, 0.8), False, False),
-        (PoseEvidence(0.0, 0.8), PoseEvidence(0.5, 0.8), False, True),
-        (PoseEvidence(0.0, 0.5), PoseEvidence(0.0, 0.8), True, True),
+        (TurnEvidence(0.0, 0.8), TurnEvidence(9.0, 0.8), True, True),
+        (TurnEvidence(9.0, 0.8), TurnEvidence(0.0, 0.8), False, False),
+        (TurnEvidence(0.0, 0.8), TurnEvidence(0.5, 0.8), False, True),
+        (TurnEvidence(0.0, 0.5), TurnEvidence(0.0, 0.8), True, True),
     ],
 )
 def test_what_is_seen_decides_between_poses(
-    here: PoseEvidence, there: PoseEvidence, is_better: bool, is_open: bool
+    here: TurnEvidence, there: TurnEvidence, is_better: bool, is_open: bool
 ) -> None:
     turned = TurnedPoses(PLATE)
     assert not turned.is_open and turned.better is None and turned.poses(np.eye(4)) == ()

@@ -19,7 +19,7 @@ from arview.assembly.log_odds import Evidence, LogOddsOptions, edge_log_odds, pl
 from arview.assembly.placement_search import Alternatives, PlacementSearch, PlacementSearchOptions
 from arview.assembly.placements import PlacementOptions, alternative_placements
 from arview.assembly.presence_net import PartImage, PresenceNet, component_crops
-from arview.assembly.turned_poses import PoseEvidence
+from arview.assembly.turned_poses import TurnEvidence
 from arview.assembly.visible_edges import VisibleEdgeCache, VisibleEdgeOptions, VisibleEdges
 from arview.cad.model import Model, make_model
 from arview.camera import Camera
@@ -215,7 +215,7 @@ class ComponentObserver:
         base = float(np.mean(points.is_found)) if len(points.is_found) else 0.0
         return Evidence(support, network, places, base), picture
 
-    def pose_evidence(self, image: NDArray[np.uint8], cam_from_model: Array) -> PoseEvidence:
+    def pose_evidence(self, image: NDArray[np.uint8], cam_from_model: Array) -> TurnEvidence:
         """How much of the base, and of components at their nominal placements, a picture shows at a pose."""
         o = self._options
         crop = self._part_crop(image, cam_from_model)
@@ -225,7 +225,7 @@ class ComponentObserver:
         is_base = np.arange(self._count) == self.base
         points = self._meter.found_points(edges, is_base)
         seen = np.clip(-by_edges[~is_base], 0.0, o.max_seen)
-        return PoseEvidence(float(seen.sum()), float(np.mean(points.is_found)) if len(points.is_found) else 0.0)
+        return TurnEvidence(float(seen.sum()), float(np.mean(points.is_found)) if len(points.is_found) else 0.0)
 
     def visible_from(self, cam_from_model: Array) -> NDArray[np.bool_]:
         """(C,) components that show enough edge points of their own from about the direction of a pose."""

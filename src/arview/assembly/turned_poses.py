@@ -43,7 +43,7 @@ class TurnedPoseOptions:
     worse: float = -3.5
 
 
-class PoseEvidence(NamedTuple):
+class TurnEvidence(NamedTuple):
     """Log odds by the components that are seen at a pose, and the share of the base's edge points that are found."""
 
     components: float
@@ -88,7 +88,7 @@ class TurnedPoses:
         self._sums: list[float] = []
         self._is_compared = False
 
-    def compare(self, cam_from_model: Array, evidence_at: Callable[[Array], PoseEvidence]) -> None:
+    def compare(self, cam_from_model: Array, evidence_at: Callable[[Array], TurnEvidence]) -> None:
         """Compare the poses in one picture, and drop those that are clearly worse.
 
         Args:

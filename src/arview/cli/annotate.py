@@ -347,7 +347,7 @@ def _exit_if_interrupted(ctx: click.Context, summary: AnnotateSummary) -> None:
 def _overlay(part: Part, inspection: Inspection | None, options: OverlayOptions, camera: Camera) -> OverlayRenderer:
     from arview.overlay import OverlayRenderer
 
-    return OverlayRenderer(part.model, camera, inspection, options, part.serial)
+    return OverlayRenderer(part.model, camera, inspection, options, serial=part.serial)
 
 
 def _drawing_options(show_edges: str, no_ghost: bool, no_labels: bool, opacity: float | None) -> OverlayOptions:

@@ -102,6 +102,7 @@ class OverlayRenderer:
         camera: Camera,
         inspection: Inspection | None = None,
         options: OverlayOptions | None = None,
+        *,
         serial: str | None = None,
     ) -> None:
         """Prepare the drawing; ``serial`` is the serial number of the part in view, where it is known."""

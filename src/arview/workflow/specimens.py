@@ -105,7 +105,7 @@ def make_overlay(specimens: Sequence[Specimen], options: OverlayOptions, camera:
 
     return SeveralOverlay(
         {
-            name: OverlayRenderer(part.model, camera, inspection, options, part.serial)
+            name: OverlayRenderer(part.model, camera, inspection, options, serial=part.serial)
             for name, part, inspection in specimens
         }
     )

@@ -163,4 +163,4 @@ class Subject:
             wanted = tuple(one for one in inspection.components if one.name == style.only)
             inspection = replace(inspection, components=wanted)
         options = replace(style.overlay_options(), max_age_days=self.label_options.max_age_days)
-        return OverlayRenderer(self.part.model, camera, inspection, options, self.serial)
+        return OverlayRenderer(self.part.model, camera, inspection, options, serial=self.serial)
