@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from arview.assembly.monitor import AssemblyMonitor
-from arview.assembly.turned_poses import TurnEvidence, TurnedPoses, base_symmetries
+from arview.assembly.turned_poses import TurnedPoses, TurnEvidence, base_symmetries
 from arview.geometry import Array, apply
 from arview.pose import Presence
 from arview.tracking import TrackingSession
