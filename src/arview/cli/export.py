@@ -30,16 +30,18 @@ Examples:
 
 \b
 csv   one line per component
-qif   QIF 3.0 results (ISO 23952): position with spherical zone, x y z, rotation, with standard
-      uncertainties
-dfq   Q-DAS ASCII transfer format (AQDEF): distance, dx, dy, dz and tilt of each component as
-      characteristics
+qif   QIF 3.0 results (ISO 23952): position with spherical zone, x y z, rotation and presence, with
+      standard uncertainties
+dfq   Q-DAS ASCII transfer format (AQDEF): distance, dx, dy, dz, tilt and presence of each component as
+      characteristics; a missing component is an attribute with one error
 glb   glTF 2.0: components at nominal and measured place, coloured by verdict, with arrows; needs --part
 html  the report, as `arview report` writes it
 pdf   the report as PDF
 
 \b
-An undetermined quantity has no value in any of them. The fields of inspection.json are described in
+An undetermined quantity has no value in any of them. Numbers are rounded to what their U allows, with U
+to two significant digits; inspection.json keeps every digit. Each carries the fingerprint of the
+inspection that report and results store show. The fields of inspection.json are described in
 src/arview/inspection/schema/inspection-json.md and by the JSON Schema next to it.""",
 )
 @click.argument("inspection", metavar="INSPECTION")
@@ -62,6 +64,7 @@ def export(
     """Write INSPECTION in other formats."""
     from arview.cad import load_part
     from arview.inspection import load_inspection
+    from arview.inspection.fingerprint import fingerprint_of_file
     from arview.inspection.export import to_csv, to_dfq, to_glb, to_qif
 
     source = Path(inspection)
@@ -70,14 +73,15 @@ def export(
     if "glb" in formats and part is None:
         raise InputError("glb: the CAD is needed; name it with --part")
     loaded = load_inspection(source, None if part is None else part.model)
+    sha256 = fingerprint_of_file(source)
     made: dict[str, Callable[[], bytes]] = {
-        "csv": lambda: to_csv(loaded).encode("utf-8"),
-        "qif": lambda: to_qif(loaded),
-        "dfq": lambda: to_dfq(loaded),
+        "csv": lambda: to_csv(loaded, sha256).encode("utf-8"),
+        "qif": lambda: to_qif(loaded, sha256),
+        "dfq": lambda: to_dfq(loaded, sha256),
     }
     if part is not None:
         model = part.model
-        made["glb"] = lambda: to_glb(loaded, model)
+        made["glb"] = lambda: to_glb(loaded, model, sha256=sha256)
     for name, target in targets.items():
         if name in made:
             write_bytes(target, made[name]())

@@ -6,7 +6,6 @@ by a hash of their content, so that adding one twice, or again after an interrup
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import random
@@ -32,6 +31,7 @@ from sqlalchemy.exc import (
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.history.tables import STORE_VERSION, about, components, guards, metadata, results
 from arview.inspection import Inspection, load_inspection
+from arview.inspection.fingerprint import content_hash
 from arview.inspection.summary import overall_verdict
 
 _BUSY_S = 30.0
@@ -329,12 +329,6 @@ class _Failure(OutputError):
     def __init__(self, message: str, is_temporary: bool) -> None:
         super().__init__(message)
         self.is_temporary = is_temporary
-
-
-def content_hash(document: Any) -> str:
-    """SHA-256 of a JSON document independent of its formatting: of its UTF-8 text with sorted keys and no spaces."""
-    text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _is_temporary(error: SQLAlchemyError) -> bool:

@@ -66,7 +66,7 @@ def save_inspection(inspection: Inspection, path: str | Path) -> None:
     """
     check_type(inspection, Inspection, "save_inspection: inspection")
     path = Path(path)
-    text = json.dumps(_to_document(inspection), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(to_document(inspection), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     try:
         with replacing(path) as file:
             file.write(text.encode())
@@ -214,7 +214,8 @@ def _component(entry: dict[str, Any]) -> ComponentDeviation:
     )
 
 
-def _to_document(inspection: Inspection) -> dict[str, Any]:
+def to_document(inspection: Inspection) -> dict[str, Any]:
+    """The inspection as the JSON document that `save_inspection` writes."""
     source = inspection.provenance
     software, options = dict(source.software), dict(source.options)
     more: dict[str, Any] = {

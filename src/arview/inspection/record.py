@@ -68,6 +68,13 @@ class ComponentDeviation:
     finding: Finding | None = None
     details: Details | None = None
 
+    @property
+    def is_present(self) -> bool | None:
+        """Whether the component is there: False if missing, True if anything of it was measured, None if unknown."""
+        if self.finding is Finding.MISSING:
+            return False
+        return True if any(self.observable) else None
+
     def __post_init__(self) -> None:
         self._check_numbers()
         self._check_observable()

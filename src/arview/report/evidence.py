@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from arview.cad.part import Part
 from arview.errors import ArviewError, InputError
 from arview.geometry import apply, invert
 from arview.inspection import Inspection, load_inspection
+from arview.inspection.fingerprint import fingerprint_of_file
 from arview.measurement.cloud.distance_map import (
     DistanceMap,
     distance_map,
@@ -27,7 +27,7 @@ class ReportEvidence:
     Attributes:
         inspection: the inspection.
         source: its file.
-        sha256: hash of that file, hexadecimal.
+        sha256: fingerprint of the inspection, as in the results store and the exports.
         part: the part with its CAD model; None when not given.
         sparse: photos with their poses, and points; None without the folder of the reconstruction.
         cloud: dense cloud in the colours of the photos, or None.
@@ -62,7 +62,7 @@ def gather(
     """
     source = Path(source)
     inspection = load_inspection(source, None if part is None else part.model)
-    sha256 = hashlib.sha256(source.read_bytes()).hexdigest()
+    sha256 = fingerprint_of_file(source)
     absent: dict[str, str] = {}
     if part is None:
         absent["part"] = "The CAD model was not given (--part), so it is not drawn."

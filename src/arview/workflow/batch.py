@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from arview.core.stage_cache import write_json
 from arview.errors import ArviewError, CannotMeasureError, InputError, MismatchError, MissingDependencyError
+from arview.inspection.fingerprint import content_hash, fingerprint_of_file
 from arview.version import __version__
 from arview.workflow.jobs_file import LOCATION_FIELDS, BatchJob
 from arview.workflow.lock import exclusive_access
@@ -43,7 +44,7 @@ class JobResult:
         text: summary of the verdicts, or why there is no verdict.
         out: folder or URL of the results.
         key: hash of everything that the results depend on; empty for errors.
-        inspection_sha256: hash of ``inspection.json``; empty when there is none.
+        inspection_sha256: fingerprint of ``inspection.json``; empty when there is none.
         is_kept: whether the result is that of an earlier run.
     """
 
@@ -147,7 +148,7 @@ def _run(job: BatchJob, local: InspectJob, folder: Path, work: Work) -> JobResul
     verdict, text = work.inspect(local, folder)
     files = [name for name in work.files if (folder / name).is_file()]
     source = folder / "inspection.json"
-    digest = hashlib.sha256(source.read_bytes()).hexdigest() if source.is_file() else ""
+    digest = fingerprint_of_file(source) if source.is_file() else ""
     result = JobResult(job.name, verdict, text, job.out, key, digest)
     write_json(folder / RESULT, {**asdict(result), "files": files, "version": __version__})
     if is_url(job.out):
@@ -165,11 +166,20 @@ def finished(job: BatchJob, key: str) -> JobResult | None:
         result = JobResult(**{**{name: known[name] for name in JobResult.__dataclass_fields__}, "is_kept": True})
     except (ValueError, KeyError, TypeError):
         return None
-    inspection = read(f"{job.out}/inspection.json") if result.inspection_sha256 else b""
-    is_whole = inspection is not None and (
-        not result.inspection_sha256 or hashlib.sha256(inspection).hexdigest() == result.inspection_sha256
+    is_whole = not result.inspection_sha256 or _has_fingerprint(
+        read(f"{job.out}/inspection.json"), result.inspection_sha256
     )
     return replace(result, name=job.name, out=job.out) if result.key == key and is_whole else None
+
+
+def _has_fingerprint(content: bytes | None, sha256: str) -> bool:
+    """Whether an inspection is there and unchanged; results of arview 0.9 and before hold the hash of its bytes."""
+    if content is None:
+        return False
+    try:
+        return sha256 in (content_hash(json.loads(content)), hashlib.sha256(content).hexdigest())
+    except ValueError:
+        return False
 
 
 def run_batch(

@@ -5,28 +5,39 @@ from __future__ import annotations
 import csv
 import io
 
+from arview.inspection.fingerprint import fingerprint
 from arview.inspection.record import ComponentDeviation, Inspection
+from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 
 HEADER = (
     "part", "serial", "measured_utc", "component", "verdict", "finding",
     "nominal_x_mm", "nominal_y_mm", "nominal_z_mm", "measured_x_mm", "measured_y_mm", "measured_z_mm",
     "dx_mm", "dy_mm", "dz_mm", "distance_mm", "U_mm", "k", "low_95_mm", "high_95_mm", "tolerance_mm",
     "position_diameter_mm", "tilt_deg", "twist_deg", "angle_deg", "angle_U_deg", "angle_tolerance_deg", "notes",
+    "inspection_sha256",
 )  # fmt: skip
 """Columns. Cells of undetermined or unmeasured values are empty."""
 
 
-def to_csv(inspection: Inspection) -> str:
-    """The inspection as CSV with the columns of `HEADER`; lines end with CR LF."""
+def to_csv(inspection: Inspection, sha256: str | None = None) -> str:
+    """The inspection as CSV with the columns of `HEADER`; lines end with CR LF.
+
+    Measured values are rounded to what their U allows.
+
+    Args:
+        inspection: the inspection.
+        sha256: fingerprint of the file it was read from; default: that of the inspection.
+    """
+    sha256 = sha256 or fingerprint(inspection)
     out = io.StringIO(newline="")
     writer = csv.writer(out)
     writer.writerow(HEADER)
     for component in inspection.components:
-        writer.writerow([_text(cell) for cell in _row(inspection, component)])
+        writer.writerow([_text(cell) for cell in (*_row(inspection, component), sha256)])
     return out.getvalue()
 
 
-def _row(inspection: Inspection, one: ComponentDeviation) -> list[str | float | None]:
+def _row(inspection: Inspection, one: ComponentDeviation) -> list[str]:
     details = one.details
     center = (None, None, None) if details is None else details.center_mm
     moved = [None if a is None or b is None else a + b for a, b in zip(center, one.displacement_mm, strict=True)]
@@ -34,21 +45,40 @@ def _row(inspection: Inspection, one: ComponentDeviation) -> list[str | float | 
     zone = None if details is None else details.zone_diameter_mm
     if None in one.displacement_mm:
         zone = None  # a displacement along the undetermined axis would enlarge it
-    angles: list[float | None] = [None] * 3
+    u, tolerance = one.uncertainty_mm, one.tolerance_mm
+    decimals = decimals_of(u)
+    angle = angle_u = angle_limit = None
     if details is not None:
-        angles = [details.angle_deg, details.angle_uncertainty_deg, details.angle_tolerance_deg]
+        angle, angle_u, angle_limit = details.angle_deg, details.angle_uncertainty_deg, details.angle_tolerance_deg
+    angle_decimals = decimals_of(angle_u)
     return [
         inspection.part, inspection.serial, inspection.created.strftime("%Y-%m-%dT%H:%M:%SZ"), one.name,
-        one.verdict.value, "" if one.finding is None else one.finding.value, *center, *moved, *one.displacement_mm,
-        one.distance_mm, one.uncertainty_mm, None if details is None else details.k, low, high, one.tolerance_mm,
-        zone, one.tilt_deg, one.twist_deg, *angles, "" if details is None else "; ".join(details.notes),
+        one.verdict.value, "" if one.finding is None else one.finding.value,
+        *(_exact(value) for value in center),
+        *(_rounded(value, decimals) for value in (*moved, *one.displacement_mm)),
+        _rounded(one.distance_mm, decimals_beside_limit(one.distance_mm or 0.0, u, tolerance)),
+        _rounded(u, decimals), _exact(None if details is None else details.k),
+        _rounded(low, decimals), _rounded(high, decimals), _exact(tolerance),
+        _rounded(zone, decimals_beside_limit(zone or 0.0, u, None if tolerance is None else 2.0 * tolerance)),
+        _rounded(one.tilt_deg, angle_decimals), _rounded(one.twist_deg, angle_decimals),
+        _rounded(angle, decimals_beside_limit(angle or 0.0, angle_u, angle_limit)),
+        _rounded(angle_u, angle_decimals), _exact(angle_limit),
+        "" if details is None else "; ".join(details.notes),
     ]  # fmt: skip
 
 
-def _text(cell: str | float | None) -> str:
-    """Numbers with six decimals; texts that a spreadsheet would read as a formula are prefixed with an apostrophe."""
-    if cell is None:
-        return ""
-    if isinstance(cell, str):
-        return f"'{cell}" if cell[:1] in ("=", "+", "-", "@", "\t") else cell
-    return f"{cell:.6f}"
+def _rounded(value: float | None, decimals: int) -> str:
+    return "" if value is None else fixed(value, decimals)
+
+
+def _exact(value: float | None) -> str:
+    return "" if value is None else exact(value)
+
+
+def _text(cell: str) -> str:
+    """A cell; texts, unlike numbers, that a spreadsheet would read as a formula are prefixed with an apostrophe."""
+    return f"'{cell}" if cell[:1] in ("=", "+", "-", "@", "\t") and not _is_number(cell) else cell
+
+
+def _is_number(cell: str) -> bool:
+    return cell.removeprefix("-").replace(".", "", 1).isdecimal()

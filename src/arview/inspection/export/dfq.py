@@ -1,17 +1,22 @@
 """Q-DAS ASCII transfer format (AQDEF), DFQ: description and values as K-fields in one file.
 
 The characteristics of each component are its distance from the design position (one-sided with natural limit 0), dx,
-dy, dz and the tilt. The characteristic of an undetermined value has no value.
+dy, dz, the tilt, and its presence: an attribute with one error for a missing component and none for one that is there.
+The characteristic of an undetermined value has no value, nor has the presence of a component that was not measured.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from arview.inspection.fingerprint import fingerprint
 from arview.inspection.record import ComponentDeviation, Inspection
+from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 
 _LIMIT, _NATURAL_LIMIT = "1", "2"
 """Values of K2120 and K2121, the kinds of the lower and upper limit."""
+_VARIABLE, _ATTRIBUTE = "0", "1"
+"""Values of K2004, the type of the characteristic."""
 _CLASS_SIGNIFICANT = "3"
 """Value of K2005, the class of the characteristic."""
 
@@ -26,13 +31,20 @@ class _Characteristic:
     is_length_from_zero: bool
     value: float | None
     remark: str = ""
+    is_present: bool | None = None
+    is_attribute: bool = False
 
 
-def to_dfq(inspection: Inspection) -> bytes:
-    """The inspection as DFQ: one part, with five characteristics for each component and one value for each of them.
+def to_dfq(inspection: Inspection, sha256: str | None = None) -> bytes:
+    """The inspection as DFQ: one part, with six characteristics for each component and one value for each of them.
 
     The encoding is Windows-1252 if possible, else UTF-8 with a byte order mark. Times are UTC.
+
+    Args:
+        inspection: the inspection.
+        sha256: fingerprint of the file it was read from; default: that of the inspection.
     """
+    sha256 = sha256 or fingerprint(inspection)
     rows = [row for component in inspection.components for row in _characteristics(component)]
     source = inspection.provenance
     fields: list[tuple[str, str]] = [
@@ -42,16 +54,16 @@ def to_dfq(inspection: Inspection) -> bytes:
         ("K1202", f"{source.tool} {source.version}"),
         ("K1203", "position of components against the CAD"),
         ("K1204", inspection.created.strftime("%d.%m.%Y")),
-        ("K1900", f"times in UTC; CAD sha256 {inspection.model_hash}"),
+        ("K1900", f"times in UTC; CAD sha256 {inspection.model_hash}; inspection sha256 {sha256}"),
     ]
     for index, row in enumerate(rows, 1):
         fields += _description(index, row)
     moment = inspection.created.strftime("%d.%m.%Y/%H:%M:%S")
     for index, row in enumerate(rows, 1):
-        if row.value is None:
+        value = _value(index, row)
+        if not value:
             continue
-        fields += [(f"K0001/{index}", f"{row.value:.{row.decimals}f}"), (f"K0002/{index}", "0"),
-                   (f"K0004/{index}", moment)]  # fmt: skip
+        fields += [*value, (f"K0002/{index}", "0"), (f"K0004/{index}", moment)]
         if row.remark:
             fields.append((f"K0009/{index}", row.remark))
         if inspection.serial:
@@ -64,34 +76,54 @@ def to_dfq(inspection: Inspection) -> bytes:
 
 
 def _characteristics(one: ComponentDeviation) -> list[_Characteristic]:
-    uncertainty = "" if one.uncertainty_mm is None else f"U = {one.uncertainty_mm:.4f} mm; {one.verdict.value}"
-    rows = [
-        _Characteristic(
-            f"{one.name}.distance", f"{one.name} distance from design place", "mm", 4, one.tolerance_mm, True,
-            one.distance_mm, uncertainty,
-        )
-    ]  # fmt: skip
-    for axis, value in zip("xyz", one.displacement_mm, strict=True):
-        rows.append(_Characteristic(f"{one.name}.d{axis}", f"{one.name} d{axis}", "mm", 4, None, False, value))
+    u = one.uncertainty_mm
+    decimals = decimals_of(u)
+    remark = one.verdict.value if u is None else f"U = {fixed(u, decimals)} mm; {one.verdict.value}"
     limit = None if one.details is None else one.details.angle_tolerance_deg
-    rows.append(_Characteristic(f"{one.name}.tilt", f"{one.name} tilt", "deg", 3, limit, True, one.tilt_deg))
-    return rows
+    angle_u = None if one.details is None else one.details.angle_uncertainty_deg
+    distance_decimals = decimals_beside_limit(one.distance_mm or 0.0, u, one.tolerance_mm)
+    tilt_decimals = 3 if angle_u is None else decimals_beside_limit(one.tilt_deg or 0.0, angle_u, limit)
+    return [
+        _Characteristic(
+            f"{one.name}.distance", f"{one.name} distance from design place", "mm", distance_decimals,
+            one.tolerance_mm, True, one.distance_mm, remark,
+        ),
+        *(
+            _Characteristic(f"{one.name}.d{axis}", f"{one.name} d{axis}", "mm", decimals, None, False, value)
+            for axis, value in zip("xyz", one.displacement_mm, strict=True)
+        ),
+        _Characteristic(f"{one.name}.tilt", f"{one.name} tilt", "deg", tilt_decimals, limit, True, one.tilt_deg),
+        _Characteristic(
+            f"{one.name}.presence", f"{one.name} is present", "", 0, None, False, None,
+            "missing" if one.is_present is False else "", one.is_present, True,
+        ),
+    ]  # fmt: skip
+
+
+def _value(index: int, row: _Characteristic) -> list[tuple[str, str]]:
+    """The fields of a value: a number, or for an attribute the sample size and the number of errors in it."""
+    if row.is_attribute:
+        if row.is_present is None:
+            return []
+        return [(f"K0020/{index}", "1"), (f"K0021/{index}", "0" if row.is_present else "1")]
+    return [] if row.value is None else [(f"K0001/{index}", fixed(row.value, row.decimals))]
 
 
 def _description(index: int, row: _Characteristic) -> list[tuple[str, str]]:
+    has_limit = row.upper is not None or row.is_attribute
     fields = [
         ("K2001", row.number),
         ("K2002", row.description),
-        ("K2004", "0"),  # variable
-        ("K2005", _CLASS_SIGNIFICANT if row.upper is not None else "0"),
-        ("K2022", str(row.decimals)),
-        ("K2101", f"{0.0:.{row.decimals}f}"),
+        ("K2004", _ATTRIBUTE if row.is_attribute else _VARIABLE),
+        ("K2005", _CLASS_SIGNIFICANT if has_limit else "0"),
     ]
-    if row.is_length_from_zero:
-        fields += [("K2110", f"{0.0:.{row.decimals}f}"), ("K2120", _NATURAL_LIMIT)]
-    if row.upper is not None:
-        fields += [("K2111", f"{row.upper:.{row.decimals}f}"), ("K2121", _LIMIT)]
-    fields.append(("K2142", row.unit))
+    if not row.is_attribute:
+        fields += [("K2022", str(row.decimals)), ("K2101", "0")]
+        if row.is_length_from_zero:
+            fields += [("K2110", "0"), ("K2120", _NATURAL_LIMIT)]
+        if row.upper is not None:
+            fields += [("K2111", exact(row.upper)), ("K2121", _LIMIT)]
+        fields.append(("K2142", row.unit))
     return [(f"{key}/{index}", value) for key, value in fields]
 
 

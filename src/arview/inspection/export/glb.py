@@ -8,7 +8,9 @@ import numpy as np
 
 from arview.cad.model import Component, Model
 from arview.geometry import Array
+from arview.inspection.fingerprint import fingerprint
 from arview.inspection.record import ComponentDeviation, Finding, Inspection, Verdict
+from arview.inspection.rounding import decimals_beside_limit, decimals_of
 
 _GHOST, _CONTEXT, _ARROW = (0.62, 0.68, 0.76, 0.3), (0.45, 0.49, 0.54, 1.0), (0.02, 0.02, 0.03, 1.0)
 _COLORS = {
@@ -24,16 +26,19 @@ _ARROW_SHARE = 0.14
 _ROUND_SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
-def to_glb(inspection: Inspection, model: Model, arrow_scale: float | None = None) -> bytes:
+def to_glb(
+    inspection: Inspection, model: Model, arrow_scale: float | None = None, sha256: str | None = None
+) -> bytes:
     """A scene in metres with the nodes ``design``, ``measured`` and ``arrows``, each with a node for each component.
 
     +Y of glTF is +Z of the model. The ``extras`` of a node hold verdict, displacement (null where undetermined),
-    distance, U and tolerance.
+    distance, U and tolerance; those of the scene hold the fingerprint of the inspection.
 
     Args:
         inspection: the inspection.
         model: the CAD model.
         arrow_scale: exaggeration of the arrows; default: a round number chosen by the largest displacement.
+        sha256: fingerprint of the file the inspection was read from; default: that of the inspection.
 
     Raises:
         MismatchError: the inspection belongs to another model.
@@ -42,7 +47,7 @@ def to_glb(inspection: Inspection, model: Model, arrow_scale: float | None = Non
 
     inspection.check_model(model)
     scale = arrow_scale or _arrow_scale(inspection, model)
-    scene = trimesh.Scene(base_frame="world")
+    scene = trimesh.Scene(base_frame="world", metadata={"inspection_sha256": sha256 or fingerprint(inspection)})
     upright = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
     scene.graph.update("model", "world", matrix=upright)
     for group in ("design", "measured", "arrows"):
@@ -116,11 +121,14 @@ def _arrow(deviation: ComponentDeviation, tail: Array, scale: float, width_mm: f
 
 
 def _extras(one: ComponentDeviation) -> dict[str, Any]:
+    decimals = decimals_of(one.uncertainty_mm)
     return {
         "verdict": one.verdict.value,
-        "displacement_mm": list(one.displacement_mm),
-        "distance_mm": one.distance_mm,
-        "uncertainty_mm": one.uncertainty_mm,
+        "displacement_mm": [None if value is None else round(value, decimals) for value in one.displacement_mm],
+        "distance_mm": None
+        if one.distance_mm is None
+        else round(one.distance_mm, decimals_beside_limit(one.distance_mm, one.uncertainty_mm, one.tolerance_mm)),
+        "uncertainty_mm": None if one.uncertainty_mm is None else round(one.uncertainty_mm, decimals),
         "tolerance_mm": one.tolerance_mm,
     }
 

@@ -2,8 +2,9 @@
 
 The position of the centre of a component is a position characteristic with a spherical zone, whose diameter is twice
 the tolerance. Its x, y, z are linear coordinate characteristics without tolerance. Its rotation is a user-defined
-angular characteristic. Structure and order of the elements follow QIFDocument.xsd, QIFResults.xsd, Characteristics.xsd,
-Units.xsd and PrimitivesPMI.xsd of QIF 3.0.0.
+angular characteristic, and its presence a user-defined attribute: so a missing component fails even without a
+tolerance. The characteristics are evaluated by ISO 1101:2017. Structure and order of the elements follow
+QIFDocument.xsd, QIFResults.xsd, Characteristics.xsd, Units.xsd and PrimitivesPMI.xsd of QIF 3.0.0.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from typing import Any
 
 from lxml import etree
 
+from arview.inspection.fingerprint import fingerprint
 from arview.inspection.record import ComponentDeviation, Finding, Inspection, Verdict
+from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 from arview.inspection.summary import overall_verdict
 
 NAMESPACE = "http://qifstandards.org/xsd/qif3"
@@ -31,18 +34,26 @@ _INSPECTION_STATUS = {
     Verdict.NOT_MEASURED: "NOT_MEASURED",
 }
 _DIRECTION = ("XAXIS", "YAXIS", "ZAXIS")
+_STANDARD = ("ISO", "1101", "2017", "Geometrical product specifications: geometrical tolerancing")
+"""Organization, designator, year and title of the standard that defines the characteristics."""
 
 
-def to_qif(inspection: Inspection) -> bytes:
-    """The inspection as a QIF 3.0 document, UTF-8. The same inspection always yields the same document."""
-    return _Document(inspection).encoded()
+def to_qif(inspection: Inspection, sha256: str | None = None) -> bytes:
+    """The inspection as a QIF 3.0 document, UTF-8. The same inspection always yields the same document.
+
+    Args:
+        inspection: the inspection.
+        sha256: fingerprint of the file it was read from; default: that of the inspection.
+    """
+    return _Document(inspection, sha256 or fingerprint(inspection)).encoded()
 
 
 class _Document:
     """Builds the document; elements are numbered in the order of their creation."""
 
-    def __init__(self, inspection: Inspection) -> None:
+    def __init__(self, inspection: Inspection, sha256: str) -> None:
         self.inspection = inspection
+        self.sha256 = sha256
         self._last_id = 0
         self.definitions: list[Any] = []
         self.nominals: list[Any] = []
@@ -51,6 +62,8 @@ class _Document:
         self._positions: dict[float, str] = {}
         self._coordinates = ""
         self._angles: dict[float | None, str] = {}
+        self._presence = ""
+        self._standard_id = self._next_id()
         self.actual_id = self._next_id()
         for component in inspection.components:
             self._add(component)
@@ -64,26 +77,40 @@ class _Document:
         header = _add(root, "Header")
         _add(header, "Description", self._description())
         _add(header, "Scope", "Results")
+        self._standard(root)
         units = _add(_add(root, "FileUnits"), "PrimaryUnits")
         _unit(units, "AngularUnit", "radian", "degree", "0.017453292519943")
         _unit(units, "LinearUnit", "meter", "mm", "0.001")
-        characteristics = _add(root, "Characteristics")
-        for name, members in (
-            ("CharacteristicDefinitions", self.definitions),
-            ("CharacteristicNominals", self.nominals),
-            ("CharacteristicItems", self.items),
-        ):
-            _list(characteristics, name, members)
+        if self.items:
+            characteristics = _add(root, "Characteristics")
+            _add(characteristics, "FormalStandardId", self._standard_id)
+            for name, members in (
+                ("CharacteristicDefinitions", self.definitions),
+                ("CharacteristicNominals", self.nominals),
+                ("CharacteristicItems", self.items),
+            ):
+                _list(characteristics, name, members)
         self._results(_add(root, "Results"), results_id)
         root.set("idMax", str(self._last_id))
         return bytes(etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True))
+
+    def _standard(self, root: Any) -> None:
+        """Add the definition of the standard that the characteristics refer to."""
+        organization, designator, year, title = _STANDARD
+        standard = etree.Element(_name("Standard"), id=self._standard_id)
+        _add(_add(standard, "Organization"), "StandardsOrganizationEnum", organization)
+        _add(standard, "Designator", designator)
+        _add(standard, "Year", year)
+        _add(standard, "Title", title)
+        _list(root, "StandardsDefinitions", [standard])
 
     def _results(self, results: Any, results_id: str) -> None:
         overall = _INSPECTION_STATUS[overall_verdict(self.inspection)]
         measured = etree.Element(_name("MeasurementResults"), id=results_id)
         _list(results, "MeasurementResultsSet", [measured])
         _add(measured, "ThisResultsInstanceQPId", self._uuid("results"))
-        _list(_add(measured, "MeasuredCharacteristics"), "CharacteristicMeasurements", self.measurements)
+        if self.measurements:
+            _list(_add(measured, "MeasuredCharacteristics"), "CharacteristicMeasurements", self.measurements)
         _add(_add(measured, "InspectionStatus"), "InspectionStatusEnum", overall)
         reference = etree.Element(_name("Id"))
         reference.text = self.actual_id
@@ -102,11 +129,17 @@ class _Document:
         if one.tolerance_mm is not None:
             item = self._item("Position", one.name, f"{one.name} position", self._position(one.tolerance_mm), [])
             value = None if one.distance_mm is None else 2.0 * one.distance_mm
+            decimals = 0
             if None in one.displacement_mm:
                 value = None  # a displacement along the undetermined axis would enlarge it
-            self._measurement("Position", item, _STATUS[one.verdict], value, None if std is None else 2.0 * std)
+            if value is not None:
+                diameter_u = None if one.uncertainty_mm is None else 2.0 * one.uncertainty_mm
+                decimals = decimals_beside_limit(value, diameter_u, 2.0 * one.tolerance_mm)
+            text = None if value is None else fixed(value, decimals)
+            self._measurement("Position", item, _STATUS[one.verdict], text, None if std is None else 2.0 * std)
         self._add_coordinates(one)
         self._add_angle(one)
+        self._add_presence(one)
 
     def _add_coordinates(self, one: ComponentDeviation) -> None:
         if not self._coordinates:
@@ -114,16 +147,17 @@ class _Document:
             _add(definition, "NonTolerance", "MEASURED")
         center = None if one.details is None else one.details.center_mm
         covariance = None if one.details is None else one.details.covariance
+        decimals = decimals_of(one.uncertainty_mm)
         for axis, moved in enumerate(one.displacement_mm):
             nominal = 0.0 if center is None else center[axis]
             what = "deviation" if center is None else "place"
-            more = [("TargetValue", _decimal(nominal)), ("Direction", _DIRECTION[axis])]
+            more = [("TargetValue", exact(nominal)), ("Direction", _DIRECTION[axis])]
             name = f"{one.name} {what} {'xyz'[axis]}"
             item = self._item("LinearCoordinate", one.name, name, self._coordinates, more)
             status = _status_without_value(one) if moved is None else "BASIC_OR_TED"
             std = None if covariance is None else max(covariance[3 + axis][3 + axis], 0.0) ** 0.5
-            value = None if moved is None else nominal + moved
-            self._measurement("LinearCoordinate", item, status, value, std)
+            text = None if moved is None else fixed(nominal + moved, decimals)
+            self._measurement("LinearCoordinate", item, status, text, std)
 
     def _add_angle(self, one: ComponentDeviation) -> None:
         details = one.details
@@ -136,18 +170,35 @@ class _Document:
                 _add(definition, "NonTolerance", "MEASURED")
             else:
                 tolerance = _add(definition, "Tolerance")
-                _add(tolerance, "MaxValue", _decimal(limit))
+                _add(tolerance, "MaxValue", exact(limit))
                 _add(tolerance, "DefinedAsLimit", "true")
             _add(definition, "WhatToMeasure", "angle of the determined rotation from the design orientation")
         item = self._item("UserDefinedAngular", one.name, f"{one.name} rotation", self._angles[limit], [])
-        std = None if details.angle_uncertainty_deg is None else details.angle_uncertainty_deg / 2.0
-        self._measurement("UserDefinedAngular", item, _angle_status(one), details.angle_deg, std)
+        angle, uncertainty = details.angle_deg, details.angle_uncertainty_deg
+        std = None if uncertainty is None else uncertainty / 2.0
+        text = None if angle is None else fixed(angle, decimals_beside_limit(angle, uncertainty, limit))
+        self._measurement("UserDefinedAngular", item, _angle_status(one), text, std)
+
+    def _add_presence(self, one: ComponentDeviation) -> None:
+        """Presence as an attribute: fails for a missing component, passes for one that was measured."""
+        if not self._presence:
+            self._presence, definition = self._definition("UserDefinedAttribute")
+            _add(definition, "WhatToMeasure", "presence of the component")
+        item = self._item("UserDefinedAttribute", one.name, f"{one.name} presence", self._presence, [])
+        for tag, word in (("PassValues", "present"), ("FailValues", "missing")):
+            value = etree.Element(_name("StringValue"))
+            value.text = word
+            _list(self.nominals[-1], tag, [value])
+        is_present = one.is_present
+        status = "NOT_ANALYZED" if is_present is None else "PASS" if is_present else "FAIL"
+        text = None if is_present is None else "present" if is_present else "missing"
+        self._measurement("UserDefinedAttribute", item, status, text, None)
 
     def _position(self, tolerance_mm: float) -> str:
         """Id of the definition of a position characteristic with this tolerance, which is added if needed."""
         if tolerance_mm not in self._positions:
             self._positions[tolerance_mm], definition = self._definition("Position")
-            _add(definition, "ToleranceValue", _decimal(2.0 * tolerance_mm))
+            _add(definition, "ToleranceValue", exact(2.0 * tolerance_mm))
             _add(definition, "MaterialCondition", "NONE")
             _add(_add(definition, "ZoneShape"), "SphericalZone")
         return self._positions[tolerance_mm]
@@ -172,7 +223,7 @@ class _Document:
         self.items.append(item)
         return str(item.get("id"))
 
-    def _measurement(self, kind: str, item: str, status: str, value: float | None, std: float | None) -> None:
+    def _measurement(self, kind: str, item: str, status: str, value: str | None, std: float | None) -> None:
         one = etree.Element(_name(f"{kind}CharacteristicMeasurement"), id=self._next_id())
         _add(_add(one, "Status"), "CharacteristicStatusEnum", status)
         _add(one, "CharacteristicItemId", item)
@@ -181,9 +232,9 @@ class _Document:
         if kind == "LinearCoordinate":
             _add(_add(one, "TypeOfCoordinates"), "CoordinateEnum", "CARTESIAN_3D")
         if value is not None:
-            element = _add(one, "Value", _decimal(value))
+            element = _add(one, "Value", value)
             if std is not None:
-                element.set("combinedUncertainty", _decimal(std))
+                element.set("combinedUncertainty", fixed(std, decimals_of(std)))
                 element.set("meanError", "0")
         self.measurements.append(one)
 
@@ -192,7 +243,7 @@ class _Document:
         return _printable(
             f"part {self.inspection.part}, serial {self.inspection.serial or 'none'}, measured"
             f" {self.inspection.created:%Y-%m-%dT%H:%M:%SZ} by {source.tool} {source.version} ({source.method})"
-            f" against CAD sha256 {self.inspection.model_hash}"
+            f" against CAD sha256 {self.inspection.model_hash}; inspection sha256 {self.sha256}"
         )
 
     def _uuid(self, what: str) -> str:
@@ -250,12 +301,6 @@ def _unit(parent: Any, tag: str, si_name: str, name: str, factor: str) -> None:
     _add(unit, "SIUnitName", si_name)
     _add(unit, "UnitName", name)
     _add(_add(unit, "UnitConversion"), "Factor", factor)
-
-
-def _decimal(value: float) -> str:
-    """An xs:decimal, which has no exponent."""
-    text = f"{value:.6f}".rstrip("0").rstrip(".")
-    return "0" if text in ("-0", "") else text
 
 
 def _printable(text: str) -> str:
