@@ -64,8 +64,8 @@ def export(
     """Write INSPECTION in other formats."""
     from arview.cad import load_part
     from arview.inspection import load_inspection
-    from arview.inspection.fingerprint import fingerprint_of_file
     from arview.inspection.export import to_csv, to_dfq, to_glb, to_qif
+    from arview.inspection.fingerprint import fingerprint_of_file
 
     source = Path(inspection)
     targets = _targets(source, formats, output, part_path)

@@ -12,7 +12,9 @@ results = Table(
     "arview_results",
     metadata,
     Column("id", _Number, primary_key=True, autoincrement=True),
-    Column("content_hash", String(64), nullable=False, unique=True),  # SHA-256, the fingerprint, see arview.inspection.fingerprint
+    Column(
+        "content_hash", String(64), nullable=False, unique=True
+    ),  # SHA-256, the fingerprint, see arview.inspection.fingerprint
     Column("part", Text, nullable=False),
     Column("serial", Text, nullable=False),
     Column("station", Text, nullable=False),

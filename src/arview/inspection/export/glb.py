@@ -26,9 +26,7 @@ _ARROW_SHARE = 0.14
 _ROUND_SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
-def to_glb(
-    inspection: Inspection, model: Model, arrow_scale: float | None = None, sha256: str | None = None
-) -> bytes:
+def to_glb(inspection: Inspection, model: Model, arrow_scale: float | None = None, sha256: str | None = None) -> bytes:
     """A scene in metres with the nodes ``design``, ``measured`` and ``arrows``, each with a node for each component.
 
     +Y of glTF is +Z of the model. The ``extras`` of a node hold verdict, displacement (null where undetermined),
