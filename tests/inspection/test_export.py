@@ -186,7 +186,8 @@ def test_rounding_moves_no_value_over_its_limit() -> None:
     assert decimals_beside_limit(0.4996, 0.2, 0.5) == 2  # 0.50 is within 0.5
     assert decimals_beside_limit(0.7, 0.2, 0.5) == 2
     assert [fixed(-0.0004, 3), fixed(-0.0006, 3)] == ["0.000", "-0.001"]
-    assert [exact(61.9999999), exact(0.05), exact(100.0), exact(0.00002), exact(-0.0)] == ["62", "0.05", "100", "0.00002", "0"]  # fmt: skip
+    numbers = {61.9999999: "62", 0.05: "0.05", 100.0: "100", 0.00002: "0.00002", -0.0: "0"}
+    assert {value: exact(value) for value in numbers} == numbers
 
 
 def test_one_fingerprint_everywhere(model: Model, found: Inspection, tmp_path: Path) -> None:
