@@ -179,8 +179,16 @@ class OverlayRenderer:
         self.draw_texts(canvas, pose, fps, now)
         return canvas
 
-    def draw_part(self, canvas: paint.Image, pose: Pose, now: datetime | None = None) -> None:
+    def draw_part(
+        self, canvas: paint.Image, pose: Pose, now: datetime | None = None, frame: paint.Image | None = None
+    ) -> None:
         """Draw ghosts and edges on a picture in place; `draw_texts` follows.
+
+        Args:
+            canvas: (H,W,3) uint8 RGB.
+            pose: of this frame.
+            now: time from which the age of the inspection is computed; None: the current time.
+            frame: the picture without anything drawn on it; None: the canvas is.
 
         Raises:
             MismatchError: the picture is not of the camera's size.
@@ -194,7 +202,7 @@ class OverlayRenderer:
             presences = self._presences(pose)
             scene = self._scene_of(pose, presences, now)
             self._drawn = _PartInPicture(view, presences, scene)
-            occluder = self._find_occluder(canvas, view, pose, scene)
+            occluder = self._find_occluder(canvas if frame is None else frame, view, pose, scene)
             self._hidden.update(view, occluder, presences)
             self._draw_model(canvas, view, pose, scene, presences, occluder)
 

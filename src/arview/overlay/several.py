@@ -87,9 +87,10 @@ class SeveralOverlay:
         Raises:
             MismatchError: the image is not of the camera's size.
         """
-        canvas = image if in_place else np.array(image, order="C")
+        frame = np.array(image, order="C")
+        canvas = image if in_place else frame.copy()
         for one in pose:
-            self.renderers[one.instance].draw_part(canvas, one, now)
+            self.renderers[one.instance].draw_part(canvas, one, now, frame)
         bottom_px = min(self.renderers[one.instance].draw_legend(canvas) for one in pose)
         wanted = self._wanted(pose)
         self.laid_out = LaidOut()
