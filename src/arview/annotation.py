@@ -101,7 +101,7 @@ class AnnotateSummary:
         states: frames by tracking state.
         reasons: frames by state and reason, of the frames that have a reason.
         withheld_reasons: frames whose labels were withheld, by the reason, see `Pose.identity_reason`.
-        never_verified: components that no frame has verified, see `Pose.unverified`; empty if no frame has a pose.
+        never_verified: components that no frame has verified or refuted; empty if no frame has a pose.
         ms: (F,) time of detection and tracking of each frame, milliseconds.
         ended_reason: why the source ended early, or empty.
         is_interrupted: stopped by Ctrl-C; the files hold what was done until then.
@@ -242,7 +242,8 @@ class _Counts:
             self._withheld_reasons[pose.identity_reason] += 1
         if pose.cam_from_model is not None:
             before = self._never_verified
-            self._never_verified = tuple(name for name in pose.unverified if before is None or name in before)
+            open_names = [name for name in pose.unverified if not is_refuted(pose, name)]
+            self._never_verified = tuple(name for name in open_names if before is None or name in before)
 
     def summary(self, source: FrameSource, seconds: float) -> AnnotateSummary:
         """Summary of the run."""
@@ -259,6 +260,12 @@ class _Counts:
             withheld_reasons=dict(self._withheld_reasons),
             specimens={name: counts.summary() for name, counts in self._specimens.items()},
         )
+
+
+def is_refuted(pose: Pose, name: str) -> bool:
+    """Whether a component was seen not to be in its place."""
+    one = pose.components.get(name)
+    return one is not None and one.presence in (Presence.MISSING, Presence.DISPLACED)
 
 
 class _SpecimenCounts:
