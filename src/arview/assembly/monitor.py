@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ from arview.geometry import Array, rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import ComponentPresence, Presence, Visibility
 from arview.refinement.view_model import PartView
+
+VISIBILITIES = (Visibility.VISIBLE, Visibility.HIDDEN, Visibility.OUTSIDE)
+"""In the order in which arrays number them."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class MonitorOptions:
         same_shift: alternative placements that differ by less than this share of the part's diameter are the same.
         max_added: cap on the log odds that one observation adds against a component, because one entering the view is
             at first only partly visible.
+        motion_px: motion from one frame to the next, in pixels of the observed picture, up to which a picture is sharp,
+            and from which on it is so blurred that edges that are not found say nothing.
         max_log_odds: bound on the summed log odds, in both directions.
         forgetting: share of the summed log odds that is lost with each observation.
         first_observations: frames after a lock that are all observed. No component is called mismatched before the
@@ -51,7 +57,7 @@ class MonitorOptions:
         incomplete_quality: poses of lower quality are observed at once while components are suspect.
         urgent_frames: frames between these observations.
         suspect_frames: frames between observations while a component is suspect, or while an open one becomes visible.
-        open_frames: frames between observations while a component is open.
+        open_frames: frames between observations while a component is open, or visible but not yet verified.
         rest_frames: frames between observations while all components are as expected. All three are for new
             directions; from a known direction the next longer interval is used.
         fresh_observations: observations from a direction before it counts as known while a component is suspect,
@@ -72,7 +78,8 @@ class MonitorOptions:
     single_log_odds: float = 1.5
     displaced_log_odds: float = 2.4
     same_shift: float = 0.05
-    max_added: float = 2.3
+    max_added: float = 1.6
+    motion_px: tuple[float, float] = (25.0, 45.0)
     max_log_odds: float = 6.0
     forgetting: float = 0.01
     first_observations: int = 2
@@ -102,6 +109,7 @@ class MonitorState:
         was_occluded: (C,) behind something in the last observation.
         alternative: (C,) summed log odds of "at an alternative placement".
         shifts: (C,3) mm in the model frame to that placement.
+        last_pose: (4,4) of the last frame; None before the first.
         has_suspects: the last observation had suspects.
         observations: made so far.
         frames_since: frames since the last observation.
@@ -116,6 +124,7 @@ class MonitorState:
     was_occluded: NDArray[np.bool_]
     alternative: Array
     shifts: Array
+    last_pose: Array | None = None
     has_suspects: bool = False
     observations: int = 0
     frames_since: int = 0
@@ -141,8 +150,10 @@ class AssemblyMonitor:
         self._has_components = len(model.components) > 1
         self._observer = ComponentObserver(views, camera, model, self.options.observation)
         boxes = np.array([one.bounds_in_model for one in model.components])
-        # (8,C,3) corners of the boxes.
-        self._corners = np.stack([np.stack([boxes[:, k >> a & 1, a] for a in range(3)], axis=1) for k in range(8)])
+        # (8 C,3) corners of the boxes of the components, and (8,3) of the part's.
+        self._corners = _box_corners(boxes).reshape(-1, 3)
+        low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+        self._part_corners = _box_corners(np.array([[low, high]])).reshape(-1, 3)
         self.reset()
 
     @property
@@ -173,6 +184,7 @@ class AssemblyMonitor:
         """Forget all observations: another part may be in view."""
         self._turned.reset()
         count = len(self._views.component_names)
+        self._said: tuple[tuple[int, bool, bytes], Mapping[str, ComponentPresence]] | None = None
         self._state = MonitorState(
             log_odds=np.zeros(count),
             directions=DirectionEvidence(count, self._views.center_in_model, self.options.directions),
@@ -198,6 +210,7 @@ class AssemblyMonitor:
         """
         o, state = self.options, self._state
         state.frames_since += 1
+        before, state.last_pose = state.last_pose, cam_from_model
         # From a new direction the lines of absent components that were not seen before are missed.
         is_urgent = quality < o.incomplete_quality and bool(self._is_suspect().any())
         if not self._has_components or not (is_supported or is_urgent):
@@ -210,7 +223,10 @@ class AssemblyMonitor:
         state.frames_since = 0
         state.has_suspects = bool((observation.is_suspect & ~self._is_settled()).any())
         state.was_visible, state.was_occluded = observation.is_visible, observation.is_occluded
+        slow, fast = o.motion_px
+        sharp = float(np.clip((fast - self._observer.motion_px(before, cam_from_model)) / (fast - slow), 0.0, 1.0))
         capped = np.minimum(observation.log_odds, o.max_added)
+        capped = np.where(capped > 0.0, sharp * capped, capped)
         added = state.directions.add(cam_from_model, capped, state.is_mismatched)
         state.log_odds = np.clip((1.0 - o.forgetting) * state.log_odds + added, -o.max_log_odds, o.max_log_odds)
         self._add_alternatives(observation)
@@ -242,22 +258,11 @@ class AssemblyMonitor:
         """
         if not self._has_components:
             return {}
-        state = self._state
         visibilities = self._visibilities(cam_from_model)
-        presences = self._presences(is_ambiguous)
-        probabilities = 1.0 / (1.0 + np.exp(state.log_odds))
-        spreads_deg = state.directions.spreads_deg
-        return {
-            name: ComponentPresence(
-                presence=presences[c],
-                visibility=visibilities[c],
-                probability=0.5 if is_ambiguous and c != self._observer.base else float(probabilities[c]),
-                observations=int(state.directions.observations[c]),
-                spread_deg=float(spreads_deg[c]),
-                model_from_nominal=rigid(np.eye(3), state.shifts[c]) if presences[c] is Presence.DISPLACED else None,
-            )
-            for c, name in enumerate(self._views.component_names)
-        }
+        key = (self._state.observations, is_ambiguous, visibilities.tobytes())
+        if self._said is None or self._said[0] != key:
+            self._said = key, MappingProxyType(self._presence_now(visibilities, is_ambiguous))
+        return self._said[1]
 
     def observe(self, image: NDArray[np.uint8], cam_from_model: Array, known: Known | None = None) -> Observation:
         """Observe all components in one picture, by default whatever was observed before; see `ComponentObserver`."""
@@ -268,6 +273,22 @@ class AssemblyMonitor:
         if not self._has_components:
             return ()
         return self._messages(self.observe(image, cam_from_model).log_odds > self.options.single_log_odds)
+
+    def _presence_now(self, visibilities: NDArray[np.int8], is_ambiguous: bool) -> dict[str, ComponentPresence]:
+        """Presence of each component by its name, for visibilities (C,) as indices of `VISIBILITIES`."""
+        state, presences = self._state, self._presences(is_ambiguous)
+        probabilities, spreads_deg = 1.0 / (1.0 + np.exp(state.log_odds)), state.directions.spreads_deg
+        return {
+            name: ComponentPresence(
+                presence=presences[c],
+                visibility=VISIBILITIES[visibilities[c]],
+                probability=0.5 if is_ambiguous and c != self._observer.base else float(probabilities[c]),
+                observations=int(state.directions.observations[c]),
+                spread_deg=float(spreads_deg[c]),
+                model_from_nominal=rigid(np.eye(3), state.shifts[c]) if presences[c] is Presence.DISPLACED else None,
+            )
+            for c, name in enumerate(self._views.component_names)
+        }
 
     def _presences(self, is_ambiguous: bool) -> list[Presence]:
         """Presence of each component."""
@@ -284,17 +305,24 @@ class AssemblyMonitor:
             found[np.arange(len(found)) != self._observer.base] = Presence.UNCERTAIN
         return [Presence(one) for one in found]
 
-    def _visibilities(self, cam_from_model: Array) -> list[Visibility]:
-        """Visibility of each component in a frame."""
-        o, camera, state = self.options, self._camera, self._state
-        corners = self._corners.reshape(-1, 3) @ cam_from_model[:3, :3].T + cam_from_model[:3, 3]
-        pixels = np.nan_to_num(camera.project(corners), nan=-1e9)
-        size = np.array([camera.width, camera.height])
-        is_inside = ((pixels >= 0) & (pixels < size)).all(axis=1) & (corners[:, 2] > 0)
-        is_outside = is_inside.reshape(8, -1).mean(axis=0) < o.inside_share
-        is_shown = self._observer.visible_from(cam_from_model) & ~state.was_occluded
-        found = np.where(is_outside, Visibility.OUTSIDE, np.where(is_shown, Visibility.VISIBLE, Visibility.HIDDEN))
-        return [Visibility(one) for one in found]
+    def _visibilities(self, cam_from_model: Array) -> NDArray[np.int8]:
+        """(C,) visibility of each component in a frame, as indices of `VISIBILITIES`."""
+        is_hidden = ~self._observer.visible_from(cam_from_model) | self._state.was_occluded
+        found = is_hidden.astype(np.int8)
+        # Mostly the whole part is inside the picture.
+        if not self._is_inside(self._part_corners, cam_from_model).all():
+            is_inside = self._is_inside(self._corners, cam_from_model).reshape(8, -1)
+            found[is_inside.mean(axis=0) < self.options.inside_share] = VISIBILITIES.index(Visibility.OUTSIDE)
+        return found
+
+    def _is_inside(self, corners: Array, cam_from_model: Array) -> NDArray[np.bool_]:
+        """(N,) which points (N,3) of the model are inside the picture at a pose."""
+        camera = self._camera
+        in_cam = corners @ cam_from_model[:3, :3].T + cam_from_model[:3, 3]
+        if in_cam[:, 2].min() <= 1.0:
+            in_cam[in_cam[:, 2] <= 1.0] = [1e6, 1e6, 1.0]
+        pixels = camera.project(in_cam)
+        return np.asarray(((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1))
 
     def _is_uncertain(self) -> NDArray[np.bool_]:
         """(C,) components against which there is some evidence, but not enough."""
@@ -340,7 +368,8 @@ class AssemblyMonitor:
             return False
         highest = float(np.where(self._is_settled(), 0.0, state.log_odds).max())
         waits = (o.suspect_frames, o.open_frames, o.rest_frames, o.rest_frames)
-        step = 0 if state.has_suspects or highest > o.cleared_log_odds else 1 if highest > o.open_log_odds else 2
+        is_open = highest > o.open_log_odds or bool(np.any(state.was_visible & ~state.is_verified & ~state.is_missing))
+        step = 0 if state.has_suspects or highest > o.cleared_log_odds else 1 if is_open else 2
         if step == 1 and self._shows_new(cam_from_model):
             step = 0
         if state.frames_since < waits[step]:
@@ -361,3 +390,8 @@ class AssemblyMonitor:
 
     def _messages(self, is_wrong: NDArray[np.bool_]) -> tuple[str, ...]:
         return tuple(f"mismatch: {name} not seen where expected" for name in self._names(is_wrong))
+
+
+def _box_corners(boxes: Array) -> Array:
+    """(8,N,3) corners of boxes (N,2,3)."""
+    return np.stack([np.stack([boxes[:, k >> a & 1, a] for a in range(3)], axis=1) for k in range(8)])

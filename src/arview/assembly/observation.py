@@ -227,6 +227,15 @@ class ComponentObserver:
         seen = np.clip(-by_edges[~is_base], 0.0, o.max_seen)
         return TurnEvidence(float(seen.sum()), float(np.mean(points.is_found)) if len(points.is_found) else 0.0)
 
+    def motion_px(self, before: Array | None, cam_from_model: Array) -> float:
+        """Largest motion of a corner of the part's box between two poses, px after shrinking; 0 for an unknown one."""
+        if before is None:
+            return 0.0
+        px_per_mm = self._camera.fx / max(float(apply(cam_from_model, self._model_from_body[:3, 3])[2]), 1.0)
+        shrink = max(1, round(self._diameter_mm * px_per_mm / self._options.max_part_px))
+        moved_mm = apply(cam_from_model, self._corners_in_model) - apply(before, self._corners_in_model)
+        return float(np.max(np.linalg.norm(moved_mm[:, :2], axis=1))) * px_per_mm / shrink
+
     def visible_from(self, cam_from_model: Array) -> NDArray[np.bool_]:
         """(C,) components that show enough edge points of their own from about the direction of a pose."""
         edges = self._visible_edges.nearest(cam_from_model)
