@@ -109,6 +109,7 @@ class PartCheck:
             f"  {_extent(size)} mm, {len(self.components)} components, {triangles:,} triangles, "
             f"hash {model.source_hash[:12]}",
             f"  view range{'' if self.part.view_range else ' (default)'}: {_range_text(self.view_range)}",
+            *([] if self.part.up == "z" else [f"  up: {self.part.up}"]),
             f"  camera{' (guessed)' if self.is_camera_guessed else ''}: "
             f"{self.camera.width}×{self.camera.height}, focal length {self.camera.fx:.0f} px",
         ]
@@ -301,20 +302,21 @@ def can_confuse(symmetry: Symmetry, view_range: ViewRange) -> bool:
     directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
     # Half the spacing of the directions as margin, so that a narrow range is not missed.
     directions = directions[view_range.contains_direction(directions, margin_deg=2.5)]
+    up = view_range.up_in_model
     width_deg = view_range.roll_deg[1] - view_range.roll_deg[0]
     for turn in range(1, symmetry.order):
         rotation = exp_so3(np.array(symmetry.axis_in_model) * (2.0 * np.pi * turn / symmetry.order))
         turned = directions @ rotation.T
-        roll_deg = _angle_about_deg(turned, _image_up(turned), _image_up(directions) @ rotation.T)
+        roll_deg = _angle_about_deg(turned, _image_up(turned, up), _image_up(directions, up) @ rotation.T)
         same_roll = np.abs(roll_deg) <= width_deg
         if np.any(view_range.contains_direction(turned, margin_deg=2.5) & same_roll):
             return True
     return False
 
 
-def _image_up(directions: Array) -> Array:
-    """(N,3) unit vectors perpendicular to directions (N,3), closest to +Z: up in a picture of roll 0."""
-    up = np.array([0.0, 0.0, 1.0]) - directions * directions[:, 2:]
+def _image_up(directions: Array, up_in_model: Array) -> Array:
+    """(N,3) unit vectors perpendicular to directions (N,3), closest to the up axis: up in a picture of roll 0."""
+    up = up_in_model - directions * (directions @ up_in_model)[:, None]
     return up / np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-12)
 
 

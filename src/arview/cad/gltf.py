@@ -1,34 +1,35 @@
 """Reader of glTF 2.0 (.glb, .gltf): named nodes, nested transforms, instances, colours.
 
-Source: Khronos glTF 2.0 specification. Written for CAD, so that every node that carries a mesh stays one
-component under its own name; skins, morph targets and textures are ignored.
+Source: Khronos glTF 2.0 specification, EXT_mesh_gpu_instancing, KHR_mesh_quantization. Written for CAD, so that every
+node that carries a mesh stays one component under its own name; skins, morph targets and textures are ignored.
 """
 
 from __future__ import annotations
 
-import base64
 import json
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.raw import RawComponent, RawModel, check_triangle_count, place, unit_in_mm
+from arview.cad.gltf_data import GltfData
+from arview.cad.raw import RawComponent, RawModel, check_instance_count, check_triangle_count, place, unit_in_mm
 from arview.errors import InputError
 from arview.geometry import Array
 
-_DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_UNREADABLE = {
+_COMPRESSED = {
     "KHR_draco_mesh_compression": "Draco compression",
     "EXT_meshopt_compression": "meshopt compression",
     "KHR_meshopt_compression": "meshopt compression",
-    "EXT_mesh_gpu_instancing": "GPU instancing",
 }
+_SUPPORTED = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing")
+_WITHOUT_GEOMETRY = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp_")
+"""Beginnings of the names of extensions that concern appearance only."""
 _MAX_DEPTH = 200
+_TOO_MUCH = (RecursionError, MemoryError, OverflowError)
 
 Color = tuple[float, float, float]
 
@@ -36,8 +37,9 @@ Color = tuple[float, float, float]
 def read_gltf(path: Path) -> RawModel:
     """Components of a .glb or .gltf file in the file's unit.
 
-    The unit is the metre, as the specification says, with one exception: trimesh writes numbers in any unit and tags
-    each mesh with ``extras.units``; the tag is used when trimesh is the generator.
+    The unit is the metre and +Y is up, as the specification says, with one exception: trimesh writes numbers in any
+    unit and axes as they are, and tags each mesh with ``extras.units``; when trimesh is the generator, the tag is used
+    and +Z is up.
 
     Raises:
         InputError: not glTF 2.0, truncated, compressed, or inconsistent in itself.
@@ -49,7 +51,7 @@ def parse_gltf(data: bytes, path: Path) -> RawModel:
     """As read_gltf, from bytes; ``path`` names the file in messages and locates external buffers."""
     try:
         return _Gltf(data, path).read()
-    except (KeyError, IndexError, ValueError, TypeError, AttributeError, struct.error, OSError) as error:
+    except (KeyError, IndexError, ValueError, TypeError, AttributeError, struct.error, OSError, *_TOO_MUCH) as error:
         raise InputError(
             f"{path}: broken or truncated glTF ({type(error).__name__}: {error}); export it again"
         ) from error
@@ -59,6 +61,15 @@ def srgb_from_linear(linear: Array) -> Array:
     """Linear values as sRGB in 0-1 (IEC 61966-2-1)."""
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
+
+
+@dataclass(frozen=True)
+class _GltfMesh:
+    """Vertices (V,3) and faces (F,3) of a mesh in its own frame, and its colour."""
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    color: Color | None
 
 
 class _Gltf:
@@ -88,11 +99,11 @@ class _Gltf:
         self.tree: dict[str, Any] = json.loads(text)
         if not str(self.tree["asset"]["version"]).startswith("2."):
             raise InputError(f"{path}: glTF version {self.tree['asset']['version']}; only 2 is supported")
-        for name in self.tree.get("extensionsRequired", []):
-            if name in _UNREADABLE:
-                raise InputError(f"{path}: uses {_UNREADABLE[name]}, which is not read; export without it")
-        self.buffers: dict[int, bytes] = {}
+        _check_extensions(self.tree, path)
+        self.data = GltfData(self.tree, self.binary, path)
         self.model = RawModel(unit_mm=1000.0)
+        self.meshes: dict[int, _GltfMesh | None] = {}
+        self.visit_count = 0
 
     def read(self) -> RawModel:
         nodes = self.tree.get("nodes", [])
@@ -104,12 +115,14 @@ class _Gltf:
             roots = [index for index in range(len(nodes)) if index not in children]
         for root in roots:
             self._visit(root, np.eye(4), ())
-        self._read_unit_tags()
+        self._read_conventions()
         return self.model
 
     def _visit(self, index: int, root_from_parent: Array, path: tuple[str, ...]) -> None:
         if len(path) > _MAX_DEPTH:
             raise ValueError("nodes are nested in a circle")
+        self.visit_count += 1
+        check_instance_count(self.visit_count, self.path)
         node = self.tree["nodes"][index]
         name = str(node.get("name") or "")
         if not name and "mesh" in node:
@@ -117,29 +130,71 @@ class _Gltf:
         here = (*path, name)
         root_from_node = root_from_parent @ _node_matrix(node)
         if "mesh" in node:
-            self._add_mesh(node["mesh"], root_from_node, here)
+            self._add_instances(node, root_from_node, here)
         for child in node.get("children", []):
             self._visit(child, root_from_node, here)
 
-    def _add_mesh(self, index: int, root_from_node: Array, path: tuple[str, ...]) -> None:
+    def _add_instances(self, node: dict[str, Any], root_from_node: Array, path: tuple[str, ...]) -> None:
+        """Add the mesh of a node once, or once for each instance of EXT_mesh_gpu_instancing, numbered from 1."""
+        instancing = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
+        mesh = self._mesh(node["mesh"], path)
+        if mesh is None:
+            return
+        if instancing is None:
+            self._add(mesh, root_from_node, path)
+            return
+        transforms = self._instance_matrices(instancing["attributes"])
+        self.visit_count += len(transforms)
+        check_instance_count(self.visit_count, self.path)
+        for number, node_from_instance in enumerate(transforms, start=1):
+            name = f"{path[-1] or 'instance'}_{number}"
+            self._add(mesh, root_from_node @ node_from_instance, (*path[:-1], name))
+
+    def _instance_matrices(self, attributes: dict[str, int]) -> list[Array]:
+        """(4,4) node_from_instance of the instances of a node; unknown attributes are custom data."""
+        keys = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}
+        columns = {keys[name]: self.data.accessor(index) for name, index in attributes.items() if name in keys}
+        counts = {len(values) for values in columns.values()}
+        if len(counts) != 1:
+            raise ValueError(f"the attributes of GPU instances have {sorted(counts) or 'no'} counts")
+        check_instance_count(counts.pop(), self.path)
+        rows = zip(*columns.values(), strict=True)
+        return [_node_matrix(dict(zip(columns, (value.astype(float) for value in row), strict=True))) for row in rows]
+
+    def _add(self, mesh: _GltfMesh, root_from_mesh: Array, path: tuple[str, ...]) -> None:
+        check_triangle_count(self.model.triangle_count + len(mesh.faces), self.path)
+        placed, turned = place(root_from_mesh, mesh.vertices, mesh.faces)
+        self.model.add(RawComponent(tuple(n for n in path if n), placed, turned, mesh.color), self.path)
+
+    def _mesh(self, index: int, path: tuple[str, ...]) -> _GltfMesh | None:
+        """The triangles of a mesh, read once however often it is used; None when it has none."""
+        if index not in self.meshes:
+            self.meshes[index] = self._read_mesh(index, path)
+        return self.meshes[index]
+
+    def _read_mesh(self, index: int, path: tuple[str, ...]) -> _GltfMesh | None:
         vertices: list[Array] = []
         faces: list[NDArray[np.int64]] = []
         area_of_color: dict[Color, float] = {}
-        offset = 0
+        offset = triangle_count = 0
         for primitive in self.tree["meshes"][index]["primitives"]:
             mode = primitive.get("mode", 4)
             if mode not in (4, 5, 6):
                 continue
-            points = self._accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
+            points = self.data.accessor(primitive["attributes"]["POSITION"], _compression(primitive))
+            points = points.astype(np.float64)
+            if points.shape[1] != 3:
+                raise ValueError(f"the positions of {'/'.join(path)!r} have {points.shape[1]} coordinates")
             corners = (
-                self._accessor(primitive["indices"]).astype(np.int64).ravel()
+                self.data.accessor(primitive["indices"], _compression(primitive)).astype(np.int64).ravel()
                 if "indices" in primitive
                 else np.arange(len(points), dtype=np.int64)
             )
             triangles = _triangles(corners, mode)
-            if len(triangles) and triangles.max() >= len(points):
+            if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(points):
                 raise ValueError(f"a triangle of {'/'.join(path)!r} refers to a vertex that does not exist")
-            check_triangle_count(self.model.triangle_count + len(triangles), self.path)
+            triangle_count += len(triangles)
+            check_triangle_count(triangle_count, self.path)
             color = self._color(primitive)
             if color is not None:
                 a, b, c = points[triangles].transpose(1, 0, 2)
@@ -148,10 +203,10 @@ class _Gltf:
             vertices.append(points)
             faces.append(triangles + offset)
             offset += len(points)
-        if faces:
-            placed, turned = place(root_from_node, np.concatenate(vertices), np.concatenate(faces))
-            color = max(area_of_color, key=lambda key: area_of_color[key]) if area_of_color else None
-            self.model.add(RawComponent(tuple(n for n in path if n), placed, turned, color), self.path)
+        if not faces:
+            return None
+        color = max(area_of_color, key=lambda key: area_of_color[key]) if area_of_color else None
+        return _GltfMesh(np.concatenate(vertices), np.concatenate(faces), color)
 
     def _color(self, primitive: dict[str, Any]) -> Color | None:
         """Base colour of a primitive's material, times its mean vertex colour, as sRGB."""
@@ -162,67 +217,16 @@ class _Gltf:
             known = "baseColorFactor" in pbr or "baseColorTexture" not in pbr
             linear = np.array(pbr.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])[:3], dtype=np.float64)
         if "COLOR_0" in primitive["attributes"]:
-            linear = linear * self._accessor(primitive["attributes"]["COLOR_0"])[:, :3].mean(axis=0)
+            linear = linear * self.data.accessor(primitive["attributes"]["COLOR_0"])[:, :3].mean(axis=0)
             known = True
         if not known:
             return None
         red, green, blue = srgb_from_linear(linear)
         return float(red), float(green), float(blue)
 
-    def _buffer(self, index: int) -> bytes:
-        if index not in self.buffers:
-            uri = self.tree["buffers"][index].get("uri")
-            if uri is None:
-                self.buffers[index] = self.binary
-            elif uri.startswith("data:"):
-                self.buffers[index] = base64.b64decode(uri.split(",", 1)[1])
-            else:
-                other = self.path.parent / unquote(uri)
-                if not other.is_file():
-                    raise InputError(f"{self.path}: its buffer file {other} is missing")
-                self.buffers[index] = other.read_bytes()
-        return self.buffers[index]
-
-    def _view(self, view_index: int, offset: int, count: int, dtype: str, width: int) -> NDArray[Any]:
-        view = self.tree["bufferViews"][view_index]
-        data = self._buffer(view["buffer"])
-        start = view.get("byteOffset", 0) + offset
-        item = np.dtype(dtype).itemsize
-        stride = view.get("byteStride") or item * width
-        needed = start + stride * (count - 1) + item * width if count else start
-        if needed > len(data):
-            raise InputError(f"{self.path}: truncated: a mesh ends at byte {needed} of {len(data)}")
-        return np.ndarray((count, width), dtype=dtype, buffer=data, offset=start, strides=(stride, item))
-
-    def _accessor(self, index: int) -> NDArray[Any]:
-        """(count, width) values of an accessor, integers scaled to floats where marked ``normalized``."""
-        accessor = self.tree["accessors"][index]
-        dtype, width = _DTYPES[accessor["componentType"]], _WIDTHS[accessor["type"]]
-        count = accessor["count"]
-        if "bufferView" in accessor:
-            view, offset = accessor["bufferView"], accessor.get("byteOffset", 0)
-            values = np.array(self._view(view, offset, count, dtype, width))
-        else:
-            values = np.zeros((count, width), dtype=dtype)
-        if "sparse" in accessor:
-            sparse = accessor["sparse"]
-            where, what = sparse["indices"], sparse["values"]
-            rows = self._view(
-                where["bufferView"],
-                where.get("byteOffset", 0),
-                sparse["count"],
-                _DTYPES[where["componentType"]],
-                1,
-            )
-            values[rows.ravel()] = self._view(
-                what["bufferView"], what.get("byteOffset", 0), sparse["count"], dtype, width
-            )
-        if accessor.get("normalized") and values.dtype.kind in "iu":
-            return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
-        return values
-
-    def _read_unit_tags(self) -> None:
+    def _read_conventions(self) -> None:
         if "trimesh" not in str(self.tree["asset"].get("generator", "")):
+            self.model.up = "y"
             return
         meshes = self.tree.get("meshes", [])
         tags = {str((mesh.get("extras") or {}).get("units", "m")) for mesh in meshes}
@@ -235,6 +239,20 @@ class _Gltf:
         else:
             self.model.unit_mm = None
             self.model.notes.append(f"its meshes are tagged with the units {', '.join(sorted(tags))}")
+
+
+def _check_extensions(tree: dict[str, Any], path: Path) -> None:
+    """Raise InputError when a file requires extensions that are not read."""
+    required = [str(name) for name in tree.get("extensionsRequired", [])]
+    missing = [n for n in required if n not in _SUPPORTED and not n.startswith(_WITHOUT_GEOMETRY)]
+    if missing:
+        told = ", ".join(f"{_COMPRESSED[name]} ({name})" if name in _COMPRESSED else name for name in missing)
+        raise InputError(f"{path}: requires {told}, which is not read; export it without")
+
+
+def _compression(primitive: dict[str, Any]) -> str | None:
+    """Name of the compression of a primitive without uncompressed data, for messages."""
+    return next((_COMPRESSED[name] for name in primitive.get("extensions", {}) if name in _COMPRESSED), None)
 
 
 def _node_matrix(node: dict[str, Any]) -> Array:

@@ -20,6 +20,7 @@ from arview.cad.model import Component, Model, make_model
 from arview.cad.obj import read_obj
 from arview.cad.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names, unit_in_mm
 from arview.cad.threemf import read_3mf
+from arview.cad.view_range import Up
 from arview.core.checks import PATH, check_type
 from arview.errors import InputError, MissingDependencyError
 from arview.geometry import Array
@@ -33,11 +34,12 @@ DEFAULT_COLOR = (0.6, 0.6, 0.62)
 
 @dataclass(frozen=True)
 class LoadedCad:
-    """A model, the unit of its file in mm, and remarks on renamed or empty nodes."""
+    """A model, the unit of its file in mm, remarks on renamed or empty nodes, and the axis that is up by its format."""
 
     model: Model
     unit_mm: float
     notes: tuple[str, ...]
+    up: Up = "z"
 
 
 def load_model(
@@ -107,7 +109,7 @@ def load_cad(
         raise InputError(f"{path}: all triangles are degenerate (they have no area)")
     model = make_model(path.stem, tuple(components))
     _check_size(model, path)
-    return LoadedCad(model, factor_mm, tuple(raw.notes + notes))
+    return LoadedCad(model, factor_mm, tuple(raw.notes + notes), raw.up)
 
 
 def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
@@ -158,6 +160,7 @@ def _read_step(path: Path, tol_linear_mm: float, tol_angular_deg: float, is_over
         reason = reason or (f"OpenCASCADE crashed, code {done.returncode}" if done.returncode else "no shape in it")
         raise InputError(f"{path}: broken or truncated STEP ({reason}); export it again")
     raw = parse_gltf(data, path)
+    raw.up = "z"
     if is_overridden:
         declared_mm = _step_unit_mm(path)
         for index, component in enumerate(raw.components):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from arview.cad.model import Model
 from arview.cad.symmetry import Symmetry
-from arview.cad.view_range import ViewRange
+from arview.cad.view_range import Up, ViewRange
 from arview.errors import InputError
 
 Role = Literal["base", "inspect", "ignore"]
@@ -90,6 +90,7 @@ class Part:
         serial: serial number of the specimen, or None.
         serial_pattern: regular expression that a code on the part must match to be a serial number; empty: the form of
             the serial number, see `arview.fiducials.serial_code.SerialNumbers`.
+        up: axis of the model that is up; the part file's, else the format's.
         notes: remarks of the loader on renamed or empty components.
     """
 
@@ -104,6 +105,7 @@ class Part:
     guides: tuple[Guide, ...] = ()
     serial: str | None = None
     serial_pattern: str = ""
+    up: Up = "z"
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -129,7 +131,7 @@ class Part:
     @property
     def effective_view_range(self) -> ViewRange:
         """The declared range of viewpoints, or the default one."""
-        return self.view_range or default_view_range(self.model)
+        return self.view_range or replace(default_view_range(self.model), up=self.up)
 
 
 def default_view_range(model: Model) -> ViewRange:

@@ -24,7 +24,7 @@ from arview.cad.part import (
 from arview.cad.raw import UNIT_MM
 from arview.cad.symmetry import Symmetry
 from arview.cad.toml_table import TomlTable
-from arview.cad.view_range import ViewRange
+from arview.cad.view_range import UP_AXES, Up, ViewRange
 from arview.core.checks import PATH, check_type
 from arview.errors import InputError
 
@@ -39,6 +39,8 @@ PART_FILE_EXAMPLE = """\
 name = "bracket plate"         # default: the name of this file, or of its folder for part.toml
 cad = "bracket_plate.step"     # relative to this file
 # unit = "mm"                  # mm, cm, m, inch: needed for OBJ, STL and PLY; overrides the unit of others
+# up = "z"                     # axis of the CAD file that is up: x, y, z, -x, -y, -z; default: y for glTF (not that of
+                               # trimesh, which writes the axes as they are), z for all others
 tol_linear_mm = 0.1            # STEP: largest distance of the triangles from the true surface
 tol_angular_deg = 10.0         # STEP: largest angle between neighbouring triangles of a curved surface
 serial = "BP-0042"             # of the specimen at hand, shown in the overlay
@@ -48,7 +50,8 @@ serial = "BP-0042"             # of the specimen at hand, shown in the overlay
 # serial_pattern = "BP-[0-9]{4}"
 
 # From where the camera may look at the middle of the part's bounding box. Azimuth runs from +X to +Y,
-# elevation from the XY plane to +Z, roll 0 has +Z up in the picture. All but distance_mm may be left out.
+# elevation from the XY plane to +Z, roll 0 has +Z up in the picture. All but distance_mm may be left out. With up = "y"
+# azimuth runs from +X to -Z, elevation to +Y, which is up at roll 0: the frame in which the up axis is called +Z.
 # Without this table: every direction and roll, from where the part fills the picture to where it spans 60 px.
 [view_range]
 distance_mm = [400.0, 900.0]
@@ -139,7 +142,7 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
     if path.suffix.lower() != ".toml":
         cad = load_cad(path, unit)
         settings = tuple(ComponentSettings(component.name) for component in cad.model.components)
-        return Part(path.stem, path, path, cad.model, settings, notes=cad.notes)
+        return Part(path.stem, path, path, cad.model, settings, up=cad.up, notes=cad.notes)
     try:
         content = tomllib.loads(path.read_bytes().decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -158,6 +161,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
     name = head.text("name", default_name)
     cad_path = path.parent / head.text("cad")
     own_unit = head.choice("unit", tuple(UNIT_MM), None)
+    own_up = head.choice("up", UP_AXES, None)
     tol_linear_mm = head.positive("tol_linear_mm", 0.1)
     tol_angular_deg = head.positive("tol_angular_deg", 10.0)
     serial = head.text("serial", "") or None
@@ -168,6 +172,8 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
     view_range = _read_view_range(root.table("view_range")) if "view_range" in root.content else None
     guides = _read_guides(root.table("guides"))
     cad = load_cad(cad_path, unit or own_unit, cast(float, tol_linear_mm), cast(float, tol_angular_deg))
+    up = cast(Up, own_up or cad.up)
+    view_range = replace(view_range, up=up) if view_range else None
     names = [component.name for component in cad.model.components]
     defaults = _read_settings(root.table("defaults"), "", cad.model, ComponentSettings(""))
     tables = root.table("components")
@@ -201,6 +207,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
         guides=guides,
         serial=serial,
         serial_pattern=serial_pattern,
+        up=up,
         notes=cad.notes,
     )
 

@@ -8,11 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.cad.view_range import Up
 from arview.errors import InputError
 from arview.geometry import Array
 
 MAX_TRIANGLES = 5_000_000
 """Largest number of triangles of a file."""
+
+MAX_INSTANCES = 10_000
+"""Largest number of components and assemblies of a file, each counted as often as it is placed."""
 
 UNIT_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 """Units that a user may name, in mm."""
@@ -53,18 +57,20 @@ class RawComponent:
 
 @dataclass
 class RawModel:
-    """The content of a file: its meshes, its unit in mm (None when it has none) and remarks for the user."""
+    """The content of a file: its meshes, unit in mm (None when it has none), remarks for the user, and up axis."""
 
     components: list[RawComponent] = field(default_factory=list)
     unit_mm: float | None = None
     notes: list[str] = field(default_factory=list)
     triangle_count: int = 0
+    up: Up = "z"
 
     def add(self, component: RawComponent, path: Path) -> None:
         """Append a component; raises InputError beyond MAX_TRIANGLES."""
         self.triangle_count += len(component.faces)
         check_triangle_count(self.triangle_count, path)
         self.components.append(component)
+        check_instance_count(len(self.components), path)
 
 
 def check_triangle_count(count: int, path: Path) -> None:
@@ -73,6 +79,15 @@ def check_triangle_count(count: int, path: Path) -> None:
         raise InputError(
             f"{path}: more than {MAX_TRIANGLES:,} triangles; decimate the mesh or export it with a coarser "
             "tolerance (for STEP: a larger tol_linear_mm); about 100,000 are plenty for tracking"
+        )
+
+
+def check_instance_count(count: int, path: Path) -> None:
+    """Raise InputError when a file places more than MAX_INSTANCES components and assemblies."""
+    if count > MAX_INSTANCES:
+        raise InputError(
+            f"{path}: more than {MAX_INSTANCES:,} components, counted as often as they are placed; "
+            "export the part without what need not be inspected"
         )
 
 
@@ -105,8 +120,10 @@ def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str]
     paths = [path or (fallback,) for path in paths]
     names = [path[-1] for path in paths]
     notes: list[str] = []
-    for name in dict.fromkeys(names):
-        same = [i for i, path in enumerate(paths) if path[-1] == name]
+    indices: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        indices.setdefault(name, []).append(i)
+    for name, same in indices.items():
         if len(same) == 1:
             continue
         deepest = max(len(paths[i]) for i in same)
@@ -123,13 +140,22 @@ def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str]
             notes.append(f"{len(same)} components are named {name!r}: called {', '.join(candidates[:4])}")
     taken: set[str] = set()
     given = set(names)
+    last_number: dict[str, int] = {}
+    renamed: dict[str, list[str]] = {}
     for i, name in enumerate(names):
-        number, unique = 1, name
+        number, unique = last_number.get(name, 1), name
         while unique in taken or (number > 1 and unique in given):
             number += 1
             unique = f"{name}_{number}"
-        if number > 1:
-            notes.append(f"another component is named {name!r}: called {unique}")
+        last_number[name] = number
+        if unique != name:
+            renamed.setdefault(name, []).append(unique)
         taken.add(unique)
         names[i] = unique
+    for name, others in renamed.items():
+        if len(others) == 1:
+            notes.append(f"another component is named {name!r}: called {others[0]}")
+        else:
+            rest = f" and {len(others) - 4} more" if len(others) > 4 else ""
+            notes.append(f"{len(others)} more components are named {name!r}: called {', '.join(others[:4])}{rest}")
     return names, notes

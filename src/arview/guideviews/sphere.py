@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from arview.cad.view_range import ViewRange
 from arview.geometry import Array, look_at
@@ -37,9 +38,11 @@ def icosphere_directions(subdivisions: int) -> Array:
     return points
 
 
-def view_poses(directions: Array, distance_mm: float, center_in_model: Array) -> Array:
-    """(N,4,4) ``cam_from_model`` of cameras on a sphere around the centre, looking at it with +Z up."""
-    up = np.array([0.0, 0.0, 1.0])
+def view_poses(
+    directions: Array, distance_mm: float, center_in_model: Array, up_in_model: ArrayLike = (0.0, 0.0, 1.0)
+) -> Array:
+    """(N,4,4) ``cam_from_model`` of cameras on a sphere around the centre, looking at it with an axis up."""
+    up = np.asarray(up_in_model, dtype=np.float64)
     return np.stack([look_at(center_in_model + distance_mm * d, center_in_model, up) for d in directions])
 
 
@@ -49,6 +52,4 @@ def directions_in_range(view_range: ViewRange, subdivisions: int, margin_deg: fl
     inside = view_range.contains_direction(directions, margin_deg)
     if inside.any():
         return directions[inside]
-    azimuth = np.deg2rad(0.5 * sum(view_range.azimuth_deg))
-    elevation = np.deg2rad(0.5 * sum(view_range.elevation_deg))
-    return np.array([[np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]])
+    return view_range.direction(0.5 * sum(view_range.azimuth_deg), 0.5 * sum(view_range.elevation_deg))[None]

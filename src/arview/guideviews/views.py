@@ -270,7 +270,7 @@ def make_guide_views(
     distance_mm = view_distance_mm(view_range, model)
     camera = guide_camera(model, distance_mm, options.resolution_px)
     directions = directions_in_range(view_range, options.subdivisions, options.margin_deg)
-    poses = view_poses(directions, distance_mm, model.center_in_model)
+    poses = view_poses(directions, distance_mm, model.center_in_model, view_range.up_in_model)
     features = []
     for found in _extracted(model, camera, poses, options):
         features.append(found)

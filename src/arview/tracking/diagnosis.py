@@ -96,7 +96,7 @@ def diagnose_search(
     credible = rejected if rejected is not None and rejected.quality >= options.min_quality else None
     reason = _too_small(camera, views, credible, options)
     if not reason and credible is not None:
-        place = viewpoint(credible.cam_from_model, views.center_in_model)
+        place = viewpoint(credible.cam_from_model, views.center_in_model, views.view_range.up)
         reason = outside_range(place, views.view_range, credible.quality >= options.fitting_quality, options)
         reason = reason or _partly_outside(camera, views, credible, options)
         reason = reason or _low_contrast(image, camera, views, credible.cam_from_model, options)
@@ -178,8 +178,7 @@ def outside_range(
         return f"too near: about {place.distance_mm:.0f} mm, declared from {low:.0f} mm"
     if not is_fitting:
         return ""
-    azimuth, elevation = np.deg2rad([place.azimuth_deg, place.elevation_deg])
-    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    direction = view_range.direction(place.azimuth_deg, place.elevation_deg)
     if not view_range.contains_direction(direction, options.angle_margin_deg):
         return (
             f"seen from outside the declared range: azimuth {place.azimuth_deg:.0f}°, "
@@ -214,9 +213,8 @@ def diagnose_loss(
     """
     center = apply(estimate.cam_from_model, views.center_in_model)
     if not is_possible and center[2] > 0:
-        return outside_range(
-            viewpoint(estimate.cam_from_model, views.center_in_model), views.view_range, False, options
-        )
+        place = viewpoint(estimate.cam_from_model, views.center_in_model, views.view_range.up)
+        return outside_range(place, views.view_range, False, options)
     step_px, share = _motion(camera, views, recent) if recent is not None else (np.zeros(2), None)
     in_picture = estimate.evidence.points_in_picture
     if center[2] <= 0 or in_picture < options.left_share:

@@ -26,7 +26,8 @@ STANDARD_GUIDES = (
     Guide("bottom", -90.0, -90.0),
     Guide("iso", -45.0, 35.26),
 )
-"""Standard views of CAD programs with +Z up: front looks along +Y, right along -X; top has +Y up in the picture."""
+"""Standard views of CAD programs, in the upright frame: front looks along +Y, right along -X; top has +Y up in the
+picture."""
 MIDDLE = "middle"
 """Name of the middle of the declared range, which every range has."""
 FILL = 0.6
@@ -80,7 +81,7 @@ def guide_pose(name: str, part: Part, view_range: ViewRange, camera: Camera) -> 
     ray = camera.unproject([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])
     roll_deg = placed.roll_deg if placed.roll_deg is not None else _usual_roll_deg(view_range)
     place = Viewpoint(distance_mm, placed.elevation_deg, placed.azimuth_deg, roll_deg)
-    return pose_at(place, part.model.center_in_model, ray)
+    return pose_at(place, part.model.center_in_model, ray, view_range.up)
 
 
 def _find(name: str, part: Part, view_range: ViewRange) -> Guide:
@@ -114,8 +115,7 @@ def _in_range(guide: Guide, view_range: ViewRange) -> Guide | None:
     Straight above or below, the azimuth only turns the part in the picture, so a standard view takes an azimuth of the
     range.
     """
-    azimuth, elevation = np.deg2rad([guide.azimuth_deg, guide.elevation_deg])
-    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    direction = view_range.direction(guide.azimuth_deg, guide.elevation_deg)
     if not view_range.contains_direction(direction, MARGIN_DEG):
         return None
     if abs(guide.elevation_deg) > 89.0 and guide in STANDARD_GUIDES:

@@ -1,0 +1,116 @@
+"""Buffers and accessors of a glTF file: every size is checked before memory is reserved for it."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.raw import MAX_TRIANGLES
+from arview.errors import InputError
+
+_DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_MAX_SPARSE_COUNT = 1_000_000
+"""Largest number of elements of an accessor that starts as zeros: they take memory without any bytes in the file."""
+
+
+class GltfData:
+    """Reader of the binary data of one file.
+
+    External buffers are read only from the folder of the file and the folders in it, so that a file of unknown origin
+    cannot bring in other files of the machine.
+    """
+
+    def __init__(self, tree: dict[str, Any], binary: bytes, path: Path) -> None:
+        self.tree = tree
+        self.binary = binary
+        self.path = path
+        self.buffers: dict[int, bytes] = {}
+
+    def accessor(self, index: int, compression: str | None = None) -> NDArray[Any]:
+        """(count, width) values of an accessor, integers scaled to floats where marked ``normalized``.
+
+        ``compression`` names that of the mesh, which is told when the accessor has no data of its own.
+        """
+        accessor = self.tree["accessors"][_natural(index, "accessor")]
+        dtype, width = _DTYPES[accessor["componentType"]], _WIDTHS[accessor["type"]]
+        count = _natural(accessor["count"], "accessor count")
+        if count > 3 * MAX_TRIANGLES:
+            raise InputError(f"{self.path}: an accessor has {count:,} elements; decimate the mesh")
+        sparse = accessor.get("sparse")
+        if "bufferView" in accessor:
+            values = np.array(self._view(accessor["bufferView"], accessor.get("byteOffset", 0), count, dtype, width))
+        elif sparse is None and compression:
+            raise InputError(f"{self.path}: uses {compression}, which is not read; export it without")
+        elif sparse is None or count > _MAX_SPARSE_COUNT:
+            raise InputError(f"{self.path}: an accessor of {count:,} elements has no data; export it again")
+        else:
+            values = np.zeros((count, width), dtype=dtype)
+        if sparse is not None:
+            self._replace(values, sparse, dtype, width)
+        if accessor.get("normalized") and values.dtype.kind in "iu":
+            return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
+        return values
+
+    def _replace(self, values: NDArray[Any], sparse: dict[str, Any], dtype: str, width: int) -> None:
+        """Overwrite the elements that a sparse accessor lists."""
+        count = _natural(sparse["count"], "sparse count")
+        where, what = sparse["indices"], sparse["values"]
+        rows = self._view(where["bufferView"], where.get("byteOffset", 0), count, _DTYPES[where["componentType"]], 1)
+        rows = rows.ravel().astype(np.int64)
+        if len(rows) and not 0 <= rows.min() <= rows.max() < len(values):
+            raise ValueError(f"a sparse accessor replaces element {rows.max()} of {len(values)}")
+        values[rows] = self._view(what["bufferView"], what.get("byteOffset", 0), count, dtype, width)
+
+    def _view(self, view_index: int, offset: int, count: int, dtype: str, width: int) -> NDArray[Any]:
+        """(count, width) view of a buffer; raises InputError where it would reach beyond the data."""
+        view = self.tree["bufferViews"][_natural(view_index, "bufferView")]
+        if any(name.endswith("meshopt_compression") for name in view.get("extensions", {})):
+            raise InputError(f"{self.path}: uses meshopt compression, which is not read; export it without")
+        data = self._buffer(_natural(view["buffer"], "buffer"))
+        item = np.dtype(dtype).itemsize
+        start = _natural(view.get("byteOffset", 0), "byteOffset") + _natural(offset, "byteOffset")
+        stride = _natural(view.get("byteStride") or item * width, "byteStride")
+        if stride < item * width:
+            raise ValueError(f"a byteStride of {stride} for elements of {item * width} bytes")
+        needed = start + stride * (count - 1) + item * width if count else start
+        if needed > len(data):
+            raise InputError(f"{self.path}: truncated: a mesh ends at byte {needed} of {len(data)}")
+        return np.ndarray((count, width), dtype=dtype, buffer=data, offset=start, strides=(stride, item))
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self.buffers:
+            uri = self.tree["buffers"][index].get("uri")
+            if uri is None:
+                self.buffers[index] = self.binary
+            elif uri.startswith("data:"):
+                self.buffers[index] = base64.b64decode(uri.split(",", 1)[1])
+            else:
+                length = _natural(self.tree["buffers"][index]["byteLength"], "byteLength")
+                self.buffers[index] = self._external(unquote(uri), length)
+        return self.buffers[index]
+
+    def _external(self, name: str, length: int) -> bytes:
+        """The first bytes of a file beside the glTF file."""
+        folder = self.path.resolve().parent
+        other = (folder / name).resolve()
+        if "://" in name or not other.is_relative_to(folder):
+            raise InputError(
+                f"{self.path}: its buffer {name!r} is not a file beside it; put the file there, or use .glb"
+            )
+        if not other.is_file():
+            raise InputError(f"{self.path}: its buffer file {self.path.parent / name} is missing")
+        with other.open("rb") as file:
+            return file.read(length)
+
+
+def _natural(value: object, what: str) -> int:
+    """A whole number from 0 on; raises ValueError for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"{what} is {value!r}")
+    return value
