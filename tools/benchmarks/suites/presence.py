@@ -106,7 +106,7 @@ class PresenceSuite:
         recorded: scenes by name.
         details: for evaluation.json.
         folder: of the sequences, which are made when missing.
-        frames: of each sequence; None for the default.
+        frames: of each sequence, and at most of a recording; None for the default, and for all.
         assemblies: how many of the assemblies; None: all.
         backgrounds: folder of photos, or None for the default.
     """
@@ -121,7 +121,8 @@ class PresenceSuite:
         backgrounds: Path | None = None,
     ) -> None:
         self._recorded, self._details, self._folder = recorded, details, folder / "presence"
-        self._frames, self._assemblies, self._backgrounds = frames or FRAMES, assemblies, backgrounds
+        self._frames, self._limit = frames or FRAMES, frames
+        self._assemblies, self._backgrounds = assemblies, backgrounds
 
     def rows(self) -> list[ResultRow]:
         """All rows of the section."""
@@ -167,7 +168,7 @@ class PresenceSuite:
                 views = full_sphere_views(scene.part.model, (min(distances), max(distances)))
                 start = None if name == "plate" else scene.frames[0].cam_from_model
                 session = TrackingSession(views, scene.camera, scene.part.model, initial_cam_from_model=start)
-                for number, shown in enumerate(scene.frames[: self._frames * 3]):
+                for number, shown in enumerate(scene.frames[: self._limit]):
                     result.add(session.process(scene.image(shown), number, number / 30.0))
                 rows.append(self._right_row(result))
         for name in CLIPS:
@@ -179,7 +180,7 @@ class PresenceSuite:
                 result = PresenceResult(f"sample {name}", there=[one.name for one in part.model.components])
                 session = TrackingSession(declared_views(part), camera, part.model)
                 for number, frame in enumerate(open_source(clip)):
-                    if number >= self._frames * 3:
+                    if self._limit is not None and number >= self._limit:
                         break
                     result.add(session.process(frame.image, number, number / 30.0))
                 rows.append(self._right_row(result))
@@ -264,8 +265,3 @@ def absent_rows(on: str, results: Sequence[PresenceResult]) -> list[ResultRow]:
         ResultRow("presence, absent", on, text, "≥ 97 % missing, none ever present", is_absent_right),
         ResultRow("presence, there", on, other, "≥ 97 % present, none ever missing", is_there_right),
     ]
-
-
-def read_results(path: Path) -> list[PresenceResult]:
-    """The results of the sequences in an evaluation.json."""
-    return [PresenceResult(**one) for one in json.loads(path.read_text())["scenes"]["presence"]]
