@@ -23,7 +23,7 @@ from click.testing import CliRunner, Result
 
 from arview.cli import ExitCode, main
 from arview.errors import InputError, MissingDependencyError, OutputError
-from arview.history import HistoryStore, capability, control_chart, series_of
+from arview.history import Capability, HistoryStore, capability, capability_by_limits, control_chart, series_of
 from arview.history import store as store_module
 from arview.history.chart import draw
 from arview.history.tables import results
@@ -481,6 +481,81 @@ def test_a_series(filled: HistoryStore, tmp_path: Path) -> None:
     assert len(newest.values) == 1
     with pytest.raises(InputError, match="no component 'nut'"):
         series_of(filled, "nut")
+
+
+def _rejudged(made: Inspection, tolerance_mm: float, model_hash: str | None = None) -> Inspection:
+    """The inspection with another tolerance, and the verdict that follows."""
+    (one,) = made.components
+    moved = (one.displacement_mm[0] or 0.0, 0.02, -0.01)
+    block = deviation("block_1", moved, np.zeros(3), tolerance_mm, uncertainty_mm=0.02)
+    return replace(made, components=(block,), model_hash=model_hash or made.model_hash)
+
+
+def _twenty_then_a_tighter_tolerance(store: HistoryStore, folder: Path, later: int = 1) -> list[float]:
+    """20 parts about 0.35 mm off that were accepted at 0.5 mm, then ``later`` about 0.1 mm off at 0.3 mm."""
+    rng = np.random.default_rng(5)
+    moved = [*rng.normal(0.35, 0.03, 20), *rng.normal(0.1, 0.03, later)]
+    for index, dx in enumerate(moved):
+        made = _rejudged(built(index, float(dx)), 0.5 if index < 20 else 0.3)
+        assert made.components[0].verdict.value == "pass"
+        store.add(saved(folder, f"t{index}", made))
+    return [float(np.hypot(np.hypot(dx, 0.02), 0.01)) for dx in moved]
+
+
+def test_each_value_is_judged_by_the_limits_that_held_for_it(store: HistoryStore, tmp_path: Path) -> None:
+    distances = _twenty_then_a_tighter_tolerance(store, tmp_path)
+    series = series_of(store, "block_1")
+    assert [one.value for one in series.values] == pytest.approx(distances)
+    assert {one.upper for one in series.values[:20]} == {0.5}
+    assert (series.values[20].upper, series.upper) == (0.3, 0.3)
+    assert all(one.is_within for one in series.values)
+    assert series.changes() == ["limits changed on 2026-03-02 08:30 (S020): at most 0.5 before, at most 0.3 since"]
+    over_all = capability(distances, None, 0.3)
+    assert over_all.cpk < 0.0  # what judging old parts by the new limit would say
+    found = capability_by_limits(series)
+    before, since = found[None, 0.5], found[None, 0.3]
+    assert isinstance(before, Capability)
+    assert before.cpk == pytest.approx((0.5 - np.mean(distances[:20])) / (3.0 * np.std(distances[:20], ddof=1)))
+    assert before.cpk > 1.0
+    assert "need at least 10 values, there is 1" in str(since)
+    given = series.with_limits(None, 0.4)
+    assert (len(given.by_limits()), given.changes(), given.upper) == (1, [], 0.4)
+
+
+def test_the_command_says_when_the_limits_changed(tmp_path: Path) -> None:
+    where = tmp_path / "results.sqlite"
+    with HistoryStore(where) as store:
+        _twenty_then_a_tighter_tolerance(store, tmp_path, later=12)
+    done = run("chart", "--component", "block_1", "--store", where, "-o", tmp_path / "t.svg")
+    assert done.exit_code == 0, done.output
+    assert "limits changed on 2026-03-02 08:30 (S020): at most 0.5 before, at most 0.3 since" in done.output
+    assert "32 of 32 within the limits that held for them" in done.output
+    lines = [line for line in done.output.splitlines() if line.startswith("limits at most")]
+    assert [line.split(":")[0] for line in lines] == ["limits at most 0.5, 20 values", "limits at most 0.3, 12 values"]
+    assert all("k -" not in line for line in lines)
+    assert (tmp_path / "t.svg").stat().st_size > 5000
+
+
+def test_a_series_goes_on_across_cad_revisions_on_wish(store: HistoryStore, tmp_path: Path) -> None:
+    for index in range(12):
+        made = built(index, 0.05 + 0.001 * index)
+        hash_then = made.model_hash if index < 7 else "b" * 64
+        store.add(saved(tmp_path, f"r{index}", replace(made, model_hash=hash_then)))
+    cut = series_of(store, "block_1")
+    assert (len(cut.values), cut.changes()) == (5, [])
+    assert cut.left_out == ("7 measured against another CAD model than the newest",)
+    whole = series_of(store, "block_1", revisions=True)
+    assert (len(whole.values), whole.left_out) == (12, ())
+    assert whole.changes() == [
+        f"CAD model changed on 2026-03-01 19:30 (S007): {MODEL.source_hash[:12]} before, {'b' * 12} since"
+    ]
+    where = store.name
+    done = run("chart", "--component", "block_1", "--store", where)
+    assert "(--revisions counts them)" in done.output
+    done = run("chart", "--component", "block_1", "--store", where, "--revisions")
+    assert done.exit_code == 0, done.output
+    assert "12 values" in done.output
+    assert "CAD model changed on" in done.output
 
 
 def test_one_of_several_parts_must_be_chosen(filled: HistoryStore, tmp_path: Path) -> None:

@@ -115,8 +115,10 @@ def test_undetermined_is_a_word_and_minus_a_minus() -> None:
     open_z = deviation("x", (0.1, -0.05, None), np.zeros(3))
     assert "dz\u00a0undetermined" in finding_text(open_z)
     assert "dy\u00a0−0.050" in finding_text(open_z)
+    rough = deviation("x", (0.1234, 0.0, 0.0), np.zeros(3), 0.3, uncertainty_mm=0.4)
+    assert finding_text(rough).startswith("0.12 mm from its design position, U = 0.40 mm; 0.3 mm is allowed: dx\u00a0+0.12")
     assert zone_text(open_z).startswith("≥ 0.224")  # an undetermined axis can only enlarge it
-    assert zone_text(deviation("x", (0.3, 0.4, 0.0), np.zeros(3))) == "1.000 (1.000)"
+    assert zone_text(deviation("x", (0.3, 0.4, 0.0), np.zeros(3))) == "1.000 (1)"
 
 
 # ---- pictures
@@ -220,7 +222,7 @@ def test_the_page_holds_all_and_needs_no_network(
     plain = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", body))
     for expected in (
         "bench", "SN-7", "Fail", "1 missing, 1 out of tolerance", "the photos are few", "+2.400", "−1.800",
-        "6.000 (1.000)", "undetermined", "The component is missing.", "Foreign object on plate, 90 mm²",
+        "6.000 (1)", "undetermined", "The component is missing.", "Foreign object on plate, 90 mm²",
         "ISO 14253-1", "fewer than 100 points", "8 photos, 300 points observed 2,400 times", "datum A",
     ):  # fmt: skip
         assert expected in plain, expected
@@ -342,7 +344,7 @@ def test_the_pdf(source: Path, part: Part, patched: None, tmp_path: Path) -> Non
         "SN-7",
         "block_2",
         "undetermined",
-        "6.000 (1.000)",
+        "6.000 (1)",
         f"Page 1 of {len(document.pages)}",
         "Inspector",
     ):

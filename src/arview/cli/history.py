@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -13,8 +14,9 @@ from arview.cli.exit_codes import ExitCode
 from arview.errors import ArviewError, InputError
 
 if TYPE_CHECKING:
-    from arview.history import HistoryStore, StoredResult
+    from arview.history import Capability, ComponentSeries, ControlChart, HistoryStore, StoredResult
 
+_SHOWN_CHANGES = 8
 _QUANTITIES = ("distance", "dx", "dy", "dz", "tilt", "twist")
 
 STORE = click.option(
@@ -164,9 +166,12 @@ Examples:
 Individuals and moving ranges (ISO 7870-2): the control limits are 3 standard deviations, estimated from
 the mean moving range. A value beyond them, 8 in a row on one side of the mean, or 6 in a row that rise or
 fall are signals. Cp and Cpk (ISO 22514-2) come with 95 % confidence intervals. They are called Pp and Ppk
-when the process is not in control, refused below 10 values, and given with a warning below 50. A distance
+when the process is not in control, refused below 10 values, and given with a warning below 50. Each value
+is judged by the limits that held when it was measured: where these changed, the date is printed, and
+there are indices for the values of each. A distance
 has an upper limit only, hence Cpk alone. Distances near zero are not normally distributed; dx, dy and dz
-describe a process better. A serial that was measured again counts once, unless --repeats is given.""",
+describe a process better. A serial that was measured again counts once, unless --repeats is given. Only
+results of the newest CAD model count, unless --revisions is given.""",
 )
 @click.option("--component", required=True, metavar="NAME", help="Component to chart.")
 @click.option("--of", "quantity", type=click.Choice(_QUANTITIES), default="distance", show_default=True,
@@ -174,63 +179,90 @@ describe a process better. A serial that was measured again counts once, unless 
 @click.option("--lower", type=float, metavar="X", help="Lower limit, instead of the tolerance's.")
 @click.option("--upper", type=float, metavar="X", help="Upper limit, instead of the tolerance's.")
 @click.option("--repeats", is_flag=True, help="Count every measurement of a serial.")
+@click.option("--revisions", is_flag=True, help="Count results of every CAD model that has the component.")
 @click.option("-o", "--output", metavar="FILE", help="Picture to write: .svg, .png or .pdf.")
 @PART
 @STATION
 @SINCE
 @STORE
 def chart(
-    component: str, quantity: str, lower: float | None, upper: float | None, repeats: bool, output: str | None,
-    part: str | None, station: str | None, since: str | None, store: str | None,
+    component: str, quantity: str, lower: float | None, upper: float | None, repeats: bool, revisions: bool,
+    output: str | None, part: str | None, station: str | None, since: str | None, store: str | None,
 ) -> None:  # fmt: skip
     """Show the trend of a component over the parts, with control limits, Cp and Cpk."""
-    from dataclasses import replace
-
-    from arview.history import capability, control_chart, series_of
+    from arview.history import Capability, capability_by_limits, control_chart, series_of
     from arview.history.chart import FORMATS, draw
 
     target = None if output is None else output_path(output, [])
     if target is not None and target.suffix.lstrip(".").lower() not in FORMATS:
         raise InputError(f"{target}: expected a name that ends with {', '.join('.' + one for one in FORMATS)}")
     with _open(store, must_exist=True) as opened:
-        series = series_of(opened, component, quantity, part, station, _moment(since), repeats)  # type: ignore[arg-type]
-    series = replace(
-        series, lower=series.lower if lower is None else lower, upper=series.upper if upper is None else upper
-    )
+        series = series_of(
+            opened, component, quantity, part, station, _moment(since), repeats, revisions  # type: ignore[arg-type]
+        )  # fmt: skip
+    series = series.with_limits(lower, upper)
     for reason in series.left_out:
-        say(f"left out: {reason}")
+        say(f"left out: {reason}{' (--revisions counts them)' if 'CAD model' in reason else ''}")
     values = [one.value for one in series.values]
-    count = f"{len(values)} value{'s' * (len(values) != 1)}"
-    click.echo(f"{series.part}, {series.component}, {series.quantity} in {series.unit}: {count}")
-    limits = ability = None
+    click.echo(f"{series.part}, {series.component}, {series.quantity} in {series.unit}: {_count(values)}")
+    changes = series.changes()
+    for sentence in changes[:_SHOWN_CHANGES]:
+        click.echo(sentence)
+    if len(changes) > _SHOWN_CHANGES:
+        click.echo(f"and {len(changes) - _SHOWN_CHANGES} more changes")
+    limits = None
     try:
         limits = control_chart(values, series.is_length)
-        click.echo(f"mean {limits.center:+.4f}, control limits {limits.lower:+.4f} to {limits.upper:+.4f}, "
-                   f"mean moving range {limits.range_center:.4f}")  # fmt: skip
-        for index, why in limits.signals.items():
-            one = series.values[index]
-            click.echo(
-                f"  {one.serial or f'no. {one.result_id}'} ({one.measured:%Y-%m-%d %H:%M}): {one.value:+.4f}, {why}"
-            )
+        _print_chart(limits, series)
     except ArviewError as error:
         say(str(error))
-    try:
-        ability = capability(values, series.lower, series.upper, [one.std for one in series.values])
-        name_cp, name_cpk = ability.names
-        if ability.cp is not None and ability.cp_interval is not None:
-            click.echo(
-                f"{name_cp} {ability.cp:.2f} (95 %: {ability.cp_interval[0]:.2f} to {ability.cp_interval[1]:.2f})"
-            )
-        click.echo(
-            f"{name_cpk} {ability.cpk:.2f} (95 %: {ability.cpk_interval[0]:.2f} to {ability.cpk_interval[1]:.2f})"
-        )
-        for warning in ability.warnings:
-            say(f"warning: {warning}")
-    except ArviewError as error:
-        say(str(error))
+    judged = [one.is_within for one in series.values if one.is_within is not None]
+    if judged:
+        click.echo(f"{sum(judged)} of {len(judged)} within the limits that held for them")
+    ability = None
+    found = capability_by_limits(series)
+    for (low, high), one in found.items():
+        _print_capability(one, series, (low, high) if len(found) > 1 else None)
+        if isinstance(one, Capability) and (low, high) == (series.lower, series.upper):
+            ability = one
     if target is not None:
         write_bytes(target, draw(series, limits, ability, target.suffix.lstrip(".").lower()))
         click.echo(f"wrote {target}")
+
+
+def _print_chart(limits: ControlChart, series: ComponentSeries) -> None:
+    click.echo(f"mean {limits.center:+.4f}, control limits {limits.lower:+.4f} to {limits.upper:+.4f}, "
+               f"mean moving range {limits.range_center:.4f}")  # fmt: skip
+    for index, why in limits.signals.items():
+        one = series.values[index]
+        click.echo(f"  {one.serial or f'no. {one.result_id}'} ({one.measured:%Y-%m-%d %H:%M}): {one.value:+.4f}, {why}")
+
+
+def _print_capability(
+    ability: Capability | InputError, series: ComponentSeries, limits: tuple[float | None, float | None] | None
+) -> None:
+    """Print the indices of the values with these limits; of all values with None."""
+    from arview.history.series import limits_text
+
+    lead = ""
+    if limits is not None:
+        values = series.by_limits()[limits]
+        lead = f"limits {limits_text(values[0])}, {_count(values)}: "
+    if isinstance(ability, InputError):
+        say(f"{lead}{ability}")
+        return
+    name_cp, name_cpk = ability.names
+    if ability.cp is not None and ability.cp_interval is not None:
+        low, high = ability.cp_interval
+        click.echo(f"{lead}{name_cp} {ability.cp:.2f} (95 %: {low:.2f} to {high:.2f})")
+    low, high = ability.cpk_interval
+    click.echo(f"{lead}{name_cpk} {ability.cpk:.2f} (95 %: {low:.2f} to {high:.2f})")
+    for warning in ability.warnings:
+        say(f"warning: {lead}{warning}")
+
+
+def _count(values: Sequence[object]) -> str:
+    return f"{len(values)} value{'s' * (len(values) != 1)}"
 
 
 @history.command(short_help="Write results as CSV or JSON lines.", epilog="""\b

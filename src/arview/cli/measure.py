@@ -179,10 +179,14 @@ def print_components(inspection: Inspection) -> None:
 
 
 def _row(component: ComponentDeviation) -> str:
-    """Numbers in mm and degrees; ``?`` means undetermined."""
+    """Numbers in mm and degrees with the decimals that U allows; ``?`` means undetermined."""
+    from arview.inspection.rounding import decimals_beside_limit, decimals_of
+
+    decimals = decimals_of(component.uncertainty_mm)
+    of_distance = decimals_beside_limit(component.distance_mm or 0.0, component.uncertainty_mm, component.tolerance_mm)
+    formats = [f"+.{decimals}f"] * 3 + [f".{of_distance}f", f".{decimals}f"]
     values = [*component.displacement_mm, component.distance_mm, component.uncertainty_mm]
-    signs = ("+", "+", "+", "", "")
-    cells = [f"{'?' if v is None else format(v, f'{sign}.3f'):>9}" for v, sign in zip(values, signs, strict=True)]
+    cells = [f"{'?' if v is None else format(v, kind):>9}" for v, kind in zip(values, formats, strict=True)]
     tilt = component.tilt_deg
     cells.append(f"{'?' if tilt is None or math.isnan(tilt) else format(tilt, '.2f') + '°':>9}")
     verdict = "missing" if component.finding is not None else component.verdict.value.replace("_", " ")

@@ -46,12 +46,7 @@ def draw(series: ComponentSeries, chart: ControlChart | None, ability: Capabilit
 def _individuals(axes: Any, series: ComponentSeries, chart: ControlChart | None) -> None:
     x = np.array([one.value for one in series.values])
     places = np.arange(1, len(x) + 1)
-    for limit in (series.lower, series.upper):
-        if limit is not None:
-            axes.axhline(limit, color=INK, linewidth=1.1)
-            _label(
-                axes, limit, f"tolerance {limit:+.3f}" if series.lower is not None else f"tolerance {limit:.3f}", INK
-            )
+    _tolerance(axes, series)
     if chart is not None:
         axes.axhline(chart.center, color=_BLUE, linewidth=0.9)
         _label(axes, chart.center, f"mean {chart.center:.3f}", _BLUE)
@@ -73,6 +68,22 @@ def _individuals(axes: Any, series: ComponentSeries, chart: ControlChart | None)
                       xytext=(5, 6), textcoords="offset points", fontsize=8, color=_RED)  # fmt: skip
     axes.set_ylabel(f"{series.quantity}, {series.unit}")
     axes.margins(x=0.02, y=0.14)
+
+
+def _tolerance(axes: Any, series: ComponentSeries) -> None:
+    """Lines at the limits that held for each value; their labels give those that hold now."""
+    places = np.arange(len(series.values) + 1) + 0.5
+    for now, limits in (
+        (series.lower, [one.lower for one in series.values]),
+        (series.upper, [one.upper for one in series.values]),
+    ):
+        heights = np.array([np.nan if limit is None else limit for limit in limits])
+        if len(set(limits)) == 1 and now is not None:
+            axes.axhline(now, color=INK, linewidth=1.1)
+        else:
+            axes.stairs(heights, places, baseline=None, color=INK, linewidth=1.1)
+        if now is not None:
+            _label(axes, now, f"tolerance {now:+.3f}" if series.lower is not None else f"tolerance {now:.3f}", INK)
 
 
 def _ranges(axes: Any, series: ComponentSeries, chart: ControlChart | None) -> None:

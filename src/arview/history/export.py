@@ -5,31 +5,45 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
+from typing import Any
 
 from arview.history.store import HistoryStore, StoredResult
+from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 
 HEADER = (
     "result", "content_hash", "part", "serial", "station", "measured_utc", "added_utc", "part_verdict", "component",
     "verdict", "finding", "dx_mm", "dy_mm", "dz_mm", "distance_mm", "U_mm", "tolerance_mm", "tilt_deg", "twist_deg",
 )  # fmt: skip
-_COLUMNS = ("dx_mm", "dy_mm", "dz_mm", "distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg", "twist_deg")
 
 
 def to_csv(store: HistoryStore, found: Sequence[StoredResult]) -> bytes:
-    """The components of results as CSV, UTF-8, RFC 4180; cells of undetermined values are empty."""
+    """The components of results as CSV, UTF-8, RFC 4180; cells of undetermined values are empty.
+
+    Measured values are rounded to what their U allows; the JSON lines keep every digit.
+    """
     out = io.StringIO(newline="")
     writer = csv.writer(out)
     writer.writerow(HEADER)
     by_id = {one.id: one for one in found}
     for row in store.components([one.id for one in found]):
         one = by_id[row["result_id"]]
-        numbers = ["" if row[key] is None else f"{row[key]:.6f}" for key in _COLUMNS]
         writer.writerow(
             [one.id, one.content_hash, _text(one.part), _text(one.serial), _text(one.station),
              f"{one.measured:%Y-%m-%dT%H:%M:%SZ}", f"{one.added:%Y-%m-%dT%H:%M:%SZ}", one.verdict, _text(row["name"]),
-             row["verdict"], row["finding"] or "", *numbers]
+             row["verdict"], row["finding"] or "", *_numbers(row)]
         )  # fmt: skip
     return out.getvalue().encode("utf-8")
+
+
+def _numbers(row: dict[str, Any]) -> list[str]:
+    u, tolerance, distance = row["uncertainty_mm"], row["tolerance_mm"], row["distance_mm"]
+    decimals = {key: decimals_of(u) for key in ("dx_mm", "dy_mm", "dz_mm", "uncertainty_mm")}
+    decimals["distance_mm"] = decimals_beside_limit(distance or 0.0, u, tolerance)
+    decimals |= {"tilt_deg": decimals_of(None), "twist_deg": decimals_of(None)}
+    cells = {key: "" if row[key] is None else fixed(row[key], digits) for key, digits in decimals.items()}
+    cells["tolerance_mm"] = "" if tolerance is None else exact(tolerance)
+    keys = ("dx_mm", "dy_mm", "dz_mm", "distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg", "twist_deg")
+    return [cells[key] for key in keys]
 
 
 def to_json_lines(store: HistoryStore, found: Sequence[StoredResult]) -> bytes:

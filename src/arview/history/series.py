@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import pairwise
 from typing import Literal, get_args
 
 from arview.errors import InputError
@@ -21,6 +22,9 @@ class SeriesValue:
         serial, station, measured: of that result.
         value: the value, mm or degrees.
         std: standard uncertainty of the measurement, mm; None for angles.
+        lower, upper: limits from the tolerance that held when it was measured; a distance has an upper one only; None
+            without a tolerance.
+        model_hash: ``Model.source_hash`` of the CAD model it was measured against.
     """
 
     result_id: int
@@ -29,6 +33,16 @@ class SeriesValue:
     measured: datetime
     value: float
     std: float | None
+    lower: float | None = None
+    upper: float | None = None
+    model_hash: str = ""
+
+    @property
+    def is_within(self) -> bool | None:
+        """Whether the value is within the limits that held then; None without limits."""
+        if self.lower is None and self.upper is None:
+            return None
+        return (self.lower is None or self.value >= self.lower) and (self.upper is None or self.value <= self.upper)
 
 
 NOT_NEGATIVE = ("distance", "tilt")
@@ -42,7 +56,7 @@ class ComponentSeries:
     Attributes:
         part, component, quantity, unit: what was measured.
         values: the determined values.
-        lower, upper: limits from the tolerance; a distance has an upper one only; None without a tolerance.
+        lower, upper: the limits that hold now, those of the last value; None without a tolerance.
         left_out: descriptions of the results that are not among the values.
     """
 
@@ -55,20 +69,62 @@ class ComponentSeries:
     upper: float | None
     left_out: tuple[str, ...]
 
+    def with_limits(self, lower: float | None, upper: float | None) -> ComponentSeries:
+        """The series with other limits for every value; None keeps those that held."""
+        values = tuple(
+            replace(one, lower=one.lower if lower is None else lower, upper=one.upper if upper is None else upper)
+            for one in self.values
+        )
+        return replace(
+            self,
+            values=values,
+            lower=self.lower if lower is None else lower,
+            upper=self.upper if upper is None else upper,
+        )
+
+    def by_limits(self) -> dict[tuple[float | None, float | None], tuple[SeriesValue, ...]]:
+        """The values by the limits that held when they were measured, in the order in which these first held."""
+        groups: dict[tuple[float | None, float | None], list[SeriesValue]] = {}
+        for one in self.values:
+            groups.setdefault((one.lower, one.upper), []).append(one)
+        return {limits: tuple(values) for limits, values in groups.items()}
+
+    def changes(self) -> list[str]:
+        """Sentences that say when the limits or the CAD model changed."""
+        sentences = []
+        for before, after in pairwise(self.values):
+            where = f"{after.measured:%Y-%m-%d %H:%M} ({after.serial or f'no. {after.result_id}'})"
+            if (before.lower, before.upper) != (after.lower, after.upper):
+                sentences.append(f"limits changed on {where}: {limits_text(before)} before, {limits_text(after)} since")
+            if before.model_hash != after.model_hash:
+                old, new = before.model_hash[:12], after.model_hash[:12]
+                sentences.append(f"CAD model changed on {where}: {old} before, {new} since")
+        return sentences
+
     @property
     def is_length(self) -> bool:
         """Whether the values cannot be negative."""
         return self.quantity in NOT_NEGATIVE
 
 
+def limits_text(one: SeriesValue) -> str:
+    """The limits of a value in words."""
+    if one.lower is None and one.upper is None:
+        return "none"
+    if one.lower is None:
+        return f"at most {one.upper:g}"
+    return f"at least {one.lower:g}" if one.upper is None else f"{one.lower:g} to {one.upper:g}"
+
+
 def series_of(
     store: HistoryStore, component: str, quantity: Quantity = "distance", part: str | None = None,
-    station: str | None = None, since: datetime | None = None, repeats: bool = False,
+    station: str | None = None, since: datetime | None = None, repeats: bool = False, revisions: bool = False,
 ) -> ComponentSeries:  # fmt: skip
-    """A quantity of a component, for the newest CAD model in the store.
+    """A quantity of a component, for the newest CAD model in the store, or for all with ``revisions``.
 
-    Of a serial number that was measured several times only the last measurement counts, unless ``repeats``. The limits
-    of dx, dy, dz are ± the tolerance of the distance, which is necessary but not sufficient for the distance.
+    Of a serial number that was measured several times only the last measurement counts, unless ``repeats``. Each value
+    has the limits that held when it was measured. Those of dx, dy, dz are ± the tolerance of the distance, which is
+    necessary but not sufficient for the distance.
 
     Raises:
         InputError: the store has no such results; or it has several parts and ``part`` is not given.
@@ -82,7 +138,7 @@ def series_of(
     if len(parts) > 1:
         raise InputError(f"{store.name}: contains several parts ({', '.join(parts)}); name one with --part")
     left_out: list[str] = []
-    current = [one for one in found if one.model_hash == found[-1].model_hash]
+    current = found if revisions else [one for one in found if one.model_hash == found[-1].model_hash]
     if len(current) < len(found):
         left_out.append(f"{len(found) - len(current)} measured against another CAD model than the newest")
     kept = current if repeats else _last_of_each_serial(current)
@@ -92,25 +148,29 @@ def series_of(
     if not rows:
         raise InputError(f"{store.name}: {parts[0]!r} has no component {component!r}")
     column = f"{quantity}_{'deg' if quantity in ('tilt', 'twist') else 'mm'}"
-    values, absent, undetermined, tolerance = [], 0, 0, None
+    values, absent, undetermined = [], 0, 0
+    is_length = column.endswith("mm")
     for one in kept:
         row = rows.get(one.id)
         if row is None or row["finding"] is not None:
             absent += 1
             continue
-        tolerance = row["tolerance_mm"] if row["tolerance_mm"] is not None else tolerance
         if row[column] is None:
             undetermined += 1
             continue
-        std = row["uncertainty_mm"] / 2.0 if row["uncertainty_mm"] is not None and column.endswith("mm") else None
-        values.append(SeriesValue(one.id, one.serial, one.station, one.measured, float(row[column]), std))
+        std = row["uncertainty_mm"] / 2.0 if row["uncertainty_mm"] is not None and is_length else None
+        upper = row["tolerance_mm"] if is_length else None
+        lower = -upper if upper is not None and quantity in ("dx", "dy", "dz") else None
+        values.append(
+            SeriesValue(
+                one.id, one.serial, one.station, one.measured, float(row[column]), std, lower, upper, one.model_hash
+            )
+        )
     if absent:
         left_out.append(f"{absent} in which it was missing or not inspected")
     if undetermined:
         left_out.append(f"{undetermined} in which it was undetermined")
-    is_length = column.endswith("mm")
-    upper = tolerance if is_length else None
-    lower = -tolerance if tolerance is not None and quantity in ("dx", "dy", "dz") else None
+    lower, upper = (values[-1].lower, values[-1].upper) if values else (None, None)
     return ComponentSeries(
         parts[0], component, quantity, "mm" if is_length else "deg", tuple(values), lower, upper, tuple(left_out)
     )

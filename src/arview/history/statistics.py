@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from arview.errors import InputError
 from arview.geometry import Array
+from arview.history.series import ComponentSeries
 
 _D2, _D4 = 1.128, 3.267
 """Factors of moving ranges of two: mean range over standard deviation; upper limit over mean range (ISO 7870-2)."""
@@ -186,6 +187,23 @@ def capability(
         count, mean, std, lower, upper, cp, cp_interval, cpk, (cpk - spread, cpk + spread), chart.is_in_control, share,
         tuple(warnings),
     )  # fmt: skip
+
+
+def capability_by_limits(
+    series: ComponentSeries, options: StatisticsOptions | None = None
+) -> dict[tuple[float | None, float | None], Capability | InputError]:
+    """Cp and Cpk of the values of each pair of limits, so that each value is judged by the limits that held for it.
+
+    Where the indices cannot be given, the reason stands in their place.
+    """
+    found: dict[tuple[float | None, float | None], Capability | InputError] = {}
+    for (lower, upper), values in series.by_limits().items():
+        try:
+            stds = [one.std for one in values]
+            found[lower, upper] = capability([one.value for one in values], lower, upper, stds, options)
+        except InputError as error:
+            found[lower, upper] = error
+    return found
 
 
 def _checked(values: ArrayLike, minimum: int, what: str) -> Array:

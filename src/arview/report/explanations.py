@@ -7,7 +7,8 @@ from typing import Any
 
 from arview.cad.part import Part
 from arview.inspection import Inspection, MethodResult
-from arview.report.formatting import NONE, determined, number
+from arview.inspection.rounding import decimals_of
+from arview.report.formatting import NONE, determined, exact_number, number
 from arview.version import __version__
 
 LEGEND = (
@@ -44,7 +45,7 @@ def facts(inspection: Inspection) -> list[tuple[str, str]]:
     source = inspection.provenance
     tolerances = {c.tolerance_mm for c in inspection.components if c.tolerance_mm is not None}
     largest = max((c.uncertainty_mm for c in inspection.components if c.uncertainty_mm is not None), default=None)
-    allowed = " to ".join(number(value) for value in sorted({min(tolerances), max(tolerances)})) if tolerances else ""
+    allowed = " to ".join(exact_number(value) for value in sorted({min(tolerances), max(tolerances)})) if tolerances else ""
     return [
         ("Part", inspection.part),
         ("Serial", inspection.serial or "none"),
@@ -52,7 +53,7 @@ def facts(inspection: Inspection) -> list[tuple[str, str]]:
         ("By", f"{source.tool} {source.version}"),
         ("Photos", str(source.photos) if source.photos else "none"),
         ("Tolerance (radius)", f"{allowed} mm" if allowed else "none"),
-        ("Largest U", f"{number(largest)} mm" if largest is not None else NONE),
+        ("Largest U", f"{number(largest, decimals_of(largest))} mm" if largest is not None else NONE),
         ("CAD, sha256", f"{inspection.model_hash[:16]}…"),
     ]
 

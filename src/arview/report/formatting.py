@@ -1,10 +1,14 @@
-"""Formatting of numbers and verdicts. An undetermined value is written as a word, never as a number."""
+"""Formatting of numbers and verdicts. An undetermined value is written as a word, never as a number.
+
+Measured lengths of a component have the decimals that its U allows; nominal positions and tolerances are exact.
+"""
 
 from __future__ import annotations
 
 from markupsafe import Markup
 
 from arview.inspection import ComponentDeviation, Finding, ForeignReport, Verdict
+from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact
 
 UNDETERMINED = Markup('<i class="open">undetermined</i>')
 NONE = "–"
@@ -31,6 +35,16 @@ def determined(value: float | None, digits: int = 3, signed: bool = False) -> st
     return UNDETERMINED if value is None else number(value, digits, signed)
 
 
+def distance_digits(deviation: ComponentDeviation) -> int:
+    """Decimals of the distance: as U allows, and enough to be on the right side of the tolerance."""
+    return decimals_beside_limit(deviation.distance_mm or 0.0, deviation.uncertainty_mm, deviation.tolerance_mm)
+
+
+def exact_number(value: float | None) -> str:
+    """An exact number, such as a tolerance; a dash for None."""
+    return NONE if value is None else exact(value).replace("-", "−")
+
+
 def verdict_word(deviation: ComponentDeviation) -> str:
     """The verdict, or ``Missing``."""
     return "Missing" if deviation.finding is Finding.MISSING else VERDICT_WORD[deviation.verdict]
@@ -42,10 +56,10 @@ def zone_text(deviation: ComponentDeviation) -> str | Markup:
         return UNDETERMINED if deviation.verdict is Verdict.UNDECIDED else NONE
     details = deviation.details
     zone = details.zone_diameter_mm if details is not None else None
-    text = number(2.0 * deviation.distance_mm if zone is None else zone)
+    text = number(2.0 * deviation.distance_mm if zone is None else zone, distance_digits(deviation))
     if None in deviation.displacement_mm:
         text = f"≥ {text}"  # a displacement along the undetermined axis can only enlarge it
-    return text if deviation.tolerance_mm is None else f"{text} ({number(2.0 * deviation.tolerance_mm)})"
+    return text if deviation.tolerance_mm is None else f"{text} ({exact(2.0 * deviation.tolerance_mm)})"
 
 
 def finding_text(deviation: ComponentDeviation) -> str:
@@ -55,11 +69,13 @@ def finding_text(deviation: ComponentDeviation) -> str:
     if deviation.distance_mm is None:
         state = "was not measured" if deviation.verdict is Verdict.NOT_MEASURED else "could not be determined"
         return f"Its position {state}."
-    text = f"{number(deviation.distance_mm)} mm from its design position, U = {number(deviation.uncertainty_mm)} mm"
+    digits = decimals_of(deviation.uncertainty_mm)
+    distance = number(deviation.distance_mm, distance_digits(deviation))
+    text = f"{distance} mm from its design position, U = {number(deviation.uncertainty_mm, digits)} mm"
     if deviation.tolerance_mm is not None:
-        text += f"; {number(deviation.tolerance_mm)} mm is allowed"
+        text += f"; {exact(deviation.tolerance_mm)} mm is allowed"
     axes = ", ".join(
-        f"d{axis}\u00a0{'undetermined' if value is None else number(value, signed=True)}"
+        f"d{axis}\u00a0{'undetermined' if value is None else number(value, digits, signed=True)}"
         for axis, value in zip("xyz", deviation.displacement_mm, strict=True)
     )
     details = deviation.details
@@ -74,8 +90,9 @@ def finding_text(deviation: ComponentDeviation) -> str:
 
 def short_text(deviation: ComponentDeviation) -> str:
     """Distance, U and tolerance as a caption."""
-    text = f"{number(deviation.distance_mm)} ± {number(deviation.uncertainty_mm)} mm"
-    return text if deviation.tolerance_mm is None else f"{text} of {number(deviation.tolerance_mm)}"
+    distance = number(deviation.distance_mm, distance_digits(deviation))
+    text = f"{distance} ± {number(deviation.uncertainty_mm, decimals_of(deviation.uncertainty_mm))} mm"
+    return text if deviation.tolerance_mm is None else f"{text} of {exact(deviation.tolerance_mm)}"
 
 
 def foreign_text(one: ForeignReport) -> str:

@@ -20,10 +20,13 @@ from arview.measurement.cloud.distance_map import COLOR_STOPS, map_picture
 from arview.overlay.labels import by_urgency
 from arview.report import charts, explanations
 from arview.report.evidence import ReportEvidence
+from arview.inspection.rounding import decimals_of
 from arview.report.formatting import (
     NONE,
     VERDICT_WORD,
     determined,
+    distance_digits,
+    exact_number,
     finding_text,
     foreign_text,
     number,
@@ -126,6 +129,7 @@ def _components(evidence: ReportEvidence) -> dict[str, Any]:
     rows = []
     for index, one in enumerate(evidence.inspection.components):
         center = _center(one, evidence)
+        digits = decimals_of(one.uncertainty_mm)
         axes = []
         for axis in range(3):
             moved = one.displacement_mm[axis]
@@ -135,9 +139,9 @@ def _components(evidence: ReportEvidence) -> dict[str, Any]:
             axes.append(
                 {
                     "name": "xyz"[axis],
-                    "nominal": number(nominal),
-                    "measured": determined(None) if is_open else number(measured),
-                    "deviation": determined(None) if is_open else number(moved, signed=True),
+                    "nominal": exact_number(nominal),
+                    "measured": determined(None) if is_open else number(measured, digits),
+                    "deviation": determined(None) if is_open else number(moved, digits, signed=True),
                 }
             )
         nothing = one.distance_mm is None and (one.finding is not None or one.verdict is Verdict.NOT_MEASURED)
@@ -146,9 +150,9 @@ def _components(evidence: ReportEvidence) -> dict[str, Any]:
                 "name": one.name,
                 "axes": axes,
                 "anchor": None if one.verdict is Verdict.PASS else f"finding-{index}",
-                "distance": NONE if nothing else determined(one.distance_mm),
-                "uncertainty": number(one.uncertainty_mm),
-                "tolerance": number(one.tolerance_mm),
+                "distance": NONE if nothing else determined(one.distance_mm, distance_digits(one)),
+                "uncertainty": number(one.uncertainty_mm, digits),
+                "tolerance": exact_number(one.tolerance_mm),
                 "zone": zone_text(one),
                 "tilt": NONE if nothing else determined(one.tilt_deg, 2),
                 "twist": NONE if nothing else determined(one.twist_deg, 2, signed=True),
@@ -269,7 +273,7 @@ def _budget(inspection: Inspection) -> dict[str, Any]:
                     "name": one.name,
                     "cells": [number(std.get(name)) for name in ordered],
                     "k": number(one.details.k, 2),
-                    "uncertainty": number(one.uncertainty_mm),
+                    "uncertainty": number(one.uncertainty_mm, decimals_of(one.uncertainty_mm)),
                 }
             )
     return {"budget": {"names": ordered, "rows": rows}}
