@@ -116,7 +116,9 @@ def test_undetermined_is_a_word_and_minus_a_minus() -> None:
     assert "dz\u00a0undetermined" in finding_text(open_z)
     assert "dy\u00a0−0.050" in finding_text(open_z)
     rough = deviation("x", (0.1234, 0.0, 0.0), np.zeros(3), 0.3, uncertainty_mm=0.4)
-    assert finding_text(rough).startswith("0.12 mm from its design position, U = 0.40 mm; 0.3 mm is allowed: dx\u00a0+0.12")
+    assert finding_text(rough).startswith(
+        "0.12 mm from its design position, U = 0.40 mm; 0.3 mm is allowed: dx\u00a0+0.12"
+    )
     assert zone_text(open_z).startswith("≥ 0.224")  # an undetermined axis can only enlarge it
     assert zone_text(deviation("x", (0.3, 0.4, 0.0), np.zeros(3))) == "1.000 (1)"
 

@@ -45,7 +45,9 @@ def facts(inspection: Inspection) -> list[tuple[str, str]]:
     source = inspection.provenance
     tolerances = {c.tolerance_mm for c in inspection.components if c.tolerance_mm is not None}
     largest = max((c.uncertainty_mm for c in inspection.components if c.uncertainty_mm is not None), default=None)
-    allowed = " to ".join(exact_number(value) for value in sorted({min(tolerances), max(tolerances)})) if tolerances else ""
+    allowed = (
+        " to ".join(exact_number(value) for value in sorted({min(tolerances), max(tolerances)})) if tolerances else ""
+    )
     return [
         ("Part", inspection.part),
         ("Serial", inspection.serial or "none"),

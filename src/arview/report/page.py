@@ -15,12 +15,12 @@ from markupsafe import Markup
 from arview.core.progress import Progress
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Details, Inspection, Verdict
+from arview.inspection.rounding import decimals_of
 from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.measurement.cloud.distance_map import COLOR_STOPS, map_picture
 from arview.overlay.labels import by_urgency
 from arview.report import charts, explanations
 from arview.report.evidence import ReportEvidence
-from arview.inspection.rounding import decimals_of
 from arview.report.formatting import (
     NONE,
     VERDICT_WORD,
