@@ -314,7 +314,7 @@ class _OutputFiles(Generic[Result]):
             self._drawer.put(frame, result)
         if self._poses is not None:
             for pose in poses:
-                self._poses.write(pose)
+                self._poses.write(pose, frame.file)
 
     def finish_drawing(self) -> None:
         """Wait until all frames are drawn."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from arview.camera import Camera
+from arview.core.atomic import unfinished_path
 from arview.errors import OutputError
 from arview.pose import Pose
 
@@ -21,8 +22,8 @@ class PoseWriter:
     A line holds ``index``, ``time_s``, ``state``, ``quality``, ``cam_from_model`` (4×4 row-major, mm, or
     null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches``
     (list), ``unverified`` (names of components not yet confirmed), ``alternatives`` (list of 4×4 poses that fit as
-    well), and what `presence_record` adds to a pose. Where the camera was not given, it also holds ``camera`` (fx, fy,
-    cx, cy in px and dist).
+    well), and what `presence_record` adds to a pose. Frames that are picture files have ``file``, its name. Where the
+    camera was not given, it also holds ``camera`` (fx, fy, cx, cy in px and dist).
 
     Args:
         path: of the file.
@@ -35,7 +36,7 @@ class PoseWriter:
     def __init__(self, path: str | Path, camera_of: Callable[[int], Camera] | None = None) -> None:
         self.path = Path(path)
         self._camera_of = camera_of
-        self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
+        self._part = unfinished_path(self.path, os.getpid())
         if self.path.is_dir():
             raise OutputError(f"{path}: is a folder; give the name of a file")
         try:
@@ -43,11 +44,11 @@ class PoseWriter:
         except OSError as error:
             raise self._explained(error) from error
 
-    def write(self, pose: Pose) -> None:
-        """Add a line."""
+    def write(self, pose: Pose, file: str = "") -> None:
+        """Add a line; ``file`` is the name of the picture file of the frame, or empty."""
         try:
             camera = None if self._camera_of is None else self._camera_of(pose.index)
-            self._file.write(pose_line(pose, camera) + "\n")
+            self._file.write(pose_line(pose, camera, file) + "\n")
         except OSError as error:
             raise self._explained(error) from error
 
@@ -100,8 +101,8 @@ def presence_record(pose: Pose) -> dict[str, object]:
     }
 
 
-def pose_line(pose: Pose, camera: Camera | None = None) -> str:
-    """A pose, and its camera if one is given, as a line of ``poses.jsonl``, see `PoseWriter`.
+def pose_line(pose: Pose, camera: Camera | None = None, file: str = "") -> str:
+    """A pose, and its camera and picture file if they are given, as a line of ``poses.jsonl``, see `PoseWriter`.
 
     A covariance that is not finite becomes null.
     """
@@ -114,6 +115,7 @@ def pose_line(pose: Pose, camera: Camera | None = None) -> str:
     return json.dumps(
         {
             "index": pose.index,
+            **({"file": file} if file else {}),
             "time_s": pose.time_s,
             "state": str(pose.state),
             "quality": pose.quality,

@@ -201,7 +201,7 @@ def test_annotate_aligns_with_a_guide_view(room: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(arview.tracking, "TrackingSession", Waiting)
     for name, azimuth_deg, elevation_deg in (("start", 5.0, 40.0), ("az-10_el50_d400", -10.0, 50.0)):
         result = run("annotate", "clip.mp4", *ANNOTATE, "--init", f"guide:{name}", "-o", "out.mp4")
-        assert result.exit_code == 0, result.output
+        assert result.exit_code == ExitCode.CANNOT_MEASURE, result.output
         found = viewpoint(guides[-1], [30.0, 30.0, 5.0])
         assert (found.azimuth_deg, found.elevation_deg) == pytest.approx((azimuth_deg, elevation_deg))
         assert "searching 12 frames: only 1 to 11 % of the outline found (8), too dark (4)" in result.stdout

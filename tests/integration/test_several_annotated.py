@@ -12,8 +12,7 @@ from click.testing import CliRunner
 
 from arview.annotation import AnnotateSummary, SpecimenSummary, summary_lines
 from arview.cli import main
-from arview.cli.annotate import presence_exit_code
-from arview.cli.exit_codes import ExitCode
+from arview.cli.exit_codes import ExitCode, presence_exit_code
 from arview.errors import InputError
 from arview.pose import Completeness, Presence
 from arview.video import open_source

@@ -228,9 +228,13 @@ def test_folder_and_glob_of_pictures(tmp_path: Path) -> None:
         frames = list(source)
         assert [number_of(frame.image) for frame in frames] == [1, 2, 9, 10]
         np.testing.assert_array_equal(frames[1].image, numbered(2))
-        assert [frame.time_s for frame in frames] == pytest.approx([0, 0.1, 0.2, 0.3])
+        assert [frame.time_s for frame in frames] == pytest.approx([0, 0.1, 0.8, 0.9])
+        assert [frame.index for frame in frames] == [1, 2, 9, 10]
+        assert [frame.file for frame in frames] == ["img_1.png", "img_2.png", "img_9.png", "img_10.png"]
         assert (source.fps, source.frame_count) == (10, 4)
-    assert [frame.index for frame in open_source(tmp_path, start=1, stride=2)] == [1, 3]
+    assert [frame.index for frame in open_source(tmp_path, start=2, stride=2)] == [2, 10]
+    with pytest.raises(InputError, match=r"no picture has a number from 11 on; the numbers .* go from 1 to 10"):
+        open_source(tmp_path, start=11)
 
 
 def test_pictures_that_do_not_fit_are_skipped(tmp_path: Path) -> None:

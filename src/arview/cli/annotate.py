@@ -22,9 +22,10 @@ from arview.cli.common import (
     say,
     session_options,
 )
-from arview.cli.exit_codes import ExitCode
-from arview.cli.guessed_camera import check_profile, report_estimate
-from arview.errors import InputError
+from arview.cli.exit_codes import ExitCode, finding_exit_code, presence_exit_code
+from arview.cli.guessed_camera import check_profile, likely_cause, report_estimate
+from arview.core.atomic import unfinished_path, writing_process
+from arview.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from arview.annotation import AnnotateSummary
@@ -99,7 +100,7 @@ def _keep_named_part(ctx: click.Context, parameter: click.Parameter, value: str 
         ExitCode.DONE: "done; with --check-presence: all components are present",
         ExitCode.FAIL: "--check-presence: a component is missing or displaced",
         ExitCode.UNDECIDED: "--check-presence: not all components are known to be present",
-        ExitCode.CANNOT_MEASURE: "--check-presence: no part was found",
+        ExitCode.CANNOT_MEASURE: "a part was found in no frame",
     },
     epilog="""\b
 Examples:
@@ -112,6 +113,11 @@ Examples:
   arview annotate clip.mp4 --part part.toml --camera camera.json --poses poses.jsonl --check-presence
   arview annotate bench.mp4 --part a.toml --part b.toml --inspection a.json --inspection b.json -o out.mp4
   arview annotate bench.mp4 --part part.toml --instances 2 --camera camera.json -o out.mp4
+
+\b
+Frames. Seconds of --start and --end, and times in the poses file, count from the first frame of SOURCE. Where the
+names of pictures differ in one number only, that is their frame number, so that gaps stay gaps. Pixels are made
+square and interlaced film is deinterlaced; a camera file may be made for the frames before or after.
 
 \b
 Where tracking starts. Without --init the part is detected. --init POSE.json, {"cam_from_model": 4x4},
@@ -153,11 +159,11 @@ Components. Each is present, missing, displaced, uncertain or unverified by what
 whatever was measured before. --check-presence exits by what is known of all components at the end.
 
 \b
-Each line of a poses file is a JSON object: index, time_s, state, quality, cam_from_model (4x4 row-major,
-mm), covariance (6x6), ms, reason (why the part is not tracked), mismatches, unverified (components that have
-not been verified yet), alternatives (poses that fit as well), presence (of each component) and
-presence_details, completeness, identity (followed, confirmed, unconfirmed or other) and identity_reason,
-serial (read from a code), instance, and camera where none was given.
+Each line of a poses file is a JSON object: index, file (of a picture), time_s, state, quality,
+cam_from_model (4x4 row-major, mm), covariance (6x6), ms, reason (why the part is not tracked), mismatches,
+unverified (components that have not been verified yet), alternatives (poses that fit as well), presence (of
+each component) and presence_details, completeness, identity (followed, confirmed, unconfirmed or other) and
+identity_reason, serial (read from a code), instance, and camera where none was given.
 Ctrl-C ends the run and finishes the files.""",
 )
 @click.argument("source")
@@ -225,7 +231,8 @@ def annotate(
 ) -> None:
     """Find and track the part in SOURCE, and write the annotated video and/or the poses.
 
-    SOURCE is a video file, a picture, a folder or glob of pictures, a camera number or an RTSP/HTTP address.
+    SOURCE is a video file, a picture, a folder, glob or pattern (frame_%04d.png) of pictures, a camera number or an
+    RTSP/HTTP address.
     """
     from arview.tracking.guide_pose import GUIDE_PREFIX
     from arview.tracking.self_calibration.session import SelfCalibratingSession
@@ -269,11 +276,11 @@ def annotate(
             keep(session.finish())
     if sink is not None and sink.audio_note:
         say(f"warning: {sink.audio_note}")
-    _print_summary(summary, [path for path in (outputs.video, outputs.poses) if path is not None])
+    written = [path for path in (outputs.video, outputs.poses) if path is not None]
+    _print_summary(summary, written, frames.notes, camera_of(0) if camera_spec is None else None)
     _save_learned(session, outputs.learned)
     _exit_if_interrupted(ctx, summary)
-    if check_presence:
-        ctx.exit(presence_exit_code(summary))
+    ctx.exit(presence_exit_code(summary) if check_presence else finding_exit_code(summary))
 
 
 def _refuse_for_several(options: dict[str, str | None]) -> None:
@@ -281,18 +288,6 @@ def _refuse_for_several(options: dict[str, str | None]) -> None:
     for name, value in options.items():
         if value:
             raise InputError(f"{name} is for one part; leave it out, or give one --part without --instances")
-
-
-def presence_exit_code(summary: AnnotateSummary) -> ExitCode:
-    """Exit code by the presence of all components of all specimens at the end of a run."""
-    from arview.pose import Completeness
-
-    found = {one.completeness for one in summary.specimens.values()}
-    if Completeness.INCOMPLETE in found:
-        return ExitCode.FAIL
-    if not found or found == {None}:
-        return ExitCode.CANNOT_MEASURE
-    return ExitCode.DONE if found == {Completeness.COMPLETE} else ExitCode.UNDECIDED
 
 
 def _annotate_one(
@@ -367,7 +362,13 @@ def _drawing_options(show_edges: str, no_ghost: bool, no_labels: bool, opacity: 
 def _check_outputs(
     video: str | None, poses: str | None, learned: str | None, inputs: Sequence[str | Path | None]
 ) -> _Outputs:
-    """The paths of the outputs, none of which overwrites an input or another output."""
+    """The paths of the outputs, none of which overwrites an input or another output, or is being written."""
+    for path in (video, poses):
+        if path and (writer := writing_process(Path(path))) is not None:
+            raise OutputError(
+                f"{path}: process {writer} is writing it; wait until it ends or choose another name "
+                f"(if it is no arview, delete {unfinished_path(Path(path), writer)})"
+            )
     return _Outputs(
         output_path(video, [*inputs]) if video else None,
         output_path(poses, [*inputs, video]) if poses else None,
@@ -467,9 +468,12 @@ def _tracking(session: TrackingSession | SelfCalibratingSession) -> TrackingSess
     return session.session if isinstance(session, SelfCalibratingSession) else session
 
 
-def _print_summary(summary: AnnotateSummary, written: list[Path]) -> None:
+def _print_summary(summary: AnnotateSummary, written: list[Path], notes: Sequence[str], guessed: Camera | None) -> None:
+    """Say what was done: files, notes of the source, counts, and what a guessed camera may have to do with them."""
     from arview.annotation import summary_lines
 
+    for note in notes:
+        say(f"note: {note}")
     if summary.ended_reason:
         say(f"warning: {summary.ended_reason}")
     if summary.frames == 0:
@@ -477,6 +481,8 @@ def _print_summary(summary: AnnotateSummary, written: list[Path]) -> None:
         return
     for line in [*(f"wrote {path}" for path in written), *summary_lines(summary)]:
         click.echo(line)
+    if guessed is not None and finding_exit_code(summary) is not ExitCode.DONE:
+        click.echo(likely_cause(guessed))
 
 
 def _default_output(source: str) -> str:

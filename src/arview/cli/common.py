@@ -273,12 +273,11 @@ def session_options(modalities: tuple[str, ...]) -> SessionOptions:
 
 def camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
     """Camera of a source's frames. Without ``spec`` it is guessed, and a warning says so."""
-    from arview.camera.read import guess_camera, load_camera
+    from arview.camera.read import guess_camera
+    from arview.video.intrinsics import load_camera_of
 
     if spec is not None:
-        return load_camera(
-            spec, frames.width, frames.height, source=source, quarter_turns_clockwise=frames.quarter_turns_clockwise
-        )
+        return load_camera_of(frames, spec, source)
     camera = guess_camera(frames.width, frames.height)
     say(
         f"WARNING: no --camera given: GUESSING a focal length of {camera.fx:.0f} px (1.2 × the longer side)"

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from arview.annotation import AnnotateSummary
 
 
 class ExitCode(IntEnum):
@@ -61,3 +65,24 @@ def help_rows(results: dict[ExitCode, str] | None = None) -> list[tuple[str, str
     """
     meanings = {ExitCode.DONE: "done"} | {code: code.meaning for code in _ERRORS} | (results or {})
     return [(str(int(code)), meanings[code]) for code in sorted(meanings)]
+
+
+def finding_exit_code(summary: AnnotateSummary) -> ExitCode:
+    """Exit code by whether each specimen was found in at least one frame."""
+    from arview.pose import TrackingState
+
+    found = (TrackingState.TRACKED, TrackingState.CRITICAL)
+    is_found = all(any(one.states.get(state) for state in found) for one in summary.specimens.values())
+    return ExitCode.DONE if is_found else ExitCode.CANNOT_MEASURE
+
+
+def presence_exit_code(summary: AnnotateSummary) -> ExitCode:
+    """Exit code by the presence of all components of all specimens at the end of a run."""
+    from arview.pose import Completeness
+
+    found = {one.completeness for one in summary.specimens.values()}
+    if Completeness.INCOMPLETE in found:
+        return ExitCode.FAIL
+    if not found or found == {None}:
+        return ExitCode.CANNOT_MEASURE
+    return ExitCode.DONE if found == {Completeness.COMPLETE} else ExitCode.UNDECIDED

@@ -8,6 +8,7 @@ from arview.cli.common import say
 from arview.errors import InputError
 
 if TYPE_CHECKING:
+    from arview.camera import Camera
     from arview.tracking.self_calibration.estimator import FocalEstimate
 
 
@@ -46,3 +47,11 @@ def report_estimate(estimate: FocalEstimate, profile: str | None, source: str, t
         return
     path = keep_profile(estimate, profile, source, turns)
     say(f"wrote {path}; use it with --camera profile:{profile}")
+
+
+def likely_cause(camera: Camera) -> str:
+    """What to try when a part was not found with a guessed camera."""
+    return (
+        f"a likely cause: the camera was guessed, with a focal length of {camera.fx:.0f} px and no distortion; "
+        "give --camera with a file, fov:DEG or exif"
+    )

@@ -37,3 +37,30 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 def is_device(path: Path) -> bool:
     """True for an existing device, pipe or socket: what is neither a file nor a folder."""
     return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def unfinished_path(path: Path, process: int) -> Path:
+    """Name under which a process writes a film or poses until they are complete."""
+    return path.with_name(f".{path.name}.{process}.part")
+
+
+def writing_process(path: Path) -> int | None:
+    """Number of another running process that is writing a film or poses; None if there is none, or on Windows."""
+    if os.name == "nt" or not path.parent.is_dir():  # there, a signal would end the process
+        return None
+    start, end = unfinished_path(path, 0).name.rsplit("0", 1)
+    for name in os.listdir(path.parent):  # noqa: PTH208 - names only, of a folder that may be large
+        number = name[len(start) : -len(end)] if name.startswith(start) and name.endswith(end) else ""
+        if number.isdecimal() and int(number) != os.getpid() and _is_running(int(number)):
+            return int(number)
+    return None
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except PermissionError:  # it runs for another user
+        return True
+    except (OSError, OverflowError):
+        return False
+    return True

@@ -16,10 +16,12 @@ class Frame:
 
     Attributes:
         image: (H,W,3) uint8 RGB, upright, contiguous.
-        index: position in the source, from 0, counting skipped frames as well.
-        time_s: time stamp in the source, seconds; of live sources since the first frame.
+        index: position in the source, from 0, counting skipped frames as well; of numbered pictures their number.
+        time_s: time since the first frame of the source, seconds.
+        file: name of the picture file; empty for frames of videos and cameras.
     """
 
     image: Image
     index: int
     time_s: float
+    file: str = ""

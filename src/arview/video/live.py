@@ -12,9 +12,11 @@ import av
 import cv2
 
 from arview.errors import InputError
-from arview.video.files import turns_of, upright_image
+from arview.video.clock import plausible_fps
+from arview.video.deinterlace import Deinterlacer
 from arview.video.frame import Frame, Image
 from arview.video.source import FrameRange, FrameSource
+from arview.video.upright import UprightPictures
 
 
 class StreamEnded(Exception):
@@ -26,6 +28,7 @@ class Grabber(Protocol):
 
     fps: float | None
     quarter_turns_clockwise: int
+    unsquared_size: tuple[int, int] | None
 
     def read(self) -> Image | None:
         """Next frame (H,W,3) uint8 RGB, None for a broken one; raises StreamEnded if there are no more."""
@@ -124,6 +127,7 @@ class LiveSource(FrameSource):
                     self.height, self.width = image.shape[:2]
                     self.fps = grabber.fps
                     self.quarter_turns_clockwise = grabber.quarter_turns_clockwise
+                    self.unsquared_size = grabber.unsquared_size
                     self._opened = True
                 if image is None or image.shape[:2] != (self.height, self.width):
                     self.skipped += 1
@@ -157,11 +161,14 @@ class UrlGrabber:
             raise StreamEnded("contains no video stream")
         stream = self._container.streams.video[0]
         stream.thread_type = "SLICE"  # frame threads would delay frames
-        rate = stream.average_rate
-        self.fps = float(rate) if rate else None
+        self.fps = plausible_fps(stream.average_rate, stream.guessed_rate)
         self.quarter_turns_clockwise = 0
+        self.unsquared_size: tuple[int, int] | None = None
+        self._stream = stream
         self._packets = self._container.demux(stream)
-        self._decoded: list[av.VideoFrame] = []
+        self._progressive: Deinterlacer[bool] = Deinterlacer()
+        self._pictures: UprightPictures | None = None
+        self._decoded: list[tuple[bool, av.VideoFrame]] = []
 
     def read(self) -> Image | None:
         """Next frame, None for a broken one; raises StreamEnded at the end or when the connection fails."""
@@ -173,14 +180,18 @@ class UrlGrabber:
             if packet is None:
                 raise StreamEnded("the stream ended")
             try:
-                self._decoded = list(packet.decode())
+                for frame in packet.decode():
+                    self._decoded += self._progressive.push(frame, frame.is_corrupt)
             except av.FFmpegError:
                 return None
-        frame = self._decoded.pop(0)
-        if frame.is_corrupt:
+        is_corrupt, frame = self._decoded.pop(0)
+        if is_corrupt:
             return None
-        self.quarter_turns_clockwise = turns_of(frame)
-        return upright_image(frame, self.quarter_turns_clockwise)
+        if self._pictures is None:
+            self._pictures = UprightPictures(frame, self._stream.sample_aspect_ratio)
+            self.quarter_turns_clockwise = self._pictures.quarter_turns_clockwise
+            self.unsquared_size = None if self._pictures.is_square else self._pictures.stored_size
+        return self._pictures.image_of(frame, 0)
 
     def close(self) -> None:
         """Close the connection."""
@@ -191,13 +202,14 @@ class CameraGrabber:
     """Reads a camera of this machine through OpenCV."""
 
     quarter_turns_clockwise = 0
+    unsquared_size: tuple[int, int] | None = None
 
     def __init__(self, index: int) -> None:
         with _quiet_opencv():
             self._capture = cv2.VideoCapture(index)
         if not self._capture.isOpened():
             raise StreamEnded(f"there is no camera {index}, or it is in use")
-        self.fps = self._capture.get(cv2.CAP_PROP_FPS) or None
+        self.fps = plausible_fps(self._capture.get(cv2.CAP_PROP_FPS))
 
     def read(self) -> Image | None:
         """Next frame; raises StreamEnded if the camera was unplugged."""

@@ -22,6 +22,7 @@ from av.packet import Packet
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 from av.video.stream import VideoStream
 
+from arview.core.atomic import unfinished_path
 from arview.errors import OutputError
 from arview.video.frame import Image
 from arview.video.source import FrameSource
@@ -82,7 +83,7 @@ class VideoSink:
         self._width, self._height = width, height
         rate = fps_hint if fps_hint is not None and 1.0 <= fps_hint <= 1000.0 else 30.0
         self._fps = Fraction(rate).limit_denominator(1001)
-        self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
+        self._part = unfinished_path(self.path, os.getpid())
         if self.path.suffix.lower() not in CONTAINERS:
             raise OutputError(f"{path}: the name of the video must end in {', '.join(CONTAINERS)}")
         if not self.path.parent.is_dir():
@@ -90,6 +91,7 @@ class VideoSink:
         if self.path.is_dir():
             raise OutputError(f"{path}: is a folder; give the name of a file")
         self._sound = _open_sound(source)
+        self._sound_start_s = source.audio_start_s if isinstance(source, FrameSource) else 0.0
         try:
             self._container, self._video, self._audio = self._opened(crf, preset)
         except BaseException:
@@ -231,7 +233,7 @@ class VideoSink:
         for image, time_s in queued:
             if origin_s is None:
                 origin_s = time_s
-                sound = self._sound_packets(origin_s)
+                sound = self._sound_packets(origin_s + self._sound_start_s)
                 waiting = next(sound, None)
             ticks = max(round((time_s - origin_s) * TICKS_PER_S), ticks + 1)
             frame = av.VideoFrame.from_numpy_buffer(image, format="rgb24").reformat(
@@ -249,7 +251,7 @@ class VideoSink:
         self._container.mux(self._video.encode(None))
 
     def _sound_packets(self, origin_s: float) -> Iterator[Packet[AudioStream]]:
-        """Sound packets from the time of the first frame on, shifted to the time of the file."""
+        """Sound packets from a time stamp of the source's file on, that of the first frame, which becomes 0."""
         if self._sound is None or self._audio is None:
             return
         stream = self._sound.streams.audio[0]

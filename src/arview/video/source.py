@@ -62,10 +62,14 @@ class FrameSource(ABC):
         frame_count: largest number of frames that an iteration yields, None if unknown.
         quarter_turns_clockwise: rotation already applied to the frames; pass it to ``load_camera`` or
             ``Camera.rotated``.
+        unsquared_size: width and height in px of the upright frames before their pixels were made square; None where
+            they were square.
         skipped: frames so far that were left out because they are broken or of another size.
+        notes: after the iteration, what was changed in the frames, or why some were left out, a sentence each.
         ended_reason: after the iteration, why it ended early, in one sentence; else empty.
         is_live: frames arrive in real time, and those that are not fetched are dropped.
         audio_path: file with the sound of the frames, or None.
+        audio_start_s: time stamp in that file of the first frame, whose time is 0.
     """
 
     name: str
@@ -74,10 +78,13 @@ class FrameSource(ABC):
     fps: float | None = None
     frame_count: int | None = None
     quarter_turns_clockwise: int = 0
+    unsquared_size: tuple[int, int] | None = None
     skipped: int = 0
+    notes: tuple[str, ...] = ()
     ended_reason: str = ""
     is_live: bool = False
     audio_path: Path | None = None
+    audio_start_s: float = 0.0
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:

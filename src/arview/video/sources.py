@@ -6,11 +6,19 @@ import glob
 import re
 from pathlib import Path
 
-from arview.camera.exif import PHOTO_SUFFIXES
 from arview.core.checks import PATH, check_type
 from arview.errors import InputError
-from arview.video.files import PictureSource, VideoFileSource, picture_paths, sorted_naturally
+from arview.video.files import VideoFileSource
 from arview.video.live import CameraGrabber, LiveSource, UrlGrabber
+from arview.video.pictures import (
+    SUFFIXES,
+    PictureSource,
+    is_picture,
+    is_printf_pattern,
+    paths_of_pattern,
+    picture_paths,
+    sorted_naturally,
+)
 from arview.video.source import FrameRange, FrameSource
 
 _CAMERA_INDEX = re.compile(r"(?:/dev/video)?([0-9]{1,3})")
@@ -27,11 +35,11 @@ def open_source(
     open_timeout_s: float = 10.0,
     read_timeout_s: float = 5.0,
 ) -> FrameSource:
-    """Open a source of frames: video file, picture, folder or glob of pictures, camera index, RTSP or HTTP URL.
+    """Open a source of frames: video file, picture, folder, glob or pattern of pictures, camera index or URL.
 
     Args:
-        spec: path, glob ("shots/*.png"), camera index ("0") or URL ("rtsp://…").
-        start: index of the first wanted frame in the source; None is 0.
+        spec: path, glob ("shots/*.png"), pattern ("frame_%04d.png"), camera index ("0") or URL ("rtsp://…").
+        start: index of the first wanted frame in the source, of numbered pictures the number; None is 0.
         end: index of the first frame that is not wanted any more; None is the end of the source.
         stride: interval between wanted frames.
         fps: frames per second from which the time stamps of pictures are made.
@@ -65,12 +73,14 @@ def open_source(
             raise InputError(f"{path}: the folder contains no pictures ({_suffixes()}); give another folder or file")
         return PictureSource(text, pictures, wanted, fps)
     if path.exists():
-        if path.suffix.lower() in PHOTO_SUFFIXES:
+        if path.suffix.lower() in SUFFIXES:
             return PictureSource(text, [path], wanted, fps)
         return VideoFileSource(path, wanted)
+    if is_printf_pattern(text):
+        return PictureSource(text, paths_of_pattern(text), wanted, fps)
     if glob.has_magic(text):
         found = (Path(match) for match in glob.glob(text, recursive=True))  # noqa: PTH207 - absolute patterns too
-        pictures = sorted_naturally(match for match in found if match.suffix.lower() in PHOTO_SUFFIXES)
+        pictures = sorted_naturally(match for match in found if is_picture(match))
         if not pictures:
             raise InputError(f"{text}: no picture ({_suffixes()}) matches; check the pattern")
         return PictureSource(text, pictures, wanted, fps)
@@ -93,4 +103,4 @@ def check_source(spec: str | Path) -> None:
 
 
 def _suffixes() -> str:
-    return ", ".join(sorted(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES))
+    return ", ".join(sorted(suffix.removeprefix(".") for suffix in SUFFIXES))

@@ -8,13 +8,14 @@ from pathlib import Path
 from arview import annotation
 from arview.cad import Part
 from arview.camera import Camera
-from arview.camera.read import guess_camera, load_camera
+from arview.camera.read import guess_camera
 from arview.core.progress import StepProgress
 from arview.guideviews.cache import cached_guide_views
 from arview.inspection import Inspection
 from arview.overlay import OverlayRenderer
 from arview.tracking import TrackingSession
 from arview.video import VideoSink, open_source
+from arview.video.intrinsics import load_camera_of
 
 
 def camera_of_video(video: str, spec: str | None, of_photos: Camera | None, is_from_video: bool) -> tuple[Camera, str]:
@@ -32,9 +33,7 @@ def camera_of_video(video: str, spec: str | None, of_photos: Camera | None, is_f
     with open_source(video) as frames:
         width, height = frames.width, frames.height
         if spec is not None:
-            return load_camera(
-                spec, width, height, source=video, quarter_turns_clockwise=frames.quarter_turns_clockwise
-            ), ""
+            return load_camera_of(frames, spec, video), ""
     if of_photos is not None and abs(of_photos.width * height - of_photos.height * width) <= max(width, height):
         warning = "the video is assumed to have the camera of the photos; if it does not, give --video-camera"
         return of_photos.scaled(width, height), "" if is_from_video else warning
@@ -88,8 +87,7 @@ def make_film(
                 made.unlink(missing_ok=True)
     tracked = sum(summary.states.get(state, 0) for state in ("tracked", "critical"))
     notes = [f"the part was tracked in {tracked} of {summary.frames} frames"]
-    if summary.ended_reason:
-        notes.append(summary.ended_reason)
+    notes += [*frames.notes, summary.ended_reason]
     if tracked == 0:
         notes.append(annotation.reasons_text(next(iter(summary.reasons.values()), {})))
     return "; ".join(note for note in notes if note)

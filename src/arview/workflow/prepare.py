@@ -19,6 +19,7 @@ from arview.reconstruction.scale import ScaleSources, load_scale_file
 from arview.reconstruction.sparse import SparseOptions
 from arview.version import __version__
 from arview.video import open_source
+from arview.video.intrinsics import load_camera_of
 from arview.workflow.job import InspectJob
 
 
@@ -76,13 +77,7 @@ def _check_cameras(job: InspectJob) -> None:
             if frames.is_live:
                 raise InputError(f"{job.video}: is a live source; record a video first and give its file")
             if job.video_camera is not None:
-                load_camera(
-                    job.video_camera,
-                    frames.width,
-                    frames.height,
-                    source=job.video,
-                    quarter_turns_clockwise=frames.quarter_turns_clockwise,
-                )
+                load_camera_of(frames, job.video_camera, job.video)
     elif job.video_camera:
         raise InputError("a camera of the video is given without a video")
     if job.camera:

@@ -20,7 +20,7 @@ from arview.camera.exif import (
     open_picture,
 )
 from arview.errors import InputError
-from arview.video.files import sorted_naturally
+from arview.video.pictures import sorted_naturally
 
 if TYPE_CHECKING:
     from PIL.Image import Image

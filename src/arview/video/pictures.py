@@ -1,0 +1,249 @@
+"""Sources on disk: pictures of a folder, a glob or a numbered pattern."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, open_picture, read_exif
+from arview.errors import InputError, MissingDependencyError
+from arview.video.frame import Frame, Image
+from arview.video.source import FrameRange, FrameSource, read_ahead
+
+SUFFIXES = PHOTO_SUFFIXES | HEIF_SUFFIXES
+MAX_NUMBER = 99_999_999
+"""Largest number in a file name that is taken for that of a frame; longer ones are dates or clocks."""
+PROBED_PICTURES = 5
+"""Pictures, spread over the sequence, whose largest values tell how many bits of 16 are used."""
+USED_BITS = (8, 10, 12, 14, 16)
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PRINTF = re.compile(r"%(0?)([0-9]*)d")
+
+
+class PictureSource(FrameSource):
+    """Frames from picture files in the given order; the EXIF orientation is applied.
+
+    Where the names differ in one number only, that number is the index of the frame, so that gaps stay gaps in index
+    and time; else the index is the position. Times are those of ``fps`` frames per second from the first picture on.
+    Pictures that cannot be read or differ in size from the first are skipped and counted. Pictures of 16 bits are
+    reduced to 8 by the bits that are used: 12-bit values in 16 bits are not left dark.
+
+    Raises:
+        InputError: on construction, if no picture can be read.
+        MissingDependencyError: a HEIC picture, without pillow-heif.
+    """
+
+    def __init__(self, name: str, paths: Sequence[Path], wanted: FrameRange, fps: float) -> None:
+        self.name = name
+        self.fps = self._pictures_per_s = fps
+        numbers = frame_numbers(paths)
+        indices = list(range(len(paths))) if numbers is None else numbers
+        self._first_index = indices[0]
+        kept = [
+            (i, path) for i, path in zip(indices, paths, strict=True) if i >= wanted.start and not wanted.is_past(i)
+        ]
+        # Every stride-th picture that is there, because numbers may have a stride of their own.
+        self._pictures = kept[:: wanted.stride]
+        self.frame_count = len(self._pictures)
+        if not kept and numbers is not None:
+            end = "" if wanted.end is None else f" and below {wanted.end}"
+            raise InputError(
+                f"{name}: no picture has a number from {wanted.start} on{end}; "
+                f"the numbers of its {len(paths)} pictures go from {min(numbers)} to {max(numbers)}"
+            )
+        if not kept:
+            raise InputError(f"{name}: start {wanted.start} is past the last of its {len(paths)} pictures")
+        self._used_bits = self._probed_bits()
+        for path in paths:
+            first = self._read(path)
+            if first is not None:
+                break
+        else:
+            raise InputError(f"{name}: none of the {len(paths)} pictures can be read; save them as JPEG or PNG")
+        self.height, self.width = first.shape[:2]
+        self.quarter_turns_clockwise = _turns_of_picture(path)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return read_ahead(self._frames)
+
+    def _frames(self) -> Iterator[Frame]:
+        self.skipped, self.notes = 0, ()
+        for index, path in self._pictures:
+            image = self._read(path)
+            if image is None or image.shape != (self.height, self.width, 3):
+                self.skipped += 1
+                if image is not None and not self.notes:
+                    self.notes = (
+                        f"{path.name} is {image.shape[1]}×{image.shape[0]} px, not {self.width}×{self.height} as the "
+                        "first picture: pictures of another size are left out",
+                    )
+                continue
+            yield Frame(image, index, (index - self._first_index) / self._pictures_per_s, path.name)
+
+    def _probed_bits(self) -> int:
+        """Bits that 16-bit pictures of the sequence use; 8 if it has none."""
+        paths = [path for _, path in self._pictures if path.suffix.lower() in {".png", ".tif", ".tiff"}]
+        used = USED_BITS[0]
+        for path in paths[:: max(len(paths) // PROBED_PICTURES, 1)][:PROBED_PICTURES]:
+            data = _bytes_of(path)
+            if data is not None and (pixels := _decoded(data)) is not None and pixels.dtype == np.uint16:
+                used = max(used, used_bits(pixels, significant_bits(data)))
+        return used
+
+    def _read(self, path: Path) -> Image | None:
+        """(H,W,3) uint8 RGB, upright; None if the file is not a readable picture."""
+        data = _bytes_of(path)
+        if data is None:
+            return None
+        if path.suffix.lower() in HEIF_SUFFIXES:
+            return _read_heif(data)
+        pixels = _decoded(data)
+        if pixels is None:
+            return None
+        if pixels.dtype == np.uint16:
+            # A picture brighter than those that were probed is not cut off.
+            self._used_bits = max(self._used_bits, used_bits(pixels, significant_bits(data)))
+            pixels = cv2.convertScaleAbs(pixels, alpha=255.0 / (2**self._used_bits - 1))
+        elif pixels.dtype != np.uint8:
+            pixels = _from_float(pixels)
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+
+
+def picture_paths(folder: Path) -> list[Path]:
+    """Picture files of a folder in natural order (2 before 10)."""
+    return sorted_naturally(path for path in folder.iterdir() if is_picture(path))
+
+
+def is_picture(path: Path) -> bool:
+    """Whether a name ends as one of a picture; hidden files, such as ``._a.jpg`` of macOS, do not count."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+
+
+def sorted_naturally(paths: Iterator[Path]) -> list[Path]:
+    """Paths in an order that takes runs of digits as numbers."""
+
+    def key(path: Path) -> list[tuple[int, str]]:
+        parts = re.split(r"([0-9]+)", str(path).lower())
+        return [(int(part), part) if part.isdecimal() and part.isascii() else (-1, part) for part in parts]
+
+    return sorted(paths, key=key)
+
+
+def frame_numbers(paths: Sequence[Path]) -> list[int] | None:
+    """Numbers of the pictures of a numbered sequence; None if their names are not one.
+
+    The names must be alike but for one run of digits, which must differ and increase from picture to picture.
+    """
+    split = [re.split(r"([0-9]+)", str(path)) for path in paths]
+    if len(paths) < 2 or len({len(parts) for parts in split}) != 1:
+        return None
+    columns = list(zip(*split, strict=True))
+    changing = [k for k, column in enumerate(columns) if len(set(column)) > 1]
+    if len(changing) != 1 or changing[0] % 2 == 0:
+        return None
+    texts = columns[changing[0]]
+    if max(len(text.lstrip("0")) for text in texts) > len(str(MAX_NUMBER)):
+        return None
+    numbers = [int(text) for text in texts]
+    return numbers if all(a < b for a, b in pairwise(numbers)) else None
+
+
+def is_printf_pattern(text: str) -> bool:
+    """Whether a name is a pattern of numbered pictures, as ``frame_%04d.png``."""
+    return len(_PRINTF.findall(Path(text).name)) == 1 and "%" not in _PRINTF.sub("", Path(text).name)
+
+
+def paths_of_pattern(text: str) -> list[Path]:
+    """Existing files of a pattern as ``shots/frame_%04d.png``, by their numbers.
+
+    Raises:
+        InputError: the folder cannot be read, or no file fits the pattern.
+    """
+    pattern = Path(text)
+    found = _PRINTF.search(pattern.name)
+    assert found is not None
+    padded, width = found.group(1) == "0", int(found.group(2) or 1)
+    digits = rf"([0-9]{{{width},9}})" if padded or width == 1 else r" *([0-9]{1,9})"
+    name = re.compile(re.escape(pattern.name[: found.start()]) + digits + re.escape(pattern.name[found.end() :]))
+    try:
+        matches = [(match, path) for path in pattern.parent.iterdir() if (match := name.fullmatch(path.name))]
+    except OSError as error:
+        raise InputError(f"{text}: the folder {pattern.parent} cannot be read ({error.strerror or error})") from error
+    if not matches:
+        raise InputError(f"{text}: no file in {pattern.parent.resolve()} fits the pattern; check it")
+    return [path for _, path in sorted(matches, key=lambda found: int(found[0].group(1)))]
+
+
+def significant_bits(data: bytes) -> int | None:
+    """Significant bits of a 16-bit PNG by its sBIT chunk, the most of any channel; None without it."""
+    if not data.startswith(_PNG_SIGNATURE):
+        return None
+    start = len(_PNG_SIGNATURE)
+    while start + 8 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, start)
+        if kind == b"sBIT":
+            return max(data[start + 8 : start + 8 + length], default=None)
+        if kind == b"IDAT":
+            break
+        start += 12 + length
+    return None
+
+
+def used_bits(pixels: NDArray[Any], significant: int | None) -> int:
+    """Bits in which the values of a 16-bit picture lie.
+
+    The largest value tells it; significant bits that are declared are believed as long as no value exceeds them, since
+    the PNG standard wants values scaled up to 16 bits, and many cameras leave them unscaled.
+    """
+    largest = int(pixels.max(initial=0))
+    if significant is not None and 8 <= significant <= 16 and largest < 2**significant:
+        return significant
+    return next(bits for bits in USED_BITS if largest < 2**bits)
+
+
+def _bytes_of(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes() or None
+    except OSError:
+        return None
+
+
+def _decoded(data: bytes) -> NDArray[Any] | None:
+    """(H,W,3) BGR as stored, of 8 or 16 bits or floating point, upright; None if it is not a picture."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    except cv2.error:
+        return None
+
+
+def _from_float(pixels: NDArray[Any]) -> Image:
+    """(H,W,3) uint8 of values from 0 to 1, or else to the largest one."""
+    values = np.nan_to_num(pixels.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    largest = float(values.max(initial=0.0))
+    return np.clip(values * (255.0 / max(largest, 1.0)), 0.0, 255.0).round().astype(np.uint8)
+
+
+def _read_heif(data: bytes) -> Image | None:
+    """(H,W,3) uint8 RGB of a HEIC picture; its reader applies the orientation."""
+    try:
+        with open_picture(data) as picture:
+            return np.array(picture.convert("RGB"))
+    except MissingDependencyError:
+        raise
+    except Exception:  # the reader raises whatever a damaged file makes it run into
+        return None
+
+
+def _turns_of_picture(path: Path) -> int:
+    try:
+        return read_exif(path).quarter_turns_clockwise
+    except InputError:
+        return 0
