@@ -215,6 +215,7 @@ def test_the_report_is_text(tmp_path):
     settings = ComponentSettings("post", role="inspect", position_tolerance_mm=0.5, angle_tolerance_deg=2.0)
     part = part_of(component("base", box((0, 0, -10), (120, 80, 0))), component("post", prism(6, 8, 40)), post=settings)
     text = check_part(replace(part, serial="S-9", notes=("renamed something",))).format()
+    assert f"model_hash {part.model.source_hash}" in text  # whole, to be copied into an inspection.json
     assert "p  serial S-9" in text
     assert "128 × 86.93 × 50 mm, 2 components, 36 triangles" in text
     assert "0.5 mm 2°" in text

@@ -194,6 +194,31 @@ def test_refuses_in_one_line(
     assert len(message) < len(str(path)) + 300
 
 
+def test_names_all_faults_at_once(model: Model, write: Callable[[Any], Path]) -> None:
+    content = document(model)
+    content["model_hash"] = "0" * 64
+    content["created"] = "2026-13-01T12:00:00Z"
+    content["coment"] = "?"
+    first, second, third = content["components"]
+    first |= {"distance_mm": 1.3, "uncertainty_mm": None, "verdict": "pass"}
+    second |= {"name": "post_0", "observable": [True] * 6}
+    third |= {"name": "nut", "verdict": "bad"}
+    path = write(content)
+    with pytest.raises(InputError) as caught:
+        load_inspection(path, model)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: 10 faults: (1) ")
+    assert "\n" not in message
+    for fault in (
+        "'coment' was unexpected", "components[2].verdict: 'bad' is not one of", "created: '2026-13-01T12:00:00Z'",
+        "components[0].distance_mm: is 1.3, but", "components[0].uncertainty_mm: is null",
+        "components[0].verdict: is pass, but", "components[1].displacement_mm[2]: is null, but",
+        "components[1].name: 'post_0' appears twice", "names 'nut', which model",
+        f"model 'part' has {model.source_hash}",
+    ):  # fmt: skip
+        assert fault in message
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [

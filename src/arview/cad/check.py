@@ -106,8 +106,8 @@ class PartCheck:
         serial = f"  serial {self.part.serial}" if self.part.serial else ""
         lines = [
             f"{self.part.name}{serial}  ({self.part.cad_path})",
-            f"  {_extent(size)} mm, {len(self.components)} components, {triangles:,} triangles, "
-            f"hash {model.source_hash[:12]}",
+            f"  {_extent(size)} mm, {len(self.components)} components, {triangles:,} triangles",
+            f"  model_hash {model.source_hash}",
             f"  view range{'' if self.part.view_range else ' (default)'}: {_range_text(self.view_range)}",
             *([] if self.part.up == "z" else [f"  up: {self.part.up}"]),
             f"  camera{' (guessed)' if self.is_camera_guessed else ''}: "

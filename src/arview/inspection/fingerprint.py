@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from arview.errors import InputError
-from arview.inspection.files import to_document
+from arview.inspection.document import to_document
 from arview.inspection.record import Inspection
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
@@ -34,6 +35,14 @@ class Finding(StrEnum):
     MISSING = "missing"
 
 
+class RecordError(InputError):
+    """Contradictions in a record, each as a text that starts with the name of a field."""
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        super().__init__("; ".join(faults))
+        self.faults = tuple(faults)
+
+
 @dataclass(frozen=True)
 class ComponentDeviation:
     """The measured deviation of a component. Undetermined degrees of freedom are None.
@@ -53,7 +62,7 @@ class ComponentDeviation:
         details: details of the measurement; None in files of version 1.0.
 
     Raises:
-        InputError: the fields contradict each other; the message starts with the name of the field.
+        RecordError: fields contradict each other; each fault starts with the name of a field.
     """
 
     name: str
@@ -76,73 +85,72 @@ class ComponentDeviation:
         return True if any(self.observable) else None
 
     def __post_init__(self) -> None:
-        self._check_numbers()
-        self._check_observable()
-        self._check_distance()
-        self._check_verdict()
+        if shape := list(self._shape_faults()):
+            raise RecordError(shape)
+        faults = [*self._number_faults(), *self._observable_faults(), *self._distance_faults(), *self._verdict_faults()]
+        if faults:
+            raise RecordError(faults)
 
-    def _check_numbers(self) -> None:
+    def _shape_faults(self) -> Iterator[str]:
         if not self.name:
-            raise InputError("name: is empty")
+            yield "name: is empty"
         if len(self.displacement_mm) != 3 or len(self.observable) != 6:
-            raise InputError("displacement_mm: needs 3 values, and observable 6")
+            yield "displacement_mm: needs 3 values, and observable 6"
+
+    def _number_faults(self) -> Iterator[str]:
         numbers = {f"displacement_mm[{i}]": value for i, value in enumerate(self.displacement_mm)}
         for field in ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg", "twist_deg"):
             numbers[field] = getattr(self, field)
         for field, value in numbers.items():
             if value is not None and not math.isfinite(value):
-                raise InputError(f"{field}: is {value}, expected a finite number or null")
+                yield f"{field}: is {value}, expected a finite number or null"
             if field in ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg") and (value or 0.0) < 0.0:
-                raise InputError(f"{field}: is {value}, must not be negative")
+                yield f"{field}: is {value}, must not be negative"
 
-    def _check_observable(self) -> None:
+    def _observable_faults(self) -> Iterator[str]:
         for axis, value, is_observable in zip("xyz", self.displacement_mm, self.observable[3:], strict=True):
             index = "xyz".index(axis)
             if value is not None and not is_observable:
-                raise InputError(
+                yield (
                     f"displacement_mm[{index}]: is {value}, but d{axis} is undetermined by observable[{index + 3}];"
                     " undetermined values must be null"
                 )
             if value is None and is_observable:
-                raise InputError(
-                    f"displacement_mm[{index}]: is null, but d{axis} is determined by observable[{index + 3}]"
-                )
+                yield (f"displacement_mm[{index}]: is null, but d{axis} is determined by observable[{index + 3}]")
         if not any(self.observable[:3]) and (self.tilt_deg is not None or self.twist_deg is not None):
-            raise InputError("rotation: is a number, but no rotation is determined by observable")
+            yield "rotation: is a number, but no rotation is determined by observable"
 
-    def _check_distance(self) -> None:
+    def _distance_faults(self) -> Iterator[str]:
         known = [value for value in self.displacement_mm if value is not None]
         if not known:
             if self.distance_mm is not None:
-                raise InputError(f"distance_mm: is {self.distance_mm}, but no displacement is determined")
+                yield f"distance_mm: is {self.distance_mm}, but no displacement is determined"
             return
         length = math.hypot(*known)
         if self.distance_mm is None:
-            raise InputError(f"distance_mm: is null, but displacement_mm has the length {length:.3f} mm")
-        if abs(self.distance_mm - length) > _DISTANCE_SLACK_MM + 1e-3 * length:
-            raise InputError(f"distance_mm: is {self.distance_mm}, but displacement_mm has the length {length:.3f} mm")
+            yield f"distance_mm: is null, but displacement_mm has the length {length:.3f} mm"
+        elif abs(self.distance_mm - length) > _DISTANCE_SLACK_MM + 1e-3 * length:
+            yield f"distance_mm: is {self.distance_mm}, but displacement_mm has the length {length:.3f} mm"
         if self.uncertainty_mm is None:
-            raise InputError("uncertainty_mm: is null, but a distance is given; a measured value needs its U")
+            yield "uncertainty_mm: is null, but a distance is given; a measured value needs its U"
 
-    def _check_verdict(self) -> None:
+    def _verdict_faults(self) -> Iterator[str]:
         if self.finding is Finding.MISSING:
             if self.verdict is not Verdict.FAIL:
-                raise InputError(f"verdict: is {self.verdict}, but the component is missing; expected fail")
+                yield f"verdict: is {self.verdict}, but the component is missing; expected fail"
             if any(self.observable) or self.distance_mm is not None:
-                raise InputError("displacement_mm: a missing component has no displacement; expected nulls")
+                yield "displacement_mm: a missing component has no displacement; expected nulls"
             return
         if self.verdict is Verdict.NOT_MEASURED:
             if any(self.observable) or self.distance_mm is not None:
-                raise InputError("verdict: is not_measured, but the component has measured values")
+                yield "verdict: is not_measured, but the component has measured values"
         elif self.verdict in (Verdict.PASS, Verdict.FAIL) and self.tolerance_mm is None:
-            raise InputError(f"tolerance_mm: is null, but the verdict is {self.verdict}")
+            yield f"tolerance_mm: is null, but the verdict is {self.verdict}"
         if self.verdict is Verdict.PASS:
             if self.distance_mm is None:
-                raise InputError("distance_mm: is null, but the verdict is pass")
-            if self.tolerance_mm is not None and self.distance_mm > self.tolerance_mm:
-                raise InputError(
-                    f"verdict: is pass, but distance_mm {self.distance_mm} exceeds tolerance_mm {self.tolerance_mm}"
-                )
+                yield "distance_mm: is null, but the verdict is pass"
+            elif self.tolerance_mm is not None and self.distance_mm > self.tolerance_mm:
+                yield (f"verdict: is pass, but distance_mm {self.distance_mm} exceeds tolerance_mm {self.tolerance_mm}")
 
 
 @dataclass(frozen=True)
@@ -230,16 +238,22 @@ class Inspection:
         Raises:
             MismatchError: the inspection belongs to another geometry, or a component does not exist in the model.
         """
-        names = {component.name for component in model.components}
-        unknown = sorted({component.name for component in self.components} - names)
-        if unknown:
-            raise MismatchError(
-                f"the inspection of {self.part!r} names {', '.join(map(repr, unknown))}, which model"
-                f" {model.name!r} does not have"
-            )
-        if self.model_hash != model.source_hash:
-            raise MismatchError(
-                f"the inspection of {self.part!r} was made against another model: model_hash"
-                f" {self.model_hash[:12]}…, model {model.name!r} has {model.source_hash[:12]}…"
-                " (other CAD file, revision, unit or tessellation)"
-            )
+        faults = model_faults(self.model_hash, [component.name for component in self.components], model)
+        if faults:
+            raise MismatchError(f"the inspection of {self.part!r} {'; it '.join(faults)}")
+
+
+def model_faults(model_hash: object, names: Sequence[str], model: Model) -> list[str]:
+    """Why an inspection with this hash and these components is not of the model, as predicates of "the inspection"."""
+    known = {component.name for component in model.components}
+    unknown = sorted(set(names) - known)
+    faults = []
+    if unknown:
+        faults.append(f"names {', '.join(map(repr, unknown))}, which model {model.name!r} does not have")
+    if model_hash != model.source_hash:
+        theirs = f"{model_hash[:12]}…" if isinstance(model_hash, str) and len(model_hash) > 12 else repr(model_hash)
+        faults.append(
+            f"was made against another model: model_hash {theirs}, model {model.name!r} has {model.source_hash}"
+            " (other CAD file, revision, unit or tessellation)"
+        )
+    return faults

@@ -1,0 +1,138 @@
+"""The JSON document of an inspection: from the record to the document, and back."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from arview.errors import InputError
+from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport, from_json, to_json
+from arview.inspection.record import (
+    SCHEMA_VERSION,
+    ComponentDeviation,
+    Finding,
+    Inspection,
+    Provenance,
+    Verdict,
+)
+
+
+def from_document(document: dict[str, Any]) -> Inspection:
+    """The inspection of a document without faults (see `arview.inspection.validation`)."""
+    created = moment(document["created"])
+    components = [component_from_entry(entry) for entry in document["components"]]
+    source = document["provenance"]
+    datums, distances = document.get("datum_system"), document.get("distance_map")
+    return Inspection(
+        part=document["part"],
+        serial=document["serial"],
+        model_hash=document["model_hash"],
+        created=created,
+        components=tuple(components),
+        provenance=Provenance(
+            source["tool"],
+            source["version"],
+            source["method"],
+            source.get("note", ""),
+            source.get("photos_hash", ""),
+            source.get("photos", 0),
+            tuple(source.get("software", {}).items()),
+            tuple(source.get("options", {}).items()),
+            source.get("cpu_s"),
+        ),
+        datum_system=None if datums is None else from_json(DatumSystem, datums),
+        warnings=tuple(document.get("warnings", ())),
+        foreign_objects=tuple(from_json(ForeignReport, one) for one in document.get("foreign_objects", ())),
+        distance_map=None if distances is None else from_json(DistanceReport, distances),
+    )
+
+
+def moment(text: str) -> datetime:
+    """The time of a measurement.
+
+    Raises:
+        InputError: the text is not a date and time.
+    """
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError as error:
+        raise InputError(f"created: {text!r} is not a date and time ({error})") from None
+
+
+def component_from_entry(entry: dict[str, Any]) -> ComponentDeviation:
+    """The record of a component from its entry in the document.
+
+    Raises:
+        RecordError: the fields of the entry contradict each other.
+    """
+    rotation = entry.get("rotation") or {}
+    finding = entry.get("finding")
+    dx, dy, dz = (None if value is None else float(value) for value in entry["displacement_mm"])
+    return ComponentDeviation(
+        name=entry["name"],
+        displacement_mm=(dx, dy, dz),
+        distance_mm=entry["distance_mm"],
+        observable=tuple(entry["observable"]),
+        uncertainty_mm=entry["uncertainty_mm"],
+        tolerance_mm=entry["tolerance_mm"],
+        verdict=Verdict(entry["verdict"]),
+        tilt_deg=rotation.get("tilt_deg"),
+        twist_deg=rotation.get("twist_deg"),
+        finding=None if finding is None else Finding(finding),
+        details=None if entry.get("details") is None else from_json(Details, entry["details"]),
+    )
+
+
+def to_document(inspection: Inspection) -> dict[str, Any]:
+    """The inspection as the JSON document that `save_inspection` writes."""
+    source = inspection.provenance
+    software, options = dict(source.software), dict(source.options)
+    more: dict[str, Any] = {
+        "photos_hash": source.photos_hash, "photos": source.photos, "software": software, "options": options,
+        "cpu_s": source.cpu_s,
+    }  # fmt: skip
+    document: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "part": inspection.part,
+        "serial": inspection.serial,
+        "model_hash": inspection.model_hash,
+        "created": inspection.created.replace(tzinfo=None).isoformat() + "Z",
+        "components": [_to_entry(component) for component in inspection.components],
+        "provenance": {
+            "tool": source.tool,
+            "version": source.version,
+            "method": source.method,
+            "note": source.note,
+            **{key: value for key, value in more.items() if value},
+        },
+    }
+    if inspection.datum_system is not None:
+        document["datum_system"] = to_json(inspection.datum_system)
+    if inspection.warnings:
+        document["warnings"] = list(inspection.warnings)
+    if inspection.foreign_objects:
+        document["foreign_objects"] = to_json(inspection.foreign_objects)
+    if inspection.distance_map is not None:
+        document["distance_map"] = to_json(inspection.distance_map)
+    return document
+
+
+def _to_entry(component: ComponentDeviation) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "name": component.name,
+        "displacement_mm": list(component.displacement_mm),
+        "distance_mm": component.distance_mm,
+    }
+    if component.tilt_deg is not None or component.twist_deg is not None:
+        entry["rotation"] = {"tilt_deg": component.tilt_deg, "twist_deg": component.twist_deg}
+    entry |= {
+        "observable": list(component.observable),
+        "uncertainty_mm": component.uncertainty_mm,
+        "tolerance_mm": component.tolerance_mm,
+        "verdict": component.verdict.value,
+    }
+    if component.finding is not None:
+        entry["finding"] = component.finding.value
+    if component.details is not None:
+        entry["details"] = to_json(component.details)
+    return entry
