@@ -25,7 +25,7 @@ def write_film(
 ) -> Path:
     """Film of RGB images whose clock starts at ``first_s``; size, codec and format follow from the arguments."""
     height, width = images[0].shape[:2]
-    options = {"crf": "8", "preset": "ultrafast", "x264-params": f"log-level=none:{parameters}".rstrip(":")}
+    options = {"crf": "8", "preset": "veryfast", "x264-params": f"log-level=none:{parameters}".rstrip(":")}
     # Without an offset, the muxer of MPEG-TS adds 1.4 s of its own.
     with av.open(str(path), "w", options={"muxdelay": "0", "muxpreload": "0"}) as container:
         video = container.add_stream(codec, rate=fps, options=options if codec == "libx264" else {"qscale": "2"})

@@ -62,11 +62,21 @@ def test_sound_stays_in_step_with_a_clock_that_starts_late(tmp_path: Path) -> No
     assert -0.06 <= sound[0] <= 0.06 and 0.9 <= sound[-1] <= 1.0
 
 
-def test_films_without_time_stamps(tmp_path: Path) -> None:
-    clip = write_film(tmp_path / "a.h264", CLIP)
-    source = open_source(clip)
+@pytest.mark.parametrize(
+    ("name", "codec", "parameters"),
+    [
+        ("raw.h264", "libx264", ""),
+        ("raw.m2v", "mpeg2video", ""),
+        ("b_frames.avi", "libx264", "bframes=3:b-adapt=0"),  # numbered in the order of decoding
+        ("b_frames.mp4", "libx264", "bframes=3:b-adapt=0"),  # decoding times below 0
+    ],
+)
+def test_films_without_time_stamps_or_in_another_order(tmp_path: Path, name: str, codec: str, parameters: str) -> None:
+    source = open_source(write_film(tmp_path / name, CLIP, codec=codec, parameters=parameters))
     assert source.fps == 30.0
-    np.testing.assert_allclose([frame.time_s for frame in source], np.arange(20) / 30, atol=1e-6)
+    frames = list(source)
+    np.testing.assert_allclose([frame.time_s for frame in frames], np.arange(20) / 30, atol=1e-4)
+    assert [number_of(frame.image) for frame in frames] == list(range(20))
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,9 @@ from arview.video.frame import Frame
 from arview.video.source import FrameRange, FrameSource, read_ahead
 from arview.video.upright import UprightPictures
 
+NO_TIMESTAMPS = 0x80
+"""FFmpeg's AVFMT_NOTIMESTAMPS."""
+
 
 class VideoFileSource(FrameSource):
     """Frames of a video file at their times from the first one on, also of variable frame rate.
@@ -41,12 +44,14 @@ class VideoFileSource(FrameSource):
             if first is None:
                 raise InputError(f"{path}: the video contains no frame that can be decoded; record or copy it again")
             frame = first[1]
-            # A raw stream has no time stamps, and its average rate is a default of the demuxer.
+            # A raw stream has no time stamps: what looks like some, and its average rate, are defaults of the demuxer.
+            self._has_stamps = not container.format.flags & NO_TIMESTAMPS
+            self._is_avi = container.format.name == "avi"
             rates = (stream.average_rate, stream.guessed_rate)
-            self.fps = plausible_fps(*(rates if frame.pts is not None else reversed(rates)))
+            self.fps = plausible_fps(*(rates if self._has_stamps else reversed(rates)))
             self._total: int | None = stream.frames or None
             self._pixel_aspect = stream.sample_aspect_ratio
-        self.audio_start_s = float(frame.time or 0.0)
+        self.audio_start_s = self._stamp_s(frame) or 0.0
         pictures = UprightPictures(frame, self._pixel_aspect)
         self._first = frame
         self.quarter_turns_clockwise = pictures.quarter_turns_clockwise
@@ -68,7 +73,7 @@ class VideoFileSource(FrameSource):
         index = -1
         with self._opened() as (container, stream):
             for index, frame in self._decoded(container, stream):
-                time_s = clock.time_s(index, frame.time)
+                time_s = clock.time_s(index, self._stamp_s(frame))
                 # One frame before the range, because a deinterlaced frame depends on its neighbours.
                 if index < self._wanted.start - 1:
                     continue
@@ -86,6 +91,14 @@ class VideoFileSource(FrameSource):
                 f"{self.name}: the file is cut short or damaged; "
                 f"{index + 1 - self.skipped} of {self._total} frames could be read"
             )
+
+    def _stamp_s(self, frame: VideoFrame) -> float | None:
+        """Time stamp of a frame by the clock of the file, seconds; None without one."""
+        # AVI numbers frames in the order of decoding, also where they are shown in another one.
+        stamp = frame.dts if self._is_avi else frame.pts
+        if not self._has_stamps or stamp is None or frame.time_base is None:
+            return None
+        return float(stamp * frame.time_base)
 
     def _wanted_pictures(
         self, frames: Sequence[tuple[tuple[int, float], VideoFrame]], pictures: UprightPictures
