@@ -1,4 +1,4 @@
-"""The pinhole camera with Brown distortion (k1 k2 p1 p2 k3), in OpenCV's conventions.
+"""The pinhole camera with Brown distortion (k1 k2 p1 p2 k3) or another lens model, in OpenCV's conventions.
 
 Pixel (u, v): integer coordinates are pixel centres. Camera frame: +X right, +Y down, +Z forward.
 """
@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from arview.camera.lens import LensDistortion
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -25,7 +26,9 @@ class Camera:
         width, height: of the image, px.
         fx, fy: focal lengths, px.
         cx, cy: principal point, px.
-        dist: (5,) distortion k1 k2 p1 p2 k3, as in OpenCV.
+        dist: (5,) distortion k1 k2 p1 p2 k3, as in OpenCV; zeros where ``lens`` is given.
+        lens: another lens model, or None. Pictures of such a camera are undistorted before the engine uses them, see
+            `arview.camera.undistort`.
 
     Raises:
         InputError: a value that no camera has.
@@ -38,6 +41,7 @@ class Camera:
     cx: float
     cy: float
     dist: Array = field(default_factory=lambda: np.zeros(5))
+    lens: LensDistortion | None = None
 
     def __post_init__(self) -> None:
         dist = np.zeros(5)
@@ -46,6 +50,8 @@ class Camera:
             raise InputError(f"camera: {given.size} distortion terms; only k1 k2 p1 p2 k3 are supported")
         dist[: min(5, given.size)] = given[:5]
         object.__setattr__(self, "dist", dist)
+        if self.lens is not None and np.any(dist != 0.0):
+            raise InputError(f"camera: distortion terms beside the lens model {self.lens.model}; give one of them")
         values = np.array([self.fx, self.fy, self.cx, self.cy, *dist], dtype=np.float64)
         if not np.all(np.isfinite(values)):
             raise InputError("camera: a value is NaN or infinite; calibrate again or correct the file")
@@ -56,6 +62,8 @@ class Camera:
 
     def __repr__(self) -> str:
         distortion = "distorted" if self.is_distorted else "no distortion"
+        if self.lens is not None:
+            distortion = f"{self.lens.model} lens"
         focal, center = f"f {self.fx:.1f}, {self.fy:.1f} px", f"centre {self.cx:.1f}, {self.cy:.1f} px"
         return f"<Camera {self.width}×{self.height}: {focal}, {center}, {distortion}>"
 
@@ -66,8 +74,8 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """True when any distortion term is not zero."""
-        return bool(np.any(self.dist != 0.0))
+        """True when any distortion term is not zero, or the lens has another model."""
+        return self.lens is not None or bool(np.any(self.dist != 0.0))
 
     def project(self, points_in_cam: ArrayLike) -> Array:
         """Pixels (..., 2) of points (..., 3) in the camera frame; NaN for points not in front of the camera."""
@@ -80,7 +88,9 @@ class Camera:
         return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
 
     def distort(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Distorted normalised coordinates of ideal ones (Brown 1966, OpenCV's formula)."""
+        """Distorted normalised coordinates of ideal ones (Brown 1966, OpenCV's formula; or the lens model)."""
+        if self.lens is not None:
+            return self.lens.distort(x, y)
         k1, k2, p1, p2, k3 = self.dist
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -89,12 +99,17 @@ class Camera:
         return xd, yd
 
     def unproject(self, pixels: ArrayLike) -> Array:
-        """Ideal normalised rays (..., 3) with z = 1 of pixels (..., 2); distortion is removed by iteration."""
+        """Ideal normalised rays (..., 3) with z = 1 of pixels (..., 2); distortion is removed by iteration.
+
+        NaN for pixels where a lens of another model sees nothing less than 90° off the axis.
+        """
         uv = np.asarray(pixels, dtype=np.float64)
         xd = (uv[..., 0] - self.cx) / self.fx
         yd = (uv[..., 1] - self.cy) / self.fy
         x, y = xd.copy(), yd.copy()
-        if self.is_distorted:
+        if self.lens is not None:
+            x, y = self.lens.undistort(xd, yd)
+        elif self.is_distorted:
             for _ in range(20):
                 xe, ye = self.distort(x, y)
                 x, y = x + xd - xe, y + yd - ye
@@ -130,9 +145,10 @@ class Camera:
                 cx=camera.height - 1 - camera.cy,
                 cy=camera.cx,
                 dist=np.array([k1, k2, p2, -p1, k3]),
+                lens=None if camera.lens is None else camera.lens.turned_clockwise(),
             )
         return camera
 
     def without_distortion(self) -> Camera:
         """The ideal camera with the same calibration matrix."""
-        return replace(self, dist=np.zeros(5))
+        return replace(self, dist=np.zeros(5), lens=None)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from arview.camera.model import COLMAP_HALF_PX, Camera
+from arview.camera.undistort import require_brown
 from arview.core.atomic import replacing
 from arview.errors import InputError, OutputError
 
@@ -27,13 +28,15 @@ def write_camera(
         extra: objects to store beside the intrinsics; only arview's own format stores them.
 
     Raises:
-        InputError: an unknown format or suffix.
+        InputError: an unknown format or suffix, or a lens model that only arview's own format holds.
         OutputError: the file cannot be written.
     """
     path = Path(path)
     kind = kind or format_of(path)
     if kind not in FORMATS:
         raise InputError(f"camera format {kind!r}: expected one of {', '.join(FORMATS)}")
+    if kind != "arview":
+        camera = require_brown(camera, f"camera format {kind}")
     text = _arview(camera, extra) if kind == "arview" else FORMATS[kind](camera)
     try:
         with replacing(path) as file:
@@ -60,17 +63,23 @@ def holds_distortion(kind: str) -> bool:
     return kind != "bop"
 
 
-def _arview(camera: Camera, extra: dict[str, Any] | None = None) -> str:
-    record = {
+def camera_record(camera: Camera) -> dict[str, Any]:
+    """A camera in arview's own JSON."""
+    lens = camera.lens
+    return {
         "width": camera.width,
         "height": camera.height,
         "fx": float(camera.fx),
         "fy": float(camera.fy),
         "cx": float(camera.cx),
         "cy": float(camera.cy),
-        "dist": [float(value) for value in camera.dist],
-        **(extra or {}),
+        **({} if lens is None else {"lens_model": str(lens.model)}),
+        "dist": [float(value) for value in (camera.dist if lens is None else lens.terms)],
     }
+
+
+def _arview(camera: Camera, extra: dict[str, Any] | None = None) -> str:
+    record = camera_record(camera) | (extra or {})
     return json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 

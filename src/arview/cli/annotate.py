@@ -142,7 +142,8 @@ DataMatrix or QR code (or AprilTag) on the part that holds the serial number of 
 that holds another serial number withholds the labels. See serial_pattern in the part file.
 
 \b
-CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt), fov:DEG
+CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML/JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt,
+RealSense JSON, nerfstudio transforms.json; FILE:NAME for one of several cameras in it, like rig.yaml:cam0), fov:DEG
 (field of view along the longer side), exif, or profile:NAME (stored by `arview calibrate --profile`;
 profile alone takes the one that matches what the source says of its camera). Without it the focal length is
 guessed, and estimated from the frames in which the part is tracked: of a film in a first pass, of a camera or

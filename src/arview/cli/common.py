@@ -349,6 +349,8 @@ def output_path(path: str, inputs: list[Any]) -> Path:
     Raises:
         OutputError: the file cannot be written there, or would overwrite one of ``inputs``.
     """
+    from arview.camera.read import split_spec
+
     target = Path(path)
     if not target.parent.is_dir():
         raise OutputError(f"{path}: there is no folder {target.parent}; create it first")
@@ -357,7 +359,7 @@ def output_path(path: str, inputs: list[Any]) -> Path:
     if not os.access(target if is_device(target) else target.parent, os.W_OK):
         raise OutputError(f"{path}: the folder {target.parent} cannot be written to; choose another")
     for other in inputs:
-        if other is not None and target.resolve() == Path(other).resolve():
+        if other is not None and target.resolve() == split_spec(other)[0].resolve():
             raise OutputError(f"{path}: would overwrite an input or another output; choose another name")
     return target
 

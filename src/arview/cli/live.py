@@ -74,7 +74,8 @@ address, or a file (played in a loop at its own rate): all pages show that pictu
 browser of this machine only, without certificates, for trying things out.
 
 \b
-CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML, ROS camera_info, COLMAP cameras.txt) or fov:DEG. It
+CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML/JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt,
+RealSense JSON, nerfstudio transforms.json; FILE:NAME for one of several cameras in it) or fov:DEG. It
 is scaled to the frames if their aspect ratio is the same. Without it a common phone is assumed, and the
 page says so, until the focal length has been estimated from views of the part from near and from several
 sides. --save-profile NAME keeps the estimate at the end, for --camera profile:NAME.

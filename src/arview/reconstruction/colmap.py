@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from arview.camera import Camera
+from arview.camera.undistort import require_brown
 from arview.errors import MissingDependencyError
 from arview.geometry import Array, rigid
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
@@ -53,7 +54,12 @@ def _take_back_signals() -> None:
 
 
 def colmap_camera(camera: Camera, is_calibrated: bool) -> Any:
-    """A pycolmap camera: RADIAL (one focal length, k1, k2) to be refined, or FULL_OPENCV if calibrated."""
+    """A pycolmap camera: RADIAL (one focal length, k1, k2) to be refined, or FULL_OPENCV if calibrated.
+
+    Raises:
+        InputError: a camera with another lens model, which the later steps do not know.
+    """
+    camera = require_brown(camera, "reconstruction")
     pycolmap = import_pycolmap()
     cx, cy = camera.cx + HALF_PX, camera.cy + HALF_PX
     k1, k2, p1, p2, k3 = camera.dist

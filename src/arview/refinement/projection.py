@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.camera.undistort import require_brown
 from arview.core.kernel import kernel
 from arview.geometry import Array
 
@@ -54,7 +55,13 @@ class ViewArrays(NamedTuple):
 
 
 def intrinsics_of(camera: Camera) -> Array:
-    """Intrinsics in the form of the kernels: (10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted."""
+    """Intrinsics in the form of the kernels: (10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted.
+
+    Raises:
+        InputError: a camera with another lens model, which the kernels do not know.
+    """
+    if camera.lens is not None:
+        camera = require_brown(camera, "tracking")
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0])
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from arview.cad import Part, load_part
-from arview.camera.read import load_camera
+from arview.camera.read import load_camera, split_spec
+from arview.camera.undistort import require_brown
 from arview.core.stage_cache import content_key, key_of
 from arview.errors import InputError
 from arview.measurement.options import MeasureOptions
@@ -82,7 +83,7 @@ def _check_cameras(job: InspectJob) -> None:
         raise InputError("a camera of the video is given without a video")
     if job.camera:
         is_angle = job.camera.startswith("fov:")
-        load_camera(job.camera, *((1000, 1000) if is_angle else (None, None)))
+        require_brown(load_camera(job.camera, *((1000, 1000) if is_angle else (None, None))), job.camera)
 
 
 def measurement_key(prepared: Prepared) -> str:
@@ -107,4 +108,4 @@ def job_key(prepared: Prepared) -> str:
 
 def _content(spec: str | None) -> str | None:
     """A hash of the content of a file, or the text itself if it is not a file."""
-    return content_key([Path(spec)]) if spec and Path(spec).is_file() else spec
+    return content_key([split_spec(spec)[0]]) + split_spec(spec)[1] if spec and split_spec(spec)[0].is_file() else spec

@@ -1,0 +1,83 @@
+"""Cameras of COLMAP's ``cameras.txt``."""
+
+from __future__ import annotations
+
+import re
+
+from arview.camera.entry import CameraEntry
+from arview.camera.lens import LensDistortion, LensModel
+from arview.camera.model import COLMAP_HALF_PX
+from arview.camera.terms import simplest
+from arview.errors import InputError
+
+# Indices of fx, fy, cx, cy and of the terms of the lens, in the parameters of each model.
+_BROWN_MODELS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
+    "SIMPLE_PINHOLE": ((0, 0, 1, 2), ()),
+    "PINHOLE": ((0, 1, 2, 3), ()),
+    "SIMPLE_RADIAL": ((0, 0, 1, 2), (3,)),
+    "RADIAL": ((0, 0, 1, 2), (3, 4)),
+    "OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7)),
+    "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
+}
+_LENS_MODELS: dict[str, tuple[tuple[int, ...], tuple[int, ...], LensModel]] = {
+    "SIMPLE_FISHEYE": ((0, 0, 1, 2), (), LensModel.FISHEYE),
+    "FISHEYE": ((0, 1, 2, 3), (), LensModel.FISHEYE),
+    "SIMPLE_RADIAL_FISHEYE": ((0, 0, 1, 2), (3,), LensModel.FISHEYE),
+    "RADIAL_FISHEYE": ((0, 0, 1, 2), (3, 4), LensModel.FISHEYE),
+    "OPENCV_FISHEYE": ((0, 1, 2, 3), (4, 5, 6, 7), LensModel.FISHEYE),
+    "FOV": ((0, 1, 2, 3), (4,), LensModel.FOV),
+    "SIMPLE_DIVISION": ((0, 0, 1, 2), (3,), LensModel.DIVISION),
+    "DIVISION": ((0, 1, 2, 3), (4,), LensModel.DIVISION),
+}
+_COLMAP_LINE = re.compile(r"^\d+\s+[A-Z][A-Z_0-9]+\s+\d+\s+\d+\s")
+
+
+def is_colmap(text: str) -> bool:
+    """Whether the first line with content is a camera of COLMAP."""
+    lines = _data_lines(text)
+    return bool(lines) and _COLMAP_LINE.match(lines[0]) is not None
+
+
+def entries_from_colmap(text: str) -> list[CameraEntry]:
+    """The cameras of a file.
+
+    Raises:
+        InputError: a line is not one of a camera, its model is not supported, or an id occurs twice.
+    """
+    entries = [_entry(line) for line in _data_lines(text)]
+    labels = [entry.label for entry in entries]
+    twice = (
+        next((label for label in labels if labels.count(label) > 1), None) if len(set(labels)) < len(labels) else None
+    )
+    if twice is not None:
+        raise InputError(f"holds camera {twice} twice; keep one of them")
+    return entries
+
+
+def _data_lines(text: str) -> list[str]:
+    return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _entry(line: str) -> CameraEntry:
+    fields = line.split()
+    label, model = fields[0][:20], fields[1][:40] if len(fields) > 1 else ""
+    if model not in _BROWN_MODELS and model not in _LENS_MODELS:
+        known = ", ".join((*_BROWN_MODELS, *_LENS_MODELS))
+        raise InputError(f"camera {label}: lens model {model} is not supported; use one of {known}")
+    try:
+        width, height = int(fields[2]), int(fields[3])
+        params = [float(value) for value in fields[4:]]
+    except (ValueError, IndexError) as error:
+        raise InputError(
+            f"camera {label}: '{line[:60]}' is not ID MODEL WIDTH HEIGHT PARAMS; export it again"
+        ) from error
+    if model in _BROWN_MODELS:
+        (places, lens_places), kind = _BROWN_MODELS[model], LensModel.RATIONAL
+    else:
+        places, lens_places, kind = _LENS_MODELS[model]
+    expected = max(*places, *lens_places) + 1
+    if len(params) != expected:
+        raise InputError(f"camera {label}: {model} needs {expected} parameters, the file gives {len(params)}")
+    fx, fy, cx, cy = (params[place] for place in places)
+    dist, lens = simplest(LensDistortion(kind, tuple(params[place] for place in lens_places)))
+    return CameraEntry(fx, fy, cx - COLMAP_HALF_PX, cy - COLMAP_HALF_PX, dist, lens, width, height, label=label)

@@ -1,0 +1,143 @@
+"""Pictures of lenses that the engine's kernels do not know, as pictures of a lens that they know.
+
+The kernels project with Brown's five terms. Where these describe a lens exactly enough they replace it; other pictures
+are resampled once to those of a pinhole camera that sees as much of the scene as fits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arview.camera.model import Camera
+from arview.errors import InputError
+from arview.geometry import Array
+
+
+@dataclass(frozen=True)
+class UndistortOptions:
+    """How a lens is replaced.
+
+    Attributes:
+        max_fit_error_px: largest deviation of Brown's terms from a lens that they replace, px of the picture.
+        grid: points across and down of the picture at which the terms are fitted; they are checked at twice as many.
+        max_half_angle_deg: the pinhole camera sees at most this far to each side.
+        max_growth: sides of the pinhole's picture by those of the original; a lens that needs more loses resolution.
+    """
+
+    max_fit_error_px: float = 0.03
+    grid: int = 40
+    max_half_angle_deg: float = 75.0
+    max_growth: float = 2.0
+
+
+def brown_camera(camera: Camera, options: UndistortOptions | None = None) -> Camera | None:
+    """The camera with Brown's five terms for its lens; None where these are not exact over the whole picture.
+
+    The terms are the linear least-squares fit, with the same calibration matrix, to rays of a grid of pixels.
+    """
+    if camera.lens is None:
+        return camera
+    o = options or UndistortOptions()
+    rays = _rays(camera, o.grid)
+    if not np.isfinite(rays).all():
+        return None
+    x, y = rays[:, 0], rays[:, 1]
+    xd, yd = camera.lens.distort(x, y)
+    r2 = x * x + y * y
+    columns = [
+        (x * r2, y * r2), (x * r2**2, y * r2**2), (2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y),
+        (x * r2**3, y * r2**3),
+    ]  # fmt: skip
+    matrix = np.stack([np.concatenate(column) for column in columns], axis=1)
+    scale = np.abs(matrix).max(axis=0)
+    terms = np.linalg.lstsq(matrix / scale, np.concatenate([xd - x, yd - y]), rcond=None)[0] / scale
+    fitted = replace(camera, dist=terms, lens=None)
+    fine = _rays(camera, 2 * o.grid)
+    off = np.hypot(*np.moveaxis(fitted.project(fine) - camera.project(fine), -1, 0))
+    return fitted if np.isfinite(off).all() and off.max() <= o.max_fit_error_px else None
+
+
+def require_brown(camera: Camera, what: str) -> Camera:
+    """The camera with Brown's five terms.
+
+    Args:
+        camera: the camera.
+        what: for the message, what can use no other lens.
+
+    Raises:
+        InputError: these terms do not describe its lens.
+    """
+    found = brown_camera(camera)
+    if found is None and camera.lens is not None:
+        raise InputError(
+            f"{what}: the lens model {camera.lens.model} of the camera is not supported here; undistort the pictures "
+            "and give the camera of the undistorted ones"
+        )
+    return found or camera
+
+
+def _rays(camera: Camera, count: int) -> Array:
+    """Rays (N,3) of a grid of pixels, from border to border."""
+    u, v = np.linspace(-0.5, camera.width - 0.5, count), np.linspace(-0.5, camera.height - 0.5, count)
+    return camera.unproject(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+
+
+class Undistorter:
+    """Resamples pictures of a camera to those of a pinhole camera, as far as less than 75° off the axis.
+
+    Attributes:
+        camera: of the pictures that are resampled.
+        ideal: the pinhole camera; rays and poses are the same in both.
+    """
+
+    def __init__(self, camera: Camera, options: UndistortOptions | None = None) -> None:
+        """Prepare the maps for a camera; raises InputError when its lens sees nothing in front of it."""
+        self.camera = camera
+        self.ideal = _covering_pinhole(camera, options or UndistortOptions())
+        self._maps = _maps(self.ideal, camera)
+
+    def undistort(self, image: Array) -> Array:
+        """The picture (H,W,3) uint8 of the ideal camera; outside the original the nearest border goes on."""
+        import cv2
+
+        resampled: Array = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return resampled
+
+    def to_ideal(self, pixels: Array) -> Array:
+        """Pixels (..., 2) of the ideal picture for those of the original; NaN where it does not show them."""
+        return self.ideal.project(self.camera.unproject(pixels))
+
+
+def _covering_pinhole(camera: Camera, options: UndistortOptions) -> Camera:
+    """A pinhole camera with the resolution of the picture's centre, for all of the picture that fits."""
+    rays = _rays(camera, options.grid)
+    rays = rays[np.isfinite(rays).all(axis=1), :2]
+    if not len(rays):
+        raise InputError("camera: the lens sees nothing in front of the camera; check its distortion terms")
+    limit = math.tan(math.radians(options.max_half_angle_deg))
+    low, high = np.maximum(rays.min(axis=0), -limit), np.minimum(rays.max(axis=0), limit)
+    # Where the picture reaches 90° or more, there are no rays at its border.
+    if len(rays) < options.grid**2:
+        low, high = np.full(2, -limit), np.full(2, limit)
+    step = 1e-4
+    fx, fy = (camera.project(np.array([[step, 0.0, 1.0], [0.0, step, 1.0]])) - [camera.cx, camera.cy]).max(
+        axis=1
+    ) / step
+    size = (high - low) * [fx, fy]
+    shrink = min(1.0, float(np.min(options.max_growth * np.array([camera.width, camera.height]) / size)))
+    fx, fy = fx * shrink, fy * shrink
+    width, height = (int(side) for side in np.ceil(size * shrink))
+    return Camera(width, height, float(fx), float(fy), float(-low[0] * fx - 0.5), float(-low[1] * fy - 0.5))
+
+
+def _maps(ideal: Camera, camera: Camera) -> tuple[Array, Array]:
+    """OpenCV's fixed-point maps from pixels of the ideal picture to the original."""
+    import cv2
+
+    pixels = np.stack(np.meshgrid(np.arange(ideal.width), np.arange(ideal.height)), axis=-1).astype(np.float64)
+    seen = np.nan_to_num(camera.project(ideal.unproject(pixels)), nan=-1e4).clip(-1e4, 3e4).astype(np.float32)
+    maps: tuple[Array, Array] = cv2.convertMaps(seen[..., 0], seen[..., 1], cv2.CV_16SC2)
+    return maps
