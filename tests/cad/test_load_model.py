@@ -247,8 +247,9 @@ def test_unit_overrides_the_files_own(file_unit, tmp_path):
 
 
 def test_unit_overrides_glb_and_3mf(tmp_path):
-    with pytest.raises(InputError, match=r"is it really 0.508 × 0.254 × 0.762 mm\?"):
-        load_model(nested_glb(tmp_path), unit="inch")
+    # A unit that the user gives is believed for small parts, too.
+    small = load_model(nested_glb(tmp_path), unit="inch")
+    np.testing.assert_allclose(np.ptp(small.bounds_in_model, axis=0), [0.508, 0.254, 0.762], rtol=1e-5)
     np.testing.assert_allclose(load_model(nested_3mf(tmp_path), unit="cm").bounds_in_model, NESTED_BOUNDS * 10.0)
 
 

@@ -37,11 +37,24 @@ class StepPart:
 
 
 @dataclass
+class StepBodies:
+    """One product with several boxes as solids: (name, size, lowest corner, sRGB or None) each.
+
+    With ``is_linked`` the solids are in a representation of their own, linked to that of the product, as many programs
+    write them.
+    """
+
+    name: str
+    bodies: list[tuple[str, tuple[float, float, float], tuple[float, float, float], tuple[float, float, float] | None]]
+    is_linked: bool = False
+
+
+@dataclass
 class StepAssembly:
     """Children as (instance name, StepPart or StepAssembly, parent_from_child)."""
 
     name: str
-    children: list[tuple[str, StepPart | StepAssembly, Array]] = field(default_factory=list)
+    children: list[tuple[str, StepPart | StepBodies | StepAssembly, Array]] = field(default_factory=list)
 
 
 class StepWriter:
@@ -104,8 +117,10 @@ class StepWriter:
         bound = self.add(f"FACE_OUTER_BOUND('',#{loop},.T.)")
         return self.add(f"ADVANCED_FACE('',(#{bound}),#{surface},.{'T' if same_sense else 'F'}.)")
 
-    def box_faces(self, size: tuple[float, float, float]) -> list[int]:
-        corners = BOX_CORNERS * np.asarray(size)
+    def box_faces(
+        self, size: tuple[float, float, float], low: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> list[int]:
+        corners = BOX_CORNERS * np.asarray(size) + np.asarray(low)
         ids = [self.vertex(c) for c in corners]
         edges: dict[tuple[int, int], int] = {}
         faces = []
@@ -154,24 +169,47 @@ class StepWriter:
         place = self.axis(np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]))
         representation = self.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',(#{place},#{brep}),#{self.context})")
         if part.color is not None:
-            red, green, blue = part.color
-            last = self.add(f"COLOUR_RGB('',{red},{green},{blue})")
-            for template in (
-                "FILL_AREA_STYLE_COLOUR('',#{})",
-                "FILL_AREA_STYLE('',(#{}))",
-                "SURFACE_STYLE_FILL_AREA(#{})",
-                "SURFACE_SIDE_STYLE('',(#{}))",
-                "SURFACE_STYLE_USAGE(.BOTH.,#{})",
-                "PRESENTATION_STYLE_ASSIGNMENT((#{}))",
-            ):
-                last = self.add(template.format(last))
-            self.styled.append(self.add(f"STYLED_ITEM('color',(#{last}),#{brep})"))
+            self.paint(brep, part.color)
         return self.product(part.name, representation), representation, place
 
-    def item(self, item: StepPart | StepAssembly) -> tuple[int, int, int]:
+    def paint(self, brep: int, color: tuple[float, float, float]) -> None:
+        """Give a solid a colour."""
+        red, green, blue = color
+        last = self.add(f"COLOUR_RGB('',{red},{green},{blue})")
+        for template in (
+            "FILL_AREA_STYLE_COLOUR('',#{})",
+            "FILL_AREA_STYLE('',(#{}))",
+            "SURFACE_STYLE_FILL_AREA(#{})",
+            "SURFACE_SIDE_STYLE('',(#{}))",
+            "SURFACE_STYLE_USAGE(.BOTH.,#{})",
+            "PRESENTATION_STYLE_ASSIGNMENT((#{}))",
+        ):
+            last = self.add(template.format(last))
+        self.styled.append(self.add(f"STYLED_ITEM('color',(#{last}),#{brep})"))
+
+    def bodies(self, part: StepBodies) -> tuple[int, int, int]:
+        place = self.axis(np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]))
+        breps = []
+        for name, size, low, color in part.bodies:
+            shell = self.add(f"CLOSED_SHELL('',{self.refs(self.box_faces(size, low))})")
+            breps.append(self.add(f"MANIFOLD_SOLID_BREP('{name}',#{shell})"))
+            if color is not None:
+                self.paint(breps[-1], color)
+        solids = self.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',{self.refs([place, *breps])},#{self.context})")
+        if not part.is_linked:
+            return self.product(part.name, solids), solids, place
+        representation = self.add(f"SHAPE_REPRESENTATION('',(#{place}),#{self.context})")
+        definition = self.product(part.name, representation)
+        self.add(f"SHAPE_REPRESENTATION_RELATIONSHIP('','',#{representation},#{solids})")
+        return definition, representation, place
+
+    def item(self, item: StepPart | StepBodies | StepAssembly) -> tuple[int, int, int]:
         """Product definition, representation and origin axis of a part or assembly (written once)."""
         if id(item) not in self.product_of:
-            self.product_of[id(item)] = self.part(item) if isinstance(item, StepPart) else self.assembly(item)
+            if isinstance(item, StepBodies):
+                self.product_of[id(item)] = self.bodies(item)
+            else:
+                self.product_of[id(item)] = self.part(item) if isinstance(item, StepPart) else self.assembly(item)
         return self.product_of[id(item)]
 
     def assembly(self, assembly: StepAssembly) -> tuple[int, int, int]:
@@ -193,7 +231,7 @@ class StepWriter:
             self.add(f"CONTEXT_DEPENDENT_SHAPE_REPRESENTATION(#{relation},#{shape})")
         return definition, representation, origin
 
-    def write(self, path: Path, item: StepPart | StepAssembly) -> Path:
+    def write(self, path: Path, item: StepPart | StepBodies | StepAssembly) -> Path:
         self.item(item)
         if self.styled:
             self.add(

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,19 +11,22 @@ from pathlib import Path
 import numpy as np
 
 from arview.cad.fitness import clean_mesh
-from arview.cad.gltf import parse_gltf, read_gltf
+from arview.cad.gltf import read_gltf
 from arview.cad.model import Component, Model, make_model
 from arview.cad.obj import read_obj
-from arview.cad.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names, unit_in_mm
+from arview.cad.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names
+from arview.cad.step import read_step
 from arview.cad.threemf import read_3mf
 from arview.cad.view_range import Up
 from arview.core.checks import PATH, check_type
-from arview.errors import InputError, MissingDependencyError
+from arview.errors import InputError
 from arview.geometry import Array
 
 SUFFIXES = (".step", ".stp", ".glb", ".gltf", ".obj", ".stl", ".ply", ".3mf")
 MIN_SIZE_MM, MAX_SIZE_MM = 1.0, 100_000.0
 """Range of the diameter of a part, for files whose unit may be wrong."""
+MIN_GIVEN_MM, MAX_GIVEN_MM = 0.1, 1_000_000.0
+"""Range of the diameter of a part whose unit was given by the user."""
 DEFAULT_COLOR = (0.6, 0.6, 0.62)
 """sRGB of components without a colour."""
 
@@ -68,7 +67,8 @@ def load_cad(
 
     Raises:
         InputError: missing, empty, broken, truncated or unsupported file; NaN vertices; no triangles; more
-            than 5 million; no unit known; a size below 1 mm or above 100 m with no ``unit`` given.
+            than 5 million; no unit known; a size below 1 mm or above 100 m with no ``unit`` given, below 0.1 mm
+            or above 1 km with one.
         MissingDependencyError: STEP without cascadio.
     """
     path = Path(path)
@@ -108,13 +108,13 @@ def load_cad(
     if not components:
         raise InputError(f"{path}: all triangles are degenerate (they have no area)")
     model = make_model(path.stem, tuple(components))
-    _check_size(model, path)
+    _check_size(model, path, unit is not None)
     return LoadedCad(model, factor_mm, tuple(raw.notes + notes), raw.up)
 
 
 def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
     if suffix in (".step", ".stp"):
-        return _read_step(path, tol_linear_mm, tol_angular_deg, is_overridden)
+        return read_step(path, tol_linear_mm, tol_angular_deg, is_overridden)
     if suffix in (".glb", ".gltf"):
         return read_gltf(path)
     if suffix == ".obj":
@@ -122,66 +122,6 @@ def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float,
     if suffix == ".3mf":
         return read_3mf(path)
     return _read_mesh_file(path, suffix)
-
-
-# cascadio runs in a process of its own: OpenCASCADE writes to the terminal, and may abort on malformed files.
-# trimesh, for which it only registers a glTF extension, is left out, so that the process starts faster.
-_STEP_TO_GLB = """
-import sys
-sys.modules["trimesh"] = None
-import cascadio
-source, target, linear, angular = sys.argv[1:]
-with open(source, "rb") as f: step = f.read()
-glb = cascadio.load(step, file_type="step", tol_linear=float(linear), tol_angular=float(angular))
-with open(target, "wb") as f: f.write(glb)
-"""
-
-
-def _read_step(path: Path, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
-    """Triangles of a STEP file by OpenCASCADE (cascadio), whose tolerance is in mm whatever the unit of the file."""
-    import importlib.util
-
-    if importlib.util.find_spec("cascadio") is None:
-        raise MissingDependencyError("reading STEP needs cascadio: pip install cascadio")
-    with path.open("rb") as file:
-        if b"ISO-10303-21" not in file.read(4096):
-            raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
-    with tempfile.TemporaryDirectory(prefix="arview-step-") as folder:
-        target = Path(folder) / "tessellated.glb"
-        angular_rad = float(np.deg2rad(tol_angular_deg))
-        arguments = [str(path.resolve()), str(target), repr(float(tol_linear_mm)), repr(angular_rad)]
-        done = subprocess.run(
-            [sys.executable, "-c", _STEP_TO_GLB, *arguments], capture_output=True, text=True, errors="replace"
-        )
-        data = target.read_bytes() if target.is_file() else b""
-    if not data:
-        printed = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + "\n" + done.stderr).splitlines()
-        reason = next((line.strip(" *") for line in printed if "ERR" in line), "")
-        reason = reason or (f"OpenCASCADE crashed, code {done.returncode}" if done.returncode else "no shape in it")
-        raise InputError(f"{path}: broken or truncated STEP ({reason}); export it again")
-    raw = parse_gltf(data, path)
-    raw.up = "z"
-    if is_overridden:
-        declared_mm = _step_unit_mm(path)
-        for index, component in enumerate(raw.components):
-            vertices = component.vertices * (1000.0 / declared_mm)
-            raw.components[index] = RawComponent(component.path, vertices, component.faces, component.color)
-    return raw
-
-
-def _step_unit_mm(path: Path) -> float:
-    """Length unit in mm that a STEP file declares; raises InputError when it declares none or several."""
-    text = path.read_text(encoding="latin-1")
-    prefixes = {"$": 1000.0, ".MILLI.": 1.0, ".CENTI.": 10.0, ".DECI.": 100.0, ".MICRO.": 0.001}
-    # An inch is defined in millimetres: of a conversion-based unit only the unit itself counts.
-    names = re.findall(r"CONVERSION_BASED_UNIT\s*\(\s*'([^']*)'[^;]*?LENGTH_UNIT", text)
-    units: set[float | None] = {unit_in_mm(name) for name in names}
-    if not units:
-        found = re.findall(r"LENGTH_UNIT\s*\(\s*\)[^;]*?SI_UNIT\s*\(\s*([^,\s]*)\s*,\s*\.METRE\.", text)
-        units = {prefixes.get(prefix) for prefix in found}
-    if len(units) != 1 or None in units:
-        raise InputError(f"{path}: its length unit is not known, so that unit cannot be overridden; leave unit out")
-    return float(next(value for value in units if value is not None))
 
 
 def _read_mesh_file(path: Path, suffix: str) -> RawModel:
@@ -264,12 +204,12 @@ def _unit_factor(raw: RawModel, path: Path, unit: str | None) -> float:
     raise InputError(f"{path}: which unit? {reason}; give {choices}")
 
 
-def _check_size(model: Model, path: Path) -> None:
-    size = model.diameter_mm
-    if MIN_SIZE_MM <= size <= MAX_SIZE_MM:
+def _check_size(model: Model, path: Path, is_unit_given: bool) -> None:
+    low_mm, high_mm = (MIN_GIVEN_MM, MAX_GIVEN_MM) if is_unit_given else (MIN_SIZE_MM, MAX_SIZE_MM)
+    if low_mm <= model.diameter_mm <= high_mm:
         return
     extent = _size_text(model.bounds_in_model[1] - model.bounds_in_model[0])
     raise InputError(
-        f"{path}: is it really {extent}? If the file's unit is wrong, say which its numbers are in: "
+        f"{path}: is it really {extent}? If so, or if the file's unit is wrong, say which its numbers are in: "
         f"--unit {'|'.join(UNIT_MM)}"
     )

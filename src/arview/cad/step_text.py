@@ -1,0 +1,242 @@
+"""STEP files as text (ISO 10303-21): whether they are whole, their unit, and named solids as products of their own.
+
+OpenCASCADE takes minutes over files whose parentheses never close, and its glTF holds one mesh for each product,
+however many named solids that has. Both are dealt with before it reads the file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from arview.cad.raw import check_instance_count, unit_in_mm
+from arview.cad.text_encoding import decode_text, text_encoding
+from arview.errors import InputError
+
+_MAX_NESTING = 64
+_CHUNK = 1 << 22
+_STRINGS_AND_COMMENTS = re.compile(rb"'[^']*(?:'|\Z)|/\*(?:.*?\*/|.*\Z)", re.S)
+_PREFIX_MM = {"$": 1000.0, ".MILLI.": 1.0, ".CENTI.": 10.0, ".DECI.": 100.0, ".MICRO.": 0.001, ".KILO.": 1e6}
+
+_TEXT = rb"\s*('(?:[^']|'')*')\s*"
+_REF = rb"\s*#(\d+)\s*"
+_SOLID = re.compile(rb"#(\d+)\s*=\s*(?:MANIFOLD_SOLID_BREP|BREP_WITH_VOIDS|FACETED_BREP)\s*\(" + _TEXT + rb",")
+_SHAPE = re.compile(
+    rb"#(\d+)\s*=\s*(?:ADVANCED_BREP_|FACETED_BREP_)?SHAPE_REPRESENTATION\s*\("
+    + _TEXT
+    + rb",\s*\(([#\d,\s]*)\)\s*,"
+    + _REF
+    + rb"\)\s*;"
+)
+_SHAPE_OF = re.compile(rb"=\s*SHAPE_DEFINITION_REPRESENTATION\s*\(" + _REF + rb"," + _REF + rb"\)")
+_SAME_SHAPE = re.compile(
+    rb"=\s*SHAPE_REPRESENTATION_RELATIONSHIP\s*\(" + _TEXT + rb",[^,]*," + _REF + rb"," + _REF + rb"\)"
+)
+_DEFINITION_SHAPE = re.compile(rb"#(\d+)\s*=\s*PRODUCT_DEFINITION_SHAPE\s*\(" + _TEXT + rb",[^,]*," + _REF + rb"\)")
+_DEFINITION = re.compile(
+    rb"#(\d+)\s*=\s*PRODUCT_DEFINITION(?:_WITH_ASSOCIATED_DOCUMENTS)?\s*\("
+    + _TEXT
+    + rb",\s*(?:'(?:[^']|'')*'|\$)\s*,"
+    + _REF
+    + rb","
+    + _REF
+    + rb"[,)]"
+)
+_FORMATION = re.compile(
+    rb"#(\d+)\s*=\s*PRODUCT_DEFINITION_FORMATION(?:_WITH_SPECIFIED_SOURCE)?\s*\("
+    + _TEXT
+    + rb",\s*(?:'(?:[^']|'')*'|\$)\s*,"
+    + _REF
+)
+_PRODUCT = re.compile(
+    rb"#(\d+)\s*=\s*PRODUCT\s*\(" + _TEXT + rb"," + _TEXT + rb",\s*(?:'(?:[^']|'')*'|\$)\s*,\s*\(" + _REF
+)
+_USE = re.compile(
+    rb"=\s*NEXT_ASSEMBLY_USAGE_OCCURRENCE\s*\("
+    + _TEXT
+    + rb",\s*(?:'(?:[^']|'')*'|\$)\s*,\s*(?:'(?:[^']|'')*'|\$)\s*,"
+    + _REF
+    + rb","
+    + _REF
+    + rb","
+)
+
+
+def prepare_step(data: bytes, path: Path) -> bytes:
+    """A STEP file that OpenCASCADE can read in bounded time, in UTF-8, with named solids as products.
+
+    Raises:
+        InputError: not STEP, parentheses that never close, an assembly in itself, or too many components.
+    """
+    if b"ISO-10303-21" not in data[:4096]:
+        raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
+    _check_whole(data, path)
+    encoding = text_encoding(data)
+    if encoding != "utf-8":
+        data = decode_text(data, encoding).encode("utf-8")
+    _check_instances(data, path)
+    return split_solids(data)
+
+
+def step_unit_mm(data: bytes, path: Path) -> float:
+    """Length unit in mm that a STEP file declares; raises InputError when it declares none or several."""
+    text = data.decode("latin-1")
+    # An inch is defined in millimetres: of a conversion-based unit only the unit itself counts.
+    names = re.findall(r"CONVERSION_BASED_UNIT\s*\(\s*'([^']*)'[^;]*?LENGTH_UNIT", text)
+    units: set[float | None] = {unit_in_mm(name) for name in names}
+    if not units:
+        found = re.findall(r"LENGTH_UNIT\s*\(\s*\)[^;]*?SI_UNIT\s*\(\s*([^,\s]*)\s*,\s*\.METRE\.", text)
+        units = {_PREFIX_MM.get(prefix) for prefix in found}
+    if len(units) != 1 or None in units:
+        raise InputError(f"{path}: its length unit is not known, so that unit cannot be overridden; leave unit out")
+    return float(next(value for value in units if value is not None))
+
+
+def _check_whole(data: bytes, path: Path) -> None:
+    """Raise InputError unless the parentheses of every statement close and are not nested deeply."""
+    plain = np.frombuffer(_STRINGS_AND_COMMENTS.sub(b"", data), dtype=np.uint8)
+    depth = 0
+    for start in range(0, len(plain), _CHUNK):
+        chunk = plain[start : start + _CHUNK]
+        depths = depth + np.cumsum((chunk == ord("(")).astype(np.int32) - (chunk == ord(")")))
+        depth = int(depths[-1])
+        if depths.min() < 0 or depths.max() > _MAX_NESTING or np.any(depths[chunk == ord(";")]):
+            raise InputError(f"{path}: broken or truncated STEP (its parentheses do not match); export it again")
+    if depth:
+        raise InputError(f"{path}: broken or truncated STEP (unexpected end of file); export it again")
+
+
+def _check_instances(data: bytes, path: Path) -> None:
+    """Raise InputError when an assembly holds itself, or all of them place too many components."""
+    children: dict[bytes, list[bytes]] = {}
+    for match in _USE.finditer(data):
+        children.setdefault(match[2], []).append(match[3])
+    counts: dict[bytes, int] = {}
+    for top in children:
+        stack = [top]
+        while stack:
+            here = stack[-1]
+            waiting = [c for c in dict.fromkeys(children.get(here, ())) if c not in counts]
+            if waiting and waiting[0] in stack:
+                raise InputError(f"{path}: broken STEP (an assembly holds itself); export it again")
+            if waiting:
+                stack.append(waiting[0])
+                continue
+            counts[here] = 1 + sum(counts[child] for child in children.get(here, ()))
+            stack.pop()
+    used = {child for several in children.values() for child in several}
+    check_instance_count(sum(counts[top] for top in children if top not in used), path)
+
+
+def split_solids(data: bytes) -> bytes:
+    """The file with a product for each solid, where a product holds several that have different names.
+
+    Each solid moves from the representation of its product to one of its own, which is placed at the same spot.
+    """
+    solids = dict(match.groups() for match in _SOLID.finditer(data))
+    if len(solids) < 2:
+        return data
+    shapes = [(match, [i for i in re.findall(rb"\d+", match[3]) if i in solids]) for match in _SHAPE.finditer(data)]
+    shapes = [(match, items) for match, items in shapes if len({_plain_name(solids[i]) for i in items}) > 1]
+    if not shapes:
+        return data
+    owners = _Owners(data)
+    new_id = 1 + max(int(i) for i in re.findall(rb"#(\d+)\s*=", data))
+    pieces: list[bytes] = []
+    added: list[bytes] = []
+    end = 0
+    for match, items in shapes:
+        owner = owners.of_shape(match[1])
+        if owner is None:
+            continue
+        definition, shape, definition_context, product_context, product_name = owner
+        kept = [b"#" + i for i in re.findall(rb"\d+", match[3]) if i not in items]
+        origin = b"#%d" % new_id
+        added += _statements(
+            new_id, [b"AXIS2_PLACEMENT_3D('',#%d,$,$)" % (new_id + 1), b"CARTESIAN_POINT('',(0.,0.,0.))"]
+        )
+        new_id += 2
+        pieces.append(data[end : match.start()])
+        pieces.append(
+            b"#%s=SHAPE_REPRESENTATION(%s,(%s),#%s);" % (match[1], match[2], b",".join([*kept, origin]), match[4])
+        )
+        end = match.end()
+        for item in items:
+            name = solids[item] if _plain_name(solids[item]) else product_name
+            parts = _product_of_solid(
+                new_id, name, b"#" + item, origin, match[4], definition, shape, definition_context, product_context
+            )
+            added += _statements(new_id, parts)
+            new_id += len(parts)
+    text = b"".join(pieces) + data[end:]
+    at = text.rfind(b"ENDSEC")
+    return text[:at] + b"\n".join(added) + b"\n" + text[at:]
+
+
+def _product_of_solid(
+    first: int,
+    name: bytes,
+    solid: bytes,
+    origin: bytes,
+    context: bytes,
+    parent: bytes,
+    parent_shape: bytes,
+    definition_context: bytes,
+    product_context: bytes,
+) -> list[bytes]:
+    """Statements, numbered from ``first``, of a product of one solid and of its use in a parent product."""
+    n = first
+    return [
+        b"ADVANCED_BREP_SHAPE_REPRESENTATION(%s,(%s,%s),#%s)" % (name, origin, solid, context),
+        b"PRODUCT(%s,%s,'',(#%s))" % (name, name, product_context),
+        b"PRODUCT_DEFINITION_FORMATION('','',#%d)" % (n + 1),
+        b"PRODUCT_DEFINITION('','',#%d,#%s)" % (n + 2, definition_context),
+        b"PRODUCT_DEFINITION_SHAPE('','',#%d)" % (n + 3),
+        b"SHAPE_DEFINITION_REPRESENTATION(#%d,#%d)" % (n + 4, n),
+        b"NEXT_ASSEMBLY_USAGE_OCCURRENCE('%d',%s,'',#%s,#%d,$)" % (n, name, parent, n + 3),
+        b"PRODUCT_DEFINITION_SHAPE('','',#%d)" % (n + 6),
+        b"ITEM_DEFINED_TRANSFORMATION('','',%s,%s)" % (origin, origin),
+        b"(REPRESENTATION_RELATIONSHIP('','',#%d,#%s)REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION(#%d)"
+        b"SHAPE_REPRESENTATION_RELATIONSHIP())" % (n, parent_shape, n + 8),
+        b"CONTEXT_DEPENDENT_SHAPE_REPRESENTATION(#%d,#%d)" % (n + 9, n + 7),
+    ]
+
+
+class _Owners:
+    """The product definition that a shape representation belongs to, and what a new product needs of it."""
+
+    def __init__(self, data: bytes) -> None:
+        self.definition_of_shape = {m[2]: m[1] for m in _SHAPE_OF.finditer(data)}
+        self.linked: dict[bytes, bytes] = {}
+        for match in _SAME_SHAPE.finditer(data):
+            self.linked[match[2]], self.linked[match[3]] = match[3], match[2]
+        self.definition = {m[1]: m[3] for m in _DEFINITION_SHAPE.finditer(data)}
+        self.formation = {m[1]: (m[3], m[4]) for m in _DEFINITION.finditer(data)}
+        self.product = {m[1]: m[3] for m in _FORMATION.finditer(data)}
+        self.name = {m[1]: (m[3], m[4]) for m in _PRODUCT.finditer(data)}
+        self.uses = Counter(self.definition_of_shape)
+
+    def of_shape(self, shape: bytes) -> tuple[bytes, bytes, bytes, bytes, bytes] | None:
+        """Definition, its own representation, its context, and the product's context and name; None when not found."""
+        if shape not in self.definition_of_shape:
+            shape = self.linked.get(shape, shape)
+        try:
+            definition = self.definition[self.definition_of_shape[shape]]
+            formation, definition_context = self.formation[definition]
+            name, product_context = self.name[self.product[formation]]
+        except KeyError:
+            return None
+        return definition, shape, definition_context, product_context, name
+
+
+def _statements(first: int, contents: list[bytes]) -> list[bytes]:
+    return [b"#%d=%s;" % (first + k, content) for k, content in enumerate(contents)]
+
+
+def _plain_name(text: bytes) -> bytes:
+    """A name without its quotes; empty for the placeholder NONE."""
+    name = text[1:-1].strip()
+    return b"" if name.upper() == b"NONE" else name
