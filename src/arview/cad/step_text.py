@@ -136,7 +136,7 @@ def split_solids(data: bytes) -> bytes:
 
     Each solid moves from the representation of its product to one of its own, which is placed at the same spot.
     """
-    solids = dict(match.groups() for match in _SOLID.finditer(data))
+    solids: dict[bytes, bytes] = {match[1]: match[2] for match in _SOLID.finditer(data)}
     if len(solids) < 2:
         return data
     shapes = [(match, [i for i in re.findall(rb"\d+", match[3]) if i in solids]) for match in _SHAPE.finditer(data)]
