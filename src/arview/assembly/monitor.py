@@ -258,6 +258,7 @@ class AssemblyMonitor:
         """
         if not self._has_components:
             return {}
+        is_ambiguous = is_ambiguous or (self._turned.is_open and bool(self._is_suspect().any()))
         visibilities = self._visibilities(cam_from_model)
         key = (self._state.observations, is_ambiguous, visibilities.tobytes())
         if self._said is None or self._said[0] != key:
@@ -293,11 +294,10 @@ class AssemblyMonitor:
     def _presences(self, is_ambiguous: bool) -> list[Presence]:
         """Presence of each component."""
         o, state = self.options, self._state
-        is_missing = state.is_missing & (not self._turned.is_open)
-        is_displaced = is_missing & (state.alternative > o.displaced_log_odds)
+        is_displaced = state.is_missing & (state.alternative > o.displaced_log_odds)
         is_uncertain = self._is_uncertain() | state.is_mismatched
         found = np.select(
-            [is_displaced, is_missing, state.is_verified, is_uncertain],
+            [is_displaced, state.is_missing, state.is_verified, is_uncertain],
             [Presence.DISPLACED, Presence.MISSING, Presence.PRESENT, Presence.UNCERTAIN],
             Presence.UNVERIFIED,
         )
