@@ -1,29 +1,43 @@
 """Reader of 3MF: build items and component objects as named instances, units, display colours.
 
 Source: 3MF Core Specification 1.3, Materials extension (basematerials, colorgroup), Production extension
-(``p:path``). Written because general loaders drop the names of instances.
+(``p:path``). Written because general loaders drop the names of instances. The XML is read as a stream, so that memory
+grows with the triangles alone.
 """
 
 from __future__ import annotations
 
 import posixpath
 import zipfile
+from array import array
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.raw import RawComponent, RawModel, place, unit_in_mm
+from arview.cad.raw import (
+    MAX_TRIANGLES,
+    RawComponent,
+    RawModel,
+    check_instance_count,
+    check_triangle_count,
+    place,
+    unit_in_mm,
+)
 from arview.errors import InputError
 from arview.geometry import Array
 
 _MAX_DEPTH = 100
 _MAX_BYTES = 2_000_000_000
+_MAX_RATIO, _RATIO_FROM_BYTES = 100, 20_000_000
+"""Largest ratio of compression, where more bytes than some are unpacked: XML of meshes reaches 20."""
 
 Color = tuple[float, float, float]
 Key = tuple[str, str]
+Attributes = dict[str, str]
 
 
 @dataclass
@@ -43,17 +57,18 @@ def read_3mf(path: Path) -> RawModel:
     Names are an item's ``partnumber``, else an object's ``name``, else ``partnumber``, else nothing.
 
     Raises:
-        InputError: not a 3MF archive, truncated, or referring to objects that do not exist.
+        InputError: not a 3MF archive, truncated, referring to objects that do not exist, or unpacking to much more
+            than a mesh of its size.
     """
-    from lxml import etree
-
     try:
         with zipfile.ZipFile(path) as archive:
             return _Archive(archive, path).read()
     except zipfile.BadZipFile as error:
         raise InputError(f"{path}: not a 3MF file, or truncated ({error}); export it again") from error
-    except (KeyError, ValueError, IndexError, TypeError, etree.LxmlError) as error:
+    except (KeyError, ValueError, IndexError, TypeError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: broken 3MF ({type(error).__name__}: {error}); export it again") from error
+    except (expat.ExpatError, RuntimeError, NotImplementedError, EOFError) as error:
+        raise InputError(f"{path}: broken 3MF ({error}); export it again") from error
 
 
 class _Archive:
@@ -63,98 +78,87 @@ class _Archive:
         self.archive = archive
         self.path = path
         self.objects: dict[Key, _Object] = {}
+        self.counts: dict[Key, int] = {}
         self.model = RawModel()
 
     def read(self) -> RawModel:
-        names = self.archive.namelist()
-        if sum(info.file_size for info in self.archive.infolist()) > _MAX_BYTES:
+        members = [info for info in self.archive.infolist() if info.filename.lower().endswith((".model", ".rels"))]
+        unpacked, packed = (sum(getattr(info, name) for info in members) for name in ("file_size", "compress_size"))
+        if unpacked > _MAX_BYTES:
             raise InputError(f"{self.path}: more than 2 GB unpacked; decimate the mesh")
+        if unpacked > max(_RATIO_FROM_BYTES, _MAX_RATIO * packed):
+            raise InputError(
+                f"{self.path}: {packed / 1e6:.1f} MB that unpack to {unpacked / 1e6:.0f} MB are no mesh; "
+                "export it again"
+            )
+        names = self.archive.namelist()
         main = self._main_part(names)
-        root = self._parse(main)
         for name in names:
             if name.lower().endswith(".model") and name != main:
-                self._read_objects(self._parse(name), name)
-        self._read_objects(root, main)
-        unit = root.get("unit", "millimeter")
-        self.model.unit_mm = unit_in_mm(unit)
+                self._read_part(name)
+        part = self._read_part(main)
+        self.model.unit_mm = unit_in_mm(part.unit)
         if self.model.unit_mm is None:
-            self.model.notes.append(f"its unit {unit!r} is not a unit of 3MF")
-        for item in root.iterfind("{*}build/{*}item"):
-            key = (self._part_of(item, main), item.attrib["objectid"])
-            self._instantiate(key, _transform(item), (), item.get("partnumber"))
+            self.model.notes.append(f"its unit {part.unit!r} is not a unit of 3MF")
+        total = 0
+        for key, _, _ in part.items:
+            total += self._count(key, ())
+            check_instance_count(total, self.path)
+        for key, root_from_object, part_number in part.items:
+            self._instantiate(key, root_from_object, (), part_number)
         return self.model
 
     def _main_part(self, names: list[str]) -> str:
         """Name of the 3D model part: by the relationships of the package, else the only candidate."""
         if "_rels/.rels" in names:
-            for relation in self._parse("_rels/.rels"):
-                if str(relation.get("Type", "")).endswith("/3dmodel"):
-                    target = str(relation.attrib["Target"]).lstrip("/")
-                    if target in names:
-                        return target
+            targets: list[str] = []
+
+            def start(tag: str, attributes: Attributes) -> None:
+                if tag == "Relationship" and attributes.get("Type", "").endswith("/3dmodel"):
+                    targets.append(attributes["Target"].lstrip("/"))
+
+            self._parse("_rels/.rels", start, lambda tag: None)
+            for target in targets:
+                if target in names:
+                    return target
         for name in names:
             if name.lower() == "3d/3dmodel.model":
                 return name
         raise InputError(f"{self.path}: a ZIP archive without a 3D model part; is it really 3MF?")
 
-    def _parse(self, name: str) -> Any:
-        from lxml import etree
-
-        parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
-        return etree.fromstring(self.archive.read(name), parser)
-
-    def _part_of(self, element: Any, part: str) -> str:
-        """Archive member that an element's objectid refers to (Production extension's path)."""
-        for key, value in element.attrib.items():
-            if key.endswith("}path"):
-                return posixpath.normpath(value).lstrip("/")
+    def _read_part(self, name: str) -> _ModelPart:
+        part = _ModelPart(self, name)
+        self._parse(name, part.start, part.end)
         return part
 
-    def _read_objects(self, root: Any, part: str) -> None:
-        colors: dict[str, list[Color]] = {}
-        for resource in root.iterfind("{*}resources/*"):
-            kind = str(resource.tag).rsplit("}", 1)[-1]
-            if kind in ("basematerials", "colorgroup"):
-                attribute = "displaycolor" if kind == "basematerials" else "color"
-                colors[resource.attrib["id"]] = [_color(entry.attrib[attribute]) for entry in resource]
-            elif kind == "object" and resource.get("type", "model") not in ("support", "other"):
-                self.objects[part, resource.attrib["id"]] = self._object(resource, part, colors)
+    def _parse(self, name: str, start: Callable[[str, Attributes], None], end: Callable[[str], None]) -> None:
+        """Report the elements of an archive member by their names without namespaces."""
+        parser = expat.ParserCreate(namespace_separator="}")
 
-    def _object(self, element: Any, part: str, colors: dict[str, list[Color]]) -> _Object:
-        vertices = [
-            (float(v.attrib["x"]), float(v.attrib["y"]), float(v.attrib["z"]))
-            for v in element.iterfind("{*}mesh/{*}vertices/{*}vertex")
-        ]
-        triangles = list(element.iterfind("{*}mesh/{*}triangles/{*}triangle"))
-        faces = [(int(t.attrib["v1"]), int(t.attrib["v2"]), int(t.attrib["v3"])) for t in triangles]
-        if faces and not 0 <= min(map(min, faces)) <= max(map(max, faces)) < len(vertices):
-            raise ValueError(f"a triangle of object {element.attrib['id']} refers to a vertex that does not exist")
-        # The property of most triangles; a triangle without a property has that of its object.
-        uses: dict[tuple[str | None, str | None], int] = {}
-        for triangle in triangles:
-            use = (triangle.get("pid", element.get("pid")), triangle.get("p1", element.get("pindex")))
-            uses[use] = uses.get(use, 0) + 1
-        group, index = max(uses, key=lambda key: uses[key]) if uses else (None, None)
-        color = colors[group][int(index or 0)] if group in colors else None
-        return _Object(
-            name=str(element.get("name") or element.get("partnumber") or ""),
-            vertices=np.array(vertices, dtype=np.float64).reshape(-1, 3),
-            faces=np.array(faces, dtype=np.int64).reshape(-1, 3),
-            color=color,
-            children=[
-                ((self._part_of(child, part), child.attrib["objectid"]), _transform(child))
-                for child in element.iterfind("{*}components/{*}component")
-            ],
-        )
+        def refuse(*_: object) -> None:
+            raise ValueError("a document type declaration, which 3MF does not allow")
 
-    def _instantiate(self, key: Key, root_from_object: Array, path: tuple[str, ...], name: str | None) -> None:
-        if len(path) > _MAX_DEPTH:
+        parser.StartDoctypeDeclHandler = refuse
+        parser.StartElementHandler = lambda tag, attributes: start(tag.rpartition("}")[2], attributes)
+        parser.EndElementHandler = lambda tag: end(tag.rpartition("}")[2])
+        with self.archive.open(name) as file:
+            parser.ParseFile(file)
+
+    def _count(self, key: Key, above: tuple[Key, ...]) -> int:
+        """Number of objects that an object places, itself included."""
+        if key in above or len(above) > _MAX_DEPTH:
             raise ValueError("objects are nested in a circle")
         if key not in self.objects:
             raise ValueError(f"object {key[1]} does not exist")
+        if key not in self.counts:
+            self.counts[key] = 1 + sum(self._count(child, (*above, key)) for child, _ in self.objects[key].children)
+        return self.counts[key]
+
+    def _instantiate(self, key: Key, root_from_object: Array, path: tuple[str, ...], name: str | None) -> None:
         this = self.objects[key]
         here = (*path, name or this.name)
         if len(this.faces):
+            check_triangle_count(self.model.triangle_count + len(this.faces), self.path)
             placed, turned = place(root_from_object, this.vertices, this.faces)
             component = RawComponent(tuple(n for n in here if n), placed, turned, this.color)
             self.model.add(component, self.path)
@@ -162,10 +166,88 @@ class _Archive:
             self._instantiate(child, root_from_object @ object_from_child, here, None)
 
 
-def _transform(element: Any) -> Array:
+class _ModelPart:
+    """Handler of the elements of one model part: its unit, colours, objects and build items."""
+
+    def __init__(self, archive: _Archive, name: str) -> None:
+        self.archive = archive
+        self.name = name
+        self.unit = "millimeter"
+        self.items: list[tuple[Key, Array, str | None]] = []
+        self.colors: dict[str | None, list[Color]] = {}
+        self.group: list[Color] = []
+        self.attributes: Attributes | None = None
+        self._clear()
+
+    def _clear(self) -> None:
+        self.points = array("d")
+        self.corners = array("q")
+        self.uses: dict[tuple[str | None, str | None], int] = {}
+        self.children: list[tuple[Key, Array]] = []
+
+    def start(self, tag: str, attributes: Attributes) -> None:
+        if tag == "vertex" and self.attributes is not None:
+            self.points.extend((float(attributes["x"]), float(attributes["y"]), float(attributes["z"])))
+            if len(self.points) > 9 * MAX_TRIANGLES:
+                check_triangle_count(MAX_TRIANGLES + 1, self.archive.path)
+        elif tag == "triangle" and self.attributes is not None:
+            self.corners.extend((int(attributes["v1"]), int(attributes["v2"]), int(attributes["v3"])))
+            if len(self.corners) > 3 * MAX_TRIANGLES:
+                check_triangle_count(len(self.corners) // 3, self.archive.path)
+            # The property of most triangles; a triangle without a property has that of its object.
+            own = self.attributes
+            use = (attributes.get("pid", own.get("pid")), attributes.get("p1", own.get("pindex")))
+            self.uses[use] = self.uses.get(use, 0) + 1
+        elif tag == "component" and self.attributes is not None:
+            self.children.append((self._key(attributes), _transform(attributes)))
+        elif tag == "object":
+            self._clear()
+            self.attributes = attributes
+        elif tag in ("basematerials", "colorgroup"):
+            self.group = self.colors[attributes["id"]] = []
+        elif tag == "base":
+            self.group.append(_color(attributes.get("displaycolor", "#999999")))
+        elif tag == "color":
+            self.group.append(_color(attributes["color"]))
+        elif tag == "item":
+            self.items.append((self._key(attributes), _transform(attributes), attributes.get("partnumber")))
+        elif tag == "model":
+            self.unit = attributes.get("unit", "millimeter")
+
+    def end(self, tag: str) -> None:
+        if tag != "object" or self.attributes is None:
+            return
+        attributes, self.attributes = self.attributes, None
+        if attributes.get("type", "model") in ("support", "other"):
+            return
+        vertices = np.array(self.points, dtype=np.float64).reshape(-1, 3)
+        faces = np.array(self.corners, dtype=np.int64).reshape(-1, 3)
+        if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+            raise ValueError(f"a triangle of object {attributes['id']} refers to a vertex that does not exist")
+        group, index = max(self.uses, key=lambda key: self.uses[key]) if self.uses else (None, None)
+        color = self.colors[group][int(index or 0)] if group in self.colors else None
+        self.archive.objects[self.name, attributes["id"]] = _Object(
+            name=attributes.get("name") or attributes.get("partnumber") or "",
+            vertices=vertices,
+            faces=faces,
+            color=color,
+            children=self.children,
+        )
+        self._clear()
+
+    def _key(self, attributes: Attributes) -> Key:
+        """Archive member and identifier that an ``objectid`` refers to (Production extension's path)."""
+        part = self.name
+        for key, value in attributes.items():
+            if key.endswith("}path"):
+                part = posixpath.normpath(value).lstrip("/")
+        return part, attributes["objectid"]
+
+
+def _transform(attributes: Attributes) -> Array:
     """(4,4) parent_from_object of a ``transform`` attribute: 12 numbers, rows of a row-vector matrix."""
     matrix = np.eye(4)
-    if text := element.get("transform"):
+    if text := attributes.get("transform"):
         numbers = np.array([float(word) for word in text.split()]).reshape(4, 3)
         matrix[:3, :3] = numbers[:3].T
         matrix[:3, 3] = numbers[3]

@@ -1,0 +1,181 @@
+"""OBJ in other encodings and with many corners; 3MF files that unpack or multiply beyond all measure."""
+
+from __future__ import annotations
+
+import time
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from arview.cad.load import load_cad, load_model
+from arview.cad.obj import triangulate
+from arview.cad.text_encoding import decode_text, text_encoding
+from arview.errors import InputError
+from helpers.cad_files import box, mesh_xml, obj_text, write_3mf
+
+VERTICES, FACES = box((0, 0, 0), (10, 20, 30))
+MESH = mesh_xml(VERTICES, FACES)
+LOOSE = MESH.replace("</triangles>", '<triangle v1="0" v2="1" v3="99"/></triangles>')
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding", "expected"),
+    [
+        ("Träger Tröger Größe", "latin-1", "cp1252"),
+        ("Écrou à œillet, Ø12", "cp1252", "cp1252"),
+        ("螺栓_1 底板 M6螺母", "gb18030", "gb18030"),
+        ("底板 Träger", "utf-8", "utf-8"),
+        ("Träger", "utf-8-sig", "utf-8-sig"),
+        ("底板", "utf-16", "utf-16"),
+        ("plain", "ascii", "utf-8"),
+    ],
+)
+def test_encodings_are_recognized(text: str, encoding: str, expected: str) -> None:
+    data = text.encode(encoding)
+    assert text_encoding(data) == expected
+    assert decode_text(data) == text
+
+
+def test_bytes_that_no_encoding_knows_stay_different() -> None:
+    assert decode_text(b"a\x81b\xff") != decode_text(b"a\x8db\xff")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "names"),
+    [
+        ("latin-1", ("Träger", "Tröger")),
+        ("gb18030", ("支架", "底板")),
+        ("utf-8", ("支架", "Träger")),
+        ("utf-8-sig", ("支架", "Träger")),
+    ],
+)
+def test_names_in_an_encoding_stay_two(encoding: str, names: tuple[str, str], tmp_path: Path) -> None:
+    first, second = (obj_text(name, VERTICES + 50 * i, FACES, 8 * i) for i, name in enumerate(names))
+    text = f"mtllib m.mtl\n{first}".replace("\nf", f"\nusemtl {names[0]}\nf", 1) + second
+    (tmp_path / "p.obj").write_bytes(text.encode(encoding))
+    (tmp_path / "m.mtl").write_bytes(f"newmtl {names[0]}\nKd 1 0.5 0\n".encode(encoding.removesuffix("-sig")))
+    cad = load_cad(tmp_path / "p.obj", "mm")
+    assert [c.name for c in cad.model.components] == list(names)
+    np.testing.assert_allclose(cad.model.components[0].bounds_in_model, [[0, 0, 0], [10, 20, 30]])
+    assert cad.model.components[0].color == (1.0, 0.5, 0.0)
+    assert not cad.notes
+
+
+def test_names_that_are_there_twice_are_told(tmp_path: Path) -> None:
+    text = "".join(obj_text("bolt", VERTICES + 50 * i, FACES, 8 * i) for i in range(3))
+    (tmp_path / "p.obj").write_text(text)
+    cad = load_cad(tmp_path / "p.obj", "mm")
+    assert [c.name for c in cad.model.components] == ["bolt", "bolt_2", "bolt_3"]
+    assert cad.notes == ("2 more components are named 'bolt': called bolt_2, bolt_3",)
+
+
+def test_materials_are_read_beside_the_file_only(tmp_path: Path) -> None:
+    (tmp_path / "m.mtl").write_text("newmtl a\nKd 1 0 0\n")
+    (tmp_path / "part").mkdir()
+    for name, color in (("../m.mtl", (0.6, 0.6, 0.62)), ("m.mtl", (1.0, 0.0, 0.0))):
+        text = f"mtllib {name}\nusemtl a\n" + obj_text("lug", VERTICES, FACES)
+        (tmp_path / "part" / "p.obj").write_text(text)
+        assert load_model(tmp_path / "part" / "p.obj", "mm").components[0].color == color
+        (tmp_path / "part" / "m.mtl").write_text("newmtl a\nKd 1 0 0\n")
+
+
+@pytest.mark.parametrize("kind", ["comb", "crossing"])
+def test_polygons_of_many_corners_take_no_minutes(kind: str) -> None:
+    x = np.arange(200.0)
+    if kind == "comb":
+        top = np.where(np.arange(200) % 2, 10.0, 1.0)
+        flat = np.concatenate([np.stack([x[::-1], top], axis=1), np.stack([x, 0 * x], axis=1)])
+    else:
+        flat = np.random.default_rng(0).normal(size=(400, 2))
+    polygon = np.pad(flat, ((0, 0), (0, 1)))
+    start = time.process_time()
+    triangles = polygon[np.array(triangulate(polygon, list(range(400))))]
+    assert time.process_time() - start < 2.0
+    assert len(triangles) == 398
+    areas = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, 2] / 2
+    expected = np.cross(polygon, np.roll(polygon, -1, axis=0))[:, 2].sum() / 2
+    assert areas.sum() == pytest.approx(expected)
+    assert kind == "crossing" or np.abs(areas).sum() == pytest.approx(abs(expected))
+
+
+def test_polygons_beyond_measure_are_refused(tmp_path: Path) -> None:
+    corners = "".join(f"v {x} {x * x} 0\n" for x in range(1200))
+    (tmp_path / "p.obj").write_text(corners + "f " + " ".join(map(str, range(1, 1102))) + "\n")
+    with pytest.raises(InputError, match="a face of 1101 corners; export triangles"):
+        load_model(tmp_path / "p.obj", "mm")
+    (tmp_path / "p.obj").write_text(corners + ("f " + " ".join(map(str, range(1, 901))) + "\n") * 70)
+    with pytest.raises(InputError, match="too many faces of many corners"):
+        load_model(tmp_path / "p.obj", "mm")
+
+
+def levels(copies: int, depth: int) -> tuple[str, str]:
+    """Resources and build of objects that hold copies of the one before."""
+    component = '<component objectid="{}"/>'
+    objects = [f'<object id="1">{MESH}</object>']
+    for i in range(2, depth + 2):
+        parts = component.format(i - 1) * copies
+        objects.append(f'<object id="{i}"><components>{parts}</components></object>')
+    return "".join(objects), f'<item objectid="{depth + 1}"/>'
+
+
+def test_nested_copies_multiply(tmp_path: Path) -> None:
+    model = load_model(write_3mf(tmp_path / "l.3mf", *levels(3, 3)))
+    assert len(model.components) == 27
+
+
+def bomb_blanks(folder: Path) -> Path:
+    """60 MB of blanks in 60 kB."""
+    path = write_3mf(folder / "b.3mf", "", "")
+    xml = f'<model><resources><object id="1">{MESH}{" " * 60_000_000}</object></resources></model>'
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("3D/3dmodel.model", xml)
+    return path
+
+
+def bomb_entities(folder: Path) -> Path:
+    """Ten levels of ten entities."""
+    path = folder / "e.3mf"
+    entities = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
+    with zipfile.ZipFile(path, "w") as archive:
+        xml = f'<!DOCTYPE model [<!ENTITY e0 "aaaaaaaaaa">{entities}]><model>&e9;</model>'
+        archive.writestr("3D/3dmodel.model", xml)
+    return path
+
+
+HOSTILE_3MF = [
+    (lambda f: write_3mf(f / "l.3mf", *levels(10, 10)), "more than 10,000 components"),
+    (bomb_blanks, "unpack to 60 MB are no mesh"),
+    (bomb_entities, "a document type declaration, which 3MF does not allow"),
+    (
+        lambda f: write_3mf(
+            f / "c.3mf",
+            '<object id="1"><components><component objectid="2"/></components></object>'
+            '<object id="2"><components><component objectid="1"/></components></object>',
+            '<item objectid="1"/>',
+        ),
+        "nested in a circle",
+    ),
+    (
+        lambda f: write_3mf(f / "t.3mf", f'<object id="1">{LOOSE}</object>', '<item objectid="1"/>'),
+        "a triangle of object 1 refers to a vertex that does not exist",
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "expected"), HOSTILE_3MF, ids=[str(i) for i in range(len(HOSTILE_3MF))])
+def test_hostile_3mf_is_refused_with_little_memory(make, expected: str, tmp_path: Path) -> None:
+    path = make(tmp_path)
+    tracemalloc.start()
+    start = time.process_time()
+    try:
+        with pytest.raises(InputError, match=expected) as caught:
+            load_model(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert time.process_time() - start < 2.0
+    assert peak < 20e6
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
