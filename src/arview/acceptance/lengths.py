@@ -7,12 +7,11 @@ sample, whose lengths are exact.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
+import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from arview.core.tables import HeaderError, read_table
 from arview.errors import InputError
 from arview.geometry import Array, apply, check_rigid
 
@@ -260,12 +260,18 @@ def _text_of(path: Path) -> str:
         raise InputError(f"{path}: is not a text file") from error
 
 
-def _rows(path: Path, text: str, needed: Iterable[str]) -> list[tuple[int, Mapping[str, Any]]]:
-    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
-    missing = [name for name in needed if name not in (reader.fieldnames or ())]
-    if missing:
-        raise InputError(f"{path}: the column {missing[0]!r} is missing; the first line must contain the column names")
-    return [(number, row) for number, row in enumerate(reader, 2) if any(row.values())]
+def _rows(path: Path, text: str, needed: Sequence[str]) -> list[tuple[int, Mapping[str, Any]]]:
+    """The rows of a table with the needed columns, separated by ``,``, ``;`` or tabs, with decimal point or comma."""
+    try:
+        table = read_table(path, lambda cells: set(needed) <= set(cells), ", ".join(needed))
+    except HeaderError:
+        first = next(iter(text.splitlines()), "")
+        cells = {cell.strip() for cell in re.split("[,;\t]", first)}
+        missing = next(name for name in needed if name not in cells or len(cells) == 1)
+        raise InputError(
+            f"{path}: the column {missing!r} is missing; the first line must contain the column names"
+        ) from None
+    return [(line, {name: table.plain(cell) for name, cell in row.items()}) for line, row in table.rows]
 
 
 def _number(where: str, value: Any, key: str, minimum: float = -math.inf) -> float:

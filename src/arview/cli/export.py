@@ -1,4 +1,4 @@
-"""The command export: an inspection in common exchange formats."""
+"""The commands export and inspection new: an inspection in exchange formats, and one that is written by hand."""
 
 from __future__ import annotations
 
@@ -104,3 +104,51 @@ def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_pa
         return {formats[0]: output_path(output, inputs)}
     folder = source.parent if output is None else Path(output)
     return {name: output_path(str(folder / f"{source.stem}.{name}"), inputs) for name in formats}
+
+
+@main.group(
+    short_help="Make an inspection file by hand, or from a list of values.",
+    epilog="""\b
+Examples:
+  arview inspection new part.toml
+  arview inspection new part.toml --values cmm.csv --serial 0042 -o out/inspection.json""",
+)
+def inspection() -> None:
+    """Make inspection files."""
+
+
+@inspection.command(
+    short_help="Make a valid inspection file of a part.",
+    epilog="""\b
+Examples:
+  arview inspection new part.toml
+  arview inspection new part.toml --values cmm.csv --serial 0042 -o out/inspection.json
+
+\b
+Without --values every component is not_measured, to be filled in by hand; a mistake is named with its
+place when the file is read. VALUES is a list of measured components, as a measuring machine writes it:
+columns name and dx, dy, dz (measured minus nominal) or x, y, z (centre of the bounding box, in the
+frame of the CAD's datums), and U (k = 2), in mm, separated by ; or , or tabs, with decimal point or
+comma. Verdicts follow ISO 14253-1 from U and the tolerances of the part file.""",
+)
+@click.argument("part")
+@click.option("-o", "--output", metavar="JSON", default="inspection.json", show_default=True, help="File to write.")
+@click.option("--values", metavar="VALUES", help="List of measured components (CSV).")
+@click.option("--serial", metavar="SERIAL", help="Serial number of the specimen; default: that of the part file.")
+@click.option("--force", is_flag=True, help="Write over a file that exists.")
+@UNIT
+def new(part: str, output: str, values: str | None, serial: str | None, force: bool, unit: str | None) -> None:
+    """Write a valid inspection file of PART."""
+    from arview.acceptance.position_list import read_position_list
+    from arview.cad import load_part
+    from arview.inspection import save_inspection
+    from arview.inspection.summary import verdict_sentence
+    from arview.workflow.new_inspection import new_inspection
+
+    target = output_path(output, [part, values])
+    if Path(target).exists() and not force:
+        raise InputError(f"{target}: exists; name another file with -o, or write over it with --force")
+    listed = () if values is None else read_position_list(values)
+    made = new_inspection(load_part(part, unit), listed, serial, values or "")
+    save_inspection(made, target)
+    click.echo(f"wrote {target}: {verdict_sentence(made)}")

@@ -216,9 +216,9 @@ def chart(
         _print_chart(limits, series)
     except ArviewError as error:
         say(str(error))
-    judged = [one.is_within for one in series.values if one.is_within is not None]
-    if judged:
-        click.echo(f"{sum(judged)} of {len(judged)} within the limits that held for them")
+    within = [one.is_within for one in series.values if one.is_within is not None]
+    if within:
+        click.echo(f"{sum(within)} of {len(within)} within the limits that held for them")
     ability = None
     found = capability_by_limits(series)
     for (low, high), one in found.items():

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from arview.cli.common import main, output_path, say, write_bytes
 from arview.cli.exit_codes import ExitCode, exit_code_of
+from arview.errors import InputError
 
 if TYPE_CHECKING:
     from arview.acceptance.conformity import LengthResult, Verification
 
 _SHOWN = 12
+_COMPARED = ("dx", "dy", "dz", "distance", "U", "U list", "E_n")
 
 
 @main.command(
@@ -23,6 +27,7 @@ Examples:
   arview verify out/inspection.json samples/plate/truth.json --mpe 0.1+L/10000
   arview verify out/inspection.json certificate.toml --mpe 0.05+L/5000 -o verify.json --plot verify.png
   arview verify points.csv lengths.csv --mpe 0.2
+  arview verify out/inspection.json cmm.csv
 
 \b
 MEASURED is an inspection.json (the centres of its components are the marks), the folder it is in, or a
@@ -39,10 +44,16 @@ Following VDI/VDE 2634 part 1, the error of each length, measured minus known, i
 maximum permissible error --mpe (A + L/K, at most B). A length passes when |error| + U of the known length
 is within it, fails when |error| - U exceeds it, and is undecided otherwise (ISO 14253-1). The stated U is
 confirmed when as many errors are within U as must be expected: by the binomial distribution if no two
-lengths share a mark, by simulation otherwise.""",
+lengths share a mark, by simulation otherwise.
+
+
+KNOWN may also be the list of another measurement, such as a measuring machine's: columns name and x, y, z
+(centre of the component's bounding box) or dx, dy, dz (measured minus nominal), in the datum frame, and U
+(k = 2), in mm; separated by ; or , or tabs, decimal point or comma. Then each component gets an E_n
+number (ISO/IEC 17043): up to 1, both agree within their U.""",
     exit_codes={
-        ExitCode.DONE: "every length passes, and the stated U is confirmed",
-        ExitCode.FAIL: "a length fails, or the stated U is too small",
+        ExitCode.DONE: "every length passes, and the stated U is confirmed; every E_n is at most 1",
+        ExitCode.FAIL: "a length fails, or the stated U is too small, or an E_n is above 1",
         ExitCode.UNDECIDED: "no length fails, but one is undecided",
     },
 )
@@ -61,6 +72,11 @@ def verify(measured: str, known: str, mpe: str | None, output: str | None, plot:
     limit = None if mpe is None else parse_limit(mpe)
     target = None if output is None else output_path(output, [measured, known])
     picture = None if plot is None else output_path(plot, [measured, known, target])
+    if _is_list(measured, known):
+        if limit is not None or picture is not None:
+            raise InputError(f"{known}: lists components, not lengths; --mpe and --plot do not apply")
+        _compare(measured, known, target, shows_all)
+        return
     places = read_measured(measured)
     test = run(places, read_known(known, places), known, limit)
     _print(test, shows_all)
@@ -75,13 +91,63 @@ def verify(measured: str, known: str, mpe: str | None, output: str | None, plot:
     click.get_current_context().exit(exit_code_of(test.verdict.value))
 
 
+def _is_list(measured: str, known: str) -> bool:
+    """Whether KNOWN lists components and MEASURED is an inspection to compare them with."""
+    from arview.acceptance.position_list import is_position_list
+
+    source = Path(measured)
+    is_inspection = source.is_dir() or source.suffix.lower() == ".json"
+    return is_inspection and Path(known).is_file() and is_position_list(known)
+
+
+def _compare(measured: str, known: str, target: Path | None, shows_all: bool) -> None:
+    """Compare an inspection with a list of components, and end with the exit code of the comparison."""
+    from arview.acceptance.comparison import compare, record_of
+    from arview.acceptance.position_list import read_position_list
+    from arview.inspection import load_inspection
+
+    source = Path(measured)
+    source = source / "inspection.json" if source.is_dir() else source
+    found = compare(load_inspection(source), read_position_list(known), known)
+    _print_left_out(found.left_out)
+    width = max(9, *(len(one.name) for one in found.components))
+    click.echo(f"{'component':{width}}" + "".join(f"{head:>9}" for head in _COMPARED))
+    ranked = sorted(found.components, key=lambda one: -(one.e_n or 0.0))
+    for one in found.components if shows_all or len(ranked) <= _SHOWN else ranked[:_SHOWN]:
+        cells = [*one.difference_mm, one.distance_mm, one.uncertainty_mm, one.list_uncertainty_mm]
+        signs = ("+", "+", "+", "", "", "")
+        row = [_cell(value, f"{sign}.3f") for value, sign in zip(cells, signs, strict=True)]
+        click.echo(f"{one.name:{width}}{''.join(row)}{_cell(one.e_n, '.2f')}{'' if one.agrees else '  differs'}")
+    if not shows_all and len(ranked) > _SHOWN:
+        click.echo(f"… and {len(ranked) - _SHOWN} with smaller E_n (--all shows them)")
+    x, y, z = found.common_shift_mm
+    click.echo(f"mean difference: {x:+.3f}, {y:+.3f}, {z:+.3f} mm (a common shift points to different datum frames)")
+    if any(one.list_uncertainty_mm is None for one in found.components):
+        say("note: the list states no U for some components: their E_n takes the inspection's U alone")
+    agreeing = sum(bool(one.agrees) for one in found.components)
+    click.echo(f"E_n ≤ 1 for {agreeing} of {len(found.components)} components")
+    if target is not None:
+        write_bytes(target, (json.dumps(record_of(found), indent=2, ensure_ascii=False) + "\n").encode())
+        click.echo(f"wrote {target}")
+    everything = all(one.agrees is not False for one in found.components)
+    click.get_current_context().exit(ExitCode.DONE if everything else ExitCode.FAIL)
+
+
+def _cell(value: float | None, kind: str) -> str:
+    return f"{'?' if value is None or math.isnan(value) else format(value, kind):>9}"
+
+
+def _print_left_out(left_out: dict[str, str]) -> None:
+    for name, reason in list(left_out.items())[:_SHOWN]:
+        say(f"left out {name}: {reason}")
+    if len(left_out) > _SHOWN:
+        say(f"left out {len(left_out) - _SHOWN} more")
+
+
 def _print(test: Verification, shows_all: bool) -> None:
     from arview.acceptance.conformity import FULL_TEST, UncertaintyCheck
 
-    for name, reason in list(test.left_out.items())[:_SHOWN]:
-        say(f"left out {name}: {reason}")
-    if len(test.left_out) > _SHOWN:
-        say(f"left out {len(test.left_out) - _SHOWN} more lengths")
+    _print_left_out(test.left_out)
     ranked = sorted(test.lengths, key=lambda one: -abs(one.error_mm) / (one.limit_mm or 1.0))
     shown = list(test.lengths) if shows_all else ranked[:_SHOWN]
     width = max(len(f"{one.known.first} to {one.known.second}") for one in shown)

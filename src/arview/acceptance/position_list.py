@@ -1,0 +1,128 @@
+"""A list of measured components, as a coordinate measuring machine writes it: positions or deviations with their U."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from arview.core.tables import Table, read_table
+from arview.errors import InputError
+from arview.geometry import Array
+
+_NAMES = frozenset({
+    "name", "component", "feature", "element", "label", "id", "point", "characteristic", "komponente", "bauteil",
+    "merkmal", "bezeichnung", "punkt",
+})  # fmt: skip
+_UNITS = ("mm", "millimeter", "millimetre")
+_EXPECTED = "name with x, y, z or dx, dy, dz, and optionally U"
+
+
+@dataclass(frozen=True)
+class ListedComponent:
+    """A line of the list, in the frame of the CAD model's datums.
+
+    Attributes:
+        name: of the component.
+        place: (3,) measured position of its centre, mm, NaN where it is not stated.
+        displacement: (3,) measured minus nominal position, mm, NaN where it is not stated.
+        uncertainty: (3,) expanded uncertainty (k = 2) along x, y, z, mm; None when it is not stated.
+    """
+
+    name: str
+    place: Array
+    displacement: Array
+    uncertainty: Array | None
+
+
+def is_position_list(path: str | Path) -> bool:
+    """Whether a file is such a list, by the names of its columns."""
+    try:
+        read_table(path, _is_header, _EXPECTED)
+    except InputError:
+        return False
+    return True
+
+
+def read_position_list(path: str | Path) -> tuple[ListedComponent, ...]:
+    """Read a list with the columns name, x, y, z (positions) or dx, dy, dz (deviations), and U or Ux, Uy, Uz (k = 2).
+
+    The columns may have units in brackets and other common names (component, feature, actual x, deviation x, …).
+
+    Raises:
+        InputError: the file cannot be read, has no such columns, another unit than mm, a name twice, or no line.
+    """
+    table = read_table(path, _is_header, _EXPECTED)
+    columns = _columns(table.columns)
+    for column in table.columns:
+        unit = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]", column)
+        if column in columns.values() and unit and unit[1].lower() not in ("", *_UNITS):
+            raise InputError(f"{table.path}: the column {column!r} is in {unit[1]}; expected mm")
+    found: dict[str, ListedComponent] = {}
+    for line, row in table.rows:
+        name = row[columns["name"]]
+        if not name:
+            raise InputError(f"{table.path}: line {line}: the name is empty")
+        if name in found:
+            raise InputError(f"{table.path}: line {line}: {name!r} is listed twice")
+        found[name] = ListedComponent(name, *_values(table, columns, line, row.__getitem__))
+    if not found:
+        raise InputError(f"{table.path}: lists no component")
+    return tuple(found.values())
+
+
+def _values(
+    table: Table, columns: dict[str, str], line: int, cell: Callable[[str], str]
+) -> tuple[Array, Array, Array | None]:
+    def number(key: str) -> float:
+        column = columns.get(key)
+        text = "" if column is None else cell(column)
+        return float("nan") if column is None or text in ("", "-", "?") else table.number(line, column, text)
+
+    place = np.array([number(axis) for axis in "xyz"])
+    displacement = np.array([number(f"d{axis}") for axis in "xyz"])
+    uncertainty = np.array([number(f"u{axis}") for axis in "xyz"])
+    uncertainty = np.where(np.isnan(uncertainty), number("u"), uncertainty)
+    stated = uncertainty[~np.isnan(uncertainty)]
+    if (stated < 0.0).any():
+        raise InputError(f"{table.path}: line {line}: U = {stated.min():g}: expected a number that is not negative")
+    return place, displacement, uncertainty if len(stated) else None
+
+
+def _is_header(cells: Sequence[str]) -> bool:
+    found = _columns(cells)
+    has_places = all(axis in found for axis in "xyz")
+    return "name" in found and (has_places or any(f"d{axis}" in found for axis in "xyz"))
+
+
+def _columns(cells: Sequence[str]) -> dict[str, str]:
+    """The column of each quantity: name, x, y, z, dx, dy, dz, u, ux, uy, uz."""
+    found: dict[str, str] = {}
+    for cell in cells:
+        key = _key(cell)
+        if key is not None:
+            found.setdefault(key, cell)
+    return found
+
+
+def _key(column: str) -> str | None:
+    """The quantity that a column holds by its name, or None."""
+    text = re.sub(r"[\[(].*?[\])]", "", column.lower())
+    words = [word for word in re.split(r"[^a-zäöüδ0-9]+", text) if word and word not in _UNITS]
+    joined = "".join(words)
+    if joined in _NAMES:
+        return "name"
+    if joined in ("u", "u95", "uncertainty", "expandeduncertainty", "unsicherheit", "messunsicherheit"):
+        return "u"
+    for axis in "xyz":
+        if joined in (f"u{axis}", f"{axis}u", f"uncertainty{axis}", f"{axis}uncertainty"):
+            return f"u{axis}"
+        marks = ("d", "δ", "dev", "deviation", "delta", "diff", "abw", "abweichung")
+        if any(joined in (mark + axis, axis + mark) for mark in marks):
+            return f"d{axis}"
+        if any(joined in (mark + axis, axis + mark) for mark in ("", "actual", "act", "measured", "meas", "ist")):
+            return axis
+    return None

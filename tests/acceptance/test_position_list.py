@@ -1,0 +1,224 @@
+"""Lists of measured components, their comparison with an inspection, and inspections made from them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from arview.acceptance.comparison import compare
+from arview.acceptance.lengths import read_known, read_measured
+from arview.acceptance.position_list import ListedComponent, is_position_list, read_position_list
+from arview.cad.model import Model
+from arview.cad.part import ComponentSettings, Part
+from arview.cli import main
+from arview.errors import InputError
+from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
+from arview.workflow.new_inspection import new_inspection
+from helpers.cad_files import box, obj_text
+from helpers.inspections import deviation, inspection, missing
+from helpers.photo_scene import bench
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return bench()
+
+
+@pytest.fixture(scope="module")
+def found(model: Model) -> Inspection:
+    """Three blocks measured by arview, one missing; standard uncertainties 0.02, 0.03 and 0.04 mm along x, y, z."""
+    center = {c.name: c.bounds_in_model.mean(axis=0) for c in model.components}
+    return inspection(
+        model,
+        (
+            deviation("block_1", (0.03, -0.02, 0.01), center["block_1"]),
+            deviation("block_2", (2.4, -1.8, 0.0), center["block_2"]),
+            deviation("block_3", (0.1, 0.05, None), center["block_3"]),
+            missing("block_4", center["block_4"]),
+        ),
+    )
+
+
+def _list(folder: Path, found: Inspection, offsets: dict[str, tuple[float, float, float]]) -> Path:
+    """A German measuring machine's list: a preamble, semicolons, decimal commas, U, Windows-1252."""
+    lines = ["Prüfbericht;Teil 7", "", "Komponente;X [mm];Y [mm];Z [mm];U [mm]"]
+    for name, offset in offsets.items():
+        one = found.find(name)
+        assert one is not None
+        assert one.details is not None
+        moved = [value or 0.0 for value in one.displacement_mm]
+        place = np.array(one.details.center_mm) + moved - np.array(offset)
+        lines.append(";".join([name, *(f"{value:.4f}".replace(".", ",") for value in place), "0,006"]))
+    path = folder / "kmm.csv"
+    path.write_bytes("\r\n".join(lines).encode("cp1252"))
+    return path
+
+
+def test_a_list_with_semicolons_and_decimal_commas_is_compared(found: Inspection, tmp_path: Path) -> None:
+    path = _list(
+        tmp_path, found, {"block_1": (0.02, 0.0, 0.0), "block_2": (0.0, 0.2, 0.0), "block_3": (0.01, 0.02, 9.0)}
+    )
+    assert is_position_list(path)
+    made = compare(found, read_position_list(path), str(path))
+    assert [one.name for one in made.components] == ["block_1", "block_2", "block_3"]
+    first, second, third = made.components
+    assert first.difference_mm == pytest.approx([0.02, 0.0, 0.0], abs=1e-4)
+    assert (first.uncertainty_mm, first.list_uncertainty_mm) == pytest.approx((0.04, 0.006), abs=1e-4)
+    # Three coordinates: the quantile of chi-squared that has the coverage of k = 2 is 2.833².
+    assert first.e_n == pytest.approx(0.02 / np.hypot(0.02, 0.003) / 2.833, rel=0.01)
+    assert second.e_n == pytest.approx(0.2 / np.hypot(0.03, 0.003) / 2.833, rel=0.01)
+    assert (first.agrees, second.agrees, third.agrees) == (True, False, True)
+    assert np.isnan(third.difference_mm[2])  # the inspection does not determine it
+    two = np.hypot(0.01 / np.hypot(0.02, 0.003), 0.02 / np.hypot(0.03, 0.003))
+    assert third.e_n == pytest.approx(two / 2.486, rel=0.01)
+    assert made.left_out == {"block_4": "is not in the list"}
+
+
+def test_e_n_of_one_coordinate_is_that_of_the_standard(found: Inspection) -> None:
+    nowhere = np.full(3, np.nan)
+    one = ListedComponent("BLOCK_1", nowhere, np.array([0.08, np.nan, np.nan]), np.full(3, 0.03))
+    made = compare(found, [one], "list").components[0]
+    assert made.e_n == pytest.approx(0.05 / np.hypot(0.04, 0.03), rel=1e-3)  # |difference| / sqrt(U² + U²)
+
+
+def test_e_n_is_calibrated(model: Model) -> None:
+    """With right uncertainties E_n is at most 1 for 95.45 % of the components, for one, two or three coordinates."""
+    rng = np.random.default_rng(1)
+    std, u_list = np.array([0.02, 0.03, 0.04]), 0.05
+    nowhere = np.full(3, np.nan)
+    for axes in (1, 2, 3):
+        good = 0
+        for _ in range(800):
+            moved = [float(v) if i < axes else None for i, v in enumerate(rng.normal(0.0, std))]
+            ours = inspection(model, (deviation("block_1", (moved[0], moved[1], moved[2]), np.zeros(3)),))
+            line = ListedComponent("block_1", nowhere, rng.normal(0.0, u_list / 2.0, 3), np.full(3, u_list))
+            good += bool(compare(ours, [line], "list").components[0].agrees)
+        assert good / 800 == pytest.approx(0.9545, abs=0.025)
+
+
+def test_what_cannot_be_compared_is_named(found: Inspection, tmp_path: Path) -> None:
+    nowhere = np.full(3, np.nan)
+    zero = np.zeros(3)
+    with pytest.raises(InputError, match=r"no component can be compared \(block_4: is missing by the inspection"):
+        compare(found, [ListedComponent("block_4", nowhere, zero, None)], "list")
+    with pytest.raises(InputError, match="nut: the inspection has no such"):
+        compare(found, [ListedComponent("nut", nowhere, zero, None)], "list")
+    old = replace(found, components=tuple(replace(one, details=None) for one in found.components))
+    with pytest.raises(InputError, match="list dx, dy, dz instead"):
+        compare(old, [ListedComponent("block_1", zero, nowhere, None)], "list")
+    without = compare(found, [ListedComponent("block_1", nowhere, zero, None)], "list").components[0]
+    assert without.list_uncertainty_mm is None
+    assert without.e_n is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("from,to,mm\na,b,3\n", "no line names the columns name with x, y, z"),
+        ("name;x;y;z\nblock_1;1,5;2;abc\n", "line 2: z = 'abc': expected a number"),
+        ("name;x;y;z\nblock_1;1,5;2.5;3\n", "line 2 has a decimal comma (1,5), line 2 a point (2.5)"),
+        ("name;x;y;z\nblock_1;1;2;3\nblock_1;1;2;3\n", "line 3: 'block_1' is listed twice"),
+        ("name;x [in];y [in];z [in]\nblock_1;1;2;3\n", "is in in; expected mm"),
+        ("name,dx,dy,dz,U\nblock_1,1,2,3,-1\n", "U = -1: expected a number that is not negative"),
+        ("name,dx,dy,dz,dx\nblock_1,1,2,3,4\n", "the column 'dx' is there twice"),
+        ("name,dx,dy,dz\n", "lists no component"),
+        (";;\n" * 80, "no line names the columns"),
+    ],
+)
+def test_lists_that_cannot_be_read(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "list.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_position_list(path)
+    assert says in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_names_of_columns(tmp_path: Path) -> None:
+    path = tmp_path / "list.txt"
+    path.write_text("Feature\tDev X (mm)\tDev Y (mm)\tDev Z (mm)\tU95\nblock_1\t0.1\t-0.2\t\t0.02\n", encoding="utf-16")
+    (one,) = read_position_list(path)
+    assert one.displacement[:2] == pytest.approx([0.1, -0.2])
+    assert np.isnan(one.displacement[2])
+    assert np.isnan(one.place).all()
+    assert one.uncertainty == pytest.approx([0.02] * 3)
+
+
+def test_lengths_with_semicolons_and_decimal_commas(found: Inspection, tmp_path: Path) -> None:
+    source = tmp_path / "inspection.json"
+    save_inspection(found, source)
+    known = tmp_path / "lengths.csv"
+    known.write_text("from;to;mm;U_mm\nblock_1;block_2;100,25;0,004\n", encoding="utf-8")
+    (length,) = read_known(known, read_measured(source))
+    assert (length.mm, length.uncertainty_mm) == (100.25, 0.004)
+
+
+def test_the_command_compares(found: Inspection, tmp_path: Path) -> None:
+    source = tmp_path / "inspection.json"
+    save_inspection(found, source)
+    path = _list(tmp_path, found, {"block_1": (0.02, 0.0, 0.0), "block_2": (0.0, 0.2, 0.0)})
+    done = CliRunner().invoke(main, ["verify", str(source), str(path), "-o", str(tmp_path / "e.json")])
+    assert done.exit_code == 1, done.output
+    assert "E_n ≤ 1 for 1 of 2 components" in done.output
+    assert next(line for line in done.output.splitlines() if line.startswith("block_2")).endswith("differs")
+    record = json.loads((tmp_path / "e.json").read_text(encoding="utf-8"))
+    assert [one["name"] for one in record["components"]] == ["block_1", "block_2"]
+    refused = CliRunner().invoke(main, ["verify", str(source), str(path), "--mpe", "0.1"])
+    assert refused.exit_code == 64
+    assert "lists components, not lengths" in refused.output
+
+
+# ---- an inspection made by hand
+
+
+def _part(model: Model) -> Part:
+    settings = tuple(
+        ComponentSettings(c.name, "base" if c.name in ("bench", "plate") else "inspect", 0.5) for c in model.components
+    )
+    return Part("bench", Path("part.toml"), Path("bench.glb"), model, settings)
+
+
+def test_a_new_inspection_is_valid(model: Model, tmp_path: Path) -> None:
+    made = new_inspection(_part(model))
+    assert {one.verdict for one in made.components} == {Verdict.NOT_MEASURED}
+    assert [one.name for one in made.components] == [f"block_{i}" for i in (1, 2, 3, 4)]
+    assert {one.tolerance_mm for one in made.components} == {0.5}
+    save_inspection(made, tmp_path / "inspection.json")
+    assert load_inspection(tmp_path / "inspection.json", model) == made
+
+
+def test_the_command_makes_one(tmp_path: Path) -> None:
+    cad = tmp_path / "block.obj"
+    cad.write_text(obj_text("block", *box((0, 0, 0), (10, 20, 30))), encoding="utf-8")
+    target = tmp_path / "inspection.json"
+    arguments = ["inspection", "new", str(cad), "--unit", "mm", "--serial", "42", "-o", str(target)]
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 0, done.output
+    assert "1 component: 1 not measured" in done.output
+    assert load_inspection(target).serial == "42"
+    again = CliRunner().invoke(main, arguments)
+    assert again.exit_code == 64
+    assert "exists; name another file with -o" in again.output
+    assert CliRunner().invoke(main, [*arguments, "--force"]).exit_code == 0
+
+
+def test_a_new_inspection_has_the_values_of_a_list(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "cmm.csv"
+    path.write_text("name;dx;dy;dz;U\nblock_1;0,3;0,0;0,0;0,02\nblock_2;0,6;0;0;0,02\nblock_3;0,1;0;;0,02\n")
+    made = new_inspection(_part(model), read_position_list(path), "S-7", "cmm.csv")
+    verdicts = [one.verdict.value for one in made.components]
+    assert verdicts == ["pass", "fail", "undecided", "not_measured"]
+    assert made.serial == "S-7"
+    assert made.components[0].displacement_mm == (0.3, 0.0, 0.0)
+    assert made.components[0].uncertainty_mm == pytest.approx(0.02)
+    assert made.components[2].displacement_mm == (0.1, 0.0, None)
+    with pytest.raises(InputError, match="no inspected component 'nut'"):
+        new_inspection(_part(model), [ListedComponent("nut", np.zeros(3), np.zeros(3), None)], None, "cmm.csv")
+    with pytest.raises(InputError, match="block_1: has no U"):
+        new_inspection(_part(model), [ListedComponent("block_1", np.zeros(3), np.zeros(3), None)], None, "cmm.csv")
