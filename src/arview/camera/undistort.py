@@ -10,7 +10,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from arview.camera.lens import LensModel
 from arview.camera.model import Camera
 from arview.errors import InputError
 from arview.geometry import Array
@@ -24,13 +26,16 @@ class UndistortOptions:
         max_fit_error_px: largest deviation of Brown's terms from a lens that they replace, px of the picture.
         grid: points across and down of the picture at which the terms are fitted; they are checked at twice as many.
         max_half_angle_deg: the pinhole camera sees at most this far to each side.
-        max_growth: sides of the pinhole's picture by those of the original; a lens that needs more loses resolution.
+        max_growth: sides of the pinhole's picture by those of the original; a lens that needs more loses resolution
+            and, from ``min_scale`` of it on, the rim of the picture.
+        min_scale: smallest resolution of the pinhole's picture by that at the centre of the original.
     """
 
     max_fit_error_px: float = 0.03
     grid: int = 40
     max_half_angle_deg: float = 75.0
-    max_growth: float = 2.0
+    max_growth: float = 2.5
+    min_scale: float = 0.6
 
 
 def brown_camera(camera: Camera, options: UndistortOptions | None = None) -> Camera | None:
@@ -99,11 +104,11 @@ class Undistorter:
         self.ideal = _covering_pinhole(camera, options or UndistortOptions())
         self._maps = _maps(self.ideal, camera)
 
-    def undistort(self, image: Array) -> Array:
+    def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The picture (H,W,3) uint8 of the ideal camera; outside the original the nearest border goes on."""
         import cv2
 
-        resampled: Array = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        resampled: NDArray[np.uint8] = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return resampled
 
     def to_ideal(self, pixels: Array) -> Array:
@@ -120,16 +125,19 @@ def _covering_pinhole(camera: Camera, options: UndistortOptions) -> Camera:
     limit = math.tan(math.radians(options.max_half_angle_deg))
     low, high = np.maximum(rays.min(axis=0), -limit), np.minimum(rays.max(axis=0), limit)
     # Where the picture reaches 90° or more, there are no rays at its border.
-    if len(rays) < options.grid**2:
+    is_wide = camera.lens is not None and camera.lens.model is not LensModel.RATIONAL
+    if is_wide and len(rays) < options.grid**2:
         low, high = np.full(2, -limit), np.full(2, limit)
     step = 1e-4
     fx, fy = (camera.project(np.array([[step, 0.0, 1.0], [0.0, step, 1.0]])) - [camera.cx, camera.cy]).max(
         axis=1
     ) / step
-    size = (high - low) * [fx, fy]
-    shrink = min(1.0, float(np.min(options.max_growth * np.array([camera.width, camera.height]) / size)))
+    largest = options.max_growth * np.array([camera.width, camera.height])
+    shrink = min(1.0, max(options.min_scale, float(np.min(largest / ((high - low) * [fx, fy])))))
     fx, fy = fx * shrink, fy * shrink
-    width, height = (int(side) for side in np.ceil(size * shrink))
+    half = 0.5 * largest / [fx, fy]
+    low, high = np.maximum(low, -half), np.minimum(high, half)
+    width, height = (int(side) for side in np.ceil((high - low) * [fx, fy]))
     return Camera(width, height, float(fx), float(fy), float(-low[0] * fx - 0.5), float(-low[1] * fy - 0.5))
 
 
@@ -141,3 +149,39 @@ def _maps(ideal: Camera, camera: Camera) -> tuple[Array, Array]:
     seen = np.nan_to_num(camera.project(ideal.unproject(pixels)), nan=-1e4).clip(-1e4, 3e4).astype(np.float32)
     maps: tuple[Array, Array] = cv2.convertMaps(seen[..., 0], seen[..., 1], cv2.CV_16SC2)
     return maps
+
+
+class FrameView:
+    """How the frames of a camera become pictures that the engine's kernels can use; rays and poses are the same.
+
+    Attributes:
+        camera: of the frames.
+        tracked_camera: of the pictures: the same, with Brown's terms for its lens, or a pinhole camera.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        brown = brown_camera(camera)
+        self._undistorter = Undistorter(camera) if brown is None else None
+        self.tracked_camera = self._undistorter.ideal if self._undistorter is not None else brown or camera
+
+    def picture(self, frame: NDArray[np.uint8], index: int) -> NDArray[np.uint8]:
+        """The picture (h,w,3) of a frame (H,W,3) uint8 RGB; raises InputError for a frame of another size or type."""
+        if frame.shape != (self.camera.height, self.camera.width, 3) or frame.dtype != np.uint8:
+            raise InputError(
+                f"frame {index}: {frame.shape} {frame.dtype}, expected "
+                f"({self.camera.height}, {self.camera.width}, 3) uint8 as the camera says"
+            )
+        return frame if self._undistorter is None else self._undistorter.undistort(frame)
+
+    def pixel(self, pixel: tuple[float, float]) -> tuple[float, float]:
+        """The pixel of the picture for one of the frame; raises InputError where the picture does not show it."""
+        u, v = pixel
+        if not (0 <= u < self.camera.width and 0 <= v < self.camera.height):
+            raise InputError(f"pixel {u:g},{v:g}: outside the picture of {self.camera.width} × {self.camera.height} px")
+        if self._undistorter is None:
+            return pixel
+        x, y = self._undistorter.to_ideal(np.array(pixel, dtype=np.float64)).tolist()
+        if not (0 <= x < self.tracked_camera.width and 0 <= y < self.tracked_camera.height):
+            raise InputError(f"pixel {u:g},{v:g}: too far off the axis of the lens for a part to be tracked there")
+        return x, y

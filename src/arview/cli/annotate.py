@@ -419,7 +419,7 @@ def _session(
         serials=specimen.serials,
     )
     if (named := click.get_current_context().meta.get(NAMED_PART)) is not None:
-        session.identity.name_at(*named)
+        session.name_at(*named)
     return session
 
 

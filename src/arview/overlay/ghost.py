@@ -18,6 +18,10 @@ NEAR_MM = 1.0
 """Geometry nearer to the camera is clipped."""
 CELL_PX = 8
 """Cell size of the coverage grid that the label layout uses."""
+MAX_ANGLE_DEG = 75.0
+"""Of a wide lens the ghost is drawn up to this angle off the axis, which is as far as parts are tracked."""
+MAX_IDEAL_PX = 16000.0
+"""Coordinates of the picture that such a ghost is rendered in are no larger."""
 GAP_OPACITY = 0.2
 """Opacity of a hatched ghost between its lines, relative to that of the lines."""
 _WINDOW_MARGIN_PX = 4
@@ -130,6 +134,8 @@ def _window(points: Array, camera: Camera) -> tuple[int, int, int, int] | None:
 
 def _monotone_limit_r2(camera: Camera) -> float:
     """Largest squared normalised radius, up to 1.5 × the corner's, up to which the lens does not fold back."""
+    if camera.lens is not None:
+        return _lens_limit_r2(camera)
     corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], dtype=float)
     rays = (corners - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     r2 = np.linspace(0.0, 2.25 * float(np.max(np.sum(rays * rays, axis=1))), 400)
@@ -137,6 +143,18 @@ def _monotone_limit_r2(camera: Camera) -> float:
     slope = 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3))
     folded = np.flatnonzero(slope < 0.05)
     return float(r2[folded[0] - 1] if len(folded) else r2[-1])
+
+
+def _lens_limit_r2(camera: Camera) -> float:
+    """As `_monotone_limit_r2`, for other lens models: up to `MAX_ANGLE_DEG` while all directions go on outwards."""
+    r = np.tan(np.radians(np.linspace(0.0, MAX_ANGLE_DEG, 400)))
+    turn = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)[:, None]
+    with np.errstate(all="ignore"):
+        xd, yd = camera.distort(r * np.cos(turn), r * np.sin(turn))
+        outwards = np.diff(xd * np.cos(turn) + yd * np.sin(turn), axis=1).min(axis=0)
+    folded = np.flatnonzero(~(outwards > 0.0))
+    end = int(folded[0]) if len(folded) else len(r) - 1
+    return float(r[max(end, 1)] ** 2)
 
 
 def _ideal_pixels(camera: Camera) -> NDArray[np.int16]:
@@ -151,7 +169,13 @@ def _ideal_pixels(camera: Camera) -> NDArray[np.int16]:
         ideal = rays[..., :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     # Where the lens model folds back there is no ray; such pixels are kept near the image.
     size = np.array([camera.width, camera.height])
-    ideal = np.clip(np.nan_to_num(ideal, nan=-1.0), -0.5 * size, 1.5 * size)
+    low, high = -0.5 * size, 1.5 * size
+    if camera.lens is not None:
+        # A wide lens sees far more than a lens without distortion of the same focal length shows in a picture.
+        reach = np.tan(np.radians(MAX_ANGLE_DEG)) * np.array([camera.fx, camera.fy])
+        center = np.array([camera.cx, camera.cy])
+        low, high = np.minimum(low, center - reach), np.maximum(high, center + reach)
+    ideal = np.clip(np.nan_to_num(ideal, nan=-1.0), np.maximum(low, -MAX_IDEAL_PX), np.minimum(high, MAX_IDEAL_PX))
     v, fraction_v = np.divmod(np.arange(camera.height), CELL_PX)
     share_v = (fraction_v / CELL_PX)[:, None, None]
     rows = ideal[v] * (1.0 - share_v) + ideal[v + 1] * share_v

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from arview.assembly.monitor import AssemblyMonitor
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.camera.undistort import FrameView
 from arview.core.checks import check_type
 from arview.detection.detector import Detection, Detector, DetectorOptions, RejectedHypothesis, local_search_for
 from arview.detection.scene_change import SceneChange, SceneChangeOptions
@@ -110,7 +111,7 @@ class TrackingSession:
 
     Args:
         views: guide views of the model.
-        camera: intrinsics of the frames.
+        camera: of the frames.
         model: the CAD model of the guide views; the texture modality needs its surface.
         options: see `SessionOptions`.
         initial_cam_from_model: (4,4) mm, rough pose in the first frame, which is refined instead of a search.
@@ -122,6 +123,7 @@ class TrackingSession:
 
     Attributes:
         views: guide views of the model.
+        frames, camera: how frames become the pictures that are tracked, and the camera of these.
         others: poses (4,4) of other specimens of the part, which are not taken for this one.
         identity: says whether the specimen in view is the one that was followed.
 
@@ -151,7 +153,8 @@ class TrackingSession:
                 f"guide views of model {views.model_name!r} ({views.model_hash[:12]}) do not belong to "
                 f"{model.name!r} ({model.source_hash[:12]})"
             )
-        self.camera = camera
+        self.frames = FrameView(camera) if like is None else like.frames
+        self.camera = camera = self.frames.tracked_camera
         self.views = views
         self.others: tuple[Array, ...] = ()
         self._local: LocalSearch = local_search_for(views, camera, o.detector) if like is None else like._local
@@ -221,6 +224,10 @@ class TrackingSession:
         """Say that the specimen tracked now is the one to which the labels belong, see `Identity`."""
         self.identity.confirm()
 
+    def name_at(self, index: int, pixel: tuple[float, float]) -> None:
+        """As `IdentityMonitor.name_at`, for a pixel of the frames as they come; raises InputError outside them."""
+        self.identity.name_at(index, self.frames.pixel(pixel))
+
     def give_up(self, reason: str) -> None:
         """Give the pose up, for a reason in words, and search again."""
         if self.has_pose:
@@ -237,8 +244,8 @@ class TrackingSession:
         Raises:
             InputError: an image of another size or type.
         """
-        self._check_image(image, index)
         started = time.perf_counter()
+        image = self.frames.picture(image, index)
         estimate, reason = self._follow(image) if self._state.has_pose else self._search(image)
         if estimate is not None:
             estimate, reason = self._disambiguate(image, estimate, reason)
@@ -269,13 +276,6 @@ class TrackingSession:
             serial=known.serial,
             components=self.components.presence(pose, bool(self._state.hypotheses)),
         )
-
-    def _check_image(self, image: NDArray[np.uint8], index: int) -> None:
-        if image.shape != (self.camera.height, self.camera.width, 3) or image.dtype != np.uint8:
-            raise InputError(
-                f"frame {index}: {image.shape} {image.dtype}, expected "
-                f"({self.camera.height}, {self.camera.width}, 3) uint8 as the camera says"
-            )
 
     # --- Follow a pose ------------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from functools import cached_property
 from arview.cad.part import Part
 from arview.camera import Camera
 from arview.camera.read import guess_camera, load_camera
+from arview.camera.undistort import require_brown
 from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
@@ -127,11 +128,13 @@ class Subject:
         """Intrinsics for the frames of a feed.
 
         Raises:
-            InputError, MismatchError: the camera file cannot be read or is for frames of another aspect ratio.
+            InputError, MismatchError: the camera file cannot be read, has a lens that the page
+                cannot draw, or is for frames of another aspect ratio.
         """
         spec, source = self.options.camera, self.options.source
         if spec is not None:
-            return load_camera(spec, width, height, source=source, quarter_turns_clockwise=quarter_turns_clockwise)
+            camera = load_camera(spec, width, height, source=source, quarter_turns_clockwise=quarter_turns_clockwise)
+            return require_brown(camera, "live")
         if self.options.is_phone:
             return load_camera(PHONE_FOV, width, height)
         return guess_camera(width, height)

@@ -37,7 +37,7 @@ class SeveralSessions:
         if not sessions:
             raise InputError("several parts: no session given")
         first = next(iter(sessions.values()))
-        if any(one.camera != first.camera for one in sessions.values()):
+        if any(one.frames.camera != first.frames.camera for one in sessions.values()):
             raise InputError("several parts: the sessions have different cameras; make them all for the same camera")
         self.sessions = dict(sessions)
         self._search_every, self._eager_frames = search_every, eager_frames
