@@ -89,7 +89,9 @@ def test_edges_are_drawn_where_the_lens_shows_them(camera: Camera) -> None:
             in_cam[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.lens.terms)
         )[0][:, 0]
     else:
-        pixels = cv2.projectPoints(in_cam, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.lens.terms))[0][:, 0]
+        pixels = cv2.projectPoints(in_cam, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.lens.terms))[0][
+            :, 0
+        ]
     off_axis = np.degrees(np.arctan2(np.hypot(in_cam[:, 0], in_cam[:, 1]), in_cam[:, 2]))
     assert off_axis.max() > 30
     np.testing.assert_allclose(camera.project(in_cam), pixels, rtol=0, atol=1e-6)
