@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -81,7 +82,7 @@ def test_edges_are_drawn_where_the_lens_shows_them(camera: Camera) -> None:
     assert drawn.sum() > 500
     # The upper rim of the plate towards the camera, by OpenCV.
     corners = np.array([[160.0, 0, 12], [160, 120, 12], [0, 120, 12]])
-    rim = np.concatenate([np.linspace(a, b, 60) for a, b in zip(corners[:2], corners[1:], strict=True)])
+    rim = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(corners)])
     in_cam = apply(pose, rim)
     assert camera.lens is not None
     if camera.lens.model is LensModel.FISHEYE:
