@@ -153,7 +153,7 @@ class TrackingSession:
                 f"guide views of model {views.model_name!r} ({views.model_hash[:12]}) do not belong to "
                 f"{model.name!r} ({model.source_hash[:12]})"
             )
-        self.frames = FrameView(camera) if like is None else like.frames
+        self.frames: FrameView = FrameView(camera) if like is None else like.frames
         self.camera = camera = self.frames.tracked_camera
         self.views = views
         self.others: tuple[Array, ...] = ()
