@@ -11,7 +11,7 @@ import pytest
 from arview.cad import PartFinding, ViewRange, check_part, load_part, make_model
 from arview.cad.check import can_confuse
 from arview.cad.model import Component
-from arview.cad.part import ComponentSettings, Part
+from arview.cad.part import ComponentSettings, Datum, Part
 from arview.cad.symmetry import Symmetry, find_symmetries
 from arview.camera import Camera
 from arview.geometry import apply, exp_so3, rigid
@@ -111,7 +111,7 @@ def test_near_symmetry_names_the_component_that_breaks_it():
     )
     said = texts(check, "warning")
     assert "nearly the same" in said
-    assert "rotated by 180° about Z; distinguished by key" in said
+    assert "rotated by 180° about Z (98 % of its surface); distinguished by key" in said
     assert "looks the same" not in texts(check, "problem")
 
 
@@ -127,7 +127,7 @@ def test_an_exact_symmetry_is_a_problem_until_declared_or_out_of_view():
     declared = tuple(Symmetry(axis, (50, 30, 15), 2) for axis in [(1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0)])
     told = check_part(replace(part_of(block), symmetries=declared))
     assert not told.has_problems
-    assert "symmetric as declared: 180° about Z" in texts(told, "note")
+    assert "symmetric as declared: 180° about X, 180° about Y, 180° about Z" in texts(told, "note")
     wrong = check_part(replace(part_of(block), symmetries=(Symmetry((0, 0, 1.0), (50, 30, 15), 3),)))
     assert "declared symmetry of the part, 120° about Z, is not in its geometry" in texts(wrong, "warning")
 
@@ -206,7 +206,7 @@ def test_sheets_open_and_non_manifold_meshes():
     check = check_part(part_of(sheet, open_box, finned))
     said = texts(check, "warning")
     assert "sheet is a sheet without thickness (0 mm)" in said
-    assert "tray is not closed: 4 open edges" in said
+    assert "2 components are not closed, 2 to 4 open edges each, which will appear as contours: tray, finned" in said
     assert "finned has 1 edges shared by more than two triangles" in said
     assert check.components[1].fitness.volume_mm3 is None
 
@@ -239,3 +239,42 @@ def test_real_parts():
     posts = next(f.text for f in plate.findings if "bodies of revolution" in f.text)
     assert all(f"post_{i} (Z)" in posts for i in (1, 2, 3, 4))
     assert "link_1" not in posts
+
+
+@pytest.mark.parametrize("bases", [0, 1, 2])
+def test_a_part_has_one_base(bases: int) -> None:
+    roles = ["base"] * bases + ["inspect"] * (3 - bases)
+    parts = [
+        component("plate", box((0, 0, 0), (200, 120, 8))),
+        component("left", box((20, 20, 8), (60, 40, 40))),
+        component("right", box((120, 30, 8), (180, 80, 30))),
+    ]
+    settings = {
+        c.name: ComponentSettings(c.name, role=role, position_tolerance_mm=1.0)
+        for c, role in zip(parts, roles, strict=True)
+    }
+    part = part_of(*parts, **settings)
+    said = texts(check_part(part), "warning")
+    assert ("no component has the role base" in said) == (bases == 0)
+    assert ("2 components have the role base: plate, left; deviations" in said) == (bases == 2)
+    if bases == 0:
+        assert "in the frame of the largest, plate" in said
+        bare = check_part(replace(part, cad_path=part.path))
+        assert "no component has the role base" in texts(bare, "note")
+    datum = Datum("A", "plane", "right", (150.0, 50.0, 30.0), (0.0, 0.0, 1.0))
+    said = texts(check_part(replace(part, datums=(datum,))), "warning")
+    assert ("datum A is on right, which is not the base" in said) == (bases > 0)
+
+
+def test_equal_remarks_are_one_line() -> None:
+    plate = component("plate", box((0, 0, 0), (200, 120, 8)))
+    pins = [component(f"pin_{i}", box((0, 0, 0), (2, 2, 6)), (10.0 + 9 * i, 20.0, 8.0)) for i in range(20)]
+    view_range = ViewRange((300.0, 900.0), elevation_deg=(20.0, 90.0))
+    check = check_part(part_of(plate, *pins, view_range=view_range))
+    said = [finding.text for finding in check.findings if "pin_" in finding.text and "small" in finding.text]
+    assert len(said) == 1
+    # 2 mm at 1536 px of focal length: 3.4 px at 900 mm, 10.2 px at 300 mm.
+    assert said[0].startswith(
+        "20 components are too small to be seen, 10.2 to 10.2 px across even at 300 mm: pin_0, pin_1"
+    )
+    assert said[0].endswith("pin_5 and 14 more")

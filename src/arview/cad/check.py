@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from types import NoneType
-from typing import Literal
 
 import numpy as np
 
+from arview.cad.component_remarks import Remark, Severity, gathered, listed, mesh_remarks, size_remarks
 from arview.cad.fitness import MeshFitness, inspect_mesh
 from arview.cad.model import Component
 from arview.cad.part import ComponentSettings, Part
@@ -17,21 +17,11 @@ from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.geometry import Array, exp_so3
 
-Severity = Literal["problem", "warning", "note"]
-
 GUESSED_CAMERA = Camera(width=1280, height=720, fx=1536.0, fy=1536.0, cx=639.5, cy=359.5)
 """Camera when none is given: a focal length of 1.2 times the longer side of a 720p picture."""
 
 USUAL_DIAMETERS = 6.0
 """Distance, in diameters of the part, up to which its components are checked where no range is declared."""
-SMALL_PX = 12.0
-"""Middle extent of a component in the picture below which its contour has too few lines."""
-
-THIN_PX = 3.0
-"""Thickness in the picture below which both edges of a component seen edge-on merge."""
-
-SHEET_FRACTION = 1e-3
-"""Ratio of the smallest to the largest extent below which a component counts as a sheet."""
 
 MOVING_SHARE = 0.02
 """Unmatched share of a component's surface above which it breaks a near-symmetry."""
@@ -144,7 +134,7 @@ class PartCheck:
                     "#" + "".join(f"{round(255 * value):02x}" for value in component.color),
                     _tolerance_text(check.settings),
                     f"{far:.0f}-{near:.0f}",
-                    _listed([found.symmetry.describe() for found in check.symmetries], 2, "; ") or "-",
+                    listed([found.symmetry.describe() for found in check.symmetries], 2, "; ") or "-",
                 )
             )
         ignored = [settings.name for settings in self.part.settings if settings.role == "ignore"]
@@ -177,9 +167,9 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         *_view_findings(part, camera, view_range),
         *_symmetry_findings(part, view_range, symmetries),
     ]
-    for check in components:
-        findings += _size_findings(check, sized_range)
-        findings += _mesh_findings(check)
+    findings += _role_findings(part)
+    remarks = [remark for check in components for remark in _remarks(check, sized_range)]
+    findings += [PartFinding(severity, text) for severity, text in gathered(remarks)]
     findings += _own_symmetry_findings(components)
     findings += _tolerance_findings(part)
     return PartCheck(
@@ -255,36 +245,42 @@ def _symmetry_findings(part: Part, view_range: ViewRange, symmetries: tuple[Foun
             text = f"the declared symmetry of the part, {declared.describe()}, is not in its geometry"
             findings.append(PartFinding("warning", text))
     ambiguous, excluded = [], []
+    near: dict[str, list[str]] = {}
+    declared_ones = []
     for found in symmetries:
         what = found.symmetry.describe()
         if not can_confuse(found.symmetry, view_range):
             excluded.append(what)
         elif any(_covers(declared, found.symmetry) for declared in part.symmetries):
-            findings.append(PartFinding("note", f"the part is symmetric as declared: {what}"))
+            declared_ones.append(what)
         elif found.is_exact:
             ambiguous.append(what)
         else:
-            findings.append(PartFinding("warning", _near_text(part, found)))
+            same = 100.0 * (1.0 - found.unmatched_share)
+            near.setdefault(_breaking_text(part, found), []).append(f"{what} ({same:.0f} % of its surface)")
+    for told, rotations in near.items():
+        text = f"the part is nearly the same when rotated by {listed(rotations, 4)}{told}"
+        findings.append(PartFinding("warning", text))
+    if declared_ones:
+        findings.append(PartFinding("note", f"the part is symmetric as declared: {listed(declared_ones, 4)}"))
     if ambiguous:
         text = (
-            f"the part looks the same when rotated by {_listed(ambiguous, 4)}: its pose is ambiguous; "
+            f"the part looks the same when rotated by {listed(ambiguous, 4)}: its pose is ambiguous; "
             "restrict [view_range], declare it as [[symmetry]] if it does not matter, or rely on its texture"
         )
         findings.append(PartFinding("problem", text))
     if excluded:
-        text = f"symmetries and near-symmetries that the view range excludes: {_listed(excluded, 4)}"
+        text = f"symmetries and near-symmetries that the view range excludes: {listed(excluded, 4)}"
         findings.append(PartFinding("note", text))
     return findings
 
 
-def _near_text(part: Part, found: FoundSymmetry) -> str:
+def _breaking_text(part: Part, found: FoundSymmetry) -> str:
+    """The components that distinguish the places of a near-symmetry."""
     names = [component.name for component in part.model.components]
     shares = zip(names, found.unmatched_of_group, strict=True)
     breaking = [name for name, share in shares if share > MOVING_SHARE]
-    told = f"; distinguished by {_listed(breaking, 6)}" if len(names) > 1 and breaking else ""
-    same = 100.0 * (1.0 - found.unmatched_share)
-    what = found.symmetry.describe()
-    return f"the part is nearly the same ({same:.0f} % of its surface) when rotated by {what}{told}"
+    return f"; distinguished by {listed(breaking, 6)}" if len(names) > 1 and breaking else ""
 
 
 def can_confuse(symmetry: Symmetry, view_range: ViewRange) -> bool:
@@ -326,43 +322,6 @@ def _angle_about_deg(axes: Array, start: Array, end: Array) -> Array:
     return np.asarray(np.rad2deg(np.arctan2(sine, np.einsum("ij,ij->i", start, end))))
 
 
-def _size_findings(check: ComponentCheck, view_range: ViewRange) -> list[PartFinding]:
-    near_mm, far_mm = view_range.distance_mm
-    far_px, near_px = check.pixels_across
-    name = check.component.name
-    is_judged = check.settings.role == "inspect"
-    if near_px < SMALL_PX:
-        text = f"{name} is too small to be seen: {near_px:.1f} px across even at {near_mm:.0f} mm"
-        return [PartFinding("problem" if is_judged else "warning", text)]
-    if far_px < SMALL_PX:
-        limit_mm = near_mm * near_px / SMALL_PX
-        text = f"{name} is small: {far_px:.1f} px across at {far_mm:.0f} mm; large enough up to {limit_mm:.0f} mm"
-        return [PartFinding("warning", text)]
-    thin_px = far_px * check.fitness.extents_mm[2] / check.fitness.extents_mm[1]
-    if thin_px < THIN_PX:
-        text = f"{name} is thin: {thin_px:.1f} px at {far_mm:.0f} mm when seen edge-on"
-        return [PartFinding("note", text)]
-    return []
-
-
-def _mesh_findings(check: ComponentCheck) -> list[PartFinding]:
-    fitness, name = check.fitness, check.component.name
-    findings = []
-    if fitness.thickness_mm < SHEET_FRACTION * fitness.extents_mm[0]:
-        text = f"{name} is a sheet without thickness ({fitness.thickness_mm:.3g} mm): give it one in the CAD"
-        findings.append(PartFinding("warning", text))
-    elif fitness.open_edge_count:
-        text = f"{name} is not closed: {fitness.open_edge_count} open edges; they will appear as contours"
-        findings.append(PartFinding("warning", text))
-    if fitness.non_manifold_edge_count:
-        count = fitness.non_manifold_edge_count
-        text = f"{name} has {count} edges shared by more than two triangles (non-manifold)"
-        findings.append(PartFinding("warning", text))
-    if not fitness.is_consistent:
-        findings.append(PartFinding("warning", f"{name} has triangles that face the wrong way"))
-    return findings
-
-
 def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[PartFinding]:
     """Inspected bodies of revolution without a declared symmetry, and declared symmetries missing in the geometry."""
     findings = []
@@ -377,8 +336,38 @@ def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[PartFindi
         if check.settings.role == "inspect" and declared is None and spins:
             spinning.append(f"{check.component.name} ({spins[0].describe().removeprefix('any angle about ')})")
     if spinning:
-        text = f"bodies of revolution, whose rotation about their axis cannot be measured: {_listed(spinning, 8)}"
+        text = f"bodies of revolution, whose rotation about their axis cannot be measured: {listed(spinning, 8)}"
         findings.append(PartFinding("note", text))
+    return findings
+
+
+def _remarks(check: ComponentCheck, view_range: ViewRange) -> list[Remark]:
+    name, is_inspected = check.component.name, check.settings.role == "inspect"
+    sizes = size_remarks(name, check.pixels_across, check.fitness.extents_mm, view_range.distance_mm, is_inspected)
+    return [*sizes, *mesh_remarks(name, check.fitness)]
+
+
+def _role_findings(part: Part) -> list[PartFinding]:
+    """No base or several, datums on components that are inspected, and nothing to inspect."""
+    components = part.model.components
+    bases = [c.name for c in components if part.component_settings(c.name).role == "base"]
+    findings = []
+    if not bases and len(components) > 1:
+        sizes = [float(np.linalg.norm(np.diff(c.bounds_in_model, axis=0))) for c in components]
+        largest = components[int(np.argmax(sizes))].name
+        text = f"no component has the role base: deviations are stated in the frame of the largest, {largest}"
+        is_bare = part.path == part.cad_path
+        hint = "a part file says which is the base" if is_bare else 'give the base role = "base" in the part file'
+        findings.append(PartFinding("note" if is_bare else "warning", f"{text}; {hint}"))
+    if len(bases) > 1:
+        text = f"{len(bases)} components have the role base: {listed(bases, 6)}; deviations are stated in the frame "
+        findings.append(PartFinding("warning", text + "of all of them together, and none of them is judged"))
+    for datum in part.datums:
+        if bases and datum.component not in bases:
+            text = f"datum {datum.label} is on {datum.component}, which is not the base: its deviation moves the frame"
+            findings.append(PartFinding("warning", text))
+    if not part.inspected:
+        findings.append(PartFinding("warning", "no component has the role inspect: nothing is measured"))
     return findings
 
 
@@ -386,7 +375,7 @@ def _tolerance_findings(part: Part) -> list[PartFinding]:
     open_ended = [name for name in part.inspected if part.component_settings(name).position_tolerance_mm is None]
     if not open_ended:
         return []
-    names = _listed(open_ended, 6)
+    names = listed(open_ended, 6)
     return [PartFinding("note", f"no position_tolerance_mm, so measured but not judged: {names}")]
 
 
@@ -395,11 +384,6 @@ def _covers(wide: Symmetry, narrow: Symmetry) -> bool:
     if not wide.is_same_axis(narrow):
         return False
     return wide.order is None or (narrow.order is not None and wide.order % narrow.order == 0)
-
-
-def _listed(items: list[str], limit: int, separator: str = ", ") -> str:
-    rest = f" and {len(items) - limit} more" if len(items) > limit else ""
-    return separator.join(items[:limit]) + rest
 
 
 def _extent(size_mm: Array) -> str:

@@ -97,14 +97,17 @@ def load_cad(
         raise InputError(f"{path}: holds no triangles (empty, or points and lines only)")
     factor_mm = _unit_factor(raw, path, unit)
     names, notes = unique_names([component.path for component in raw.components], path.stem)
-    components = []
+    components, empty = [], []
     for name, component in zip(names, raw.components, strict=True):
         vertices, faces = clean_mesh(component.vertices * factor_mm, component.faces)
         if len(faces) == 0:
-            notes.append(f"component {name!r} has no triangles of any area: left out")
+            empty.append(name)
             continue
         color = component.color or DEFAULT_COLOR
         components.append(Component(name, vertices, faces.astype(np.int32), color))
+    if empty:
+        rest = f" and {len(empty) - 4} more" if len(empty) > 4 else ""
+        notes.append(f"left out, because they have no triangles of any area: {', '.join(empty[:4])}{rest}")
     if not components:
         raise InputError(f"{path}: all triangles are degenerate (they have no area)")
     model = make_model(path.stem, tuple(components))
