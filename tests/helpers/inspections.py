@@ -37,7 +37,9 @@ def deviation(
     rotation = exp_so3(np.array([0.0, 0.0, np.deg2rad(turn_deg)]))
     shift = np.array([value or 0.0 for value in moved])
     place = rigid(rotation, center - rotation @ center + shift)
-    if tolerance_mm is None or distance + uncertainty_mm > tolerance_mm >= distance - uncertainty_mm:
+    if tolerance_mm is None:
+        verdict = Verdict.MEASURED
+    elif distance + uncertainty_mm > tolerance_mm >= distance - uncertainty_mm:
         verdict = Verdict.UNDECIDED
     else:
         verdict = Verdict.PASS if distance + uncertainty_mm <= tolerance_mm else Verdict.FAIL

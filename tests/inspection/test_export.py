@@ -17,16 +17,17 @@ from lxml import etree
 
 from arview.cad.model import Model
 from arview.cli import main
-from arview.errors import MismatchError
+from arview.cli.exit_codes import ExitCode, exit_code_of
+from arview.errors import InputError, MismatchError
 from arview.history import HistoryStore
-from arview.inspection import Inspection, save_inspection
+from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.export import to_csv, to_dfq, to_glb, to_qif
 from arview.inspection.fingerprint import fingerprint, fingerprint_of_file
 from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 from arview.inspection.schema_doc import schema_markdown
 from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.report.evidence import gather
-from helpers.inspections import bench_inspection, deviation, inspection
+from helpers.inspections import bench_inspection, deviation, inspection, not_measured
 from helpers.paths import ROOT, SHARED
 from helpers.photo_scene import bench
 
@@ -54,6 +55,30 @@ def test_the_whole_in_words(model: Model, found: Inspection) -> None:
     assert overall_verdict(replace(good, foreign_objects=found.foreign_objects)).value == "undecided"
     assert overall_verdict(replace(found, components=found.components[4:])).value == "not_measured"
     assert overall_verdict(replace(found, components=())).value == "not_measured"
+
+
+def test_a_bare_cad_without_tolerances_is_measured(model: Model, tmp_path: Path) -> None:
+    center = np.array([1.0, 2.0, 3.0])
+    bare = tuple(deviation(f"block_{i}", (0.1 * i, 0.0, 0.0), center, None) for i in (1, 2, 3, 4))
+    one = inspection(model, bare)
+    assert overall_verdict(one).value == "measured"
+    assert verdict_sentence(one) == "4 components: 4 measured without a tolerance"
+    assert exit_code_of("measured") is ExitCode.DONE
+    save_inspection(one, tmp_path / "inspection.json")
+    assert load_inspection(tmp_path / "inspection.json", model) == one
+    judged = deviation("block_1", (0.1, 0.0, 0.0), center)
+    assert overall_verdict(replace(one, components=(judged, *bare[1:]))).value == "pass"
+    hidden = not_measured("block_1", center)
+    assert overall_verdict(replace(one, components=(hidden, *bare[1:]))).value == "undecided"
+    with pytest.raises(InputError, match=r"verdict: is measured, but tolerance_mm is 0\.5"):
+        replace(bare[0], tolerance_mm=0.5)
+
+
+def test_a_component_judged_by_its_angle_alone_may_pass_or_fail() -> None:
+    only_angle = deviation("block_1", (0.1, 0.0, 0.0), np.zeros(3), None, turn_deg=0.7, angle_tolerance_deg=1.0)
+    assert replace(only_angle, verdict=Verdict.FAIL).verdict is Verdict.FAIL
+    with pytest.raises(InputError, match="tolerance_mm: is null, but the verdict is fail"):
+        replace(deviation("block_1", (0.1, 0.0, 0.0), np.zeros(3), None), verdict=Verdict.FAIL)
 
 
 def test_csv_holds_what_was_measured_and_nothing_for_what_was_not(found: Inspection) -> None:

@@ -57,10 +57,12 @@ def test_guard_bands(value: float, uncertainty: float, guard: float, expected: V
 
 
 def test_without_tolerance_or_value() -> None:
-    assert decide(0.1, 0.02, None) is UNDECIDED
+    assert decide(0.1, 0.02, None) is Verdict.MEASURED
     assert decide(None, None, 0.5) is Verdict.NOT_MEASURED
     assert worst([PASS, UNDECIDED, FAIL]) is FAIL
     assert worst([PASS, Verdict.NOT_MEASURED]) is Verdict.NOT_MEASURED
+    assert worst([Verdict.MEASURED, PASS]) is PASS
+    assert worst([Verdict.MEASURED, FAIL]) is FAIL
     assert worst([]) is Verdict.NOT_MEASURED
     assert zone_diameter_mm(0.5) == 1.0
     with pytest.raises(InputError, match="guard factor"):
@@ -133,7 +135,7 @@ def test_a_full_record_comes_back_as_it_was(model: Model, tmp_path: Path) -> Non
     save_inspection(inspection, tmp_path / "inspection.json")
     assert load_inspection(tmp_path / "inspection.json", model) == inspection
     content = json.loads((tmp_path / "inspection.json").read_text(encoding="utf-8"))
-    assert content["schema_version"] == "1.1"
+    assert content["schema_version"] == "1.2"
     assert content["components"][0]["details"]["budget"][0] == {"name": "scale", "std_mm": 0.02}
     assert "reason" not in content["components"][0]["details"]["methods"][0]  # defaults are left out
 

@@ -45,6 +45,7 @@ _ERRORS = (ExitCode.BAD_INPUT, ExitCode.BUG, ExitCode.INTERRUPTED)
 _VERDICTS = {
     "pass": ExitCode.DONE,
     "fail": ExitCode.FAIL,
+    "measured": ExitCode.DONE,
     "undecided": ExitCode.UNDECIDED,
     "not_measured": ExitCode.CANNOT_MEASURE,
     "error": ExitCode.CANNOT_MEASURE,
@@ -52,7 +53,7 @@ _VERDICTS = {
 
 
 def exit_code_of(verdict: str) -> ExitCode:
-    """Exit code of a verdict: ``pass``, ``fail``, ``undecided``, ``not_measured``, or ``error`` of a job."""
+    """Exit code of a verdict: ``pass``, ``fail``, ``undecided``, ``measured``, ``not_measured`` or ``error``."""
     return _VERDICTS[verdict]
 
 

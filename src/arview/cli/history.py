@@ -106,7 +106,7 @@ Examples:
 @SINCE
 @click.option(
     "--verdict",
-    type=click.Choice(["pass", "fail", "undecided", "not_measured"]),
+    type=click.Choice(["pass", "fail", "undecided", "measured", "not_measured"]),
     help="Only results with this verdict.",
 )
 @click.option("--limit", type=click.IntRange(min=1), metavar="N", help="Only the newest N.")

@@ -156,7 +156,7 @@ def _print(inspection: Inspection, target: Path) -> None:
             f"{whole.sigma_mm:.3f}, FWHM {whole.fwhm_mm:.3f} mm"
         )
     counts = [f"{sum(c.verdict.value == v for c in inspection.components)} {v.replace('_', ' ')}" for v in
-              ("pass", "fail", "undecided", "not_measured")]  # fmt: skip
+              ("pass", "fail", "undecided", "measured", "not_measured")]  # fmt: skip
     missing = [c.name for c in inspection.components if c.finding is not None]
     if inspection.foreign_objects:
         counts.append(f"{len(inspection.foreign_objects)} foreign")

@@ -13,8 +13,8 @@ from arview.cad.model import Model
 from arview.errors import InputError, MismatchError
 from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport
 
-SCHEMA_VERSION = "1.1"
-READABLE_VERSIONS = ("1.0", "1.1")
+SCHEMA_VERSION = "1.2"
+READABLE_VERSIONS = ("1.0", "1.1", "1.2")
 
 _DISTANCE_SLACK_MM = 0.006
 """Tolerated difference between distance and displacement, which may both be rounded to 0.01 mm in a file."""
@@ -26,6 +26,8 @@ class Verdict(StrEnum):
     PASS = "pass"
     FAIL = "fail"
     UNDECIDED = "undecided"
+    MEASURED = "measured"
+    """Measured, but without a tolerance to judge it by."""
     NOT_MEASURED = "not_measured"
 
 
@@ -83,6 +85,10 @@ class ComponentDeviation:
         if self.finding is Finding.MISSING:
             return False
         return True if any(self.observable) else None
+
+    @property
+    def _has_angle_limit(self) -> bool:
+        return self.details is not None and self.details.angle_tolerance_deg is not None
 
     def __post_init__(self) -> None:
         if shape := list(self._shape_faults()):
@@ -144,7 +150,12 @@ class ComponentDeviation:
         if self.verdict is Verdict.NOT_MEASURED:
             if any(self.observable) or self.distance_mm is not None:
                 yield "verdict: is not_measured, but the component has measured values"
-        elif self.verdict in (Verdict.PASS, Verdict.FAIL) and self.tolerance_mm is None:
+        elif self.verdict is Verdict.MEASURED:
+            if self.distance_mm is None:
+                yield "distance_mm: is null, but the verdict is measured"
+            if self.tolerance_mm is not None:
+                yield f"verdict: is measured, but tolerance_mm is {self.tolerance_mm}; expected pass, fail or undecided"
+        elif self.verdict in (Verdict.PASS, Verdict.FAIL) and self.tolerance_mm is None and not self._has_angle_limit:
             yield f"tolerance_mm: is null, but the verdict is {self.verdict}"
         if self.verdict is Verdict.PASS:
             if self.distance_mm is None:

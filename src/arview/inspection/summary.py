@@ -9,6 +9,7 @@ from arview.inspection.record import Finding, Inspection, Verdict
 _WORDS = {
     Verdict.FAIL: "out of tolerance",
     Verdict.UNDECIDED: "undecided",
+    Verdict.MEASURED: "measured without a tolerance",
     Verdict.NOT_MEASURED: "not measured",
     Verdict.PASS: "in tolerance",
 }
@@ -18,14 +19,16 @@ def overall_verdict(inspection: Inspection) -> Verdict:
     """Verdict of the whole part.
 
     Fail if one component fails; not measured if none was measured; undecided if a component is undecided or was not
-    measured, or if there are foreign objects; otherwise pass.
+    measured, or if there are foreign objects; measured if none has a tolerance; otherwise pass.
     """
     verdicts = {component.verdict for component in inspection.components}
     if Verdict.FAIL in verdicts:
         return Verdict.FAIL
     if not verdicts or verdicts == {Verdict.NOT_MEASURED}:
         return Verdict.NOT_MEASURED
-    return Verdict.UNDECIDED if verdicts != {Verdict.PASS} or inspection.foreign_objects else Verdict.PASS
+    if not verdicts <= {Verdict.PASS, Verdict.MEASURED} or inspection.foreign_objects:
+        return Verdict.UNDECIDED
+    return Verdict.PASS if Verdict.PASS in verdicts else Verdict.MEASURED
 
 
 def verdict_sentence(inspection: Inspection) -> str:

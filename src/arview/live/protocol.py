@@ -123,7 +123,7 @@ Part::
      "part": {"name", "serial", "model_hash", "diameter_mm",
               "center_in_model": [3], "bounds_in_model": [[3], [3]]} | null,
      "components": [{"name", "color": "#rrggbb", "anchor_in_model": [3], "rank": by urgency | null,
-                     "verdict": "pass" | "fail" | "undecided" | "not_measured" | null,     null: not inspected,
+                     "verdict": "pass" | "fail" | "undecided" | "measured" | "not_measured" | null, null: not inspected,
                      "verdict_text": "PASS" | null, "verdict_color": "#rrggbb", "missing": bool,
                      "value_text", "detail_text", "distance_mm" | null, "uncertainty_mm" | null, "tolerance_mm" | null,
                      "displacement_mm": [3, null where undetermined]}],

@@ -22,7 +22,7 @@ from arview.pose import ComponentPresence
 
 _MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
 _UNIT_SUFFIX = {"mm": " mm", "inch": " in"}
-_RANK = {Verdict.FAIL: 0, Verdict.UNDECIDED: 1, Verdict.NOT_MEASURED: 3, Verdict.PASS: 2}
+_RANK = {Verdict.FAIL: 0, Verdict.UNDECIDED: 1, Verdict.PASS: 2, Verdict.MEASURED: 3, Verdict.NOT_MEASURED: 4}
 CHANGED = "changed since measured"
 UNVERIFIED = "not verified here"
 UNCERTAIN = "evidence here conflicts"

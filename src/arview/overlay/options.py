@@ -17,12 +17,14 @@ VERDICT_RGB: dict[Verdict, Rgb] = {
     Verdict.PASS: (52, 211, 122),
     Verdict.FAIL: (255, 72, 66),
     Verdict.UNDECIDED: (255, 176, 32),
+    Verdict.MEASURED: (96, 175, 255),
     Verdict.NOT_MEASURED: (126, 156, 196),
 }
 VERDICT_WORD: dict[Verdict, str] = {
     Verdict.PASS: "PASS",
     Verdict.FAIL: "FAIL",
     Verdict.UNDECIDED: "UNDECIDED",
+    Verdict.MEASURED: "MEASURED",
     Verdict.NOT_MEASURED: "NOT MEASURED",
 }
 NEUTRAL_RGB: Rgb = (70, 196, 255)

@@ -29,7 +29,7 @@ _COMPLETENESS_RGB: dict[Completeness, Rgb] = {
     Completeness.INCOMPLETE: VERDICT_RGB[Verdict.FAIL],
     Completeness.NOT_YET_CHECKED: VERDICT_RGB[Verdict.UNDECIDED],
 }
-_COUNT_ORDER = (Verdict.FAIL, Verdict.UNDECIDED, Verdict.PASS, Verdict.NOT_MEASURED)
+_COUNT_ORDER = (Verdict.FAIL, Verdict.UNDECIDED, Verdict.PASS, Verdict.MEASURED, Verdict.NOT_MEASURED)
 
 
 def age_text(age_s: float) -> str:

@@ -20,10 +20,17 @@ VERDICT_HEX = {
     Verdict.PASS: "#12805c",
     Verdict.FAIL: "#c22f2b",
     Verdict.UNDECIDED: "#a96a00",
+    Verdict.MEASURED: "#2b5c8a",
     Verdict.NOT_MEASURED: "#5b6675",
 }
 """Colours of the verdicts, dark enough for text on white (contrast above 4.5 : 1)."""
-_MARKER = {Verdict.PASS: "o", Verdict.FAIL: "X", Verdict.UNDECIDED: "D", Verdict.NOT_MEASURED: "_"}
+_MARKER = {
+    Verdict.PASS: "o",
+    Verdict.FAIL: "X",
+    Verdict.UNDECIDED: "D",
+    Verdict.MEASURED: "s",
+    Verdict.NOT_MEASURED: "_",
+}
 _SERIES = ("#2b5c8a", "#e0912f", "#7aa6c2", "#7a5195", "#5a8f5a", "#b0413e", "#9c8a5a", "#8796a5", "#3d8b8b", "#c58fb4")
 
 

@@ -16,6 +16,7 @@ VERDICT_WORD = {
     Verdict.PASS: "Pass",
     Verdict.FAIL: "Fail",
     Verdict.UNDECIDED: "Undecided",
+    Verdict.MEASURED: "Measured",
     Verdict.NOT_MEASURED: "Not measured",
 }
 

@@ -5,8 +5,8 @@
   const host = document.getElementById("viewer");
   const source = document.getElementById("scene");
   if (!host || !source) return;
-  const COLORS = { pass: 0x2fbf86, fail: 0xf0564f, undecided: 0xf0b13c, not_measured: 0x8ea3bd, none: 0xb9c2cc };
-  const VERDICT_TEXTS = { pass: "pass", fail: "fail", undecided: "undecided", not_measured: "not measured" };
+  const COLORS = { pass: 0x2fbf86, fail: 0xf0564f, undecided: 0xf0b13c, measured: 0x5aa0e6, not_measured: 0x8ea3bd, none: 0xb9c2cc };
+  const VERDICT_TEXTS = { pass: "pass", fail: "fail", undecided: "undecided", measured: "measured", not_measured: "not measured" };
 
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const points = (pack) => {

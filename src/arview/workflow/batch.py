@@ -40,7 +40,7 @@ class JobResult:
 
     Attributes:
         name: name of the job.
-        verdict: pass, fail, undecided or not_measured; ``error`` when an input is invalid or the job failed.
+        verdict: pass, fail, undecided, measured or not_measured; ``error`` when an input is invalid or the job failed.
         text: summary of the verdicts, or why there is no verdict.
         out: folder or URL of the results.
         key: hash of everything that the results depend on; empty for errors.

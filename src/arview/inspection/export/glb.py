@@ -17,6 +17,7 @@ _COLORS = {
     Verdict.PASS: (0.07, 0.50, 0.36, 1.0),
     Verdict.FAIL: (0.76, 0.18, 0.17, 1.0),
     Verdict.UNDECIDED: (0.80, 0.52, 0.05, 1.0),
+    Verdict.MEASURED: (0.14, 0.40, 0.70, 1.0),
     Verdict.NOT_MEASURED: (0.36, 0.42, 0.50, 1.0),
 }
 """Colours of the components: sRGB and opacity."""

@@ -25,12 +25,14 @@ _STATUS = {
     Verdict.PASS: "PASS",
     Verdict.FAIL: "FAIL",
     Verdict.UNDECIDED: "INDETERMINATE",
+    Verdict.MEASURED: "NOT_ANALYZED",
     Verdict.NOT_MEASURED: "NOT_ANALYZED",
 }
 _INSPECTION_STATUS = {
     Verdict.PASS: "PASS",
     Verdict.FAIL: "FAIL",
     Verdict.UNDECIDED: "UNKNOWN",
+    Verdict.MEASURED: "NOT_CALCULATED",
     Verdict.NOT_MEASURED: "NOT_MEASURED",
 }
 _DIRECTION = ("XAXIS", "YAXIS", "ZAXIS")

@@ -4,6 +4,7 @@ const PATHS = {
   pass: '<circle cx="12" cy="12" r="10"/><path class="ink" d="M7 12.5l3.4 3.4L17 9"/>',
   fail: '<path d="M7.9 2h8.2L22 7.9v8.2L16.1 22H7.9L2 16.1V7.9z"/><path class="ink" d="M8 8l8 8M16 8l-8 8"/>',
   undecided: '<path d="M12 1.8L23 21.5H1z"/><path class="ink" d="M9.6 11.2c.2-3 4.8-2.8 4.6 0-.1 1.6-2.2 1.7-2.2 3.6M12 17.9v.1"/>',
+  measured: '<rect x="2" y="2" width="20" height="20" rx="3"/><path class="ink" d="M6 12h12M6 8.5v7M18 8.5v7"/>',
   not_measured: '<circle cx="12" cy="12" r="9" fill="none" stroke="currentColor" stroke-width="2.4" stroke-dasharray="3.5 3"/>' +
     '<path d="M8 12h8" stroke="currentColor" stroke-width="2.4"/>',
   missing: '<g fill="none" stroke="currentColor" stroke-width="2.6"><rect x="2.5" y="2.5" width="19" height="19" stroke-dasharray="4 3"/>' +

@@ -2,8 +2,8 @@
 
 import { icon, make } from "./icons.js";
 
-const ORDER = ["fail", "undecided", "not_measured", "pass"];
-const VERDICT_TEXTS = { fail: "FAIL", undecided: "UNDECIDED", not_measured: "NOT MEASURED", pass: "PASS" };
+const ORDER = ["fail", "undecided", "not_measured", "measured", "pass"];
+const VERDICT_TEXTS = { fail: "FAIL", undecided: "UNDECIDED", measured: "MEASURED", not_measured: "NOT MEASURED", pass: "PASS" };
 
 const COMPLETENESS = { COMPLETE: "pass", INCOMPLETE: "fail", "NOT YET CHECKED": "undecided" };
 

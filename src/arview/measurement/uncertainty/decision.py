@@ -24,12 +24,12 @@ def decide(value: float | None, uncertainty: float | None, tolerance: float | No
     """Verdict on a value with its expanded uncertainty U, all in the unit of the tolerance.
 
     It passes if ``value + guard · U`` is within the tolerance, fails if ``value − guard · U`` is not, and is undecided
-    in between or without a tolerance. Without a value it is not measured.
+    in between. Without a tolerance it is only measured, and without a value not measured.
     """
     if value is None or uncertainty is None:
         return Verdict.NOT_MEASURED
     if tolerance is None:
-        return Verdict.UNDECIDED
+        return Verdict.MEASURED
     if value + guard * uncertainty <= tolerance:
         return Verdict.PASS
     return Verdict.FAIL if value - guard * uncertainty > tolerance else Verdict.UNDECIDED
@@ -37,7 +37,7 @@ def decide(value: float | None, uncertainty: float | None, tolerance: float | No
 
 def worst(verdicts: Iterable[Verdict]) -> Verdict:
     """Verdict on a component with several characteristics: fail if one fails, else undecided if one is undecided."""
-    order = (Verdict.PASS, Verdict.NOT_MEASURED, Verdict.UNDECIDED, Verdict.FAIL)
+    order = (Verdict.MEASURED, Verdict.PASS, Verdict.NOT_MEASURED, Verdict.UNDECIDED, Verdict.FAIL)
     return max(verdicts, key=order.index, default=Verdict.NOT_MEASURED)
 
 
