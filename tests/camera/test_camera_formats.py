@@ -83,9 +83,10 @@ cam1:
   resolution: *size
   timeshift_cam_imu: 0.002
 """
+NERF_FRAME = {"file_path": "images/1.png", "transform_matrix": np.eye(4).tolist()}
 NERF = {"camera_model": "OPENCV", "fl_x": 1000.0, "fl_y": 1001.0, "cx": 640.0, "cy": 360.0, "w": 1280, "h": 720,
         "k1": 0.05, "k2": -0.02, "p1": 0.001, "p2": -0.0005, "applied_scale": 2.0, "aabb_scale": 16,
-        "frames": [{"file_path": "images/1.png", "transform_matrix": np.eye(4).tolist()}]}  # fmt: skip
+        "frames": [NERF_FRAME]}  # fmt: skip
 
 
 def write(folder: Path, content: object, name: str = "camera.yaml") -> str:
@@ -173,7 +174,7 @@ def test_several_cameras_are_asked_for_by_name(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="distortion_model stands beside the camera left"):
         load_camera(write(tmp_path, TWO + "distortion_model: equidistant\n") + ":left")
     with pytest.raises(InputError, match="left: crop is not understood"):
-        load_camera(write(tmp_path, TWO.replace("left:\n", "left:\n  crop: [1, 2, 3, 4]\n")) + ":right")
+        load_camera(write(tmp_path, TWO.replace("left:\n", "left:\n  crop: [1, 2, 3, 4]\n")) + ":left")
 
 
 def test_stereo_calibration_of_opencv(tmp_path: Path) -> None:
@@ -195,6 +196,31 @@ def test_kalibr(tmp_path: Path) -> None:
     assert second.lens == LensDistortion(LensModel.FISHEYE, (-0.01, 0.02, -0.01, 0.003))
     with pytest.raises(InputError, match="lens model 'omni' is not supported"):
         load_camera(write(tmp_path, KALIBR.replace("camera_model: pinhole", "camera_model: omni")) + ":cam0")
+    # A camera that nobody asked for may be of any kind.
+    assert load_camera(write(tmp_path, KALIBR.replace("equidistant", "eucm")) + ":cam0").fx == 458.6
+
+
+def test_cameras_of_a_list_go_by_the_names_that_they_have(tmp_path: Path) -> None:
+    cameras = {"cameras": [PLAIN | {"name": "left"}, PLAIN | {"name": "right", "fx": 900.0}]}
+    assert load_camera(write(tmp_path, cameras) + ":right").fx == 900.0
+    with pytest.raises(InputError, match="cameras/left, cameras/right"):
+        load_camera(write(tmp_path, cameras))
+
+
+@pytest.mark.parametrize(
+    ("line", "lens"),
+    [
+        ("OPENCV_FISHEYE 640 480 300 301 320 240 0.1 0.02 0 0", LensDistortion(LensModel.FISHEYE, (0.1, 0.02))),
+        ("SIMPLE_RADIAL_FISHEYE 640 480 300 320 240 0.1", LensDistortion(LensModel.FISHEYE, (0.1,))),
+        ("FOV 640 480 300 301 320 240 0.9", LensDistortion(LensModel.FOV, (0.9,))),
+        ("SIMPLE_DIVISION 640 480 300 320 240 -0.1", LensDistortion(LensModel.DIVISION, (-0.1,))),
+        ("FULL_OPENCV 640 480 300 301 320 240 0 0 0 0 0 0.2 0 0", LensDistortion(LensModel.RATIONAL, (0, 0, 0, 0, 0, 0.2))),
+    ],
+)  # fmt: skip
+def test_lenses_of_colmap(tmp_path: Path, line: str, lens: LensDistortion) -> None:
+    path = write(tmp_path, f"1 {line}\n2 EUCM 640 480 1 1 1 1 0 0\n", "cameras.txt")
+    camera = load_camera(f"{path}:1", 640, 480)
+    assert (camera.lens, camera.cx, camera.cy) == (lens, 319.5, 239.5)
 
 
 def test_rational_polynomial_of_ros(tmp_path: Path) -> None:
@@ -210,6 +236,11 @@ def test_nerfstudio_counts_pixels_from_the_corner(tmp_path: Path) -> None:
     assert camera.dist.tolist() == [0.05, -0.02, 0.001, -0.0005, 0.0]
     fisheye = NERF | {"camera_model": "OPENCV_FISHEYE", "p1": 0.0, "p2": 0.0, "k3": 0.01, "k4": 0.002}
     assert load_camera(write(tmp_path, fisheye)).lens == LensDistortion(LensModel.FISHEYE, (0.05, -0.02, 0.01, 0.002))
+    each = NERF | {"scale": 0.5, "frames": [NERF_FRAME | {"fl_x": 1000.0}]}
+    of_frame = load_camera(write(tmp_path, each))
+    assert (of_frame.fx, of_frame.dist[0]) == (1000.0, 0.05)
+    zoomed = NERF | {"frames": [NERF_FRAME | {"fl_x": 1000.0}, NERF_FRAME | {"fl_x": 1100.0}]}
+    assert load_camera(write(tmp_path, zoomed) + ":frames/1").fx == 1100.0
     angle = {"camera_angle_x": math.radians(60), "w": 800, "h": 800, "frames": []}
     assert load_camera(write(tmp_path, angle)).fx == pytest.approx(400 / math.tan(math.radians(30)))
 

@@ -38,13 +38,15 @@ def is_colmap(text: str) -> bool:
     return bool(lines) and _COLMAP_LINE.match(lines[0]) is not None
 
 
-def entries_from_colmap(text: str) -> list[CameraEntry]:
-    """The cameras of a file.
+def entries_from_colmap(text: str, name: str = "") -> list[CameraEntry]:
+    """The cameras of a file; where one has the wanted name, its id, the others are not read.
 
     Raises:
         InputError: a line is not one of a camera, its model is not supported, or an id occurs twice.
     """
-    entries = [_entry(line) for line in _data_lines(text)]
+    lines = _data_lines(text)
+    wanted = [line for line in lines if name and line.split()[0] == name]
+    entries = [_entry(line) for line in wanted or lines]
     labels = [entry.label for entry in entries]
     twice = (
         next((label for label in labels if labels.count(label) > 1), None) if len(set(labels)) < len(labels) else None

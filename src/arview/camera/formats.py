@@ -43,8 +43,12 @@ _STEREO = re.compile(r"(M|K|cameraMatrix|camera_matrix|D|distCoeffs|dist_coeffs)
 _MAX_DEPTH = 6
 
 
-def entries_from_trees(trees: Sequence[Any]) -> list[CameraEntry]:
+def entries_from_trees(trees: Sequence[Any], name: str = "") -> list[CameraEntry]:
     """The cameras of the documents of a file.
+
+    Args:
+        trees: of the documents.
+        name: of the camera that is wanted; where there is one of this name, the others are not read.
 
     Raises:
         InputError: no camera, or one that is not understood.
@@ -53,10 +57,11 @@ def entries_from_trees(trees: Sequence[Any]) -> list[CameraEntry]:
         raise InputError(f"is not a camera file; expected {FORMATS}")
     if any(isinstance(tree, list) and not _has_map(tree) for tree in trees):
         raise InputError("the JSON is a list, expected an object with fx, fy, cx, cy")
-    entries = []
+    found: list[tuple[str, Mapping[str, Any]]] = []
     for index, tree in enumerate(trees):
-        prefix = f"document{index + 1}" if len(trees) > 1 else ""
-        entries += [_entry(node, label) for label, node in _cameras(tree, prefix, 0)]
+        found += _cameras(tree, f"document{index + 1}" if len(trees) > 1 else "", 0)
+    wanted = [one for one in found if name and name in (one[0], one[0].rsplit("/", 1)[-1])]
+    entries = [_entry(node, label) for label, node in wanted or found]
     if not entries:
         raise InputError(f"no camera matrix and no fx, fy, cx, cy in the camera file; expected {FORMATS}")
     return entries
@@ -72,12 +77,23 @@ def _cameras(tree: Any, label: str, depth: int) -> Iterator[tuple[str, Mapping[s
         return
     children: list[tuple[str, Any]] = []
     if isinstance(tree, list):
-        children = [(str(index), item) for index, item in enumerate(tree)]
+        children = [(_name_of(item) or str(index), item) for index, item in enumerate(tree)]
+        names = [name for name, _ in children]
+        if len(set(names)) < len(names):
+            children = [(str(index), item) for index, item in enumerate(tree)]
     elif isinstance(tree, dict):
         pair = _stereo(tree)
         if pair:
             for name, node in pair.items():
                 yield (f"{label}/{name}" if label else name), node
+            return
+        frames = tree.get("frames")
+        if isinstance(frames, list) and any(isinstance(one, dict) and _is_camera(one) for one in frames):
+            # Intrinsics of each frame, with those of the file where a frame has none.
+            common = {key: value for key, value in tree.items() if key != "frames"}
+            for index, one in enumerate(frames):
+                if isinstance(one, dict):
+                    yield f"{label}/frames/{index}".lstrip("/"), common | one
             return
         if _is_camera(tree):
             yield label, tree
@@ -98,6 +114,12 @@ def _cameras(tree: Any, label: str, depth: int) -> Iterator[tuple[str, Mapping[s
                 raise InputError(f"{key} stands beside the camera {inside[0][0]}, not in it; move it there")
         _check_names(beside, depth=_MAX_DEPTH)
     yield from inside
+
+
+def _name_of(item: Any) -> str:
+    """The name that a camera of a list says it has, or empty."""
+    names = [item.get(key) for key in ("name", "camera_name", "id", "camera_id")] if isinstance(item, dict) else []
+    return next((str(name) for name in names if isinstance(name, str | int) and str(name)), "")
 
 
 def _holds_camera(value: Any) -> bool:
@@ -208,15 +230,18 @@ def _read(node: Mapping[str, Any], label: str) -> CameraEntry:
                 raise InputError(f"{key} has {len(size)} numbers; expected width and height")
         elif name not in ("roi", "binningx", "binningy"):
             rest[key] = value
+    names = {plain_name(key) for key in node}
+    if NERF_SIGNS & names and {"frames", "transformmatrix"} & names:
+        rest = {key: value for key, value in rest.items() if key not in ("scale", "offset")}  # of the scene
     _check_names(rest)
     for one, other in pairwise(listed):
         if one[1] != other[1]:
             raise InputError(f"{one[0]} and {other[0]} differ; keep one of them")
-    # Names in capitals mean what those in small letters mean, except that nerfstudio's pixels begin at the corner.
-    half_px = COLMAP_HALF_PX if NERF_SIGNS & {plain_name(key) for key in node} else 0.0
+    # nerfstudio's pixels begin at the corner.
+    half_px = COLMAP_HALF_PX if NERF_SIGNS & names else 0.0
     width, height = _image_size(numbers, size)
-    fx, fy, cx, cy = _pinhole(matrices, numbers, width, height)
     dist, lens = lens_from_terms(models, listed[0][1] if listed else None, named)
+    fx, fy, cx, cy = _pinhole(matrices, numbers, width, height)
     return CameraEntry(
         fx, fy, cx - half_px, cy - half_px, dist, lens, width, height, _roi(node), _binning(node), label=label
     )  # fmt: skip

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,7 @@ def load_camera(
         path, name = find_profile(text, source), ""
     else:
         path, name = split_spec(text)
-    entry = _entry_of(_read_entries(path), path, name)
+    entry = _entry_of(_read_entries(path, name), path, name)
     turns = quarter_turns_clockwise % 4
     if turns == 0 or width is None or height is None:
         return _fit_to_frames(entry, path, width, height)
@@ -208,7 +209,7 @@ def split_spec(spec: str | Path) -> tuple[Path, str]:
     return Path(text), ""
 
 
-def _read_entries(path: Path) -> list[CameraEntry]:
+def _read_entries(path: Path, name: str) -> list[CameraEntry]:
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the camera file itself ({FORMATS})")
     try:
@@ -224,11 +225,16 @@ def _read_entries(path: Path) -> list[CameraEntry]:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else None
         raise InputError(f"{path}: cannot read the camera file: {reason or error}") from error
+    if re.search(r"[\x00-\x08\x0e-\x1f]", text):
+        raise InputError(f"{path}: is not a text file; expected {FORMATS}")
     stripped = text.lstrip()
     if not stripped:
         raise InputError(f"{path}: the camera file is empty; expected {FORMATS}")
     try:
-        entries = entries_from_colmap(stripped) if is_colmap(stripped) else entries_from_trees(parse_trees(stripped))
+        if is_colmap(stripped):
+            entries = entries_from_colmap(stripped, name)
+        else:
+            entries = entries_from_trees(parse_trees(stripped), name)
         return [entry.as_recorded() for entry in entries]
     except ArviewError as error:
         raise type(error)(f"{path}: {error}") from error
