@@ -214,7 +214,7 @@ def test_cameras_of_a_list_go_by_the_names_that_they_have(tmp_path: Path) -> Non
         ("SIMPLE_RADIAL_FISHEYE 640 480 300 320 240 0.1", LensDistortion(LensModel.FISHEYE, (0.1,))),
         ("FOV 640 480 300 301 320 240 0.9", LensDistortion(LensModel.FOV, (0.9,))),
         ("SIMPLE_DIVISION 640 480 300 320 240 -0.1", LensDistortion(LensModel.DIVISION, (-0.1,))),
-        ("FULL_OPENCV 640 480 300 301 320 240 0 0 0 0 0 0.2 0 0", LensDistortion(LensModel.RATIONAL, (0, 0, 0, 0, 0, 0.2))),
+        ("FULL_OPENCV 640 480 300 301 320 240 0 0 0 0 0 2 0 0", LensDistortion(LensModel.RATIONAL, (0, 0, 0, 0, 0, 2))),
     ],
 )  # fmt: skip
 def test_lenses_of_colmap(tmp_path: Path, line: str, lens: LensDistortion) -> None:
