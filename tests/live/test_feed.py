@@ -88,7 +88,7 @@ class Scripted:
         self.expected: list[SerialNumbers | None] = []
         self.options = options()
 
-    def camera(self, width: int, height: int, turns: int) -> Camera:
+    def camera(self, width: int, height: int, turns: int, unsquared_size: tuple[int, int] | None) -> Camera:
         if width == height:
             raise MismatchError("/secret/place/camera.json: for frames of another shape")
         return guess_camera(width, height)

@@ -228,7 +228,7 @@ class Feed:
         height, width = frame.image.shape[:2]
         shape = width, height, frame.quarter_turns_clockwise
         if shape != self._shape:
-            self._start_session(shape)
+            self._start_session(shape, frame.unsquared_size)
         if self._wants_reset and self._session is not None:
             self._wants_reset = False
             self._session.reset()
@@ -262,13 +262,13 @@ class Feed:
             self._wants_confirmation = False
             session.confirm()
 
-    def _start_session(self, shape: tuple[int, int, int]) -> None:
+    def _start_session(self, shape: tuple[int, int, int], unsquared_size: tuple[int, int] | None) -> None:
         """Start a session for frames of another size or orientation, or note why there is none."""
         width, height, turns = shape
         self._tell_estimate()
         self._shape, self._session, self._refused = shape, None, None
         try:
-            self._camera = self._subject.camera(width, height, turns)
+            self._camera = self._subject.camera(width, height, turns, unsquared_size)
             self._session = self._subject.session(self._camera)
         except ArviewError as error:
             self._camera = guess_camera(width, height)

@@ -26,14 +26,16 @@ class DecodedFrame:
     Attributes:
         frame_id: 0 to 2^20 - 1, assigned by the page for a phone and by the server for a station camera.
         image: (H,W,3) uint8 RGB in the size in which it was taken.
-        quarter_turns_clockwise: rotation that the browser applied to the picture of the sensor.
+        quarter_turns_clockwise: rotation that the browser, or the reader, applied to the picture of the sensor.
         scale: received size over the size in which it was taken; 1 when the frame was not scaled in transit.
+        unsquared_size: width and height in px before pixels were made square; None where they were square.
     """
 
     frame_id: int
     image: Image
     quarter_turns_clockwise: int = 0
     scale: float = 1.0
+    unsquared_size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)

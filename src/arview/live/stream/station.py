@@ -110,17 +110,18 @@ class StationCamera:
                 return
             if self._ended.is_set():
                 return
-            self._put(frame)
+            self._put(frame, source)
         if not source.is_live and source.fps:
             self._ended.wait(1.0 / source.fps)
 
-    def _put(self, frame: Frame) -> None:
+    def _put(self, frame: Frame, source: FrameSource) -> None:
         now_s = time.monotonic()
         self._fault = ""
         step = self._options.sample_step_px
         sample = frame.image[::step, ::step].copy()
         if self._sample is None or not np.array_equal(sample, self._sample):
             self._sample, self._same_since_s = sample, now_s
-        decoded = DecodedFrame(self._count % FRAME_IDS, frame.image)
+        turns, unsquared = source.quarter_turns_clockwise, source.unsquared_size
+        decoded = DecodedFrame(self._count % FRAME_IDS, frame.image, turns, unsquared_size=unsquared)
         self._count += 1
         self._feed.put(IncomingFrame(lambda: decoded, now_s))

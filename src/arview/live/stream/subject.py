@@ -22,6 +22,7 @@ from arview.overlay.options import EdgeMode
 from arview.tracking import TrackingSession
 from arview.tracking.guide_pose import guide_pose
 from arview.tracking.self_calibration.session import SelfCalibratingSession
+from arview.video.intrinsics import load_square_camera
 
 _SECONDS_PER_DAY = 86400.0
 PHONE_FOV = "fov:66"
@@ -124,8 +125,14 @@ class Subject:
             )
         return notices
 
-    def camera(self, width: int, height: int, quarter_turns_clockwise: int = 0) -> Camera:
-        """Intrinsics for the frames of a feed.
+    def camera(
+        self,
+        width: int,
+        height: int,
+        quarter_turns_clockwise: int = 0,
+        unsquared_size: tuple[int, int] | None = None,
+    ) -> Camera:
+        """Intrinsics for the frames of a feed, whose pixels may have been made square.
 
         Raises:
             InputError, MismatchError: the camera file cannot be read, has a lens that the page
@@ -133,7 +140,8 @@ class Subject:
         """
         spec, source = self.options.camera, self.options.source
         if spec is not None:
-            camera = load_camera(spec, width, height, source=source, quarter_turns_clockwise=quarter_turns_clockwise)
+            size = (width, height)
+            camera = load_square_camera(spec, size, unsquared_size, quarter_turns_clockwise, source)
             return require_brown(camera, "live")
         if self.options.is_phone:
             return load_camera(PHONE_FOV, width, height)
