@@ -1,5 +1,6 @@
 """Films and pictures of unusual kinds: clocks, pixel shapes, fields, sizes, colours, names and bits."""
 
+import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from arview.camera import Camera
 from arview.camera.read import save_camera
-from arview.errors import InputError, MismatchError
+from arview.errors import InputError, MismatchError, MissingDependencyError
 from arview.video import VideoSink, open_source
 from arview.video.clock import FrameClock, plausible_fps
 from arview.video.intrinsics import load_camera_of
@@ -238,6 +239,19 @@ def test_printf_patterns(tmp_path: Path) -> None:
         open_source(tmp_path / "none" / "frame_%04d.png")
 
 
+def test_exif_of_a_pattern(tmp_path: Path) -> None:
+    from PIL import Image
+
+    for k in (1, 2):
+        picture = Image.fromarray(numbered(k))
+        exif = picture.getexif()
+        exif.get_ifd(0x8769)[0xA405] = 28
+        picture.save(tmp_path / f"shot_{k:03d}.jpg", exif=exif)
+    source = open_source(tmp_path / "shot_%03d.jpg")
+    camera = load_camera_of(source, "exif", tmp_path / "shot_%03d.jpg")
+    assert camera.fx == pytest.approx(28 * 200 / np.hypot(36, 24))
+
+
 def test_gaps_stay_gaps(tmp_path: Path) -> None:
     for k in (0, 1, 2, 7, 8):
         write_picture(tmp_path / f"frame_{k:04d}.png", numbered(k))
@@ -307,3 +321,52 @@ def test_folder_of_heic(tmp_path: Path) -> None:
     assert [number_of(frame.image) for frame in frames] == [1, 2, 4]
     assert [frame.file for frame in frames] == ["IMG_0001.HEIC", "IMG_0002.HEIC", "IMG_0004.HEIC"]
     assert source.skipped == 1 and (source.width, source.height) == (160, 120)
+
+
+def write_dng(path: Path, level: int) -> None:
+    """A DNG of 64 × 48 px of Bayer pixels RGGB of 12 bits, all of one level."""
+    import struct
+
+    pixels = np.full((48, 64), level, "<u2").tobytes()
+    identity = [value for k in range(9) for value in (int(k % 4 == 0), 1)]
+    tags = [
+        (254, "I", [0]), (256, "I", [64]), (257, "I", [48]), (258, "H", [16]), (259, "H", [1]), (262, "H", [32803]),
+        (271, "c", b"Test\0"), (272, "c", b"Test\0"), (273, "I", [8]), (274, "H", [1]), (277, "H", [1]),
+        (278, "I", [48]), (279, "I", [len(pixels)]), (33421, "H", [2, 2]), (33422, "B", [0, 1, 1, 2]),
+        (50706, "B", [1, 4, 0, 0]), (50708, "c", b"Test\0"), (50714, "I", [0]), (50717, "I", [4095]),
+        (50721, "srational", identity), (50728, "rational", [1, 1, 1, 1, 1, 1]), (50778, "H", [21]),
+    ]  # fmt: skip
+    codes = {"B": 1, "c": 2, "H": 3, "I": 4, "rational": 5, "srational": 10}
+    directory = struct.pack("<H", len(tags))
+    extra, extra_at = b"", 8 + len(pixels) + 2 + 12 * len(tags) + 4
+    for tag, kind, values in tags:
+        form = {"rational": "I", "srational": "i", "c": "B"}.get(kind, kind)
+        content = struct.pack(f"<{len(values)}{form}", *values)
+        count = len(values) // 2 if "rational" in kind else len(values)
+        if len(content) > 4:
+            place, extra = struct.pack("<I", extra_at + len(extra)), extra + content + b"\0" * (len(content) % 2)
+        else:
+            place = content.ljust(4, b"\0")
+        directory += struct.pack("<HHI", tag, codes[kind], count) + place
+    path.write_bytes(struct.pack("<2sHI", b"II", 42, 8 + len(pixels)) + pixels + directory + b"\0" * 4 + extra)
+
+
+def test_dng_pictures(tmp_path: Path) -> None:
+    """Linear values are developed: a fifth of white is BT.709's 0.4, whatever other pictures hold."""
+    pytest.importorskip("rawpy")
+    for k, level in enumerate((819, 4095)):
+        write_dng(tmp_path / f"IMG_000{k}.dng", level)
+    write_dng(tmp_path / "IMG_0002.dng", 819)
+    write_picture(tmp_path / "IMG_0002.jpg", np.zeros((48, 64, 3), np.uint8))  # developed already
+    frames = list(open_source(tmp_path))
+    assert [frame.file for frame in frames] == ["IMG_0000.dng", "IMG_0001.dng", "IMG_0002.jpg"]
+    fifth = 255 * (1.099 * 0.2**0.45 - 0.099)
+    np.testing.assert_allclose(frames[0].image[24, 32], fifth, atol=4)
+    assert frames[1].image[24, 32].min() >= 250
+
+
+def test_dng_without_its_reader_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_dng(tmp_path / "a.dng", 819)
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    with pytest.raises(MissingDependencyError, match="DNG pictures need rawpy; run: pip install rawpy"):
+        open_source(tmp_path)

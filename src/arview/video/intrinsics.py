@@ -8,6 +8,7 @@ from pathlib import Path
 from arview.camera import Camera
 from arview.camera.read import load_camera
 from arview.errors import MismatchError
+from arview.video.pictures import PictureSource
 from arview.video.source import FrameSource
 
 
@@ -23,6 +24,8 @@ def load_camera_of(frames: FrameSource, spec: str | Path, source: str | Path | N
         InputError, MismatchError: the camera cannot be read or is not for these frames.
     """
     size = (frames.width, frames.height)
+    if isinstance(frames, PictureSource):
+        source = frames.first_path
     return load_square_camera(spec, size, frames.unsquared_size, frames.quarter_turns_clockwise, source)
 
 

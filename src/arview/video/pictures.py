@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,8 @@ from arview.errors import InputError, MissingDependencyError
 from arview.video.frame import Frame, Image
 from arview.video.source import FrameRange, FrameSource, read_ahead
 
-SUFFIXES = PHOTO_SUFFIXES | HEIF_SUFFIXES
+RAW_SUFFIXES = frozenset({".dng"})
+SUFFIXES = PHOTO_SUFFIXES | HEIF_SUFFIXES | RAW_SUFFIXES
 MAX_NUMBER = 99_999_999
 """Largest number in a file name that is taken for that of a frame; longer ones are dates or clocks."""
 PROBED_PICTURES = 5
@@ -36,9 +39,12 @@ class PictureSource(FrameSource):
     Pictures that cannot be read or differ in size from the first are skipped and counted. Pictures of 16 bits are
     reduced to 8 by the bits that are used: 12-bit values in 16 bits are not left dark.
 
+    Attributes:
+        first_path: the first picture that can be read.
+
     Raises:
         InputError: on construction, if no picture can be read.
-        MissingDependencyError: a HEIC picture, without pillow-heif.
+        MissingDependencyError: a HEIC picture without pillow-heif, or a DNG without rawpy.
     """
 
     def __init__(self, name: str, paths: Sequence[Path], wanted: FrameRange, fps: float) -> None:
@@ -68,6 +74,7 @@ class PictureSource(FrameSource):
                 break
         else:
             raise InputError(f"{name}: none of the {len(paths)} pictures can be read; save them as JPEG or PNG")
+        self.first_path = path
         self.height, self.width = first.shape[:2]
         self.quarter_turns_clockwise = _turns_of_picture(path)
 
@@ -105,6 +112,8 @@ class PictureSource(FrameSource):
             return None
         if path.suffix.lower() in HEIF_SUFFIXES:
             return _read_heif(data)
+        if path.suffix.lower() in RAW_SUFFIXES:
+            return _read_raw(data)
         pixels = _decoded(data)
         if pixels is None:
             return None
@@ -118,8 +127,17 @@ class PictureSource(FrameSource):
 
 
 def picture_paths(folder: Path) -> list[Path]:
-    """Picture files of a folder in natural order (2 before 10)."""
-    return sorted_naturally(path for path in folder.iterdir() if is_picture(path))
+    """Picture files of a folder in natural order (2 before 10), see `pictures_among`."""
+    return pictures_among(folder.iterdir())
+
+
+def pictures_among(paths: Iterable[Path]) -> list[Path]:
+    """Picture files among some paths in natural order; a raw is left out if its developed picture is there, too."""
+    pictures = [path for path in paths if is_picture(path)]
+    developed = {path.with_suffix("") for path in pictures if path.suffix.lower() not in RAW_SUFFIXES}
+    return sorted_naturally(
+        path for path in pictures if path.suffix.lower() not in RAW_SUFFIXES or path.with_suffix("") not in developed
+    )
 
 
 def is_picture(path: Path) -> bool:
@@ -127,7 +145,7 @@ def is_picture(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
 
 
-def sorted_naturally(paths: Iterator[Path]) -> list[Path]:
+def sorted_naturally(paths: Iterable[Path]) -> list[Path]:
     """Paths in an order that takes runs of digits as numbers."""
 
     def key(path: Path) -> list[tuple[int, str]]:
@@ -238,6 +256,19 @@ def _read_heif(data: bytes) -> Image | None:
             return np.array(picture.convert("RGB"))
     except MissingDependencyError:
         raise
+    except Exception:  # the reader raises whatever a damaged file makes it run into
+        return None
+
+
+def _read_raw(data: bytes) -> Image | None:
+    """(H,W,3) uint8 RGB of a DNG, upright, with the white balance of the camera and one brightness for all pictures."""
+    try:
+        rawpy = import_module("rawpy")
+    except ImportError as error:
+        raise MissingDependencyError("DNG pictures need rawpy; run: pip install rawpy") from error
+    try:
+        with rawpy.imread(io.BytesIO(data)) as raw:
+            return np.ascontiguousarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8))
     except Exception:  # the reader raises whatever a damaged file makes it run into
         return None
 

@@ -13,11 +13,10 @@ from arview.video.live import CameraGrabber, LiveSource, UrlGrabber
 from arview.video.pictures import (
     SUFFIXES,
     PictureSource,
-    is_picture,
     is_printf_pattern,
     paths_of_pattern,
     picture_paths,
-    sorted_naturally,
+    pictures_among,
 )
 from arview.video.source import FrameRange, FrameSource
 
@@ -80,7 +79,7 @@ def open_source(
         return PictureSource(text, paths_of_pattern(text), wanted, fps)
     if glob.has_magic(text):
         found = (Path(match) for match in glob.glob(text, recursive=True))  # noqa: PTH207 - absolute patterns too
-        pictures = sorted_naturally(match for match in found if is_picture(match))
+        pictures = pictures_among(found)
         if not pictures:
             raise InputError(f"{text}: no picture ({_suffixes()}) matches; check the pattern")
         return PictureSource(text, pictures, wanted, fps)
