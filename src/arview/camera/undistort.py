@@ -159,11 +159,16 @@ class FrameView:
         tracked_camera: of the pictures: the same, with Brown's terms for its lens, or a pinhole camera.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, options: UndistortOptions | None = None) -> None:
         self.camera = camera
-        brown = brown_camera(camera)
-        self._undistorter = Undistorter(camera) if brown is None else None
+        brown = brown_camera(camera, options)
+        self._undistorter = Undistorter(camera, options) if brown is None else None
         self.tracked_camera = self._undistorter.ideal if self._undistorter is not None else brown or camera
+
+    @property
+    def is_resampling(self) -> bool:
+        """Whether pictures differ from the frames."""
+        return self._undistorter is not None
 
     def picture(self, frame: NDArray[np.uint8], index: int) -> NDArray[np.uint8]:
         """The picture (h,w,3) of a frame (H,W,3) uint8 RGB; raises InputError for a frame of another size or type."""

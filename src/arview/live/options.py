@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from arview.camera.undistort import UndistortOptions
 from arview.errors import InputError
 
 PHONE = "phone"
@@ -22,6 +23,8 @@ class FeedOptions:
     silence_s: float = 1.5  # a feed without a frame for longer than this is waiting
     max_unreadable: int = 15  # consecutive frames without a readable stamp, half a second, that raise a notice
     min_scale: float = 0.95  # a frame received at less than this share of its size raises a notice
+    # A wide lens: pictures are undistorted for the page, too, so they stay about as large as the frames.
+    undistort: UndistortOptions = field(default_factory=lambda: UndistortOptions(max_growth=1.25, min_scale=0.3))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from arview.cad import load_part
 from arview.camera.read import guess_camera
+from arview.camera.undistort import require_brown
 from arview.core.progress import StepProgress
 from arview.errors import ArviewError, MismatchError
 from arview.guideviews import GuideViewOptions, load_guide_views
@@ -42,7 +43,7 @@ def load_subject(
         views = cached_guide_views(part.model, part.effective_view_range, view_options, progress=progress)
     subject = Subject(part, views, options)
     if options.is_phone:
-        subject.camera(options.width, options.height)
+        require_brown(subject.camera(options.width, options.height), "pictures of a phone")
     elif options.camera is not None:
         with suppress(MismatchError):  # the size of a station camera's pictures is only known from the first one
             subject.camera(options.width, options.height)

@@ -7,13 +7,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from arview.camera import Camera
 from arview.camera.read import guess_camera
+from arview.camera.undistort import FrameView, require_brown
 from arview.errors import ArviewError
 from arview.live.stream.frames import DecodedFrame, IncomingFrame, to_jpeg
 from arview.live.stream.newest import NewestSlot
@@ -98,6 +99,7 @@ class Feed:
         self._kept: deque[TrackedFrame] = deque(maxlen=self.options.kept_frames)
         self._arrived_s: float | None = None
         self._session: TrackingSession | SelfCalibratingSession | None = None
+        self._view: FrameView | None = None
         self._wants_reset = self._wants_confirmation = False
         self._refused: Notice | None = None
         self._shape: tuple[int, int, int] | None = None
@@ -234,6 +236,9 @@ class Feed:
             self._session.reset()
         if self._session is not None:
             self._identify(self._session)
+        if self._view is not None and self._view.is_resampling:
+            picture = self._view.picture(np.ascontiguousarray(frame.image), frame.frame_id)
+            frame = replace(frame, image=picture)
         self._serial += 1
         if self._session is None:
             reason = self._refused.text if self._refused else ""
@@ -266,9 +271,13 @@ class Feed:
         """Start a session for frames of another size or orientation, or note why there is none."""
         width, height, turns = shape
         self._tell_estimate()
-        self._shape, self._session, self._refused = shape, None, None
+        self._shape, self._session, self._view, self._refused = shape, None, None, None
         try:
-            self._camera = self._subject.camera(width, height, turns, unsquared_size)
+            camera = self._subject.camera(width, height, turns, unsquared_size)
+            if self.kind == "phone":  # whose page shows the picture of the phone as it is
+                camera = require_brown(camera, "pictures of a phone")
+            self._view = FrameView(camera, self.options.undistort)
+            self._camera = self._view.tracked_camera
             self._session = self._subject.session(self._camera)
         except ArviewError as error:
             self._camera = guess_camera(width, height)

@@ -9,7 +9,6 @@ from functools import cached_property
 from arview.cad.part import Part
 from arview.camera import Camera
 from arview.camera.read import guess_camera, load_camera
-from arview.camera.undistort import require_brown
 from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
@@ -135,14 +134,12 @@ class Subject:
         """Intrinsics for the frames of a feed, whose pixels may have been made square.
 
         Raises:
-            InputError, MismatchError: the camera file cannot be read, has a lens that the page
-                cannot draw, or is for frames of another aspect ratio.
+            InputError, MismatchError: the camera file cannot be read or is for frames of another aspect ratio.
         """
         spec, source = self.options.camera, self.options.source
         if spec is not None:
             size = (width, height)
-            camera = load_square_camera(spec, size, unsquared_size, quarter_turns_clockwise, source)
-            return require_brown(camera, "live")
+            return load_square_camera(spec, size, unsquared_size, quarter_turns_clockwise, source)
         if self.options.is_phone:
             return load_camera(PHONE_FOV, width, height)
         return guess_camera(width, height)
