@@ -19,6 +19,7 @@ import pytest
 from arview.cad import load_part
 from arview.cad.model import Model
 from arview.camera import Camera
+from arview.camera.lens import LensDistortion, LensModel
 from arview.camera.read import guess_camera
 from arview.errors import InputError, MismatchError
 from arview.fiducials.serial_code import SerialNumbers
@@ -132,6 +133,31 @@ def test_a_confirmation_and_another_serial_number_reach_the_session(closing: Cal
         assert wait(lambda number=number: feed.newest.frame.frame_id == number)
     assert subject.confirmed == 1
     assert subject.expected == [None, SerialNumbers("BP-0042"), SerialNumbers("BP-0042")]
+
+
+class WideLens(Scripted):
+    """A subject whose camera file has a fisheye lens."""
+
+    def camera(self, width: int, height: int, turns: int, unsquared_size: tuple[int, int] | None) -> Camera:
+        lens = LensDistortion(LensModel.FISHEYE, (0.05, 0.01))
+        return Camera(width, height, 0.5 * width, 0.5 * width, 0.5 * width - 0.5, 0.5 * height - 0.5, lens=lens)
+
+
+def test_pages_get_pictures_of_a_wide_station_camera_undistorted(closing: Callable[[Feed], Feed]) -> None:
+    feed = closing(feed_of(WideLens(), "station"))
+    feed.put(frame(1))
+    assert wait(lambda: feed.newest is not None)
+    assert feed.newest is not None
+    camera, picture = feed.newest.camera, feed.newest.frame.image
+    assert camera.lens is None and not camera.is_distorted
+    assert picture.shape == (camera.height, camera.width, 3)
+    assert camera.width <= 1.25 * 160 + 1
+    # A phone shows its own pictures, which must not be drawn on as if they were undistorted.
+    phone = closing(feed_of(WideLens(), "phone"))
+    phone.put(frame(1))
+    assert wait(lambda: phone.newest is not None)
+    assert [notice.level for notice in phone.notices()] == ["error"]
+    assert "lens model fisheye" in phone.notices()[0].text
 
 
 @pytest.mark.slow
