@@ -558,6 +558,73 @@ def test_a_series_goes_on_across_cad_revisions_on_wish(store: HistoryStore, tmp_
     assert "CAD model changed on" in done.output
 
 
+def test_a_voided_result_stays_but_does_not_count(store: HistoryStore, tmp_path: Path) -> None:
+    for index in range(12):
+        store.add(saved(tmp_path, f"v{index}", built(index, 0.05 + 0.001 * index)))
+    voided = store.void("3", "part was  not seated\n", "qa@bench")
+    assert voided.void is not None
+    assert (voided.serial, voided.void.reason, voided.void.by) == ("S002", "part was not seated", "qa@bench")
+    assert [one.serial for one in store.listed()] == [f"S{i:03d}" for i in range(12) if i != 2]
+    assert len(store.listed(limit=11)) == 11
+    assert [one.serial for one in store.listed(with_voided=True) if one.void is not None] == ["S002"]
+    assert store.find("3")[0] == voided
+    series = series_of(store, "block_1")
+    assert (len(series.values), series.left_out) == (11, ("1 voided",))
+    assert store.check() == (12, [])
+    with pytest.raises(InputError, match="result 3 is void already: part was not seated"):
+        store.void("3", "again")
+    with pytest.raises(InputError, match="the reason is empty"):
+        store.void("4", "  ")
+    with pytest.raises(InputError, match="no result 99"):
+        store.void("99", "why")
+    outside = sqlite3.connect(store.name)
+    for statement in ("DELETE FROM arview_voids", "UPDATE arview_voids SET reason = ''"):
+        with pytest.raises(sqlite3.IntegrityError, match="append-only"):
+            outside.execute(statement)
+    outside.close()
+
+
+def test_a_store_of_version_1_is_read_as_it_is_and_upgraded_when_written(tmp_path: Path) -> None:
+    where = tmp_path / "old.sqlite"
+    with HistoryStore(where) as store:
+        store.add(saved(tmp_path, "a", built(1, 0.1)))
+    outside = sqlite3.connect(where)
+    for name in ("no_update", "no_delete", "no_replace"):
+        outside.execute(f"DROP TRIGGER arview_store_{name}")
+    outside.execute("DROP TABLE arview_voids")
+    outside.execute("UPDATE arview_store SET version = 1")
+    outside.commit()
+    with HistoryStore(where, must_exist=True) as store:
+        assert len(store.listed()) == 1
+    assert outside.execute("SELECT max(version) FROM arview_store").fetchone() == (1,)
+    with HistoryStore(where, must_exist=True) as store:
+        assert store.void("1", "why").void is not None
+        assert store.listed() == []
+    assert outside.execute("SELECT max(version) FROM arview_store").fetchone() == (2,)
+    outside.close()
+
+
+def test_the_commands_void_and_take_time_zones(tmp_path: Path) -> None:
+    where = tmp_path / "results.sqlite"
+    run("add", saved(tmp_path, "a", built(1, 0.1)), saved(tmp_path, "b", built(2, 0.1)), "--store", where)
+    listing = run("list", "--store", where, "--zone", "Asia/Tokyo").output
+    assert "measured (Asia/Tokyo)" in listing
+    assert "2026-03-01 22:30:15" in listing  # 13:30:15 UTC
+    since = ("--since", "2026-03-01T23:00", "--zone", "Asia/Tokyo")
+    assert run("list", "--store", where, *since).output.splitlines()[-1] == "1 result"
+    assert run("list", "--store", where, "--since", "2026-03-01T23:00+09:00").output.splitlines()[-1] == "1 result"
+    wrong = run("list", "--store", where, "--zone", "Mars/Olympus")
+    assert (wrong.exit_code, "expected a time zone" in wrong.output) == (64, True)
+    done = run("void", 1, "--reason", "dropped", "--by", "qa", "--store", where)
+    assert done.exit_code == 0, done.output
+    assert "by qa: dropped" in run("show", 1, "--store", where).output
+    assert run("list", "--store", where).output.splitlines()[-1] == "1 result"
+    every = run("list", "--store", where, "--voided").output
+    assert "void" in next(line for line in every.splitlines() if "S001" in line)
+    again = run("void", 1, "--reason", "x", "--store", where)
+    assert (again.exit_code, "void already: dropped" in again.output) == (64, True)
+
+
 def test_one_of_several_parts_must_be_chosen(filled: HistoryStore, tmp_path: Path) -> None:
     filled.add(saved(tmp_path, "p", built(50, 0.0, part="other")))
     with pytest.raises(InputError, match=r"several parts \(bench, other\)"):

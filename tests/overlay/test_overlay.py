@@ -216,6 +216,9 @@ def test_label_texts_come_from_the_inspection() -> None:
         "a", (None,) * 3, None, (False,) * 6, None, None, Verdict.FAIL, finding=Finding.MISSING
     )
     assert (labels.value_text(missing, options), labels.detail_text(missing, options)) == ("missing", "")
+    rough = replace(failed, uncertainty_mm=2.34)
+    assert labels.value_text(rough, options) == "1.2 mm"  # no more decimals than U allows
+    assert labels.detail_text(rough, options) == "U 2.3"
     inch = OverlayOptions(unit="inch", decimals=3)
     assert labels.value_text(deviation("a", (0.0, 25.4, 0.0), "fail"), inch) == "1.000 in"
 

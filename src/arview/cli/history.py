@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import zoneinfo
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from typing import TYPE_CHECKING
 
 import click
@@ -27,8 +28,21 @@ PART = click.option("--part", metavar="NAME", help="Only results of this part.")
 SERIAL = click.option("--serial", metavar="SERIAL", help="Only results of this serial.")
 STATION = click.option("--station", metavar="NAME", help="Only results of this station.")
 SINCE = click.option(
-    "--since", metavar="DATE", help="Only results measured from then on: 2026-03-01 or with a time, UTC."
+    "--since", metavar="DATE", help="Only results measured from then on: 2026-03-01 or with a time (+02:00)."
 )
+
+
+def _parse_zone(ctx: click.Context, parameter: click.Parameter, value: str) -> tzinfo:
+    if value.upper() == "UTC":
+        return UTC
+    try:
+        return zoneinfo.ZoneInfo(value)
+    except (zoneinfo.ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise click.BadParameter(f"{value!r}: expected a time zone such as Europe/Berlin") from error
+
+
+ZONE = click.option("--zone", metavar="ZONE", default="UTC", show_default=True, callback=_parse_zone,
+                    help="Time zone of the dates, such as Europe/Berlin.")  # fmt: skip
 
 
 @main.group(
@@ -40,10 +54,12 @@ Examples:
   arview history show 12 -o inspection.json
   arview history chart --part plate --component post_1 -o post_1.svg
   arview history export -o plate.csv --part plate
+  arview history void 12 --reason "part was not seated"
   arview history add out/inspection.json --store postgresql://qa@db/arview
 
 \b
-The store only grows: results are added, never changed or deleted; the database itself refuses that.
+The store only grows: results are added, never changed or deleted; the database itself refuses that. One
+that must not count is voided with a reason, and stays visible.
 Each result is identified by the SHA-256 of its content, so that adding it again changes nothing. Two
 stations may add at the same time. SQLite serves one machine; use PostgreSQL for several
 (pip install 'arview[postgres]').""",
@@ -99,7 +115,8 @@ def add(inspections: tuple[str, ...], station: str | None, store: str | None) ->
 @history.command("list", short_help="List results.", epilog="""\b
 Examples:
   arview history list
-  arview history list --part plate --verdict fail --since 2026-03-01""")  # fmt: skip
+  arview history list --part plate --verdict fail --since 2026-03-01
+  arview history list --voided --zone Europe/Berlin""")  # fmt: skip
 @PART
 @SERIAL
 @STATION
@@ -110,18 +127,22 @@ Examples:
     help="Only results with this verdict.",
 )
 @click.option("--limit", type=click.IntRange(min=1), metavar="N", help="Only the newest N.")
+@click.option("--voided", is_flag=True, help="Also those that were voided.")
+@ZONE
 @STORE
 def list_results(
     part: str | None, serial: str | None, station: str | None, since: str | None, verdict: str | None,
-    limit: int | None, store: str | None,
+    limit: int | None, voided: bool, zone: tzinfo, store: str | None,
 ) -> None:  # fmt: skip
     """List the results in the order in which they were measured."""
     with _open(store, must_exist=True) as opened:
-        found = opened.listed(part, serial, station, verdict, _moment(since), limit=limit)
+        found = opened.listed(
+            part, serial, station, verdict, _moment(since, zone), limit=limit, with_voided=voided
+        )  # fmt: skip
     _table(
-        ("no.", "measured (UTC)", "part", "serial", "station", "verdict", "hash"),
-        [(str(r.id), f"{r.measured:%Y-%m-%d %H:%M:%S}", r.part, r.serial or "-", r.station,
-          r.verdict.replace("_", " "), r.content_hash[:12]) for r in found],
+        ("no.", f"measured ({zone})", "part", "serial", "station", "verdict", "hash"),
+        [(str(r.id), f"{r.measured.astimezone(zone):%Y-%m-%d %H:%M:%S}", r.part, r.serial or "-", r.station,
+          "void" if r.void is not None else r.verdict.replace("_", " "), r.content_hash[:12]) for r in found],
     )  # fmt: skip
     click.echo(f"{len(found)} result{'s' * (len(found) != 1)}")
 
@@ -154,6 +175,23 @@ def show(result: str, output: str | None, store: str | None) -> None:
         click.echo(f"wrote {target}")
 
 
+@history.command(short_help="Void a result.", epilog="""\b
+Examples:
+  arview history void 12 --reason "part was not seated"
+
+\b
+The result stays in the store with the reason, and `show` and `list --voided` still print it. Lists,
+trends, capability and exports leave it out. This cannot be undone.""")  # fmt: skip
+@click.argument("result")
+@click.option("--reason", required=True, metavar="TEXT", help="Why it does not count.")
+@click.option("--by", metavar="NAME", help="Who voids it; default: your user name and this machine.")
+@STORE
+def void(result: str, reason: str, by: str | None, store: str | None) -> None:
+    """Void the RESULT with this number, or whose hash begins so."""
+    with _open(store, must_exist=True) as opened:
+        _about(opened.void(result, reason, by))
+
+
 @history.command(
     short_help="Trend, control limits, Cp and Cpk of a component.",
     epilog="""\b
@@ -178,6 +216,7 @@ results of the newest CAD model count, unless --revisions is given.""",
               help="Quantity to chart.")  # fmt: skip
 @click.option("--lower", type=float, metavar="X", help="Lower limit, instead of the tolerance's.")
 @click.option("--upper", type=float, metavar="X", help="Upper limit, instead of the tolerance's.")
+@ZONE
 @click.option("--repeats", is_flag=True, help="Count every measurement of a serial.")
 @click.option("--revisions", is_flag=True, help="Count results of every CAD model that has the component.")
 @click.option("-o", "--output", metavar="FILE", help="Picture to write: .svg, .png or .pdf.")
@@ -187,7 +226,7 @@ results of the newest CAD model count, unless --revisions is given.""",
 @STORE
 def chart(
     component: str, quantity: str, lower: float | None, upper: float | None, repeats: bool, revisions: bool,
-    output: str | None, part: str | None, station: str | None, since: str | None, store: str | None,
+    output: str | None, zone: tzinfo, part: str | None, station: str | None, since: str | None, store: str | None,
 ) -> None:  # fmt: skip
     """Show the trend of a component over the parts, with control limits, Cp and Cpk."""
     from arview.history import Capability, capability_by_limits, control_chart, series_of
@@ -198,9 +237,9 @@ def chart(
         raise InputError(f"{target}: expected a name that ends with {', '.join('.' + one for one in FORMATS)}")
     with _open(store, must_exist=True) as opened:
         series = series_of(
-            opened, component, quantity, part, station, _moment(since), repeats, revisions  # type: ignore[arg-type]
+            opened, component, quantity, part, station, _moment(since, zone), repeats, revisions  # type: ignore[arg-type]
         )  # fmt: skip
-    series = series.with_limits(lower, upper)
+    series = series.with_limits(lower, upper).in_zone(zone)
     for reason in series.left_out:
         say(f"left out: {reason}{' (--revisions counts them)' if 'CAD model' in reason else ''}")
     values = [one.value for one in series.values]
@@ -273,15 +312,17 @@ Examples:
 \b
 .csv has a line for each component of each result; .jsonl has one whole inspection per line.""")  # fmt: skip
 @click.option("-o", "--output", required=True, metavar="FILE", help="File to write: .csv or .jsonl.")
+@ZONE
 @PART
 @SERIAL
 @STATION
 @SINCE
 @STORE
 def export(
-    output: str, part: str | None, serial: str | None, station: str | None, since: str | None, store: str | None
-) -> None:
-    """Write results to a file."""
+    output: str, zone: tzinfo, part: str | None, serial: str | None, station: str | None, since: str | None,
+    store: str | None,
+) -> None:  # fmt: skip
+    """Write results to a file; its times are UTC."""
     from arview.history.export import to_csv, to_json_lines
 
     target = output_path(output, [])
@@ -289,7 +330,7 @@ def export(
     if kind not in (".csv", ".jsonl"):
         raise InputError(f"{target}: expected a name that ends with .csv or .jsonl")
     with _open(store, must_exist=True) as opened:
-        found = opened.listed(part, serial, station, since=_moment(since))
+        found = opened.listed(part, serial, station, since=_moment(since, zone))
         content = to_csv(opened, found) if kind == ".csv" else to_json_lines(opened, found)
     write_bytes(target, content)
     click.echo(f"wrote {target}: {len(found)} results")
@@ -321,14 +362,15 @@ def _open(store: str | None, must_exist: bool = False) -> HistoryStore:
     return HistoryStore(store or default_store(), must_exist)
 
 
-def _moment(text: str | None) -> datetime | None:
+def _moment(text: str | None, zone: tzinfo) -> datetime | None:
+    """The time of --since, which is in the zone unless it states its offset."""
     if text is None:
         return None
     try:
         moment = datetime.fromisoformat(text)
     except ValueError as error:
         raise InputError(f"--since {text!r}: expected a date like 2026-03-01 or 2026-03-01T12:00") from error
-    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=zone)
 
 
 def _about(one: StoredResult) -> None:
@@ -336,6 +378,8 @@ def _about(one: StoredResult) -> None:
     click.echo(f"measured {one.measured:%Y-%m-%d %H:%M:%S} UTC at {one.station} by {one.tool}")
     click.echo(f"added    {one.added:%Y-%m-%d %H:%M:%S} UTC, content {one.content_hash}")
     click.echo(f"CAD      {one.model_hash}")
+    if one.void is not None:
+        click.echo(f"void     {one.void.added:%Y-%m-%d %H:%M:%S} UTC by {one.void.by}: {one.void.reason}")
 
 
 def _number(value: float | None, sign: str, digits: int = 3) -> str:
@@ -345,8 +389,10 @@ def _number(value: float | None, sign: str, digits: int = 3) -> str:
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
     """Print columns as narrow as their content allows: text to the left, numbers to the right."""
     widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    numeric = [bool(rows) and all(row[i][:1] in "+-?0123456789" and "." in row[i] + "." for row in rows)
-               and i > 0 and head[i] not in ("hash", "serial", "measured (UTC)") for i in range(len(head))]  # fmt: skip
+    is_text = [i == 0 or name in ("hash", "serial") or name.startswith("measured") for i, name in enumerate(head)]
+    numeric = [
+        bool(rows) and not is_text[i] and all(row[i][:1] in "+-?0123456789" for row in rows) for i in range(len(head))
+    ]
     for row in [head, *rows]:
         cells = [c.rjust(w) if n else c.ljust(w) for c, w, n in zip(row, widths, numeric, strict=True)]
         click.echo("  ".join(cells).rstrip())

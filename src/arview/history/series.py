@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, tzinfo
 from itertools import pairwise
 from typing import Literal, get_args
 
@@ -82,6 +82,10 @@ class ComponentSeries:
             upper=self.upper if upper is None else upper,
         )
 
+    def in_zone(self, zone: tzinfo) -> ComponentSeries:
+        """The series with its times in another zone."""
+        return replace(self, values=tuple(replace(one, measured=one.measured.astimezone(zone)) for one in self.values))
+
     def by_limits(self) -> dict[tuple[float | None, float | None], tuple[SeriesValue, ...]]:
         """The values by the limits that held when they were measured, in the order in which these first held."""
         groups: dict[tuple[float | None, float | None], list[SeriesValue]] = {}
@@ -131,13 +135,14 @@ def series_of(
     """
     if quantity not in get_args(Quantity):
         raise InputError(f"{quantity!r}: expected one of {', '.join(get_args(Quantity))}")
-    found = store.listed(part=part, station=station, since=since)
+    every = store.listed(part=part, station=station, since=since, with_voided=True)
+    found = [one for one in every if one.void is None]
     if not found:
         raise InputError(f"{store.name}: no such results")
     parts = sorted({one.part for one in found})
     if len(parts) > 1:
         raise InputError(f"{store.name}: contains several parts ({', '.join(parts)}); name one with --part")
-    left_out: list[str] = []
+    left_out = [f"{len(every) - len(found)} voided"] if len(found) < len(every) else []
     current = found if revisions else [one for one in found if one.model_hash == found[-1].model_hash]
     if len(current) < len(found):
         left_out.append(f"{len(found) - len(current)} measured against another CAD model than the newest")

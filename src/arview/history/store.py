@@ -6,6 +6,7 @@ by a hash of their content, so that adding one twice, or again after an interrup
 
 from __future__ import annotations
 
+import getpass
 import json
 import os
 import random
@@ -29,7 +30,7 @@ from sqlalchemy.exc import (
 )
 
 from arview.errors import InputError, MissingDependencyError, OutputError
-from arview.history.tables import STORE_VERSION, about, components, guards, metadata, results
+from arview.history.tables import STORE_VERSION, about, components, guards, metadata, results, voids
 from arview.inspection import Inspection, load_inspection
 from arview.inspection.fingerprint import content_hash
 from arview.inspection.summary import overall_verdict
@@ -55,8 +56,17 @@ class AddedResult:
 
 
 @dataclass(frozen=True)
+class Void:
+    """Why a result no longer counts, by whom it was voided (user and machine), and when (UTC)."""
+
+    reason: str
+    by: str
+    added: datetime
+
+
+@dataclass(frozen=True)
 class StoredResult:
-    """A stored result without its document; times are UTC."""
+    """A stored result without its document; times are UTC. ``void`` says why it no longer counts, if so."""
 
     id: int
     content_hash: str
@@ -68,6 +78,7 @@ class StoredResult:
     added: datetime
     verdict: str
     tool: str
+    void: Void | None = None
 
 
 def default_store() -> str:
@@ -82,6 +93,15 @@ def default_store() -> str:
 def default_station() -> str:
     """The name of ``ARVIEW_STATION``, else that of this machine."""
     return os.environ.get("ARVIEW_STATION") or socket.gethostname()
+
+
+def default_author() -> str:
+    """Who works with the store: the user's name, if it is known, and the name of this machine."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError, ImportError):
+        user = "unknown"
+    return f"{user}@{socket.gethostname()}"
 
 
 class HistoryStore:
@@ -112,7 +132,7 @@ class HistoryStore:
         if self.is_sqlite:
             sa.event.listen(self._engine, "connect", _prepare_sqlite)
             sa.event.listen(self._engine, "begin", _begin_sqlite)
-        self._make_tables()
+        self._make_tables(upgrades=not must_exist)
 
     def close(self) -> None:
         """Close all connections."""
@@ -173,9 +193,12 @@ class HistoryStore:
     def listed(
         self, part: str | None = None, serial: str | None = None, station: str | None = None,
         verdict: str | None = None, since: datetime | None = None, model_hash: str | None = None,
-        limit: int | None = None,
+        limit: int | None = None, with_voided: bool = False,
     ) -> list[StoredResult]:  # fmt: skip
-        """Results in the order of their measurement; with a ``limit``, the newest ones."""
+        """Results in the order of their measurement; with a ``limit``, the newest ones.
+
+        Voided results are left out unless ``with_voided``.
+        """
         wanted = {"part": part, "serial": serial, "station": station, "verdict": verdict, "model_hash": model_hash}
         query = sa.select(*(c for c in results.c if c.name != "document"))
         for name, value in wanted.items():
@@ -184,10 +207,47 @@ class HistoryStore:
         if since is not None:
             query = query.where(results.c.measured >= _stamp(since))
         query = query.order_by(results.c.measured.desc(), results.c.id.desc())
-        if limit is not None:
-            query = query.limit(limit)
         with self._begin() as connection:
-            return [_listed(row) for row in reversed(connection.execute(query).all())]
+            voided = _voided(connection)
+            if voided and not with_voided:
+                query = query.where(results.c.id.not_in(sa.select(voids.c.result_id)))
+            if limit is not None:
+                query = query.limit(limit)
+            return [_listed(row, voided) for row in reversed(connection.execute(query).all())]
+
+    def void(self, key: str, reason: str, by: str | None = None) -> StoredResult:
+        """Void a result: it stays in the store with the reason, but lists, statistics and exports leave it out.
+
+        Args:
+            key: number of the result, or the first digits of its hash.
+            reason: why it does not count.
+            by: who voids it; default: `default_author`.
+
+        Raises:
+            InputError: there is no such result, it is void already, or the reason is empty.
+            OutputError: the store cannot be written to.
+        """
+        reason = " ".join(reason.split())
+        if not reason:
+            raise InputError("void: the reason is empty")
+        self._make_tables(upgrades=True)
+        found, _ = self.find(key)
+        row = {
+            "result_id": found.id, "reason": reason, "by": by or default_author(), "added": _stamp(datetime.now(UTC)),
+        }  # fmt: skip
+
+        def insert() -> bool:
+            with self._begin(writes=True) as connection:
+                if found.id in _voided(connection):
+                    return False
+                connection.execute(sa.insert(voids).values(row))
+                return True
+
+        is_new = self._retried(insert)
+        found, _ = self.find(str(found.id))
+        if not is_new and found.void is not None:
+            raise InputError(f"{self.name}: result {found.id} is void already: {found.void.reason} ({found.void.by})")
+        return found
 
     def find(self, key: str) -> tuple[StoredResult, str]:
         """A result and its document, found by its number or the first digits of its hash (at least six).
@@ -200,6 +260,7 @@ class HistoryStore:
             raise InputError(f"{key!r}: expected the number of a result or the first digits of its hash (at least six)")
         rows: Sequence[Any] = ()
         with self._begin() as connection:
+            voided = _voided(connection)
             if key.isdigit() and len(key) <= 18:
                 rows = connection.execute(sa.select(results).where(results.c.id == int(key))).all()
             if not rows and is_hash:
@@ -209,7 +270,7 @@ class HistoryStore:
             raise InputError(f"{self.name}: no result {key}")
         if len(rows) > 1:
             raise InputError(f"{self.name}: more than one result begins with {key}; give more digits")
-        return _listed(rows[0]), str(rows[0].document)
+        return _listed(rows[0], voided), str(rows[0].document)
 
     def components(self, ids: list[int] | None = None, name: str | None = None) -> Iterator[dict[str, Any]]:
         """Rows of the components of results, all or those of one name, in the order of ``ids`` or of the numbers."""
@@ -268,7 +329,9 @@ class HistoryStore:
                 time.sleep(0.05 * 2**attempt * random.uniform(0.5, 1.5))
         raise AssertionError("unreachable")
 
-    def _make_tables(self) -> None:
+    def _make_tables(self, upgrades: bool) -> None:
+        """Create the tables of a new store, and with ``upgrades`` those that an older one lacks."""
+
         def make() -> None:
             with self._begin(writes=True) as connection:
                 if not self.is_sqlite:
@@ -277,7 +340,7 @@ class HistoryStore:
                 for statement in guards("sqlite" if self.is_sqlite else "postgresql"):
                     connection.exec_driver_sql(statement)
                 version = connection.scalar(sa.select(sa.func.max(about.c.version)))
-                if version is None:
+                if version is None or version < STORE_VERSION:
                     connection.execute(sa.insert(about).values(version=STORE_VERSION))
                 elif version > STORE_VERSION:
                     raise InputError(
@@ -293,7 +356,7 @@ class HistoryStore:
                 raise InputError(
                     f"{self.name}: the store was written by a newer arview (version {version}); update arview"
                 )
-            return version is not None
+            return version is not None and (version == STORE_VERSION or not upgrades)
 
         if not self._retried(has_tables):
             self._retried(make)
@@ -397,8 +460,17 @@ def _stamp(moment: datetime) -> str:
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
-def _listed(row: Any) -> StoredResult:
+def _voided(connection: sa.Connection) -> dict[int, Void]:
+    """The voids by the number of their result; none in the store of an older arview."""
+    if not sa.inspect(connection).has_table(voids.name):
+        return {}
+    rows = connection.execute(sa.select(voids))
+    return {int(row.result_id): Void(row.reason, row.by, datetime.fromisoformat(row.added)) for row in rows}
+
+
+def _listed(row: Any, voided: dict[int, Void]) -> StoredResult:
     return StoredResult(
         int(row.id), row.content_hash, row.part, row.serial, row.station, row.model_hash,
         datetime.fromisoformat(row.measured), datetime.fromisoformat(row.added), row.verdict, row.tool,
+        voided.get(int(row.id)),
     )  # fmt: skip

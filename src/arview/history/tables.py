@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy import BigInteger, Column, Float, ForeignKey, Index, Integer, MetaData, String, Table, Text
 
-STORE_VERSION = 1
+STORE_VERSION = 2
 metadata = MetaData()
 _Number = BigInteger().with_variant(Integer, "sqlite")  # SQLite increments only INTEGER keys automatically
 
@@ -46,6 +46,15 @@ components = Table(
     Index("arview_components_by_name", "name"),
 )
 
+voids = Table(
+    "arview_voids",
+    metadata,
+    Column("result_id", _Number, ForeignKey("arview_results.id"), primary_key=True),
+    Column("reason", Text, nullable=False),
+    Column("by", Text, nullable=False),  # user and machine
+    Column("added", String(27), nullable=False),
+)
+
 about = Table("arview_store", metadata, Column("version", Integer, primary_key=True))
 
 _MESSAGE = "the results store is append-only"
@@ -53,7 +62,7 @@ _MESSAGE = "the results store is append-only"
 
 def guards(dialect: str) -> list[str]:
     """Statements that make changes of existing rows fail; they can be executed repeatedly."""
-    tables = (results.name, components.name, about.name)
+    tables = (results.name, components.name, voids.name, about.name)
     return _sqlite_guards(tables) if dialect == "sqlite" else _postgresql_guards(tables)
 
 
@@ -68,6 +77,7 @@ def _sqlite_guards(tables: tuple[str, ...]) -> list[str]:
     same = {
         results.name: "content_hash = NEW.content_hash OR id = NEW.id",
         components.name: "result_id = NEW.result_id AND name = NEW.name",
+        voids.name: "result_id = NEW.result_id",
         about.name: "version = NEW.version",
     }
     return statements + [

@@ -16,6 +16,7 @@ import numpy as np
 
 from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
+from arview.inspection.rounding import decimals_of
 from arview.overlay.evidence import DISPLACED_RGB, MISSING_RGB, DrawnEvidence, dimmed, evidence_of
 from arview.overlay.options import NEUTRAL_RGB, VERDICT_RGB, VERDICT_WORD, OverlayOptions, Rgb
 from arview.pose import ComponentPresence
@@ -39,11 +40,14 @@ _ARROW_FRACTION = 0.14
 """Length of the longest arrow, at most, in diameters of the part."""
 
 
-def _number(value_mm: float, options: OverlayOptions, signed: bool = False) -> str:
-    """A length in the unit of the labels, with a typographic minus sign."""
+def _number(value_mm: float, options: OverlayOptions, signed: bool = False, uncertainty_mm: float | None = None) -> str:
+    """A length in the unit of the labels, with a typographic minus sign and no more decimals than U allows."""
+    decimals = options.decimals
+    if uncertainty_mm:
+        decimals = min(decimals, decimals_of(uncertainty_mm / _MM_PER_UNIT[options.unit]))
     value = value_mm / _MM_PER_UNIT[options.unit]
     sign = "+" if signed else ""
-    return f"{value:{sign}.{options.decimals}f}".replace("-", "−")
+    return f"{value:{sign}.{decimals}f}".replace("-", "−")
 
 
 def by_urgency(inspection: Inspection) -> list[ComponentDeviation]:
@@ -65,7 +69,7 @@ def value_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
         return "missing"
     if deviation.distance_mm is None:
         return "" if deviation.verdict is Verdict.NOT_MEASURED else "undetermined"
-    return _number(deviation.distance_mm, options) + _UNIT_SUFFIX[options.unit]
+    return _number(deviation.distance_mm, options, uncertainty_mm=deviation.uncertainty_mm) + _UNIT_SUFFIX[options.unit]
 
 
 def detail_parts(deviation: ComponentDeviation, options: OverlayOptions) -> tuple[str, ...]:
@@ -81,13 +85,13 @@ def detail_parts(deviation: ComponentDeviation, options: OverlayOptions) -> tupl
         if value is None:
             shown.append(f"d{axis} ?")
         elif abs(value) > uncertainty_mm:
-            shown.append(f"d{axis} {_number(value, options, signed=True)}")
+            shown.append(f"d{axis} {_number(value, options, True, uncertainty_mm)}")
     parts = list(shown)
     if deviation.tilt_deg is not None and deviation.tilt_deg >= 0.1:
         parts.append(f"tilt {deviation.tilt_deg:.1f}°")
     if deviation.twist_deg is not None and abs(deviation.twist_deg) >= 0.1:
         parts.append(f"twist {deviation.twist_deg:+.1f}°".replace("-", "−"))
-    parts.append(f"U {_number(uncertainty_mm, options)}")
+    parts.append(f"U {_number(uncertainty_mm, options, uncertainty_mm=uncertainty_mm)}")
     return tuple(parts)
 
 
