@@ -173,3 +173,49 @@ def test_a_session_follows_a_part_of_which_most_is_absent() -> None:
         set(NAMES) - set(absent)
     )
     assert result.completeness is Completeness.INCOMPLETE
+
+
+def test_what_was_known_before_a_loss_is_taken_up_for_the_same_specimen() -> None:
+    absent = "post_2"
+    model = changed(**{absent: None})
+    frames = list(round_walk(model))
+    monitor = AssemblyMonitor(assembly_views(), CAMERA, assembly())
+    for image, pose in frames:
+        for _ in range(6):
+            monitor.update(image, pose)
+    before = monitor.presence(frames[-1][1])
+    assert before[absent].presence is Presence.MISSING
+    monitor.set_aside()
+    monitor.reset()
+    image, pose = frames[3]
+    monitor.update(image, pose)
+    fresh = monitor.presence(pose)
+    assert fresh[absent].presence is not Presence.MISSING
+    monitor.resume()
+    again = monitor.presence(pose)
+    assert again[absent].presence is Presence.MISSING
+    assert all(again[name].presence is Presence.PRESENT for name in NAMES if name != absent)
+    assert again["post_1"].observations > fresh["post_1"].observations
+    # Only once, and nothing after everything was forgotten.
+    monitor.resume()
+    assert monitor.presence(pose) == again
+    monitor.set_aside()
+    monitor.forget()
+    monitor.resume()
+    assert all(one.observations == 0 for one in monitor.presence(pose).values())
+
+
+def test_a_component_that_was_added_during_a_loss_becomes_present() -> None:
+    absent = "post_2"
+    monitor = AssemblyMonitor(assembly_views(), CAMERA, assembly())
+    for image, pose in round_walk(changed(**{absent: None})):
+        for _ in range(6):
+            monitor.update(image, pose)
+    monitor.set_aside()
+    monitor.reset()
+    for number, (image, pose) in enumerate(round_walk(None, count=9)):
+        for _ in range(6):
+            monitor.update(image, pose)
+            if number == 0:
+                monitor.resume()
+    assert monitor.presence(pose)[absent].presence is Presence.PRESENT

@@ -9,7 +9,7 @@ all parts.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -52,6 +52,7 @@ class MonitorOptions:
             and from which on it is so blurred that edges that are not found say nothing.
         max_log_odds: bound on the summed log odds, in both directions.
         forgetting: share of the summed log odds that is lost with each observation.
+        carried_share: share of the summed log odds that counts after the part was lost and found again.
         first_observations: frames after a lock that are all observed. No component is called mismatched before the
             last of them, because noise differs between frames.
         incomplete_quality: poses of lower quality are observed at once while components are suspect.
@@ -82,6 +83,7 @@ class MonitorOptions:
     motion_px: tuple[float, float] = (25.0, 45.0)
     max_log_odds: float = 6.0
     forgetting: float = 0.01
+    carried_share: float = 0.7
     first_observations: int = 2
     incomplete_quality: float = 0.85
     urgent_frames: int = 2
@@ -140,6 +142,8 @@ class AssemblyMonitor:
         options: see `MonitorOptions`.
     """
 
+    _state: MonitorState
+
     def __init__(
         self, views: GuideViewSet, camera: Camera, model: Model, options: MonitorOptions | None = None
     ) -> None:
@@ -154,6 +158,7 @@ class AssemblyMonitor:
         self._corners = _box_corners(boxes).reshape(-1, 3)
         low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
         self._part_corners = _box_corners(np.array([[low, high]])).reshape(-1, 3)
+        self._aside: MonitorState | None = None
         self.reset()
 
     @property
@@ -180,8 +185,38 @@ class AssemblyMonitor:
         """Poses (4,4) in which the base looks the same, and of which nothing has yet shown that they are wrong."""
         return self._turned.poses(cam_from_model) if self._is_suspect().any() else ()
 
+    def set_aside(self) -> None:
+        """Keep what is known while the part is lost, for `resume`."""
+        if self._state.observations:
+            self._aside = self._state
+
+    def resume(self) -> None:
+        """Take up what was known before the part was lost: the same specimen was found again."""
+        o, before, now = self.options, self._aside, self._state
+        self._aside = None
+        if before is None or before is now:
+            return
+        summed = np.clip(o.carried_share * before.log_odds + now.log_odds, -o.max_log_odds, o.max_log_odds)
+        is_wrong = summed > o.cleared_log_odds
+        self._state = replace(
+            now,
+            log_odds=summed,
+            directions=before.directions,
+            is_mismatched=(before.is_mismatched | now.is_mismatched) & is_wrong,
+            is_missing=(before.is_missing | now.is_missing) & is_wrong,
+            is_verified=(before.is_verified | now.is_verified) & ~is_wrong,
+            alternative=np.maximum(before.alternative, now.alternative),
+            shifts=np.where((now.alternative > before.alternative)[:, None], now.shifts, before.shifts),
+            observations=before.observations + now.observations,
+        )
+
+    def forget(self) -> None:
+        """Forget all observations, those set aside too."""
+        self._aside = None
+        self.reset()
+
     def reset(self) -> None:
-        """Forget all observations: another part may be in view."""
+        """Forget the observations since the part was found: another part may be in view."""
         self._turned.reset()
         count = len(self._views.component_names)
         self._said: tuple[tuple[int, bool, bytes], Mapping[str, ComponentPresence]] | None = None

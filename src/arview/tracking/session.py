@@ -9,7 +9,6 @@ states are a table, see `session_state`.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,21 +18,22 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.camera.undistort import FrameView
 from arview.core.checks import check_type
-from arview.detection.detector import Detection, Detector, DetectorOptions, RejectedHypothesis, local_search_for
-from arview.detection.scene_change import SceneChange, SceneChangeOptions
+from arview.detection.detector import Detection, Detector, RejectedHypothesis, local_search_for
+from arview.detection.scene_change import SceneChange
 from arview.detection.search.local_search import LocalSearch
-from arview.errors import InputError, MismatchError
+from arview.errors import MismatchError
 from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import Array, apply, check_rigid, invert
 from arview.guideviews import GuideViewSet
-from arview.pose import Pose, TrackingState
+from arview.pose import Identity, Pose, TrackingState
 from arview.tracking.appearance_memory import AppearanceMemory
 from arview.tracking.diagnosis import NOTHING_IN_VIEW, diagnose_loss, diagnose_picture, diagnose_search
 from arview.tracking.disambiguation import HypothesisSet
 from arview.tracking.estimate import Estimate
 from arview.tracking.guided_init import GuidedInit
-from arview.tracking.identity import IdentityMonitor, IdentityOptions
+from arview.tracking.identity import IdentityMonitor
 from arview.tracking.pose_recheck import LocalSearchRecheck
+from arview.tracking.session_options import SessionOptions
 from arview.tracking.session_state import Event, SessionState
 from arview.tracking.several.specimens import hide_specimens, is_same_specimen
 from arview.tracking.tracker import Tracker
@@ -41,69 +41,8 @@ from arview.tracking.tracker_options import TrackerOptions
 
 ALIGN = "align the part with the outline"
 """Reason given while the session waits for the part at its guide pose."""
-
-
-@dataclass(frozen=True)
-class SessionOptions:
-    """Options of a session.
-
-    Attributes:
-        use_region: let the tracker use colours along the outline.
-        use_edge: let the tracker use grey-level edges.
-        use_texture: let the tracker use the part's own texture.
-        use_recheck: run the detector's local search where a tracked pose is far from the predicted one.
-        use_appearance_memory: remember how the part looks while it is tracked, and look for that after a loss.
-        lock_quality: a detection of this quality is accepted at once; a weaker one must be confirmed by a second frame.
-            Near a given initial pose ``tracked_quality`` is enough.
-        tracked_quality: quality needed to become ``tracked``.
-        critical_quality: a tracked pose becomes ``critical`` only below this quality (hysteresis).
-        lost_quality: a pose below this quality for ``lost_frames`` frames is given up.
-        lost_frames: frames in a row below ``lost_quality`` after which the part is lost.
-        critical_frames: critical frames in a row after which the part is lost.
-        eager_frames: frames after a loss in each of which the part is searched for.
-        search_every: later the part is searched for only so many frames after the last search.
-        thorough_every: frames from the end of one thorough search for a lost part to the next.
-        thorough_parts: number of searches over which a thorough one is spread, so that no frame takes long.
-        max_unchanged_frames: frames after which a picture in which nothing has changed is searched again.
-        scene_change: what counts as a change of the picture.
-        min_resting_score: correlation with the remembered appearance from which a place is examined in frames between
-            these searches.
-        align_again_frames: frames after a loss from which the part may be aligned with the guide view again.
-        align_advice_every: frames between two checks of the picture while the session waits for the alignment.
-        min_in_picture: share of the outline inside the picture below which no pose is kept.
-        distance_margin: factor by which a pose may be nearer or farther than the declared range.
-        detector: options of the detector; None chooses them by the declared range.
-        identity: of the monitoring of the identity.
-    """
-
-    use_region: bool = True
-    use_edge: bool = True
-    use_texture: bool = True
-    use_recheck: bool = True
-    use_appearance_memory: bool = True
-    lock_quality: float = 0.8
-    tracked_quality: float = 0.5
-    critical_quality: float = 0.25
-    lost_quality: float = 0.1
-    lost_frames: int = 2
-    critical_frames: int = 45
-    eager_frames: int = 2
-    search_every: int = 3
-    thorough_every: int = 24
-    thorough_parts: int = 3
-    max_unchanged_frames: int = 30
-    scene_change: SceneChangeOptions = field(default_factory=SceneChangeOptions)
-    min_resting_score: float = 0.7
-    align_again_frames: int = 60
-    align_advice_every: int = 10
-    min_in_picture: float = 0.25
-    distance_margin: float = 2.0
-    detector: DetectorOptions | None = None
-    identity: IdentityOptions = field(default_factory=IdentityOptions)
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.lost_quality <= self.critical_quality <= self.tracked_quality <= 1:
-            raise InputError("session: expected 0 ≤ lost_quality ≤ critical_quality ≤ tracked_quality ≤ 1")
+SAME_SPECIMEN = (Identity.FOLLOWED, Identity.CONFIRMED)
+"""With these identities what was known of the components before a loss is taken up."""
 
 
 class TrackingSession:
@@ -218,6 +157,7 @@ class TrackingSession:
     def reset(self) -> None:
         """Forget the part's pose and search again. The remembered appearance is kept."""
         self._state = SessionState()
+        self.components.forget()
         self.identity.reset()
 
     def confirm(self) -> None:
@@ -254,6 +194,12 @@ class TrackingSession:
         known = self.identity.update(image, estimate, index, time_s, self, self._state.is_confirmed)
         if known.cam_from_model is not None and estimate is not None:
             estimate = self._restart(image, known.cam_from_model)
+        elif (
+            estimate is not None
+            and self._state.is_confirmed
+            and known.identity in (Identity.FOLLOWED, Identity.CONFIRMED)
+        ):
+            self.components.resume()
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
             guide = self._guide if self.is_aligning else None
@@ -308,6 +254,7 @@ class TrackingSession:
             self._state.retract()
         else:
             self._state.lose(reason)
+            self.components.set_aside()
         return None, self._state.reason
 
     def _is_possible(self, estimate: Estimate) -> bool:
