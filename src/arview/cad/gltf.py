@@ -206,7 +206,12 @@ class _Gltf:
         if not faces:
             return None
         color = max(area_of_color, key=lambda key: area_of_color[key]) if area_of_color else None
-        return _GltfMesh(np.concatenate(vertices), np.concatenate(faces), color)
+        # Only vertices in use are kept: every instance takes a copy of them.
+        used, corners = np.unique(np.concatenate(faces), return_inverse=True)
+        points = np.concatenate(vertices)
+        if len(used) < len(points) and not np.isfinite(points).all():
+            raise ValueError(f"vertices of {'/'.join(path)!r} are NaN or infinite")
+        return _GltfMesh(points[used], corners.reshape(-1, 3), color)
 
     def _color(self, primitive: dict[str, Any]) -> Color | None:
         """Base colour of a primitive's material, times its mean vertex colour, as sRGB."""
