@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from arview.cad.formats.meshopt import _filtered
 from arview.cad.load import load_cad, load_model
 from arview.errors import InputError
 from helpers.cad_files import box, glb_with_boxes, write_glb
@@ -124,6 +125,89 @@ def test_sparse_positions(from_zeros: bool, tmp_path: Path) -> None:
     np.testing.assert_allclose(model.bounds_in_model, [[0, 0, 0], SIZE_MM], atol=1e-4)
 
 
+# The unit box of `box`, as meshoptimizer 0.22 encodes it: vertices of four 16-bit integers (corners at 32767) and
+# triangles in both versions and as a sequence.
+CODED_VERTICES = bytes.fromhex(
+    "a001004000000100c00000fe0104840000010ccc0000fefdfe0119990000013fff0000fefdfefdfefdfe" + "00" * 34
+)
+CODED_TRIANGLES = "fe00ff0f0716a102071391050f06ff02040203007687566778a9866589689801690000"
+CODED_SEQUENCE = "d10004080a0c020808040a0c0612100412140e0404101214021608101618060a100816180e00000000"
+
+
+def meshopt_glb(path: Path, vertices: bytes, coded: bytes, mode: str) -> Path:
+    """A GLB of one box of 10 × 20 × 30 mm whose vertices and indices are compressed."""
+    binary = vertices + b"\0" * (-len(vertices) % 4) + coded
+    streams = [
+        {"byteOffset": 0, "byteLength": len(vertices), "byteStride": 8, "count": 8, "mode": "ATTRIBUTES"},
+        {"byteOffset": len(binary) - len(coded), "byteLength": len(coded), "byteStride": 4, "count": 36, "mode": mode},
+    ]
+    tree: dict[str, object] = {
+        "nodes": [{"name": "lug", "mesh": 0, "scale": (SIZE_MM / 1000.0 / 32767).tolist()}],
+        "scenes": [{"nodes": [0]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5122, "count": 8, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": 36, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 1, "byteLength": length, "extensions": {"EXT_meshopt_compression": {"buffer": 0, **stream}}}
+            for length, stream in zip((64, 144), streams, strict=True)
+        ],
+        "buffers": [{"byteLength": len(binary)}, {"byteLength": 208, "extensions": {"EXT_meshopt_compression": {}}}],
+        "extensionsRequired": ["EXT_meshopt_compression", "KHR_mesh_quantization"],
+    }
+    return write_glb(path, tree, binary)
+
+
+@pytest.mark.parametrize(
+    ("coded", "mode"),
+    [("e0" + CODED_TRIANGLES, "TRIANGLES"), ("e1" + CODED_TRIANGLES, "TRIANGLES"), (CODED_SEQUENCE, "INDICES")],
+)
+def test_meshopt_compression(coded: str, mode: str, tmp_path: Path) -> None:
+    model = load_model(meshopt_glb(tmp_path / "m.glb", CODED_VERTICES, bytes.fromhex(coded), mode))
+    assert len(model.components[0].faces) == 12
+    np.testing.assert_allclose(model.bounds_in_model, [[0, 0, 0], SIZE_MM], atol=1e-4)
+    vertices, faces = box((0, 0, 0), (1, 1, 1))
+    expected = {frozenset(map(tuple, vertices[face])) for face in faces}
+    shape = np.round(model.components[0].vertices_in_model / SIZE_MM)
+    assert {frozenset(map(tuple, shape[face])) for face in model.components[0].faces} == expected
+
+
+def test_damaged_meshopt_data_is_refused_or_read(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    refused = 0
+    for _ in range(150):
+        vertices, coded = bytearray(CODED_VERTICES), bytearray(bytes.fromhex("e1" + CODED_TRIANGLES))
+        for data in (vertices, coded):
+            data[int(rng.integers(len(data)))] = int(rng.integers(256))
+        if rng.random() < 0.3:
+            del coded[int(rng.integers(len(coded))) :]
+        try:
+            load_model(meshopt_glb(tmp_path / "m.glb", bytes(vertices), bytes(coded), "TRIANGLES"))
+        except InputError as error:
+            assert "\n" not in str(error)
+            refused += 1
+    assert refused > 50
+
+
+@pytest.mark.parametrize(
+    ("stored", "filter_name", "expected"),
+    [
+        (np.array([[3 | (-1 << 24), -5 & 0xFFFFFF | (2 << 24)]], dtype=np.int64), "EXPONENTIAL", [[1.5, -20.0]]),
+        (np.array([[1023, 0, 0, 1020 | 1], [0, 0, 0, 1020 | 3]], dtype="<i2"), "QUATERNION", None),
+    ],
+)
+def test_meshopt_filters(stored: np.ndarray, filter_name: str, expected: list[list[float]] | None) -> None:
+    if expected is not None:
+        rows = stored.astype("<i4").view(np.uint8)
+        np.testing.assert_allclose(np.frombuffer(_filtered(rows, filter_name), "<f4"), np.ravel(expected))
+        return
+    rotations = np.frombuffer(_filtered(stored.view(np.uint8), filter_name), "<i2").reshape(-1, 4)
+    # The largest part is the second of the first rotation and the last of the second.
+    half = round(32767 * np.sqrt(0.5))
+    np.testing.assert_allclose(rotations, [[0, half, half, 0], [0, 0, 0, 32767]], atol=1)
+
+
 def gltf(folder: Path, **changes: Any) -> Path:
     """A triangle in a .gltf file, some of whose entries are changed."""
     tree: dict[str, Any] = {
@@ -165,6 +249,12 @@ def test_a_buffer_elsewhere_is_never_read(uri: str, tmp_path: Path) -> None:
 
 
 DRACO = {"attributes": {"POSITION": 0}, "extensions": {"KHR_draco_mesh_compression": {"bufferView": 0}}}
+
+
+def meshopt(**entries: object) -> list[dict[str, Any]]:
+    return [{"buffer": 0, "byteLength": 36, "extensions": {"EXT_meshopt_compression": {"buffer": 0, **entries}}}]
+
+
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"accessors": accessor(count=40_000_000)}, "40,000,000 elements"),
     ({"accessors": accessor(count=12_000_000)}, "truncated: a mesh ends at byte 144000000 of 36"),
@@ -179,8 +269,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"nodes": [{"children": [i + 1] * 10} for i in range(9)] + [{"mesh": 0}]}, "more than 10,000 components"),
     ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, r"requires Draco compression \(KHR_draco"),
     (
-        {"extensionsRequired": ["EXT_meshopt_compression", "X_y"]},
-        r"requires meshopt compression \(EXT.*, X_y, which is",
+        {"extensionsRequired": ["KHR_meshopt_compression", "X_y"]},
+        r"requires meshopt compression \(KHR.*, X_y, which is",
     ),
     ({"meshes": [{"primitives": [DRACO]}], "accessors": [{**accessor()[0], "bufferView": 9}]}, "broken"),
     (
@@ -188,9 +278,12 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "uses Draco compression, which is not read",
     ),
     (
-        {"bufferViews": [{"buffer": 0, "byteLength": 36, "extensions": {"EXT_meshopt_compression": {}}}]},
-        "uses meshopt compression",
+        {"bufferViews": meshopt(byteLength=36, byteStride=12, count=3, mode="ATTRIBUTES")},
+        "meshopt: attributes of version",
     ),
+    ({"bufferViews": meshopt(byteLength=36, byteStride=12, count=10**9, mode="ATTRIBUTES")}, "36 bytes cannot hold"),
+    ({"bufferViews": meshopt(byteLength=36, byteStride=4, count=30, mode="TRIANGLES")}, "meshopt: 30 indices"),
+    ({"bufferViews": meshopt(byteLength=0, byteStride=4, count=1, mode="INDICES")}, "meshopt: 1 indices"),
 ]
 
 

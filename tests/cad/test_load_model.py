@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from arview.cad.fitness import clean_mesh, inspect_mesh, signed_volumes
+from arview.cad.formats.obj import triangulate
+from arview.cad.formats.raw import unique_names
 from arview.cad.load import load_cad, load_model
 from arview.cad.model import Component
-from arview.cad.obj import triangulate
-from arview.cad.raw import unique_names
 from arview.errors import InputError
 from helpers.cad_files import (
     NESTED_BOUNDS,

@@ -157,7 +157,7 @@ def test_bad_files_get_one_clear_line_and_nothing_is_printed(make, expected, tmp
 
 
 def test_too_many_triangles_in_instances(tmp_path, monkeypatch):
-    monkeypatch.setattr("arview.cad.raw.MAX_TRIANGLES", 30)
+    monkeypatch.setattr("arview.cad.formats.raw.MAX_TRIANGLES", 30)
     nodes: list[dict[str, object]] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(3)]
     with pytest.raises(InputError, match="more than 30 triangles"):
         load_model(glb_with_boxes(tmp_path / "g.glb", nodes, [0, 1, 2]))

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from arview.cad.formats.obj import triangulate
+from arview.cad.formats.text_encoding import decode_text, text_encoding
 from arview.cad.load import load_cad, load_model
-from arview.cad.obj import triangulate
-from arview.cad.text_encoding import decode_text, text_encoding
 from arview.errors import InputError
 from helpers.cad_files import box, mesh_xml, obj_text, write_3mf
 

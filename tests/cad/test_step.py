@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from arview.cad.formats.step import StepLimits, read_step
 from arview.cad.load import load_cad, load_model
-from arview.cad.step import StepLimits, read_step
 from arview.errors import InputError
 from helpers.cad_files import QUARTER_TURN, SHIFT, StepAssembly, StepBodies, StepPart, StepWriter, scaled
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from arview.cad.fitness import clean_mesh
-from arview.cad.gltf import read_gltf
+from arview.cad.formats.gltf import read_gltf
+from arview.cad.formats.obj import read_obj
+from arview.cad.formats.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names
+from arview.cad.formats.step import read_step
+from arview.cad.formats.threemf import read_3mf
 from arview.cad.model import Component, Model, make_model
-from arview.cad.obj import read_obj
-from arview.cad.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names
-from arview.cad.step import read_step
-from arview.cad.threemf import read_3mf
 from arview.cad.view_range import Up
 from arview.core.checks import PATH, check_type
 from arview.errors import InputError

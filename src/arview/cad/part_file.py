@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+from arview.cad.formats.raw import UNIT_MM
 from arview.cad.load import SUFFIXES, load_cad
 from arview.cad.model import Model, make_model
 from arview.cad.part import (
@@ -21,7 +22,6 @@ from arview.cad.part import (
     Vector,
     unknown_component,
 )
-from arview.cad.raw import UNIT_MM
 from arview.cad.symmetry import Symmetry
 from arview.cad.toml_table import TomlTable
 from arview.cad.view_range import UP_AXES, Up, ViewRange

@@ -1,7 +1,8 @@
 """Reader of glTF 2.0 (.glb, .gltf): named nodes, nested transforms, instances, colours.
 
-Source: Khronos glTF 2.0 specification, EXT_mesh_gpu_instancing, KHR_mesh_quantization. Written for CAD, so that every
-node that carries a mesh stays one component under its own name; skins, morph targets and textures are ignored.
+Source: Khronos glTF 2.0 specification, EXT_mesh_gpu_instancing, KHR_mesh_quantization, EXT_meshopt_compression. Written
+for CAD, so that every node that carries a mesh stays one component under its own name; skins, morph targets and
+textures are ignored.
 """
 
 from __future__ import annotations
@@ -15,17 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.gltf_data import GltfData
-from arview.cad.raw import RawComponent, RawModel, check_instance_count, check_triangle_count, place, unit_in_mm
+from arview.cad.formats.gltf_data import GltfData
+from arview.cad.formats.raw import RawComponent, RawModel, check_instance_count, check_triangle_count, place, unit_in_mm
 from arview.errors import InputError
 from arview.geometry import Array
 
 _COMPRESSED = {
     "KHR_draco_mesh_compression": "Draco compression",
-    "EXT_meshopt_compression": "meshopt compression",
     "KHR_meshopt_compression": "meshopt compression",
 }
-_SUPPORTED = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing")
+_SUPPORTED = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing", "EXT_meshopt_compression")
 _WITHOUT_GEOMETRY = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp_")
 """Beginnings of the names of extensions that concern appearance only."""
 _MAX_DEPTH = 200

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.cad.gltf import parse_gltf
-from arview.cad.raw import RawComponent, RawModel
-from arview.cad.step_text import prepare_step, step_unit_mm
+from arview.cad.formats.gltf import parse_gltf
+from arview.cad.formats.raw import RawComponent, RawModel
+from arview.cad.formats.step_text import prepare_step, step_unit_mm
 from arview.errors import InputError, MissingDependencyError
 
 

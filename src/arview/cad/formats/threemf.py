@@ -18,7 +18,7 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.raw import (
+from arview.cad.formats.raw import (
     MAX_TRIANGLES,
     RawComponent,
     RawModel,

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.cad.raw import RawComponent, RawModel
-from arview.cad.text_encoding import decode_text, text_encoding
+from arview.cad.formats.raw import RawComponent, RawModel
+from arview.cad.formats.text_encoding import decode_text, text_encoding
 from arview.errors import InputError
 from arview.geometry import Array
 

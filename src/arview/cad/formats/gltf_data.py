@@ -10,7 +10,8 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.raw import MAX_TRIANGLES
+from arview.cad.formats.meshopt import decode_meshopt
+from arview.cad.formats.raw import MAX_TRIANGLES
 from arview.errors import InputError
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -31,6 +32,7 @@ class GltfData:
         self.binary = binary
         self.path = path
         self.buffers: dict[int, bytes] = {}
+        self.decoded: dict[int, bytes] = {}
 
     def accessor(self, index: int, compression: str | None = None) -> NDArray[Any]:
         """(count, width) values of an accessor, integers scaled to floats where marked ``normalized``.
@@ -70,11 +72,14 @@ class GltfData:
     def _view(self, view_index: int, offset: int, count: int, dtype: str, width: int) -> NDArray[Any]:
         """(count, width) view of a buffer; raises InputError where it would reach beyond the data."""
         view = self.tree["bufferViews"][_natural(view_index, "bufferView")]
-        if any(name.endswith("meshopt_compression") for name in view.get("extensions", {})):
-            raise InputError(f"{self.path}: uses meshopt compression, which is not read; export it without")
-        data = self._buffer(_natural(view["buffer"], "buffer"))
+        compressed = view.get("extensions", {}).get("EXT_meshopt_compression")
         item = np.dtype(dtype).itemsize
-        start = _natural(view.get("byteOffset", 0), "byteOffset") + _natural(offset, "byteOffset")
+        if compressed is not None:
+            data, start, view = self._decoded(view_index, compressed), 0, compressed
+        else:
+            data = self._buffer(_natural(view["buffer"], "buffer"))
+            start = _natural(view.get("byteOffset", 0), "byteOffset")
+        start += _natural(offset, "byteOffset")
         stride = _natural(view.get("byteStride") or item * width, "byteStride")
         if stride < item * width:
             raise ValueError(f"a byteStride of {stride} for elements of {item * width} bytes")
@@ -82,6 +87,18 @@ class GltfData:
         if needed > len(data):
             raise InputError(f"{self.path}: truncated: a mesh ends at byte {needed} of {len(data)}")
         return np.ndarray((count, width), dtype=dtype, buffer=data, offset=start, strides=(stride, item))
+
+    def _decoded(self, view_index: int, compressed: dict[str, Any]) -> bytes:
+        """The bytes of a buffer view of EXT_meshopt_compression, decoded once."""
+        if view_index not in self.decoded:
+            numbers = {key: _natural(compressed[key], key) for key in ("buffer", "byteLength", "byteStride", "count")}
+            start = _natural(compressed.get("byteOffset", 0), "byteOffset")
+            data = self._buffer(numbers["buffer"])[start : start + numbers["byteLength"]]
+            filter_name = str(compressed.get("filter", "NONE"))
+            self.decoded[view_index] = decode_meshopt(
+                data, numbers["count"], numbers["byteStride"], str(compressed["mode"]), filter_name
+            )
+        return self.decoded[view_index]
 
     def _buffer(self, index: int) -> bytes:
         if index not in self.buffers:

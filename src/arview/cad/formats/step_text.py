@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.cad.raw import check_instance_count, unit_in_mm
-from arview.cad.text_encoding import decode_text, text_encoding
+from arview.cad.formats.raw import check_instance_count, unit_in_mm
+from arview.cad.formats.text_encoding import decode_text, text_encoding
 from arview.errors import InputError
 
 _MAX_NESTING = 64

@@ -1,0 +1,1 @@
+"""Readers of CAD files, and what they have in common."""
