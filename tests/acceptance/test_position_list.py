@@ -101,7 +101,7 @@ def test_e_n_is_calibrated(model: Model) -> None:
         assert good / 800 == pytest.approx(0.9545, abs=0.025)
 
 
-def test_what_cannot_be_compared_is_named(found: Inspection, tmp_path: Path) -> None:
+def test_what_cannot_be_compared_is_named(model: Model, found: Inspection) -> None:
     nowhere = np.full(3, np.nan)
     zero = np.zeros(3)
     with pytest.raises(InputError, match=r"no component can be compared \(block_4: is missing by the inspection"):
@@ -109,8 +109,12 @@ def test_what_cannot_be_compared_is_named(found: Inspection, tmp_path: Path) -> 
     with pytest.raises(InputError, match="nut: the inspection has no such"):
         compare(found, [ListedComponent("nut", nowhere, zero, None)], "list")
     old = replace(found, components=tuple(replace(one, details=None) for one in found.components))
-    with pytest.raises(InputError, match="list dx, dy, dz instead"):
+    with pytest.raises(InputError, match="give --part, or list dx, dy, dz"):
         compare(old, [ListedComponent("block_1", zero, nowhere, None)], "list")
+    center = model.component("block_1").bounds_in_model.mean(axis=0)
+    line = ListedComponent("block_1", center + np.array([0.03, -0.02, 0.0]), nowhere, None)
+    by_cad = compare(old, [line], "list", model).components[0]
+    assert by_cad.difference_mm == pytest.approx([0.0, 0.0, 0.01])
     without = compare(found, [ListedComponent("block_1", nowhere, zero, None)], "list").components[0]
     assert without.list_uncertainty_mm is None
     assert without.e_n is not None

@@ -148,6 +148,7 @@ def _set(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("components/0/distance_mm", float("nan")), "components[0].distance_mm: is nan"),
         (_set("components/0/displacement_mm/1", float("inf")), "components[0].displacement_mm[1]: is inf"),
         (_set("components/0/displacement_mm/1", 10**400), "components[0].displacement_mm[1]"),
+        (_set("components/0/name", "post_\ud800"), "components[0].name: holds half of a character"),
         (_set("components/0/distance_mm", 1.3), "components[0].distance_mm: is 1.3, but displacement_mm has"),
         (_set("components/0/distance_mm", None), "components[0].distance_mm: is null"),
         (_set("components/0/distance_mm", -1.17), "components[0].distance_mm"),
@@ -229,6 +230,7 @@ def test_names_all_faults_at_once(model: Model, write: Callable[[Any], Path]) ->
         ('{"part": 1, "part": 2}', "'part' occurs twice"),
         ("[" + "1" * 5000 + "]", "a number too long"),
         ("[" * 100_000, "nested too deeply"),
+        ('{"schema_version": "1.2", "part": ' + "[" * 5000 + "]" * 5000 + "}", "nested too deeply"),
     ],
 )
 def test_refuses_other_files(write: Callable[[Any], Path], text: str, says: str) -> None:

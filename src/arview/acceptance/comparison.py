@@ -16,6 +16,7 @@ import numpy as np
 
 from arview.acceptance.lengths import K
 from arview.acceptance.position_list import ListedComponent
+from arview.cad.model import Model
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Finding, Inspection
@@ -72,8 +73,16 @@ class Comparison:
         return np.asarray(np.where(known, stacked, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
 
 
-def compare(inspection: Inspection, listed: Sequence[ListedComponent], label: str) -> Comparison:
+def compare(
+    inspection: Inspection, listed: Sequence[ListedComponent], label: str, model: Model | None = None
+) -> Comparison:
     """Compare the components of an inspection with those of a list, in the same datum frame.
+
+    Args:
+        inspection: the inspection.
+        listed: components of the list.
+        label: file of the list, for messages.
+        model: the CAD model, for nominal positions that the inspection does not hold.
 
     Raises:
         InputError: no component is in both.
@@ -88,7 +97,7 @@ def compare(inspection: Inspection, listed: Sequence[ListedComponent], label: st
             left_out[line.name] = "the inspection has no such component"
             continue
         named.add(one.name)
-        compared = _compare(one, line)
+        compared = _compare(one, line, _center_of(one, model))
         if isinstance(compared, str):
             left_out[one.name] = compared
         else:
@@ -120,15 +129,15 @@ def record_of(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _compare(one: ComponentDeviation, line: ListedComponent) -> ComparedComponent | str:
+def _compare(one: ComponentDeviation, line: ListedComponent, center: Array | None) -> ComparedComponent | str:
     """The comparison of a component, or the reason why there is none."""
     if one.finding is Finding.MISSING:
         return "is missing by the inspection"
     theirs = line.displacement
     if np.isnan(theirs).all():
-        if one.details is None:
-            return "the inspection has no nominal positions to compare x, y, z with; list dx, dy, dz instead"
-        theirs = line.place - np.array(one.details.center_mm)
+        if center is None:
+            return "the inspection has no nominal positions to compare x, y, z with; give --part, or list dx, dy, dz"
+        theirs = line.place - center
     ours = np.array([np.nan if value is None else value for value in one.displacement_mm])
     difference = ours - theirs
     axes = np.flatnonzero(~np.isnan(difference))
@@ -150,6 +159,13 @@ def _compare(one: ComponentDeviation, line: ListedComponent) -> ComparedComponen
         None if of_list is None else K * float(np.sqrt(along @ of_list @ along)),
         _e_n(known, total),
     )
+
+
+def _center_of(one: ComponentDeviation, model: Model | None) -> Array | None:
+    """(3,) nominal position of the centre of the component's bounding box, mm, or None."""
+    if one.details is not None:
+        return np.array(one.details.center_mm)
+    return None if model is None else np.asarray(model.component(one.name).bounds_in_model.mean(axis=0))
 
 
 def _covariance(one: ComponentDeviation) -> Array:

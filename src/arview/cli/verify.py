@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from arview.cli.common import main, output_path, say, write_bytes
+from arview.cli.common import UNIT, main, output_path, say, write_bytes
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.errors import InputError
 
 if TYPE_CHECKING:
     from arview.acceptance.conformity import LengthResult, Verification
+    from arview.cad.model import Model
 
 _SHOWN = 12
 _COMPARED = ("dx", "dy", "dz", "distance", "U", "U list", "E_n")
@@ -62,12 +63,18 @@ number (ISO/IEC 17043): up to 1, both agree within their U.""",
 @click.option("--mpe", metavar="A+L/K[<=B]", help="Maximum permissible error in mm; without it only U is tested.")
 @click.option("-o", "--output", metavar="JSON", help="Write all lengths, errors and verdicts.")
 @click.option("--plot", metavar="PNG", help="Plot the errors over the length (png, svg, pdf).")
+@click.option("--part", "part_path", metavar="PART", help="Part or CAD file, for positions of an old inspection.")
+@UNIT
 @click.option("--all", "shows_all", is_flag=True, help=f"Print every length, not only the {_SHOWN} worst.")
-def verify(measured: str, known: str, mpe: str | None, output: str | None, plot: str | None, shows_all: bool) -> None:
+def verify(
+    measured: str, known: str, mpe: str | None, output: str | None, plot: str | None, part_path: str | None,
+    unit: str | None, shows_all: bool,
+) -> None:  # fmt: skip
     """Test what was MEASURED against KNOWN lengths: errors, limits, and whether the stated U is confirmed."""
     from arview.acceptance.conformity import parse_limit, record_of
     from arview.acceptance.conformity import verify as run
     from arview.acceptance.lengths import read_known, read_measured
+    from arview.cad import load_part
 
     limit = None if mpe is None else parse_limit(mpe)
     target = None if output is None else output_path(output, [measured, known])
@@ -75,7 +82,7 @@ def verify(measured: str, known: str, mpe: str | None, output: str | None, plot:
     if _is_list(measured, known):
         if limit is not None or picture is not None:
             raise InputError(f"{known}: lists components, not lengths; --mpe and --plot do not apply")
-        _compare(measured, known, target, shows_all)
+        _compare(measured, known, target, None if part_path is None else load_part(part_path, unit).model, shows_all)
         return
     places = read_measured(measured)
     test = run(places, read_known(known, places), known, limit)
@@ -100,7 +107,7 @@ def _is_list(measured: str, known: str) -> bool:
     return is_inspection and Path(known).is_file() and is_position_list(known)
 
 
-def _compare(measured: str, known: str, target: Path | None, shows_all: bool) -> None:
+def _compare(measured: str, known: str, target: Path | None, model: Model | None, shows_all: bool) -> None:
     """Compare an inspection with a list of components, and end with the exit code of the comparison."""
     from arview.acceptance.comparison import compare, record_of
     from arview.acceptance.position_list import read_position_list
@@ -108,7 +115,7 @@ def _compare(measured: str, known: str, target: Path | None, shows_all: bool) ->
 
     source = Path(measured)
     source = source / "inspection.json" if source.is_dir() else source
-    found = compare(load_inspection(source), read_position_list(known), known)
+    found = compare(load_inspection(source, model), read_position_list(known), known, model)
     _print_left_out(found.left_out)
     width = max(9, *(len(one.name) for one in found.components))
     click.echo(f"{'component':{width}}" + "".join(f"{head:>9}" for head in _COMPARED))

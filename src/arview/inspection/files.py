@@ -28,7 +28,10 @@ def load_inspection(path: str | Path, model: Model | None = None) -> Inspection:
     check_type(path, PATH, "load_inspection: path")
     path = Path(path)
     document = _read_json(path)
-    faults = document_faults(document)
+    try:
+        faults = document_faults(document)
+    except RecursionError as error:
+        raise InputError(f"{path}: is nested too deeply to be an inspection") from error
     if faults and model is not None:
         faults += _model_faults(document, model)
     if faults:

@@ -21,7 +21,8 @@ _NUMBER_LIMIT = 1e9
 def document_faults(document: Any) -> list[str]:
     """All faults of a document, each with its place in the file (``components[2].distance_mm``); none if valid.
 
-    A document of an unknown version, or with numbers that are not finite, is not looked at further.
+    A document of an unknown version, with numbers that are not finite or texts that are not Unicode, is not looked at
+    further.
     """
     try:
         _check_version(document)
@@ -80,20 +81,25 @@ def _message(error: Any) -> str:
 
 
 def _not_finite(document: Any) -> Iterator[str]:
-    for place, value in _numbers(document, ""):
+    """Faults of numbers that are not finite, and of texts that are not Unicode."""
+    for place, value in _leaves(document, ""):
+        if isinstance(value, str):
+            if any("\ud800" <= character <= "\udfff" for character in value):
+                yield f"{place}: holds half of a character (a lone surrogate)"
+            continue
         if not abs(value) < _NUMBER_LIMIT:
             shown = value if isinstance(value, float) else "a huge number"
             yield f"{place}: is {shown}, expected a finite number below 1e9, or null"
 
 
-def _numbers(node: Any, place: str) -> Iterator[tuple[str, float]]:
+def _leaves(node: Any, place: str) -> Iterator[tuple[str, float | str]]:
     if isinstance(node, dict):
         for key, value in node.items():
-            yield from _numbers(value, f"{place}.{key}" if place else key)
+            yield from _leaves(value, f"{place}.{key}" if place else key)
     elif isinstance(node, list):
         for index, value in enumerate(node):
-            yield from _numbers(value, f"{place}[{index}]")
-    elif isinstance(node, int | float):
+            yield from _leaves(value, f"{place}[{index}]")
+    elif isinstance(node, int | float | str):
         yield place, node
 
 
