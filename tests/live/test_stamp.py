@@ -146,6 +146,13 @@ def test_what_is_no_usable_jpeg_is_refused(content: bytes) -> None:
         from_jpeg(content)
 
 
+def test_a_jpeg_of_thousands_of_scans_is_refused_before_it_is_decoded() -> None:
+    content = to_jpeg(picture(640, 480))
+    scan = content[content.rfind(b"\xff\xda") : -2]
+    with pytest.raises(InputError, match="scans, more than any camera writes"):
+        from_jpeg(content[:-2] + 101 * scan[:20] + b"\xff\xd9")
+
+
 @pytest.mark.parametrize("side_px", [8000, 65000])
 def test_a_jpeg_bomb_is_refused_before_it_is_decoded(side_px: int) -> None:
     """A header that claims 65,000 × 65,000 px; decoding it would take 12 GB."""

@@ -159,6 +159,11 @@ def test_interlaced_film_is_deinterlaced(tmp_path: Path) -> None:
     for frame in frames[1:-1]:
         np.testing.assert_allclose(left_ends(frame.image), 20 + STEP_PX * frame.index, atol=1)
     assert source.notes == ("the film is interlaced: it was deinterlaced",)
+    left_early = open_source(clip)
+    for frame in left_early:
+        assert frame.index == 0
+        break
+    assert left_early.notes == source.notes
     some = list(open_source(clip, start=4, end=9, stride=2))
     assert [frame.index for frame in some] == [4, 6, 8]
     np.testing.assert_array_equal(some[0].image, frames[4].image)
@@ -370,3 +375,37 @@ def test_dng_without_its_reader_is_one_clear_line(tmp_path: Path, monkeypatch: p
     monkeypatch.setitem(sys.modules, "rawpy", None)
     with pytest.raises(MissingDependencyError, match="DNG pictures need rawpy; run: pip install rawpy"):
         open_source(tmp_path)
+
+
+def test_pictures_that_would_take_minutes_or_gigabytes(tmp_path: Path) -> None:
+    """A JPEG of thousands of scans, and a PNG of 10^9 pixels in 1 MB, are refused in a moment."""
+    import io
+    import struct
+    import time
+    import zlib
+
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.new("RGB", (640, 640), (9, 9, 9)).save(buffer, "JPEG", progressive=True)
+    data = buffer.getvalue()
+    last = data[data.rfind(b"\xff\xda") : -2]
+    (tmp_path / "scans.jpg").write_bytes(data[:-2] + last * 3000 + b"\xff\xd9")
+    header = struct.pack(">IIBBBBB", 32000, 32000, 8, 0, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(10**6))), (b"IEND", b""))
+    (tmp_path / "bomb.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(
+            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+            for kind, body in chunks
+        )
+    )
+    (tmp_path / "good.jpg").write_bytes(data)
+    began_s = time.perf_counter()
+    with pytest.raises(InputError, match=r"scans\.jpg: the picture is a JPEG of 30\d\d scans"):
+        open_source(tmp_path / "scans.jpg")
+    with pytest.raises(InputError, match=r"bomb\.png: the picture has far too many pixels"):
+        open_source(tmp_path / "bomb.png")
+    source = open_source(tmp_path)
+    assert [frame.file for frame in source] == ["good.jpg"] and source.skipped == 2
+    assert time.perf_counter() - began_s < 5.0

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 PHOTO_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 
+MAX_JPEG_SCANS = 100
+"""Most scans of a JPEG that is decoded: progressive ones have about ten, and each takes as long as a picture."""
+
 _HEIF_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 _ORIENTATION, _MAKE, _MODEL, _DATE, _EXIF_IFD = 0x0112, 0x010F, 0x0110, 0x0132, 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _DIGITAL_ZOOM, _TAKEN, _SERIAL = 0x920A, 0xA405, 0xA404, 0x9003, 0xA431
@@ -59,6 +62,17 @@ class PhotoExif:
         return (self.height, self.width) if self.orientation >= 5 else (self.width, self.height)
 
 
+def check_jpeg_scans(data: bytes) -> None:
+    """Check that a JPEG, if the data are one, does not consist of so many scans that decoding takes minutes.
+
+    Raises:
+        InputError: it does.
+    """
+    scans = data.count(b"\xff\xda") if data.startswith(b"\xff\xd8") else 0
+    if scans > MAX_JPEG_SCANS:
+        raise InputError(f"is a JPEG of {scans} scans, more than any camera writes; save it again")
+
+
 def open_picture(data: bytes) -> Image:
     """Open a picture with Pillow, which reads the header and decodes the pixels when they are first used.
 
@@ -77,6 +91,7 @@ def open_picture(data: bytes) -> Image:
         raise InputError("is empty (0 bytes); copy it again from the camera")
     if data[4:8] == b"ftyp" and data[8:12] in _HEIF_BRANDS:
         _add_heif_to_pillow()
+    check_jpeg_scans(data)
     try:
         return Image.open(io.BytesIO(data))
     except Image.DecompressionBombError as error:

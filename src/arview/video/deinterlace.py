@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 
 from av.error import BlockingIOError as NotReadyError
 from av.error import EOFError as EndOfStreamError
+from av.error import FFmpegError
 from av.filter import Graph
 from av.video.frame import VideoFrame
 
@@ -35,16 +36,21 @@ class Deinterlacer(Generic[Tag]):
         self._kind: tuple[int, int, str] | None = None
         self._tags: deque[Tag] = deque()
         self._pushed = 0
+        self._unfit: set[tuple[int, int, str]] = set()  # too small, or of a format that the filter does not take
 
     def push(self, frame: VideoFrame, tag: Tag) -> list[tuple[Tag, VideoFrame]]:
         """Add a frame; returns those that are ready, in order."""
         kind = (frame.width, frame.height, frame.format.name)
         ready = self.flush() if self._graph is not None and kind != self._kind else []
         if self._graph is None:
-            if not frame.interlaced_frame:
+            if not frame.interlaced_frame or kind in self._unfit:
+                return [*ready, (tag, frame)]
+            try:
+                self._graph, self._kind = _filter_graph(frame), kind
+            except (FFmpegError, ValueError):
+                self._unfit.add(kind)
                 return [*ready, (tag, frame)]
             self.is_active = True
-            self._graph, self._kind = _filter_graph(frame), kind
         # The filter counts in stamps of its own, because those of the file may be missing or not increase.
         frame.pts, frame.time_base = self._pushed, Fraction(1, 1000)
         self._pushed += 1

@@ -71,17 +71,19 @@ class VideoFileSource(FrameSource):
         clock = FrameClock(self.fps)
         progressive: Deinterlacer[tuple[int, float]] = Deinterlacer()
         index = -1
-        with self._opened() as (container, stream):
-            for index, frame in self._decoded(container, stream):
-                time_s = clock.time_s(index, self._stamp_s(frame))
-                # One frame before the range, because a deinterlaced frame depends on its neighbours.
-                if index < self._wanted.start - 1:
-                    continue
-                yield from self._wanted_pictures(progressive.push(frame, (index, time_s)), pictures)
-                if self._wanted.is_past(index):
-                    break
-            yield from self._wanted_pictures(progressive.flush(), pictures)
-        self._take_notes(pictures, clock, progressive.is_active)
+        try:
+            with self._opened() as (container, stream):
+                for index, frame in self._decoded(container, stream):
+                    time_s = clock.time_s(index, self._stamp_s(frame))
+                    # One frame before the range, because a deinterlaced frame depends on its neighbours.
+                    if index < self._wanted.start - 1:
+                        continue
+                    yield from self._wanted_pictures(progressive.push(frame, (index, time_s)), pictures)
+                    if self._wanted.is_past(index):
+                        break
+                yield from self._wanted_pictures(progressive.flush(), pictures)
+        finally:  # also where the iteration is left early
+            self._take_notes(pictures, clock, progressive.is_active)
         if (
             self._total is not None
             and index + 1 < self._total

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, open_picture, read_exif
+from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, check_jpeg_scans, open_picture, read_exif
 from arview.errors import InputError, MissingDependencyError
 from arview.video.frame import Frame, Image
 from arview.video.source import FrameRange, FrameSource, read_ahead
@@ -67,13 +67,17 @@ class PictureSource(FrameSource):
             )
         if not kept:
             raise InputError(f"{name}: start {wanted.start} is past the last of its {len(paths)} pictures")
+        self._fault = "cannot be read"
         self._used_bits = self._probed_bits()
         for path in paths:
             first = self._read(path)
             if first is not None:
                 break
         else:
-            raise InputError(f"{name}: none of the {len(paths)} pictures can be read; save them as JPEG or PNG")
+            which = (
+                f"the picture {self._fault}" if len(paths) == 1 else f"none of the {len(paths)} pictures can be read"
+            )
+            raise InputError(f"{name}: {which}; save {'it' if len(paths) == 1 else 'them'} as JPEG or PNG")
         self.first_path = path
         self.height, self.width = first.shape[:2]
         self.quarter_turns_clockwise = _turns_of_picture(path)
@@ -101,6 +105,8 @@ class PictureSource(FrameSource):
         used = USED_BITS[0]
         for path in paths[:: max(len(paths) // PROBED_PICTURES, 1)][:PROBED_PICTURES]:
             data = _bytes_of(path)
+            if data is not None and path.suffix.lower() == ".png" and data[24:25] != b"\x10":
+                continue
             if data is not None and (pixels := _decoded(data)) is not None and pixels.dtype == np.uint16:
                 used = max(used, used_bits(pixels, significant_bits(data)))
         return used
@@ -109,6 +115,11 @@ class PictureSource(FrameSource):
         """(H,W,3) uint8 RGB, upright; None if the file is not a readable picture."""
         data = _bytes_of(path)
         if data is None:
+            return None
+        try:
+            check_picture(data)
+        except InputError as error:
+            self._fault = str(error).partition(";")[0]
             return None
         if path.suffix.lower() in HEIF_SUFFIXES:
             return _read_heif(data)
@@ -124,6 +135,26 @@ class PictureSource(FrameSource):
         elif pixels.dtype != np.uint8:
             pixels = _from_float(pixels)
         return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+
+
+def check_picture(data: bytes) -> None:
+    """Check from the header of a picture that decoding it takes neither minutes nor gigabytes.
+
+    What Pillow does not know, such as TIFF of 16-bit colours, is left to the limits of OpenCV.
+
+    Raises:
+        InputError: it has too many scans or pixels.
+    """
+    from PIL.Image import DecompressionBombError
+
+    check_jpeg_scans(data)
+    try:
+        open_picture(data).close()
+    except MissingDependencyError:
+        return
+    except InputError as error:
+        if isinstance(error.__cause__, DecompressionBombError):
+            raise
 
 
 def picture_paths(folder: Path) -> list[Path]:

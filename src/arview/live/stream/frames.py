@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from av.video.frame import VideoFrame
 
+from arview.camera.exif import check_jpeg_scans
 from arview.errors import InputError
 from arview.live.stream.stamp import read_stamp
 from arview.video import Image
@@ -87,6 +88,7 @@ def from_jpeg(content: bytes) -> Image:
         raise InputError("the body is not a JPEG picture") from error
     if min(width, height) < MIN_SIDE_PX or max(width, height) > MAX_SIDE_PX:
         raise InputError(f"the picture is {width}×{height} px, expected sides of {MIN_SIDE_PX} to {MAX_SIDE_PX} px")
+    check_jpeg_scans(content)
     buffer = np.frombuffer(content, dtype=np.uint8)
     try:
         bgr = cv2.imdecode(buffer, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -88,9 +88,9 @@ def intake_video(
                 progress(min(total // 2 + done, total), total)
             if len(seen) == len(chosen):
                 break
-        cut_short = source.ended_reason
+        notes = tuple(note for note in (*source.notes, source.ended_reason) if note)
     intake = assess(str(path), seen, {}, camera, options.checks)
-    return replace(intake, warnings=(*intake.warnings, cut_short)) if cut_short else intake
+    return replace(intake, warnings=(*intake.warnings, *notes))
 
 
 def intake_frames(
