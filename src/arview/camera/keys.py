@@ -42,7 +42,7 @@ IGNORED = frozenset({
 })  # fmt: skip
 _SUSPICIOUS = re.compile(
     r"distort|^dist$|coef|^lens|fisheye|crop|^roi|region|offset|binn|^bin$|scal|skip|zoom|skew|^tau|^xi$|omega|^alpha$"
-    r"|decimat|(?:sub|down|up)sampl|resiz|mirror|flip|radial|tangential|prism|rectif|^[kpsd]\d+$"
+    r"|decimat|(?:sub|down|up)sampl|resiz|mirror|flip|radial|tangential|prism|rectif|^[kpsdb]\d+$|^kc$|brown|equidist|kannala|^aoi|^pad|^trim|shift"
 )
 _ONES = re.compile(r"binn|^bin$|scal|skip|zoom|decimat|sampl|resiz")
 """Words whose value 1 changes nothing."""

@@ -29,6 +29,9 @@ from arview.camera.write import camera_record
 from arview.core.checks import PATH, check_type
 from arview.errors import ArviewError, InputError, MismatchError, OutputError
 
+MAX_MESSAGE = 400
+"""Letters of a message about the content of a file."""
+
 
 def load_camera(
     spec: str | Path,
@@ -237,7 +240,9 @@ def _read_entries(path: Path, name: str) -> list[CameraEntry]:
             entries = entries_from_trees(parse_trees(stripped), name)
         return [entry.as_recorded() for entry in entries]
     except ArviewError as error:
-        raise type(error)(f"{path}: {error}") from error
+        # Texts of the file in a message may be long, or have several lines.
+        text = " ".join(str(error).split())
+        raise type(error)(f"{path}: {text if len(text) <= MAX_MESSAGE else text[:MAX_MESSAGE] + '…'}") from error
 
 
 # --- EXIF ----------------------------------------------------------------------------------------------
