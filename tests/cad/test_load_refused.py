@@ -131,6 +131,8 @@ REFUSED = [
     (text_file("t.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"), "degenerate"),
     (text_file("t.obj", "v 0 0 0\nv 1 0 nan\nv 2 0 0\nf 1 2 3\n"), "NaN"),
     (text_file("t.stl"), "STL|no triangles"),
+    (text_file("n.stl", "solid x\nfacet normal a b c\nouter loop\nvertex 0 0 0\nvertex 1 z 0\n"), "STL|no triangles"),
+    (text_file("o.obj", "v 0 0 0\nv 1e300 0 0\nv 0 1e300 1e308\nf 1 2 3\n"), "NaN|is it really|degenerate"),
     (truncated_stl, "broken or truncated STL"),
     (huge_stl, "more than 5,000,000 triangles; decimate"),
     (text_file("t.ply"), "broken or truncated PLY"),

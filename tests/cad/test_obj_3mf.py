@@ -72,6 +72,18 @@ def test_names_that_are_there_twice_are_told(tmp_path: Path) -> None:
     assert cad.notes == ("2 more components are named 'bolt': called bolt_2, bolt_3",)
 
 
+def test_names_of_stl_solids_in_latin_1(tmp_path: Path) -> None:
+    import trimesh
+
+    texts = []
+    for i, name in enumerate(("Träger", "Tröger")):
+        mesh = trimesh.Trimesh(VERTICES + 50 * i, FACES, process=False)
+        texts.append(mesh.export(file_type="stl_ascii").replace("solid \n", f"solid {name}\n", 1))
+    (tmp_path / "p.stl").write_bytes("\n".join(texts).encode("latin-1"))
+    model = load_model(tmp_path / "p.stl", "mm")
+    assert [c.name for c in model.components] == ["Träger", "Tröger"]
+
+
 def test_materials_are_read_beside_the_file_only(tmp_path: Path) -> None:
     (tmp_path / "m.mtl").write_text("newmtl a\nKd 1 0 0\n")
     (tmp_path / "part").mkdir()

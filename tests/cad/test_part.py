@@ -9,7 +9,7 @@ import pytest
 
 from arview.cad import PART_FILE_EXAMPLE, default_view_range, load_part
 from arview.errors import ArviewError, InputError
-from helpers.cad_files import box, obj_text
+from helpers.cad_files import box, glb_with_boxes, obj_text
 from helpers.paths import SAMPLES
 
 
@@ -214,3 +214,32 @@ def test_sample_part_file():
     part = load_part(path)
     assert "base_plate" not in part.inspected
     assert part.view_range is not None
+
+
+def test_a_table_holds_for_all_that_its_selector_names(folder):
+    text = (
+        '[defaults]\nrole = "ignore"\n[components."post_*"]\nrole = "inspect"\nposition_tolerance_mm = 0.5\n'
+        'color = "#ff0000"\n[components.post_2]\nposition_tolerance_mm = 0.2\n[components.base_plate]\nrole = "base"\n'
+    )
+    part = load_part(write(folder, text))
+    assert [s.role for s in part.settings] == ["base", "inspect", "inspect", "ignore"]
+    assert [s.position_tolerance_mm for s in part.settings] == [None, 0.5, 0.2, None]
+    assert [c.color for c in part.model.components[1:]] == [(1.0, 0.0, 0.0)] * 2
+    with pytest.raises(InputError, match=r"no component 'pots_\*' in the CAD; did you mean 'post_"):
+        load_part(write(folder, '[components."pots_*"]\nrole = "base"\n'))
+
+
+def test_a_selector_names_an_assembly(tmp_path):
+    nodes: list[dict[str, object]] = [
+        {"name": "root", "children": [1, 3]},
+        {"name": "sub_1", "children": [2]},
+        {"name": "post", "mesh": 0},
+        {"name": "sub_2", "children": [4, 5]},
+        {"name": "post", "mesh": 0, "translation": [0.1, 0, 0]},
+        {"name": "nut", "mesh": 0, "translation": [0.2, 0, 0]},
+    ]
+    glb_with_boxes(tmp_path / "a.glb", nodes, [0])
+    text = '[part]\ncad = "a.glb"\n[components."sub_2/*"]\nrole = "base"\n'
+    (tmp_path / "p.toml").write_text(text)
+    roles = {s.name: s.role for s in load_part(tmp_path / "p.toml").settings}
+    assert roles == {"sub_1/post": "inspect", "sub_2/post": "base", "nut": "base"}

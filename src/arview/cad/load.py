@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from arview.cad.formats.gltf import read_gltf
 from arview.cad.formats.obj import read_obj
 from arview.cad.formats.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names
 from arview.cad.formats.step import read_step
+from arview.cad.formats.text_encoding import decode_text
 from arview.cad.formats.threemf import read_3mf
 from arview.cad.model import Component, Model, make_model
 from arview.cad.view_range import Up
@@ -27,18 +29,29 @@ MIN_SIZE_MM, MAX_SIZE_MM = 1.0, 100_000.0
 """Range of the diameter of a part, for files whose unit may be wrong."""
 MIN_GIVEN_MM, MAX_GIVEN_MM = 0.1, 1_000_000.0
 """Range of the diameter of a part whose unit was given by the user."""
+MAX_COORDINATE = 1e15
+"""Coordinates beyond it are no geometry, and their squares overflow."""
 DEFAULT_COLOR = (0.6, 0.6, 0.62)
 """sRGB of components without a colour."""
 
 
 @dataclass(frozen=True)
 class LoadedCad:
-    """A model, the unit of its file in mm, remarks on renamed or empty nodes, and the axis that is up by its format."""
+    """A model and what its file says besides.
+
+    Attributes:
+        model: its components.
+        unit_mm: unit of the file, mm.
+        notes: remarks on renamed or empty nodes.
+        up: axis that is up by the format.
+        paths: of each component, its names in the assembly from the root on.
+    """
 
     model: Model
     unit_mm: float
     notes: tuple[str, ...]
     up: Up = "z"
+    paths: tuple[tuple[str, ...], ...] = ()
 
 
 def load_model(
@@ -49,6 +62,7 @@ def load_model(
     return load_cad(path, unit, tol_linear_mm, tol_angular_deg).model
 
 
+@np.errstate(all="ignore")  # Numbers that overflow are refused with the vertices that are not finite.
 def load_cad(
     path: str | Path, unit: str | None = None, tol_linear_mm: float = 0.1, tol_angular_deg: float = 10.0
 ) -> LoadedCad:
@@ -97,13 +111,14 @@ def load_cad(
         raise InputError(f"{path}: holds no triangles (empty, or points and lines only)")
     factor_mm = _unit_factor(raw, path, unit)
     names, notes = unique_names([component.path for component in raw.components], path.stem)
-    components, empty = [], []
+    components, empty, paths = [], [], []
     for name, component in zip(names, raw.components, strict=True):
         vertices, faces = clean_mesh(component.vertices * factor_mm, component.faces)
         if len(faces) == 0:
             empty.append(name)
             continue
         color = component.color or DEFAULT_COLOR
+        paths.append(component.path)
         components.append(Component(name, vertices, faces.astype(np.int32), color))
     if empty:
         rest = f" and {len(empty) - 4} more" if len(empty) > 4 else ""
@@ -112,7 +127,7 @@ def load_cad(
         raise InputError(f"{path}: all triangles are degenerate (they have no area)")
     model = make_model(path.stem, tuple(components))
     _check_size(model, path, unit is not None)
-    return LoadedCad(model, factor_mm, tuple(raw.notes + notes), raw.up)
+    return LoadedCad(model, factor_mm, tuple(raw.notes + notes), raw.up, tuple(paths))
 
 
 def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
@@ -139,8 +154,8 @@ def _read_mesh_file(path: Path, suffix: str) -> RawModel:
         if 84 + 50 * count == size:
             check_triangle_count(count, path)
     try:
-        with _quiet_trimesh(), path.open("rb") as file:
-            scene = trimesh.load_scene(file, file_type=suffix[1:], process=False)
+        with _quiet_trimesh():
+            scene = trimesh.load_scene(_mesh_bytes(path, suffix), file_type=suffix[1:], process=False)
     except Exception as error:  # trimesh raises whatever its parsers stumble over
         kind, printed = suffix[1:].upper(), next(iter(str(error).splitlines()), "")
         raise InputError(
@@ -164,21 +179,33 @@ def _read_mesh_file(path: Path, suffix: str) -> RawModel:
     return raw
 
 
+def _mesh_bytes(path: Path, suffix: str) -> BytesIO:
+    """The content of an STL or PLY file; ASCII STL, whose names may be in any encoding, in UTF-8."""
+    data = path.read_bytes()
+    is_text = suffix == ".stl" and len(data) != 84 + 50 * int.from_bytes(data[80:84], "little")
+    if is_text and data[:5].lower() == b"solid" and not data.isascii():
+        data = decode_text(data).encode("utf-8")
+    return BytesIO(data)
+
+
 @contextmanager
 def _quiet_trimesh() -> Iterator[None]:
     """Suppress the warnings of trimesh and numpy about malformed files."""
-    logger = logging.getLogger("trimesh")
-    was_disabled = logger.disabled
-    logger.disabled = True
+    logger, silent = logging.getLogger("trimesh"), logging.NullHandler()
+    was_passed_on = logger.propagate
+    # Its modules have loggers of their own, whose records end here.
+    logger.addHandler(silent)
+    logger.propagate = False
     try:
         with np.errstate(all="ignore"):
             yield
     finally:
-        logger.disabled = was_disabled
+        logger.propagate = was_passed_on
+        logger.removeHandler(silent)
 
 
 def _check_finite(component: RawComponent, path: Path) -> None:
-    bad = int(np.count_nonzero(~np.isfinite(component.vertices).all(axis=1)))
+    bad = int(np.count_nonzero(~(np.abs(component.vertices) < MAX_COORDINATE).all(axis=1)))
     if bad:
         name = "/".join(component.path) or path.stem
         total = len(component.vertices)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, cast
 
@@ -73,6 +74,8 @@ position_tolerance_mm = 1.0
 
 # One table for each component that needs one. Names as `arview check` prints them; quote odd ones:
 # [components."sub_1/post"]
+# A table may hold for several: [components."post_*"], or [components."sub_1/*"] for all of an assembly; a table of the
+# component's own name comes after those.
 [components.base_plate]
 role = "base"                  # base: carries the datums and is not judged; inspect: is measured and judged;
                                # ignore: is left out of the model (a fixture that the camera never sees)
@@ -177,13 +180,14 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
     names = [component.name for component in cad.model.components]
     defaults = _read_settings(root.table("defaults"), "", cad.model, ComponentSettings(""))
     tables = root.table("components")
-    for unknown in [key for key in tables.content if key not in names]:
-        raise InputError(f"{path}: [components] {unknown_component(unknown, names)}")
+    selectors = _selectors(tables, names, cad.paths)
     settings, components = [], []
     for component in cad.model.components:
-        table = tables.table(component.name)
-        color = table.color("color")
-        setting = _read_settings(table, component.name, cad.model, defaults)
+        setting, color = replace(defaults, name=component.name), None
+        for key in selectors[component.name]:
+            table = tables.table(key)
+            color = table.color("color") or color
+            setting = _read_settings(table, component.name, cad.model, setting)
         settings.append(setting)
         if setting.role != "ignore":
             components.append(replace(component, color=color) if color else component)
@@ -210,6 +214,32 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
         up=up,
         notes=cad.notes,
     )
+
+
+def _selectors(tables: TomlTable, names: list[str], paths: tuple[tuple[str, ...], ...]) -> dict[str, list[str]]:
+    """Keys of the tables that hold for each component: those with wildcards in the order of the file, then its own.
+
+    A selector with ``*`` or ``?`` is compared with the name and with the names of the assemblies above it, so that
+    ``sub/*`` holds for all that is in ``sub``.
+
+    Raises:
+        InputError: a key that is no component and matches none.
+    """
+    selectors: dict[str, list[str]] = {name: [] for name in names}
+    for key in [key for key in tables.content if key not in names]:
+        ways = [
+            (name, [name, *("/".join(path[k:]) for k in range(len(path)))])
+            for name, path in zip(names, paths, strict=True)
+        ]
+        chosen = [name for name, ends in ways if any(fnmatchcase(end, key) for end in ends)]
+        if not chosen or not set(key) & set("*?["):
+            raise InputError(f"{tables.path}: [components] {unknown_component(key, names)}")
+        for name in chosen:
+            selectors[name].append(key)
+    for name in names:
+        if name in tables.content:
+            selectors[name].append(name)
+    return selectors
 
 
 def _read_pattern(table: TomlTable) -> str:
