@@ -17,6 +17,7 @@ from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.geometry import apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, Verdict, load_inspection
+from arview.inspection.summary import overall_verdict
 from arview.measurement import folder as folder_module
 from arview.measurement import run
 from arview.measurement.datums.planes import base_plane, plane_samples
@@ -89,6 +90,22 @@ def test_verdicts_and_findings(inspection: Inspection) -> None:
     assert any("turned by" in note for note in turned.details.notes)
     missing = inspection.find("block_4")
     assert missing is not None and missing.finding is not None and missing.distance_mm is None
+
+
+@pytest.mark.slow
+def test_without_tolerances_components_are_measured_not_judged(reconstruction: MetricReconstruction) -> None:
+    bare = part()
+    settings = tuple(
+        replace(one, position_tolerance_mm=None, angle_tolerance_deg=1.0 if one.name == "block_3" else None)
+        for one in bare.settings
+    )
+    found = measure(reconstruction, replace(bare, settings=settings), MeasureOptions(methods=("edges",)))
+    verdicts = {one.name: one.verdict for one in found.components}
+    assert verdicts["block_1"] is verdicts["block_2"] is Verdict.MEASURED
+    assert verdicts["block_3"] is Verdict.FAIL  # turned by 2°, 1° allowed, without a tolerance of its position
+    assert verdicts["block_4"] is Verdict.FAIL  # missing
+    only = replace(found, components=tuple(one for one in found.components if one.name in ("block_1", "block_2")))
+    assert overall_verdict(only) is Verdict.MEASURED
 
 
 @pytest.mark.slow

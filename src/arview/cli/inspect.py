@@ -44,7 +44,7 @@ differently: give --video-camera then.
 \b
 A video or PDF that cannot be made is a warning: the verdict stands without it.""",
     exit_codes={
-        ExitCode.DONE: "pass: every component passes, and there is no foreign object",
+        ExitCode.DONE: "pass: every component passes or has no tolerance, and there is no foreign object",
         ExitCode.FAIL: "fail: a component fails or is missing",
         ExitCode.UNDECIDED: "undecided: none fails, but one is undecided or was not measured, or there is a foreign "
         "object",

@@ -55,7 +55,7 @@ draws it. Where there is a cloud, surfaces that belong to nothing in the CAD are
 objects, and the signed distances of the points to the nominal CAD are written to the folder
 INSPECTION_distances: coloured PLY, a picture, histograms.""",
     exit_codes={
-        ExitCode.DONE: "every component passes, and there is no foreign object",
+        ExitCode.DONE: "every component passes or has no tolerance, and there is no foreign object",
         ExitCode.FAIL: "a component fails or is missing",
         ExitCode.UNDECIDED: "none fails, but one is undecided or was not measured, or there is a foreign object",
         ExitCode.CANNOT_MEASURE: "no component could be measured",

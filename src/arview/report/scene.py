@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from arview.cad.model import Model
 from arview.geometry import Array
 from arview.inspection import Inspection
+from arview.inspection.rounding import decimals_of
 from arview.measurement.cloud.distance_map import COLOR_STOPS, DistanceMap
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.overlay.labels import arrow_scale
@@ -73,6 +74,7 @@ def make_scene(
                 "displacement": list(deviation.displacement_mm),
                 "distance": deviation.distance_mm,
                 "uncertainty": deviation.uncertainty_mm,
+                "digits": decimals_of(deviation.uncertainty_mm),
                 "missing": deviation.finding is not None,
                 "place": None if place is None else np.array(place).ravel().tolist(),
             }

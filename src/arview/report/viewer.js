@@ -177,8 +177,8 @@
       else if (component.missing) line("fail: missing");
       else {
         line(VERDICT_TEXTS[component.verdict]);
-        if (component.distance != null) line(`distance ${number(component.distance)} ± ${number(component.uncertainty)} mm`);
-        component.displacement.forEach((value, k) => line(`d${"xyz"[k]} ${number(value)}${value === null ? "" : " mm"}`));
+        if (component.distance != null) line(`distance ${number(component.distance, component.digits)} ± ${number(component.uncertainty, component.digits)} mm`);
+        component.displacement.forEach((value, k) => line(`d${"xyz"[k]} ${number(value, component.digits)}${value === null ? "" : " mm"}`));
       }
       panel.hidden = false;
     }
