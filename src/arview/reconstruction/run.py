@@ -34,7 +34,14 @@ from arview.geometry import Array
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of, write_model
 from arview.reconstruction.coverage import Coverage, coverage
 from arview.reconstruction.dense import Cad, DenseOptions, read_ply, reconstruct_dense, write_ply
-from arview.reconstruction.intake import Intake, VideoIntakeOptions, intake_frames, intake_photos, intake_video
+from arview.reconstruction.intake import (
+    Intake,
+    VideoIntakeOptions,
+    intake_frames,
+    intake_photos,
+    intake_video,
+    undistort_photos,
+)
 from arview.reconstruction.quality import Quality, quality_of
 from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
 from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
@@ -170,6 +177,7 @@ class _ReconstructionRun:
             intake = self._frames(Path(source), camera)
         else:
             intake = intake_photos(source, camera, progress=lambda i, n: self.tell("photos", i, n))
+        intake = undistort_photos(intake, self.folder / "undistorted", lambda i, n: self.tell("photos", i, n))
         write_json(self.folder / "photos.json", intake_summary(intake))
         self._record_time("photos", began)
         return intake

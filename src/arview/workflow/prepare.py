@@ -7,7 +7,6 @@ from pathlib import Path
 
 from arview.cad import Part, load_part
 from arview.camera.read import load_camera, split_spec
-from arview.camera.undistort import require_brown
 from arview.core.stage_cache import content_key, key_of
 from arview.errors import InputError
 from arview.measurement.options import MeasureOptions
@@ -83,7 +82,7 @@ def _check_cameras(job: InspectJob) -> None:
         raise InputError("a camera of the video is given without a video")
     if job.camera:
         is_angle = job.camera.startswith("fov:")
-        require_brown(load_camera(job.camera, *((1000, 1000) if is_angle else (None, None))), job.camera)
+        load_camera(job.camera, *((1000, 1000) if is_angle else (None, None)))
 
 
 def measurement_key(prepared: Prepared) -> str:

@@ -200,11 +200,15 @@ class _InspectionRun:
             if video is None:
                 raise InputError("no --video")
             of_photos = None if found.sparse is None else found.sparse.photos[0].camera
-            camera, warning = camera_of_video(video, job.video_camera, of_photos, job.is_from_video)
+            spec = job.video_camera
+            if any(lens.camera.lens is not None for lens in found.intake.lenses):
+                # The photos were undistorted, the video is not.
+                of_photos, spec = None, spec or (job.camera if job.is_from_video else None)
+            camera, warning = camera_of_video(video, spec, of_photos, job.is_from_video)
             self.warnings += [warning] if warning else []
             key = key_of(
                 content_key([Path(video), self.folder / "inspection.json"]), camera.width, camera.height,
-                camera.matrix.tolist(), camera.dist.tolist(), part.effective_view_range, __version__,
+                camera.matrix.tolist(), camera.dist.tolist(), str(camera.lens), part.effective_view_range, __version__,
             )  # fmt: skip
             self._once(
                 "film", "film", key, [film, poses],

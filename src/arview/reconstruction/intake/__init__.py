@@ -4,6 +4,7 @@ from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck
 from arview.reconstruction.intake.lenses import Lens
 from arview.reconstruction.intake.photos import Intake, intake_photos
 from arview.reconstruction.intake.reading import read_photo
+from arview.reconstruction.intake.undistorted import undistort_photos
 from arview.reconstruction.intake.video import VideoIntakeOptions, intake_frames, intake_video
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "intake_photos",
     "intake_video",
     "read_photo",
+    "undistort_photos",
 ]

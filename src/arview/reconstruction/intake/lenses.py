@@ -11,7 +11,7 @@ from arview.camera import Camera
 from arview.camera.exif import PhotoExif, focal_length_px
 from arview.camera.profiles import profile_of_photo
 from arview.camera.read import guess_camera, load_camera
-from arview.camera.undistort import require_brown
+from arview.camera.undistort import brown_camera
 from arview.errors import MismatchError
 
 _FOCAL_ROUNDING_MM = 0.055  # focal lengths are written in tenths of a millimetre, or finer
@@ -113,14 +113,14 @@ def _new_lens(exif: PhotoExif, camera: str | Path | None, is_file: bool, taken: 
     turns = exif.quarter_turns_clockwise
     try:
         found = load_camera(camera, width, height, quarter_turns_clockwise=turns)
-        return Lens(key, require_brown(found, str(camera)), True, str(camera))
+        return Lens(key, brown_camera(found) or found, True, str(camera))
     except MismatchError:
         if turns % 2:
             raise
         # The pixels are upright without an EXIF orientation, so the direction of the camera's rotation is unknown: the
         # principal point may be mirrored, and the calibration is only an initial guess.
         turned = load_camera(camera, width, height, quarter_turns_clockwise=1)
-        return Lens(key, require_brown(turned, str(camera)), False, f"{camera}, rotated by 90°")
+        return Lens(key, brown_camera(turned) or turned, False, f"{camera}, rotated by 90°")
 
 
 def _lens_from_exif(key: str, exif: PhotoExif) -> Lens:
