@@ -168,7 +168,7 @@ BAD_FILES = {
     "noise.mp4": (lambda path: path.write_bytes(bytes(range(256)) * 8), "is not a readable video"),
     "no_frames.mp4": (write_without_frames, "no frame that can be decoded|no video stream|cut-short"),
     "sound.mp4": (write_sound_only, "contains no video stream"),
-    "empty.png": (lambda path: path.write_bytes(b""), "the picture cannot be read; save it as JPEG or PNG"),
+    "empty.png": (lambda path: path.write_bytes(b""), "the picture is empty .0 bytes.; save it as JPEG or PNG"),
     "folder": (lambda path: path.mkdir(), "contains no pictures"),
     "missing.mp4": (lambda path: None, "no such file or folder"),
     "missing*.png": (lambda path: None, "no picture .* matches"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Protocol
 
 import av
@@ -15,6 +14,7 @@ from arview.errors import InputError
 from arview.video.clock import plausible_fps
 from arview.video.deinterlace import Deinterlacer
 from arview.video.frame import Frame, Image
+from arview.video.pictures import quiet_opencv
 from arview.video.source import FrameRange, FrameSource
 from arview.video.upright import UprightPictures
 
@@ -205,7 +205,7 @@ class CameraGrabber:
     unsquared_size: tuple[int, int] | None = None
 
     def __init__(self, index: int) -> None:
-        with _quiet_opencv():
+        with quiet_opencv():
             self._capture = cv2.VideoCapture(index)
         if not self._capture.isOpened():
             raise StreamEnded(f"there is no camera {index}, or it is in use")
@@ -227,14 +227,3 @@ def _reason(error: Exception) -> str:
     if isinstance(error, av.error.ExitError):
         return "no answer in time"
     return getattr(error, "strerror", None) or str(error)
-
-
-@contextmanager
-def _quiet_opencv() -> Iterator[None]:
-    """Suppress OpenCV's own warnings: the error raised says the same in one line."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(level)

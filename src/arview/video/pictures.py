@@ -6,6 +6,7 @@ import io
 import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +29,7 @@ PROBED_PICTURES = 5
 """Pictures, spread over the sequence, whose largest values tell how many bits of 16 are used."""
 USED_BITS = (8, 10, 12, 14, 16)
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_TIFF_SIGNATURES = (b"II", b"MM")
 _PRINTF = re.compile(r"%(0?)([0-9]*)d")
 
 
@@ -104,22 +106,31 @@ class PictureSource(FrameSource):
         paths = [path for _, path in self._pictures if path.suffix.lower() in {".png", ".tif", ".tiff"}]
         used = USED_BITS[0]
         for path in paths[:: max(len(paths) // PROBED_PICTURES, 1)][:PROBED_PICTURES]:
-            data = _bytes_of(path)
-            if data is not None and path.suffix.lower() == ".png" and data[24:25] != b"\x10":
+            data = self._checked_bytes(path)
+            if data is None or (data.startswith(_PNG_SIGNATURE) and data[24:25] != b"\x10"):
                 continue
-            if data is not None and (pixels := _decoded(data)) is not None and pixels.dtype == np.uint16:
+            pixels = _decoded(data)
+            if pixels is not None and pixels.dtype == np.uint16:
                 used = max(used, used_bits(pixels, significant_bits(data)))
         return used
 
-    def _read(self, path: Path) -> Image | None:
-        """(H,W,3) uint8 RGB, upright; None if the file is not a readable picture."""
-        data = _bytes_of(path)
-        if data is None:
-            return None
+    def _checked_bytes(self, path: Path) -> bytes | None:
+        """The content of a file that `check_picture` lets pass; else None, and why is kept."""
         try:
+            data = path.read_bytes()
             check_picture(data)
+        except OSError as error:
+            self._fault = f"cannot be read ({error.strerror or error})"
         except InputError as error:
             self._fault = str(error).partition(";")[0]
+        else:
+            return data
+        return None
+
+    def _read(self, path: Path) -> Image | None:
+        """(H,W,3) uint8 RGB, upright; None if the file is not a readable picture."""
+        data = self._checked_bytes(path)
+        if data is None:
             return None
         if path.suffix.lower() in HEIF_SUFFIXES:
             return _read_heif(data)
@@ -140,10 +151,10 @@ class PictureSource(FrameSource):
 def check_picture(data: bytes) -> None:
     """Check from the header of a picture that decoding it takes neither minutes nor gigabytes.
 
-    What Pillow does not know, such as TIFF of 16-bit colours, is left to the limits of OpenCV.
+    TIFF files that Pillow does not know, as those of 16-bit colours, are left to the limits of OpenCV.
 
     Raises:
-        InputError: it has too many scans or pixels.
+        InputError: it has too many scans or pixels, or no readable header.
     """
     from PIL.Image import DecompressionBombError
 
@@ -153,7 +164,7 @@ def check_picture(data: bytes) -> None:
     except MissingDependencyError:
         return
     except InputError as error:
-        if isinstance(error.__cause__, DecompressionBombError):
+        if isinstance(error.__cause__, DecompressionBombError) or not data.startswith(_TIFF_SIGNATURES):
             raise
 
 
@@ -258,17 +269,22 @@ def used_bits(pixels: NDArray[Any], significant: int | None) -> int:
     return next(bits for bits in USED_BITS if largest < 2**bits)
 
 
-def _bytes_of(path: Path) -> bytes | None:
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Suppress OpenCV's own warnings: what arview raises or counts says the same in one line."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        return path.read_bytes() or None
-    except OSError:
-        return None
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:
     """(H,W,3) BGR as stored, of 8 or 16 bits or floating point, upright; None if it is not a picture."""
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        with quiet_opencv():
+            return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error:
         return None
 
