@@ -125,6 +125,9 @@ def test_what_cannot_be_compared_is_named(model: Model, found: Inspection) -> No
     [
         ("from,to,mm\na,b,3\n", "no line names the columns name with x, y, z"),
         ("name;x;y;z\nblock_1;1,5;2;abc\n", "line 2: z = 'abc': expected a number"),
+        ("name;x;y;z\nblock_1;1;2;1_0\n", "line 2: z = '1_0': expected a number"),
+        ("name;x;y;z\nblock_1;1;2;1e300\n", "line 2: z = '1e300': expected a number"),
+        ("name;x;y;z\nblock_1;1;2;1.2.3\n", "line 2: z = '1.2.3': expected a number"),
         ("name;x;y;z\nblock_1;1,5;2.5;3\n", "line 2 has a decimal comma (1,5), line 2 a point (2.5)"),
         ("name;x;y;z\nblock_1;1;2;3\nblock_1;1;2;3\n", "line 3: 'block_1' is listed twice"),
         ("name;x [in];y [in];z [in]\nblock_1;1;2;3\n", "is in in; expected mm"),

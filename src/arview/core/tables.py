@@ -15,6 +15,7 @@ _DELIMITERS = (";", "\t", ",")
 _HEADER_LINES = 60
 """Lines in which the header is looked for: measuring machines write a preamble before it."""
 _MAX_CHARACTERS = 20_000_000
+_MAX_NUMBER = 1e9
 
 
 class HeaderError(InputError):
@@ -47,13 +48,13 @@ class Table:
         """The number in a cell.
 
         Raises:
-            InputError: the cell holds no finite number.
+            InputError: the cell holds no number below 1e9.
         """
         try:
-            value = float(self.plain(cell).replace("\u00a0", "").replace(" ", ""))
+            value = float(self.plain(cell).replace("\u00a0", "").replace(" ", "")) if _is_number(cell) else math.nan
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        if not abs(value) < _MAX_NUMBER:
             raise InputError(f"{self.path}: line {line}: {column} = {cell!r}: expected a number")
         return value
 
