@@ -8,6 +8,7 @@ from types import NoneType
 import numpy as np
 
 from arview.cad.component_remarks import Remark, Severity, gathered, listed, mesh_remarks, size_remarks
+from arview.cad.datum_check import datum_problems
 from arview.cad.fitness import MeshFitness, inspect_mesh
 from arview.cad.model import Component
 from arview.cad.part import ComponentSettings, Part
@@ -168,6 +169,7 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         *_symmetry_findings(part, view_range, symmetries),
     ]
     findings += _role_findings(part)
+    findings += [PartFinding("warning", text) for text in datum_problems(part)]
     remarks = [remark for check in components for remark in _remarks(check, sized_range)]
     findings += [PartFinding(severity, text) for severity, text in gathered(remarks)]
     findings += _own_symmetry_findings(components)

@@ -1,0 +1,168 @@
+"""Whether the features that a part file declares as datums are in the geometry, and which are nearest if not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad.fitness import face_areas
+from arview.cad.model import Component
+from arview.cad.part import Datum, Part
+from arview.geometry import Array
+
+
+@dataclass(frozen=True)
+class DatumCheckOptions:
+    """Tolerances between a declared datum and the geometry.
+
+    Attributes:
+        sharp_deg: angle between faces from which their common edge is a rim.
+        min_corners: vertices that a rim has at least.
+        round_share: largest deviation of the vertices of a rim from a circle, of its radius.
+        axis_deg: largest angle between declared and actual direction.
+        radius_share: largest difference of radii, of the declared one.
+        place_share: largest distance of the declared point from the axis, of the radius.
+        place_mm: largest distance of the declared point from a plane, and a share that is added to the others.
+    """
+
+    sharp_deg: float = 25.0
+    min_corners: int = 6
+    round_share: float = 0.02
+    axis_deg: float = 5.0
+    radius_share: float = 0.05
+    place_share: float = 0.25
+    place_mm: float = 0.2
+
+
+@dataclass(frozen=True)
+class RoundEdge:
+    """A round edge: centre and axis in the model, mm, and radius."""
+
+    center_in_model: Array
+    axis_in_model: Array
+    radius_mm: float
+
+
+def datum_problems(part: Part, options: DatumCheckOptions | None = None) -> list[str]:
+    """A text for each datum plane, hole, pin or cylinder that is not where the part file has it."""
+    options = options or DatumCheckOptions()
+    rims: dict[str, list[RoundEdge]] = {}
+    texts = []
+    names = {component.name for component in part.model.components}
+    for datum in part.datums:
+        if datum.component not in names:
+            continue
+        component = part.model.component(datum.component)
+        if datum.feature in ("hole", "pin", "cylinder"):
+            if datum.component not in rims:
+                rims[datum.component] = find_rims(component, options)
+            text = _round_problem(datum, rims[datum.component], options)
+        elif datum.feature == "plane":
+            text = _plane_problem(datum, component, options)
+        else:
+            continue
+        if text:
+            texts.append(text)
+    return texts
+
+
+def find_rims(component: Component, options: DatumCheckOptions | None = None) -> list[RoundEdge]:
+    """The round edges of a component: closed loops of sharp edges whose vertices lie on a circle."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    options = options or DatumCheckOptions()
+    vertices = component.vertices_in_model
+    edges = _sharp_edges(vertices, component.faces.astype(np.int64), options.sharp_deg)
+    count = len(vertices)
+    degree = np.bincount(edges.ravel(), minlength=count)
+    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    _, labels = connected_components(graph, directed=False)
+    order = np.argsort(labels, kind="stable")
+    loops = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
+    return [
+        rim
+        for loop in loops
+        if len(loop) >= options.min_corners and np.all(degree[loop] == 2)
+        if (rim := _fitted_rim(vertices[loop], options.round_share)) is not None
+    ]
+
+
+def _sharp_edges(vertices: Array, faces: NDArray[np.int64], sharp_deg: float) -> NDArray[np.int64]:
+    """(E,2) vertices of the edges whose faces meet at an angle."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    ends = np.sort(np.stack([faces.ravel(), np.roll(faces, -1, axis=1).ravel()], axis=1), axis=1)
+    unique, inverse, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(inverse.ravel(), kind="stable")
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])[counts == 2]
+    owner = order // 3
+    cosine = np.einsum("ij,ij->i", normals[owner[first]], normals[owner[first + 1]])
+    return np.asarray(unique[counts == 2][cosine < np.cos(np.deg2rad(sharp_deg))])
+
+
+def _fitted_rim(points: Array, round_share: float) -> RoundEdge | None:
+    """The circle through points (N,3), or None when they are not on one."""
+    middle = points.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(points - middle)
+    if sizes[1] < 1e-9:
+        return None
+    flat = (points - middle) @ axes[:2].T
+    # Circle of least squares (Kåsa 1976): x² + y² = 2 a x + 2 b y + c.
+    system = np.column_stack([2.0 * flat, np.ones(len(flat))])
+    x, y, rest = np.linalg.lstsq(system, (flat**2).sum(axis=1), rcond=None)[0]
+    radius = float(np.sqrt(max(rest + x * x + y * y, 0.0)))
+    away = np.abs(np.hypot(*(flat - [x, y]).T) - radius)
+    height = np.abs((points - middle) @ axes[2])
+    if radius <= 0 or max(away.max(), height.max()) > round_share * radius:
+        return None
+    return RoundEdge(middle + x * axes[0] + y * axes[1], axes[2], radius)
+
+
+def _round_problem(datum: Datum, rims: list[RoundEdge], options: DatumCheckOptions) -> str:
+    point, axis = np.array(datum.point_in_model), np.array(datum.direction_in_model)
+    diameter_mm = datum.diameter_mm or 0.0
+    radius_mm = 0.5 * diameter_mm
+    differences = []
+    for rim in rims:
+        offset = rim.center_in_model - point
+        aside_mm = float(np.linalg.norm(offset - (offset @ axis) * axis))
+        is_same = (
+            abs(float(rim.axis_in_model @ axis)) > np.cos(np.deg2rad(options.axis_deg))
+            and abs(rim.radius_mm - radius_mm) <= options.radius_share * radius_mm
+            and aside_mm <= options.place_share * radius_mm + options.place_mm
+        )
+        if is_same:
+            return ""
+        differences.append(float(np.linalg.norm(offset)) + 2.0 * abs(rim.radius_mm - radius_mm))
+    what = f"datum {datum.label}: {datum.component} has no {datum.feature} of ⌀ {diameter_mm:g} mm at {_place(point)}"
+    if not rims:
+        return f"{what}; it has no round edges at all"
+    nearest = rims[int(np.argmin(differences))]
+    return f"{what}; the nearest round edge has ⌀ {2 * nearest.radius_mm:.4g} mm at {_place(nearest.center_in_model)}"
+
+
+def _plane_problem(datum: Datum, component: Component, options: DatumCheckOptions) -> str:
+    point, normal = np.array(datum.point_in_model), np.array(datum.direction_in_model)
+    faces = component.faces.astype(np.int64)
+    a, b, c = component.vertices_in_model[faces].transpose(1, 0, 2)
+    crossed = np.cross(b - a, c - a)
+    crossed /= np.maximum(np.linalg.norm(crossed, axis=1, keepdims=True), 1e-300)
+    is_parallel = np.abs(crossed @ normal) > np.cos(np.deg2rad(options.axis_deg))
+    what = f"datum {datum.label}: {datum.component} has no plane at {_place(point)} with normal {_place(normal)}"
+    if not is_parallel.any():
+        return f"{what}; no face of it is parallel to that"
+    heights = np.einsum("ij,j->i", component.vertices_in_model[faces].mean(axis=1) - point, normal)[is_parallel]
+    if np.abs(heights).min() <= options.place_mm:
+        return ""
+    areas = face_areas(component.vertices_in_model, faces)[is_parallel]
+    near = np.abs(heights) <= np.abs(heights).min() + options.place_mm
+    height = float(np.average(heights[near], weights=areas[near]))
+    return f"{what}; the nearest is {height:+.4g} mm away along the normal"
+
+
+def _place(point: Array) -> str:
+    return "(" + ", ".join(f"{value + 0.0:.4g}" for value in np.round(point, 6)) + ")"
