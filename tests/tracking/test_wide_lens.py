@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.camera.lens import LensDistortion, LensModel
 from arview.camera.undistort import FrameView
+from arview.detection.detector import Detector
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.overlay import OverlayOptions, OverlayRenderer
@@ -68,6 +69,17 @@ def test_part_is_found_and_tracked_far_off_the_axis(camera: Camera) -> None:
         assert distance_mm < 2.5
         assert angle_deg < 0.6
     assert tracked >= 6
+
+
+@pytest.mark.slow
+def test_detector_takes_pictures_of_a_wide_lens() -> None:
+    truth = poses(1)[0]
+    found = Detector(assembly_views(), FISHEYE).detect(through(FISHEYE, truth, 0))
+    assert len(found) > 0
+    distance_mm, across_mm, angle_deg = error(found[0].cam_from_model, truth)
+    assert across_mm < 0.5
+    assert distance_mm < 4.0
+    assert angle_deg < 1.0
 
 
 @pytest.mark.parametrize("camera", [FISHEYE, RATIONAL], ids=["fisheye", "rational"])

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.camera.undistort import FrameView
 from arview.core.checks import check_type
 from arview.detection.confidence import (
     ConfidenceOptions,
@@ -189,7 +190,8 @@ class Detector:
         check_type(camera, Camera, "Detector: camera")
         self.options = o = options or options_for(views)
         self.views = views
-        self.camera = camera
+        self.frames = FrameView(camera)
+        self.camera = camera = self.frames.tracked_camera
         self.best_rejected: RejectedHypothesis | None = None
         self.local = local or local_search_for(views, camera, o)
         self.symmetries = find_rotational_symmetries(views, o.symmetry)
@@ -219,7 +221,7 @@ class Detector:
             searches: indices of the only budgets that are used, so that a thorough search can be spread over several
                 frames; a result must then be as sure as one of the quick search.
         """
-        pyramid = self.local.pyramid(image)
+        pyramid = self.local.pyramid(self._picture(image))
         if found := self._detect_near(pyramid, guesses):
             return found
         o = self.options
@@ -235,7 +237,11 @@ class Detector:
             image: (H,W,3) uint8 RGB of the camera's size.
             guesses: rough poses (4,4) ``cam_from_model``.
         """
-        return self._detect_near(self.local.pyramid(image), guesses)
+        return self._detect_near(self.local.pyramid(self._picture(image)), guesses)
+
+    def _picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image, undistorted where its lens is one that the kernels do not know."""
+        return self.frames.picture(image, 0) if self.frames.is_resampling else image
 
     @property
     def wider_searches(self) -> list[int]:
