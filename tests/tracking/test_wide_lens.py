@@ -113,6 +113,7 @@ def test_edges_are_drawn_where_the_lens_shows_them(camera: Camera) -> None:
     assert np.mean(near <= 1.5) > 0.9
 
 
+@pytest.mark.slow
 def test_pixels_and_sizes_of_frames() -> None:
     view = FrameView(FISHEYE)
     u, v = view.pixel((300.0, 200.0))
