@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from arview.cad.fitness import inspect_mesh
 from arview.cad.formats.obj import triangulate
 from arview.cad.formats.text_encoding import decode_text, text_encoding
 from arview.cad.load import load_cad, load_model
@@ -82,6 +83,22 @@ def test_names_of_stl_solids_in_latin_1(tmp_path: Path) -> None:
     (tmp_path / "p.stl").write_bytes("\n".join(texts).encode("latin-1"))
     model = load_model(tmp_path / "p.stl", "mm")
     assert [c.name for c in model.components] == ["Träger", "Tröger"]
+
+
+def test_faces_that_are_wrong_are_told_and_mended(tmp_path: Path) -> None:
+    inverted = obj_text("inverted", VERTICES, FACES[:, ::-1])
+    mixed = np.concatenate([FACES[:5, ::-1], FACES[5:]])
+    text = inverted + obj_text("mixed", VERTICES + 50, mixed, 8) + obj_text("right", VERTICES + 100, FACES, 16)
+    flat = np.concatenate([FACES, FACES[:1], [[0, 0, 1]]])
+    text += obj_text("flat", VERTICES + 150, flat, 24) + obj_text("open", VERTICES + 200, FACES[2:, ::-1], 32)
+    (tmp_path / "p.obj").write_text(text)
+    cad = load_cad(tmp_path / "p.obj", "mm")
+    for component in cad.model.components[:4]:
+        assert inspect_mesh(component).volume_mm3 == pytest.approx(6000.0)
+    assert cad.notes == (
+        "triangles that faced inwards were turned: inverted, mixed",
+        "triangles without area, or that were there twice, were left out: flat",
+    )
 
 
 def test_materials_are_read_beside_the_file_only(tmp_path: Path) -> None:

@@ -86,6 +86,16 @@ def clean_mesh(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     return vertices[used], inverse.reshape(-1, 3).astype(np.int64)
 
 
+def wrong_winding(vertices: Array, faces: Faces, clean_vertices: Array, clean_faces: Faces) -> bool:
+    """Whether triangles of a closed mesh faced inwards before it was cleaned, by the volume that they enclosed."""
+    before = float(signed_volumes(vertices, faces).sum())
+    after = float(signed_volumes(clean_vertices, clean_faces).sum())
+    if after <= 0 or abs(before - after) <= 0.01 * after:
+        return False
+    counts, _, _ = _edges(clean_faces, len(clean_vertices))
+    return bool(np.all(counts == 2))
+
+
 def signed_volumes(vertices: Array, faces: Faces) -> Array:
     """(F,) signed volume of the tetrahedron of each triangle and the mesh's first vertex."""
     a, b, c = (vertices[faces] - vertices[faces[0, 0]]).transpose(1, 0, 2)

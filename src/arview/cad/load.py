@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.cad.fitness import clean_mesh
+from arview.cad.fitness import clean_mesh, wrong_winding
 from arview.cad.formats.gltf import read_gltf
 from arview.cad.formats.obj import read_obj
 from arview.cad.formats.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names
@@ -31,6 +31,8 @@ MIN_GIVEN_MM, MAX_GIVEN_MM = 0.1, 1_000_000.0
 """Range of the diameter of a part whose unit was given by the user."""
 MAX_COORDINATE = 1e15
 """Coordinates beyond it are no geometry, and their squares overflow."""
+MAX_FLAT_SHARE = 0.02
+"""Share of triangles without area, or double ones, that is not told: the poles of spheres have a few."""
 DEFAULT_COLOR = (0.6, 0.6, 0.62)
 """sRGB of components without a colour."""
 
@@ -111,18 +113,30 @@ def load_cad(
         raise InputError(f"{path}: holds no triangles (empty, or points and lines only)")
     factor_mm = _unit_factor(raw, path, unit)
     names, notes = unique_names([component.path for component in raw.components], path.stem)
-    components, empty, paths = [], [], []
+    components, paths = [], []
+    empty: list[str] = []
+    turned: list[str] = []
+    flat: list[str] = []
     for name, component in zip(names, raw.components, strict=True):
         vertices, faces = clean_mesh(component.vertices * factor_mm, component.faces)
         if len(faces) == 0:
             empty.append(name)
             continue
         color = component.color or DEFAULT_COLOR
+        if wrong_winding(component.vertices * factor_mm, component.faces, vertices, faces):
+            turned.append(name)
+        if len(faces) < (1.0 - MAX_FLAT_SHARE) * len(component.faces):
+            flat.append(name)
         paths.append(component.path)
         components.append(Component(name, vertices, faces.astype(np.int32), color))
-    if empty:
-        rest = f" and {len(empty) - 4} more" if len(empty) > 4 else ""
-        notes.append(f"left out, because they have no triangles of any area: {', '.join(empty[:4])}{rest}")
+    for names_told, text in (
+        (empty, "left out, because they have no triangles of any area"),
+        (turned, "triangles that faced inwards were turned"),
+        (flat, "triangles without area, or that were there twice, were left out"),
+    ):
+        if names_told:
+            rest = f" and {len(names_told) - 4} more" if len(names_told) > 4 else ""
+            notes.append(f"{text}: {', '.join(names_told[:4])}{rest}")
     if not components:
         raise InputError(f"{path}: all triangles are degenerate (they have no area)")
     model = make_model(path.stem, tuple(components))
