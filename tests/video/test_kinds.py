@@ -378,7 +378,7 @@ def test_dng_without_its_reader_is_one_clear_line(tmp_path: Path, monkeypatch: p
 
 
 def test_pictures_that_would_take_minutes_or_gigabytes(tmp_path: Path) -> None:
-    """A JPEG of thousands of scans, and a PNG of 10^9 pixels in 1 MB, are refused in a moment."""
+    """A JPEG of thousands of scans, and PNGs of 10^9 pixels or a chunk of 4 GB, are refused in a moment."""
     import io
     import struct
     import time
@@ -400,12 +400,18 @@ def test_pictures_that_would_take_minutes_or_gigabytes(tmp_path: Path) -> None:
             for kind, body in chunks
         )
     )
+    write_picture(tmp_path / "chunk.png", numbered(1))
+    damaged = bytearray((tmp_path / "chunk.png").read_bytes())
+    damaged[33:37] = b"\xec\xbc\x1d\x03"  # a chunk of 4 GB
+    (tmp_path / "chunk.png").write_bytes(damaged)
     (tmp_path / "good.jpg").write_bytes(data)
     began_s = time.perf_counter()
     with pytest.raises(InputError, match=r"scans\.jpg: the picture is a JPEG of 30\d\d scans"):
         open_source(tmp_path / "scans.jpg")
-    with pytest.raises(InputError, match=r"bomb\.png: the picture has far too many pixels"):
+    with pytest.raises(
+        InputError, match=r"bomb\.png: the picture is a damaged PNG: \d+ bytes cannot hold 32000×32000 px"
+    ):
         open_source(tmp_path / "bomb.png")
     source = open_source(tmp_path)
-    assert [frame.file for frame in source] == ["good.jpg"] and source.skipped == 2
+    assert [frame.file for frame in source] == ["good.jpg"] and source.skipped == 3
     assert time.perf_counter() - began_s < 5.0

@@ -27,8 +27,11 @@ MAX_NUMBER = 99_999_999
 """Largest number in a file name that is taken for that of a frame; longer ones are dates or clocks."""
 PROBED_PICTURES = 5
 """Pictures, spread over the sequence, whose largest values tell how many bits of 16 are used."""
+MAX_DEFLATE_RATIO = 1032
+"""Bytes that a byte of compressed data can stand for (RFC 1951): a PNG that claims more is damaged or hostile."""
 USED_BITS = (8, 10, 12, 14, 16)
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _TIFF_SIGNATURES = (b"II", b"MM")
 _PRINTF = re.compile(r"%(0?)([0-9]*)d")
 
@@ -154,11 +157,13 @@ def check_picture(data: bytes) -> None:
     TIFF files that Pillow does not know, as those of 16-bit colours, are left to the limits of OpenCV.
 
     Raises:
-        InputError: it has too many scans or pixels, or no readable header.
+        InputError: it has too many scans or pixels, more pixels than its data can hold, or no readable header.
     """
     from PIL.Image import DecompressionBombError
 
     check_jpeg_scans(data)
+    if data.startswith(_PNG_SIGNATURE):
+        _check_png(data)
     try:
         open_picture(data).close()
     except MissingDependencyError:
@@ -166,6 +171,24 @@ def check_picture(data: bytes) -> None:
     except InputError as error:
         if isinstance(error.__cause__, DecompressionBombError) or not data.startswith(_TIFF_SIGNATURES):
             raise
+
+
+def _check_png(data: bytes) -> None:
+    """Check that the chunks of a PNG end within it, and that its data can hold as many pixels as its header says.
+
+    Raises:
+        InputError: they do not, as in a file that was cut short or made to occupy memory.
+    """
+    start = len(_PNG_SIGNATURE)
+    while start + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, start)
+        if start + 12 + length > len(data):
+            raise InputError("is a damaged PNG, or one that was cut short; copy it again")
+        if kind == b"IHDR" and length >= 10:
+            width, height, bits, color = struct.unpack_from(">IIBB", data, start + 8)
+            if width * height * bits * _PNG_CHANNELS.get(color, 1) > 8 * MAX_DEFLATE_RATIO * len(data):
+                raise InputError(f"is a damaged PNG: {len(data)} bytes cannot hold {width}×{height} px")
+        start += 12 + length
 
 
 def picture_paths(folder: Path) -> list[Path]:
