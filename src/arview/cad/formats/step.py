@@ -32,7 +32,7 @@ class StepLimits:
         output_mb: largest file of triangles, MB.
     """
 
-    cpu_s: float = 8.0
+    cpu_s: float = 5.0
     cpu_s_per_mb: float = 20.0
     max_cpu_s: float = 600.0
     wall_factor: float = 4.0
