@@ -386,10 +386,14 @@ class AssemblyMonitor:
         state.alternative = np.clip(total, 0.0, o.max_log_odds)
 
     def _searched(self) -> NDArray[np.bool_]:
-        """(C,) components to search for elsewhere: at first all that are open, then one after another."""
+        """(C,) components to search for elsewhere: at first all that are open, then one after another.
+
+        After a loss it is one after another from the start, because more was known before.
+        """
         state = self._state
         is_open = state.log_odds > self.options.open_log_odds
-        if state.observations < self.options.first_observations or not is_open.any():
+        is_new = state.observations < self.options.first_observations and self._aside is None
+        if is_new or not is_open.any():
             return is_open
         open_indices = np.flatnonzero(is_open)
         return np.asarray(np.arange(len(is_open)) == open_indices[state.observations % len(open_indices)])
