@@ -28,7 +28,7 @@ from arview.core.atomic import unfinished_path, writing_process
 from arview.errors import InputError, OutputError
 
 if TYPE_CHECKING:
-    from arview.annotation import AnnotateSummary
+    from arview.annotation import AnnotateSummary, Overlay, Result, Session
     from arview.cad import Part
     from arview.camera import Camera
     from arview.geometry import Array
@@ -64,6 +64,17 @@ class _Run(NamedTuple):
     span_s: tuple[float | None, ...]
     camera_of: Callable[[int], Camera]
     is_guessed: bool
+
+    def annotate(self, session: Session[Result], overlay: Overlay[Result] | None) -> AnnotateSummary:
+        """Track in all frames, and draw what the session returns."""
+        from arview.annotation import annotate as annotate_frames
+
+        with progress_bar("frames", self.frames.frame_count) as progress:
+            return annotate_frames(
+                self.frames, session, overlay, self.sink, self.poses,
+                progress=lambda done, pose: progress(done, self.frames.frame_count or 0),
+                start_s=self.span_s[0], end_s=self.span_s[1], camera_of=self.camera_of if self.is_guessed else None,
+            )  # fmt: skip
 
 
 def _parse_moment(ctx: click.Context, parameter: click.Parameter, value: str | None) -> int | float | None:
@@ -298,12 +309,7 @@ def _annotate_one(
     from arview import annotation
 
     overlay = None if run.sink is None else annotation.FollowingOverlay(make, run.camera_of)
-    with progress_bar("frames", run.frames.frame_count) as progress:
-        return annotation.annotate(
-            run.frames, session, overlay, run.sink, run.poses,
-            progress=lambda done, pose: progress(done, run.frames.frame_count or 0),
-            start_s=run.span_s[0], end_s=run.span_s[1], camera_of=run.camera_of if run.is_guessed else None,
-        )  # fmt: skip
+    return run.annotate(session, overlay)
 
 
 def _annotate_several(
@@ -315,7 +321,6 @@ def _annotate_several(
     renderer: str,
 ) -> AnnotateSummary:
     """Track and draw several specimens; guide views of the first part are given."""
-    from arview import annotation
     from arview.workflow.specimens import make_overlay, make_sessions
 
     camera = run.camera_of(0)
@@ -326,12 +331,7 @@ def _annotate_several(
 
     sessions = make_sessions(specimens, views_of, camera, options)
     overlay = None if run.sink is None else make_overlay(specimens, drawing, camera)
-    with progress_bar("frames", run.frames.frame_count) as progress:
-        return annotation.annotate(
-            run.frames, sessions, overlay, run.sink, run.poses,
-            progress=lambda done, pose: progress(done, run.frames.frame_count or 0),
-            start_s=run.span_s[0], end_s=run.span_s[1], camera_of=run.camera_of if run.is_guessed else None,
-        )  # fmt: skip
+    return run.annotate(sessions, overlay)
 
 
 def _exit_if_interrupted(ctx: click.Context, summary: AnnotateSummary) -> None:

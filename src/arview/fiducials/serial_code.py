@@ -52,6 +52,18 @@ class SerialNumbers:
         except re.error as error:
             raise InputError(f"serial_pattern = {self.pattern!r}: not a regular expression: {error}") from error
 
+    @classmethod
+    def expected(cls, inspected: str | None, declared: str | None, pattern: str) -> SerialNumbers | None:
+        """What codes are read for; None where nothing names a serial number.
+
+        Args:
+            inspected: serial number of the inspection, which comes first.
+            declared: serial number of the part file.
+            pattern: see the class.
+        """
+        serial = inspected or declared or ""
+        return cls(serial, pattern) if serial or pattern else None
+
     @cached_property
     def form(self) -> re.Pattern[str] | None:
         """What a serial number looks like; None if any text that is not the part's own number is ignored."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,16 @@ class LabelledComponent:
     seen_px: int
 
 
+class WantedLabels(NamedTuple):
+    """Components of a part that may get a label, the most urgent first; the columns of the image that the part covers;
+    and the weighted covered area, px², of each cell of the image.
+    """
+
+    components: list[LabelledComponent]
+    part_px: tuple[float, float]
+    cells: NDArray[np.float32]
+
+
 class Annotations:
     """Places and draws labels and arrows, stable from frame to frame."""
 
@@ -158,7 +169,22 @@ class Annotations:
         without = [one for one in components if one.text.is_urgent and one.text.name not in {*shown, *edges}]
         return LaidOut(labels, (*edges.values(), *(self._pointer(one, placed) for one in without)))
 
-    def draw_leaders(self, canvas: paint.Image, laid_out: LaidOut, seen_px: Mapping[str, int]) -> None:
+    def draw_leaders(self, canvas: paint.Image, wanted: WantedLabels | None, bottom_px: int) -> LaidOut:
+        """Lay out the labels of a picture, and draw their leaders and arrows; `draw_labels` follows.
+
+        Args:
+            canvas: (H,W,3) uint8 RGB, drawn on in place.
+            wanted: labels; None: where labels were is forgotten.
+            bottom_px: row above which all must stay.
+        """
+        if wanted is None:
+            self.reset()
+            return LaidOut()
+        laid_out = self.lay_out(*wanted, bottom_px)
+        self._draw_leaders(canvas, laid_out, {one.text.name: one.seen_px for one in wanted.components})
+        return laid_out
+
+    def _draw_leaders(self, canvas: paint.Image, laid_out: LaidOut, seen_px: Mapping[str, int]) -> None:
         """Draw leaders and arrows; ``seen_px`` are the visible pixels of each component."""
         outside = {pointer.key for pointer in laid_out.pointers if pointer.is_outside}
         for label in laid_out.labels:

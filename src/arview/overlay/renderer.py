@@ -17,7 +17,7 @@ from arview.errors import MismatchError
 from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Inspection, Verdict
 from arview.overlay import labels, paint
-from arview.overlay.annotations import Annotations, LabelledComponent, LaidOut
+from arview.overlay.annotations import Annotations, LabelledComponent, LaidOut, WantedLabels
 from arview.overlay.displaced import DisplacedGhosts
 from arview.overlay.edges import Edges
 from arview.overlay.evidence import ComponentStyles, DrawnEvidence, component_styles, evidence_of, presence_of
@@ -70,16 +70,6 @@ class _PartInPicture(NamedTuple):
     view: GhostView
     presences: list[ComponentPresence | None]
     scene: _PartLook
-
-
-class WantedLabels(NamedTuple):
-    """Components of a part that may get a label, the most urgent first; the columns of the image that the part covers;
-    and the weighted covered area, px², of each cell of the image.
-    """
-
-    components: list[LabelledComponent]
-    part_px: tuple[float, float]
-    cells: NDArray[np.float32]
 
 
 class OverlayRenderer:
@@ -221,18 +211,10 @@ class OverlayRenderer:
             fps: frame rate to show; None: not shown.
             now: time from which the age of the inspection is computed; None: the current time.
         """
-        self.laid_out = LaidOut()
         bottom_px = self.draw_legend(canvas)
-        wanted = self.wanted_labels(pose)
-        if wanted is None:
-            self._annotations.reset()
-        else:
-            self.laid_out = self._annotations.lay_out(*wanted, bottom_px)
-            seen = {one.text.name: one.seen_px for one in wanted.components}
-            self._annotations.draw_leaders(canvas, self.laid_out, seen)
+        self.laid_out = self._annotations.draw_leaders(canvas, self.wanted_labels(pose), bottom_px)
         self.draw_arrows(canvas, pose)
-        if wanted is not None:
-            self._annotations.draw_labels(canvas, self.laid_out)
+        self._annotations.draw_labels(canvas, self.laid_out)
         self.draw_state(canvas, pose, fps, now)
 
     def wanted_labels(self, pose: Pose) -> WantedLabels | None:

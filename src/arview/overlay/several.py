@@ -13,9 +13,9 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import apply
 from arview.overlay import labels, paint
-from arview.overlay.annotations import Annotations, LaidOut
+from arview.overlay.annotations import Annotations, LaidOut, WantedLabels
 from arview.overlay.options import Rgb
-from arview.overlay.renderer import OverlayRenderer, WantedLabels
+from arview.overlay.renderer import OverlayRenderer
 from arview.pose import Pose
 
 _HUES = (0.58, 0.08, 0.83, 0.47, 0.92, 0.14)
@@ -92,14 +92,7 @@ class SeveralOverlay:
         for one in pose:
             self.renderers[one.instance].draw_part(canvas, one, now, frame)
         bottom_px = min(self.renderers[one.instance].draw_legend(canvas) for one in pose)
-        wanted = self._wanted(pose)
-        self.laid_out = LaidOut()
-        if wanted is None:
-            self._annotations.reset()
-        else:
-            self.laid_out = self._annotations.lay_out(*wanted, bottom_px)
-            seen = {one.text.name: one.seen_px for one in wanted.components}
-            self._annotations.draw_leaders(canvas, self.laid_out, seen)
+        self.laid_out = self._annotations.draw_leaders(canvas, self._wanted(pose), bottom_px)
         for one in pose:
             self.renderers[one.instance].draw_arrows(canvas, one)
             self._draw_tag(canvas, one)

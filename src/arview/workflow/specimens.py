@@ -32,9 +32,8 @@ class Specimen(NamedTuple):
         """Serial number that a code on the specimen must hold; None where neither part nor inspection says one."""
         from arview.fiducials.serial_code import SerialNumbers
 
-        serial = (self.inspection.serial if self.inspection else "") or self.part.serial or ""
-        pattern = self.part.serial_pattern
-        return SerialNumbers(serial, pattern) if serial or pattern else None
+        inspected = None if self.inspection is None else self.inspection.serial
+        return SerialNumbers.expected(inspected, self.part.serial, self.part.serial_pattern)
 
 
 def load_specimens(

@@ -101,9 +101,8 @@ class Subject:
     def serial_numbers(self) -> SerialNumbers | None:
         """Serial number to which the labels belong, and which codes name one; None where there is neither."""
         inspection = self.inspection
-        serial = (inspection.serial if inspection is not None else "") or self.serial or ""
-        pattern = self.part.serial_pattern
-        return SerialNumbers(serial, pattern) if serial or pattern else None
+        inspected = None if inspection is None else inspection.serial
+        return SerialNumbers.expected(inspected, self.serial, self.part.serial_pattern)
 
     def reload(self) -> bool:
         """Read the inspection again if its file has changed; returns whether another one is shown now."""
