@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from arview.geometry import Array
-from arview.live.options import LiveOptions, RequestLimits, WebrtcOptions
+from arview.live.options import ConnectionLimits, LiveOptions, RequestLimits, WebrtcOptions
 from arview.live.server.loading import load_subject
 from arview.live.stream.subject import Subject
 from arview.video import Image, open_source
@@ -48,7 +48,10 @@ def options(**more: Any) -> LiveOptions:
     """Options of a server that shows the sample to phones, without rate limits and with long timeouts."""
     usual: dict[str, Any] = {
         "camera": str(CAMERA), "inspection": INSPECTION, "width": WIDTH, "height": HEIGHT,
-        "requests": RequestLimits(per_s=1e6, burst=1e6, joins_per_s=1e6, joins_burst=1e6),
+        "requests": RequestLimits(
+            per_s=1e6, burst=1e6, strangers_per_s=1e6, strangers_burst=1e6, joins_per_s=1e6, joins_burst=1e6
+        ),
+        "connections": ConnectionLimits(handshakes_per_s=1e6, handshakes_burst=1e6),
         "jpeg_silence_s": 120.0, "webrtc": WebrtcOptions(connect_timeout_s=60.0),  # tests share their cores
     }  # fmt: skip
     return LiveOptions(**{**usual, **more})

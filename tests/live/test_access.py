@@ -16,14 +16,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from arview.live.options import RequestLimits
+from arview.live.options import ConnectionLimits, RequestLimits
 from arview.live.security import limits
 from arview.live.security.access import Access
 from arview.live.security.addresses import LOOPBACK
 from arview.live.security.limits import MAX_ADDRESSES, RateLimit
 from arview.live.security.refusals import Refusal
 from arview.live.server.app import page_files
-from arview.live.server.uvicorn_server import ConnectionLimits, TimeLimitedProtocol
+from arview.live.server.uvicorn_server import TimeLimitedProtocol
 from arview.live.stream.frames import to_jpeg
 from helpers.live_client import Http, Running, running
 from helpers.live_sample import frames, loader, options

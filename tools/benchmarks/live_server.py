@@ -26,7 +26,7 @@ def live_server(arguments: Sequence[object], folder: Path | None = None) -> Iter
     server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=folder)
     try:
         assert server.stdout is not None
-        found = next((match for line in server.stdout if (match := re.search(r"http://\S+token=\S+", line))), None)
+        found = next((match for line in server.stdout if (match := re.search(r"https?://\S+token=\S+", line))), None)
         if found is None:
             raise SystemExit("live: the server did not start")
         yield server.pid, found.group()

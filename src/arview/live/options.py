@@ -58,10 +58,29 @@ class RequestLimits:
     body_timeout_s: float = 10.0  # time in which a body must arrive
     per_s: float = 80.0  # requests of one address; a page that sends JPEGs needs about 35
     burst: float = 240.0
+    strangers_per_s: float = 20.0  # requests of one address without the token
+    strangers_burst: float = 60.0
     joins_per_s: float = 1.0  # of one address; each join costs a tracker and a handshake
     joins_burst: float = 12.0
     images_per_s: float = 2.0  # of one page; drawing and packing a PNG takes 50 ms of a core
     images_burst: float = 6.0
+
+
+@dataclass(frozen=True)
+class ConnectionLimits:
+    """Bounds on the connections of the server."""
+
+    handshake_timeout_s: float = 5.0  # time for the TLS handshake
+    closing_timeout_s: float = 2.0  # time for the other end to answer the end of a TLS connection
+    headers_timeout_s: float = 10.0  # time to send a whole request; later the connection is closed (Slowloris)
+    write_timeout_s: float = 20.0  # a client that accepts no data for so long is disconnected
+    keep_alive_s: int = 20  # time between two requests of a connection
+    max_header_bytes: int = 16_384
+    strangers_of_address: int = 64  # connections of one address that have not shown the token; an idle one is 0.3 MB
+    max_strangers: int = 256  # of all addresses
+    max_guests: int = 256  # connections that have shown the token
+    handshakes_per_s: float = 30.0  # new connections of one address: about a tenth of a core at most
+    handshakes_burst: float = 300.0
 
 
 @dataclass(frozen=True)
@@ -112,6 +131,7 @@ class LiveOptions:
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     requests: RequestLimits = field(default_factory=RequestLimits)
     webrtc: WebrtcOptions = field(default_factory=WebrtcOptions)
+    connections: ConnectionLimits = field(default_factory=ConnectionLimits)
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):

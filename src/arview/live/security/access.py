@@ -14,6 +14,7 @@ from starlette.responses import HTMLResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from arview.live.protocol import COOKIE
+from arview.live.security.connections import ConnectionTable
 from arview.live.security.limits import RateLimit
 from arview.live.security.refusals import Refusal
 
@@ -84,10 +85,26 @@ class Access:
 
 
 class Gate:
-    """ASGI middleware that serves what `Access` and the rate limit allow, and adds the security headers."""
+    """ASGI middleware that serves what `Access` and the rate limits allow, and adds the security headers.
 
-    def __init__(self, app: ASGIApp, access: Access, rate: RateLimit) -> None:
+    Args:
+        app: the application.
+        access: what a request must present.
+        rate: limit on requests with the token, by address.
+        connections: the open connections, which are told who has shown the token.
+        stranger_rate: limit on requests without the token, by address; they cannot use up the other one.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        access: Access,
+        rate: RateLimit,
+        connections: ConnectionTable | None = None,
+        stranger_rate: RateLimit | None = None,
+    ) -> None:
         self._app, self._access, self._rate = app, access, rate
+        self._connections, self._stranger_rate = connections, stranger_rate or rate
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve or refuse a request."""
@@ -109,10 +126,17 @@ class Gate:
                     answer.append("Set-Cookie", self._access.cookie)
             await send(message)
 
+        address, port = scope.get("client") or ("?", 0)
         try:
-            self._check_host(headers)
-            self._rate.check(str((scope.get("client") or ("?",))[0]))
-            carries_token = self._check_token(scope, headers)
+            try:
+                self._check_host(headers)
+                carries_token = self._check_token(scope, headers)
+            except Refusal:
+                self._stranger_rate.check(str(address))
+                raise
+            self._rate.check(str(address))
+            if self._connections is not None:
+                self._connections.show_token((str(address), int(port)))
             self._check_origin(scope, headers)
         except Refusal as refusal:
             await self._refused(scope, refusal)(scope, receive, send_with_headers)

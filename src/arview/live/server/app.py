@@ -21,6 +21,7 @@ from starlette.types import ASGIApp
 from arview.errors import InputError
 from arview.live.protocol import ANSWER_HEADER, FRAME_IDS
 from arview.live.security.access import Access, Gate
+from arview.live.security.connections import ConnectionTable
 from arview.live.security.limits import RateLimit, body, json_body
 from arview.live.security.refusals import Refusal
 from arview.live.server.annotated_png import annotated_png
@@ -39,8 +40,8 @@ _TYPES = {".js": "text/javascript", ".webmanifest": "application/manifest+json",
 _CODES = {404: "not_found", 405: "bad_method"}
 
 
-def make_app(hub: Hub, access: Access) -> ASGIApp:
-    """The application with its access control."""
+def make_app(hub: Hub, access: Access, connections: ConnectionTable | None = None) -> ASGIApp:
+    """The application with its access control; the connections are told who has shown the token."""
     limits = hub.options.requests
     handlers = Handlers(hub)
     client = "/api/clients/{client}"
@@ -62,7 +63,8 @@ def make_app(hub: Hub, access: Access) -> ASGIApp:
         Route("/api/recordings/{number:int}", handlers.recording),
     ]
     app = Starlette(routes=routes, exception_handlers={Refusal: _refused, HTTPException: _http_error, Exception: _bug})
-    return Gate(app, access, RateLimit(limits.per_s, limits.burst))
+    strangers = RateLimit(limits.strangers_per_s, limits.strangers_burst)
+    return Gate(app, access, RateLimit(limits.per_s, limits.burst), connections, strangers)
 
 
 class Handlers:

@@ -22,6 +22,7 @@ from arview.live.security.certificates import (
     local_certificates,
     own_certificates,
 )
+from arview.live.security.connections import ConnectionTable
 from arview.live.security.trust_page import trust_app
 from arview.live.server.app import make_app
 from arview.live.server.hub import Hub
@@ -145,7 +146,9 @@ class LiveServer:
         self._loop.set_default_executor(ThreadPoolExecutor(self.options.workers, thread_name_prefix="arview-worker"))
         raise_bitrates()
         hub = Hub(self.options, [address for address in self.endpoint.addresses if address != "localhost"])
-        servers = [UvicornServer(make_app(hub, self.access), self.endpoint.listener, self.endpoint.certificates)]
+        connections, place = ConnectionTable(self.options.connections), self.endpoint
+        app = make_app(hub, self.access, connections)
+        servers = [UvicornServer(app, place.listener, place.certificates, connections)]
         if self.endpoint.trust_listener is not None and self.endpoint.certificates is not None:
             servers.append(UvicornServer(trust_app(self.endpoint.certificates), self.endpoint.trust_listener))
         stopped = asyncio.ensure_future(self._stop.wait())

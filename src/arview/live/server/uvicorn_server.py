@@ -5,31 +5,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Generator
-from dataclasses import dataclass
+from collections.abc import Callable, Generator
 
 import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from arview.live.options import ConnectionLimits
 from arview.live.security.certificates import Certificates
-
-
-@dataclass(frozen=True)
-class ConnectionLimits:
-    """Bounds on the connections of the server."""
-
-    headers_timeout_s: float = 10.0  # time to send a whole request; later the connection is closed (Slowloris)
-    write_timeout_s: float = 20.0  # a client that accepts no data for so long is disconnected
-    keep_alive_s: int = 20  # time between two requests of a connection
-    max_connections: int = 200
-    max_header_bytes: int = 16_384
+from arview.live.security.connections import ConnectionTable, Peer
 
 
 class TimeLimitedProtocol(H11Protocol):
     """HTTP/1.1 with time limits for the headers of a request and for the reading of a response."""
 
     limits = ConnectionLimits()
+    on_lost: Callable[[], None] | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start to wait for the first request."""
@@ -56,6 +47,8 @@ class TimeLimitedProtocol(H11Protocol):
             if timer is not None:
                 timer.cancel()
         super().connection_lost(exc)
+        if self.on_lost is not None:
+            self.on_lost()
 
     def pause_writing(self) -> None:
         """Start to wait for the client to read the response."""
@@ -79,10 +72,28 @@ class TimeLimitedProtocol(H11Protocol):
 
 
 class UvicornServer(uvicorn.Server):
-    """A server on one socket, run as a task of an existing event loop."""
+    """A server on one socket, run as a task of an existing event loop.
 
-    def __init__(self, app: ASGIApp, listener: socket.socket, certificates: Certificates | None = None) -> None:
+    It accepts connections itself, so that their number is limited before the TLS handshake.
+
+    Args:
+        app: the application.
+        listener: the listening socket.
+        certificates: of HTTPS; None for plain HTTP.
+        connections: the open connections; share it with the application, which sees who shows the token.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        listener: socket.socket,
+        certificates: Certificates | None = None,
+        connections: ConnectionTable | None = None,
+    ) -> None:
         self._listener = listener
+        self._connections = connections or ConnectionTable()
+        self._accepting: asyncio.Task[None] | None = None
+        self._handshakes: set[asyncio.Task[None]] = set()
         super().__init__(
             uvicorn.Config(
                 app,
@@ -93,7 +104,6 @@ class UvicornServer(uvicorn.Server):
                 access_log=False,
                 server_header=False,
                 proxy_headers=False,
-                limit_concurrency=TimeLimitedProtocol.limits.max_connections,
                 timeout_keep_alive=TimeLimitedProtocol.limits.keep_alive_s,
                 timeout_graceful_shutdown=1,
                 h11_max_incomplete_event_size=TimeLimitedProtocol.limits.max_header_bytes,
@@ -119,3 +129,72 @@ class UvicornServer(uvicorn.Server):
     def capture_signals(self) -> Generator[None, None, None]:
         """Leave the handling of signals to the program."""
         yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start to accept connections; the socket is bound already."""
+        self.servers = []
+        await self.lifespan.startup()
+        self._accepting = asyncio.ensure_future(self._accept())
+        self.started = True
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop accepting, let responses end, then close what is left."""
+        if self._accepting is not None:
+            self._accepting.cancel()
+            await asyncio.wait([self._accepting])
+        self._listener.close()
+        for handshake in tuple(self._handshakes):
+            handshake.cancel()
+        await super().shutdown(sockets)
+        self._connections.close_all()
+
+    async def _accept(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                line, peer = await loop.sock_accept(self._listener)
+            except OSError:  # out of file descriptors, or the other end has gone
+                await asyncio.sleep(0.1)
+                continue
+            self._admit(line, (str(peer[0]), int(peer[1])))
+            await asyncio.sleep(0)  # a burst of connections leaves the loop to requests
+
+    def _admit(self, line: socket.socket, peer: Peer) -> None:
+        """Start the handshake of an accepted connection, or close it."""
+        line.setblocking(False)
+        protocol = TimeLimitedProtocol(
+            config=self.config, server_state=self.server_state, app_state=self.lifespan.state
+        )
+        protocol.on_lost = lambda: self._connections.remove(peer)
+        handshake: list[asyncio.Task[None]] = []
+
+        def close() -> None:
+            handshake[0].cancel()
+            transport = getattr(protocol, "transport", None)
+            if transport is not None:
+                transport.abort()
+
+        if not self._connections.admit(peer, close):
+            line.close()
+            return
+        handshake.append(asyncio.ensure_future(self._shake_hands(line, peer, protocol)))
+        self._handshakes.add(handshake[0])
+        handshake[0].add_done_callback(self._handshakes.discard)
+
+    async def _shake_hands(self, line: socket.socket, peer: Peer, protocol: TimeLimitedProtocol) -> None:
+        limits, tls = protocol.limits, self.config.ssl
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(
+                lambda: protocol,
+                line,
+                ssl=tls,
+                ssl_handshake_timeout=limits.handshake_timeout_s if tls else None,
+                ssl_shutdown_timeout=limits.closing_timeout_s if tls else None,
+            )
+        except OSError:  # the handshake failed or took too long; ssl.SSLError is an OSError
+            self._connections.remove(peer)
+            line.close()
+        except asyncio.CancelledError:
+            self._connections.remove(peer)
+            line.close()
+            raise
