@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import re
+import subprocess
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,13 +15,11 @@ from arview.cad.model import Component, Model, make_model
 from arview.camera import Camera
 from arview.errors import InputError, MissingDependencyError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
+from arview.rendering import pyrender_renderer
+from arview.rendering.pyrender_renderer import PyrenderRenderer
 from arview.rendering.rasterizer import rasterise
-from arview.rendering.renderers import (
-    PyrenderRenderer,
-    Rendering,
-    ZBufferRenderer,
-    open_renderer,
-)
+from arview.rendering.renderers import ZBufferRenderer, choose_renderer, open_renderer
+from arview.rendering.rendering import Rendering
 from helpers.cad_files import box
 from helpers.synthetic import assembly, pose_from
 
@@ -150,6 +150,75 @@ def test_both_renderers_draw_the_same(gl: PyrenderRenderer, azimuth: float, elev
     assert np.quantile(apart, 0.999) < 0.05
 
 
+@pytest.mark.slow
+def test_a_batch_of_views_is_the_views_one_by_one(gl: PyrenderRenderer) -> None:
+    """40 views are more than one batch holds: none is mixed up or keeps something of the one before."""
+    poses = [pose_from(9 * i, 60 - 3 * i, 400 + 5 * i) for i in range(40)]
+    drawn = [draw() for draw in gl.draw_each(poses)]
+    alone = ZBufferRenderer(assembly(), CAMERA)
+    assert len(drawn) == 40
+    for pose, rendering in zip(poses, drawn, strict=True):
+        ids = alone.render(pose).component_ids
+        assert np.count_nonzero(ids != rendering.component_ids) < 0.003 * np.count_nonzero(ids >= 0)
+
+
+@pytest.mark.slow
+def test_pyrender_draws_a_sheet_and_an_inverted_body_from_both_sides() -> None:
+    corners = np.array([[-40.0, -30, 0], [40, -30, 0], [40, 30, 0], [-40, 30, 0]])
+    vertices, faces = box((50, -20, -20), (80, 20, 20))
+    model = make_model(
+        "sheet",
+        (
+            Component("sheet", corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)),
+            Component("inverted", vertices, faces[:, ::-1].astype(np.int32)),
+        ),
+    )
+    try:
+        renderer = PyrenderRenderer(model, CAMERA)
+    except MissingDependencyError as error:
+        pytest.skip(str(error))
+    for pose in (pose_from(20, 50, 400), pose_from(20, -50, 400)):
+        ids, expected = renderer.render(pose).component_ids, ZBufferRenderer(model, CAMERA).render(pose).component_ids
+        assert (expected == 0).sum() > 1000
+        assert (expected == 1).sum() > 500
+        assert np.count_nonzero(ids != expected) < 0.005 * np.count_nonzero(expected >= 0)
+    renderer.close()
+
+
+@pytest.mark.parametrize(
+    "asked,name,reason",
+    [
+        ('"NVIDIA Corporation NVIDIA T4"', "pyrender", "NVIDIA T4"),
+        ('"Mesa llvmpipe (LLVM 15.0.6, 256 bits)"', "zbuffer", "in software.*llvmpipe"),
+        (None, "zbuffer", "no working OpenGL"),
+    ],
+)
+def test_auto_takes_pyrender_where_a_gpu_draws(
+    monkeypatch: pytest.MonkeyPatch, asked: str | None, name: str, reason: str
+) -> None:
+    def answer(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(command, 0 if asked else 1, f"{asked}\n", "")
+
+    monkeypatch.setattr(pyrender_renderer, "has_gpu_device", lambda: True)
+    monkeypatch.setattr(pyrender_renderer.subprocess, "run", answer)
+    pyrender_renderer.probe_gpu.cache_clear()
+    try:
+        chosen = choose_renderer("auto")
+    finally:
+        pyrender_renderer.probe_gpu.cache_clear()
+    assert chosen.name == name
+    assert re.search(reason, chosen.reason)
+
+
+def test_auto_asks_no_opengl_on_a_machine_without_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pyrender_renderer, "has_gpu_device", lambda: False)
+    pyrender_renderer.probe_gpu.cache_clear()
+    try:
+        assert choose_renderer("auto") == ("zbuffer", "no GPU")
+    finally:
+        pyrender_renderer.probe_gpu.cache_clear()
+
+
 def test_without_gl_the_error_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     real = ctypes.CDLL
@@ -166,7 +235,6 @@ def test_without_gl_the_error_names_the_command(monkeypatch: pytest.MonkeyPatch)
     assert "apt-get install -y --no-install-recommends libegl1 libgl1" in str(caught.value)
     assert "libEGL.so.1" in str(caught.value)
     assert asked == ["libEGL.so.1"]
-    assert isinstance(open_renderer(assembly(), CAMERA, "auto"), ZBufferRenderer)
 
 
 def test_an_unknown_renderer_is_refused() -> None:

@@ -246,7 +246,8 @@ RENDERER = click.option(
     type=click.Choice(["auto", "pyrender", "zbuffer"]),
     default="auto",
     show_default=True,
-    help="Renderer of the guide views: pyrender needs a GL library, zbuffer needs nothing.",
+    help="Renderer of the guide views: pyrender draws with OpenGL, zbuffer on the processor and without any library; "
+    "auto takes pyrender where there is a GPU. Both draw the same views.",
 )
 MODALITY = click.option(
     "--modalities",

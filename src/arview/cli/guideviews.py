@@ -35,6 +35,7 @@ def guideviews(
     from arview.guideviews import GuideViewOptions, make_guide_views
     from arview.guideviews.findings import confusable_pair
     from arview.guideviews.uniqueness import assess
+    from arview.rendering.renderers import choose_renderer
 
     loaded = load_part(part, unit)
     path = output_path(output, [loaded.path, loaded.cad_path])
@@ -42,15 +43,16 @@ def guideviews(
     if preview_path is not None and preview_path.suffix.lower() != ".png":
         raise OutputError(f"{preview}: the name of the preview must end in .png")
     model = loaded.model.only([component]) if component else loaded.model
+    chosen = choose_renderer(renderer)
     began = time.perf_counter()
     with progress_bar("guide views") as progress:
         views = make_guide_views(
-            model, loaded.effective_view_range, GuideViewOptions(renderer=renderer), progress=progress
+            model, loaded.effective_view_range, GuideViewOptions(renderer=chosen.name), progress=progress
         )
     views.save(path)
     seconds = time.perf_counter() - began
     size_mb = path.stat().st_size / 1e6
-    click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB")
+    click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s by {chosen}, {size_mb:.1f} MB")
     unique = assess(views)
     click.echo(f"{unique.reason} (score {unique.score:.2f})")
     alike = confusable_pair(views, unique)

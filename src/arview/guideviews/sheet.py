@@ -22,7 +22,6 @@ SHARP_COLOR = (215, 35, 30)
 EDGE_COLOR = (60, 110, 235)
 PLAIN_COLOR = (190, 120, 0)
 CONFUSABLE_COLOR = (150, 30, 140)
-LIGHT_IN_CAM = np.array([-0.4, -0.6, -0.7]) / np.linalg.norm([0.4, 0.6, 0.7])
 """Direction towards the light, over the viewer's left shoulder."""
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -81,9 +80,7 @@ def _tile(
     view = views.view(index)
     camera = renderer.camera
     rendering = renderer.render(view.cam_from_model)
-    shade = np.clip(rendering.normals_in_cam(camera) @ LIGHT_IN_CAM, 0.0, 1.0)
-    gray = np.where(rendering.component_ids >= 0, 140.0 + 105.0 * shade, 255.0).astype(np.uint8)
-    picture = cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB)
+    picture = cv2.cvtColor(rendering.shaded(camera), cv2.COLOR_GRAY2RGB)
     f = view.features
     sharp = (f.edge_kinds & EDGE_SHARP) > 0
     for points, color in (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -25,7 +25,8 @@ from arview.guideviews.mesh_edges import mesh_edges
 from arview.guideviews.sphere import directions_in_range, view_poses
 from arview.guideviews.store import read_arrays, write_arrays
 from arview.guideviews.surface import Surface, reduced_surface, surface_about
-from arview.rendering.renderers import Rendering, open_renderer
+from arview.rendering.renderers import open_renderer
+from arview.rendering.rendering import Rendering
 
 FORMAT_VERSION = 2
 _UNIT16 = 32767.0
@@ -33,7 +34,7 @@ _UNIT16 = 32767.0
 MAX_THREADS = 8
 """Threads that extract features."""
 MAX_PENDING = 32
-"""Renderings that wait for extraction, where one thread renders."""
+"""Views that are drawn or wait to be."""
 
 
 @dataclass(frozen=True)
@@ -295,19 +296,15 @@ def _extracted(model: Model, camera: Camera, poses: Array, options: GuideViewOpt
     """Features of the views at some poses (N,4,4), in their order, rendered and extracted by a pool of threads."""
     edges = mesh_edges(model, options.crease_angle_deg)
 
-    def extract(rendering: Rendering, pose: Array) -> ViewFeatures:
-        return extract_features(rendering, pose, camera, edges, options.contour_points, options.edge_points)
+    def extract(draw: Callable[[], Rendering], pose: Array) -> ViewFeatures:
+        return extract_features(draw(), pose, camera, edges, options.contour_points, options.edge_points)
 
     renderer = open_renderer(model, camera, options.renderer)
     try:
         with ThreadPoolExecutor(max(1, min(MAX_THREADS, os.cpu_count() or 1))) as pool:
-            if renderer.is_thread_safe:
-                yield from pool.map(lambda pose: extract(renderer.render(pose), pose), poses)
-                return
-            # One GL context, one thread: it renders while the pool extracts what is rendered.
             pending: deque[Future[ViewFeatures]] = deque()
-            for pose in poses:
-                pending.append(pool.submit(extract, renderer.render(pose), pose))
+            for pose, draw in zip(poses, renderer.draw_each(list(poses)), strict=True):
+                pending.append(pool.submit(extract, draw, pose))
                 if len(pending) >= MAX_PENDING:
                     yield pending.popleft().result()
             while pending:
