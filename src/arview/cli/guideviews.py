@@ -52,7 +52,7 @@ def guideviews(
     views.save(path)
     seconds = time.perf_counter() - began
     size_mb = path.stat().st_size / 1e6
-    click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s by {chosen}, {size_mb:.1f} MB")
+    click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB; drawn by {chosen}")
     unique = assess(views)
     click.echo(f"{unique.reason} (score {unique.score:.2f})")
     alike = confusable_pair(views, unique)
