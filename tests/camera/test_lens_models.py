@@ -52,6 +52,13 @@ def test_lens_is_that_of_opencv_and_colmap(name: str) -> None:
     np.testing.assert_allclose(reference(camera, rays), pixels(), rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("dist", [[0.2, 0.3], [-0.3, 0.09], [-0.28, 0.07, 1e-3, -2e-3, 0.01]])
+def test_strong_brown_terms_are_undone_exactly(dist: list[float]) -> None:
+    camera = Camera(1280, 960, 700.0, 700.0, 640.0, 480.0, np.array(dist))
+    grid = np.stack(np.meshgrid(np.linspace(0, 1279, 33), np.linspace(0, 959, 21)), axis=-1)
+    np.testing.assert_allclose(camera.project(camera.unproject(grid)), grid, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("name", LENSES)
 def test_lens_turns_scales_and_crops_with_the_picture(name: str) -> None:
     camera = camera_with(LENSES[name])

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.camera.lens import LensDistortion
 from arview.fiducials.board import Board, parse_board
 from arview.fiducials.board_sheet import rectangles_mm
 from arview.geometry import Array, exp_so3, rigid
@@ -36,14 +37,16 @@ def _texture(board: Board) -> tuple[NDArray[np.uint8], float]:
 
 
 @cache
-def _rays(width: int, height: int, numbers: tuple[float, ...]) -> NDArray[np.float32]:
-    """(H·s, W·s, 2) ideal normalised coordinates of sub-pixels."""
-    camera = Camera(width, height, *numbers[:4], np.array(numbers[4:]))
+def _rays(
+    width: int, height: int, numbers: tuple[float, ...], lens: LensDistortion | None
+) -> NDArray[np.float32]:
+    """(H·s, W·s, 2) ideal normalised coordinates of sub-pixels; 1e6 where the lens sees nothing."""
+    camera = Camera(width, height, *numbers[:4], np.array(numbers[4:]), lens)
     step = (np.arange(_SUPER) + 0.5) / _SUPER - 0.5
     u = (np.arange(width)[:, None] + step).ravel()
     v = (np.arange(height)[:, None] + step).ravel()
     grid = np.stack(np.meshgrid(u, v), axis=-1)
-    return camera.unproject(grid)[..., :2].astype(np.float32)
+    return np.nan_to_num(camera.unproject(grid)[..., :2], nan=1e6).astype(np.float32)
 
 
 def photograph(
@@ -57,14 +60,14 @@ def photograph(
 ) -> NDArray[np.uint8]:
     """(H,W) uint8 gray picture; blur is a Gaussian's sigma in px, noise a normal's in grey levels."""
     picture, margin = _texture(board)
-    rays = _rays(camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist))
+    rays = _rays(camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist), camera.lens)
     # Plane to normalised coordinates, and back.
     h = np.linalg.inv(cam_from_board[:3, [0, 1, 3]])
     w = h[2, 0] * rays[..., 0] + h[2, 1] * rays[..., 1] + h[2, 2]
     x = (h[0, 0] * rays[..., 0] + h[0, 1] * rays[..., 1] + h[0, 2]) / w
     y = (h[1, 0] * rays[..., 0] + h[1, 1] * rays[..., 1] + h[1, 2]) / w
-    column = np.floor((x + margin) * _PX_PER_MM).astype(np.int32)
-    row = np.floor((y + margin) * _PX_PER_MM).astype(np.int32)
+    column = np.floor(np.nan_to_num(x + margin, nan=-1.0).clip(-1e3, 1e4) * _PX_PER_MM).astype(np.int32)
+    row = np.floor(np.nan_to_num(y + margin, nan=-1.0).clip(-1e3, 1e4) * _PX_PER_MM).astype(np.int32)
     inside = (row >= 0) & (column >= 0) & (row < picture.shape[0]) & (column < picture.shape[1]) & (w > 0)
     fine = np.full(rays.shape[:2], ground, np.float32)
     fine[inside] = picture[row[inside], column[inside]]
@@ -72,6 +75,17 @@ def photograph(
     if blur_px > 0:
         gray = cv2.GaussianBlur(gray, (0, 0), blur_px)
     return np.clip(gray + rng.normal(0.0, noise, gray.shape) + 0.5, 0, 255).astype(np.uint8)
+
+
+def wide_pose(board: Board, rng: np.random.Generator, off_axis_deg: float = 60.0) -> Array:
+    """``cam_from_board`` of a random view for a wide lens: up to an angle off the axis, and tilted against the ray."""
+    middle = 0.5 * np.array([board.columns * board.cell_mm, board.rows * board.cell_mm, 0.0])
+    angle, azimuth = np.deg2rad(rng.uniform(0, off_axis_deg)), rng.uniform(0, 2 * np.pi)
+    around = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    tilt = np.deg2rad(rng.uniform(10.0, 40.0)) * exp_so3([0, 0, rng.uniform(0, 2 * np.pi)])[:, 0]
+    from_board = exp_so3(angle * around) @ exp_so3(tilt) @ exp_so3([0, 0, rng.uniform(-0.4, 0.4)])
+    place = rng.uniform(130.0, 300.0) * exp_so3(angle * around)[:, 2]
+    return rigid(from_board, place - from_board @ middle)
 
 
 def pose(

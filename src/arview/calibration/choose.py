@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, intrinsics_of, pose_of_board
 from arview.calibration.solve import SolveOptions, information, solve
 from arview.calibration.views import BoardView
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.geometry import Array, rigid
+from arview.geometry import Array
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,11 @@ class ChoiceOptions:
 
 
 def choose_views(
-    views: Sequence[BoardView], width: int, height: int, options: ChoiceOptions | None = None
+    views: Sequence[BoardView],
+    width: int,
+    height: int,
+    options: ChoiceOptions | None = None,
+    lens: CalibratedLens = CalibratedLens.BROWN,
 ) -> tuple[list[BoardView], dict[str, str]]:
     """The views to calibrate from, in their order, and why others are left out, by name.
 
@@ -46,6 +51,7 @@ def choose_views(
         views: all views of the board.
         width, height: of the sensor's picture, px.
         options: see `ChoiceOptions`.
+        lens: model of the lens.
 
     Raises:
         InputError: no camera explains the views at all.
@@ -70,21 +76,26 @@ def choose_views(
         else:
             rejected[name] = "there are better views"
     if len(kept) > options.max_views:
-        chosen = _max_information([views[i] for i in kept], [outlines[i] for i in kept], width, height, options)
+        chosen = _max_information([views[i] for i in kept], [outlines[i] for i in kept], (width, height), options, lens)
         rejected |= {views[i].name: "adds little to the others" for k, i in enumerate(kept) if k not in chosen}
         kept = [kept[k] for k in chosen]
     return [views[i] for i in sorted(kept)], rejected
 
 
 def _max_information(
-    views: list[BoardView], outlines: list[Array], width: int, height: int, options: ChoiceOptions
+    views: list[BoardView],
+    outlines: list[Array],
+    size: tuple[int, int],
+    options: ChoiceOptions,
+    lens: CalibratedLens,
 ) -> list[int]:
     """Indices of the views that together have the most information, chosen greedily."""
-    camera = solve([views[k] for k in _spread(outlines, options.initial_views)], width, height).camera
+    camera = solve([views[k] for k in _spread(outlines, options.initial_views)], *size, lens=lens).camera
     shares = np.array([_information(view, camera) for view in views])
     # Prior information: the order of magnitude of the intrinsics.
-    side = float(max(width, height))
-    known = np.diag(1.0 / np.array([side, side, 0.2 * side, 0.2 * side, 1.0, 1.0, 0.05, 0.05, 1.0]) ** 2)
+    side = float(max(size))
+    spread = {"fx": side, "fy": side, "cx": 0.2 * side, "cy": 0.2 * side, "p1": 0.05, "p2": 0.05}
+    known = np.diag([spread.get(name, 1.0) ** -2.0 for name in PARAMETERS_OF[lens]])
     chosen: list[int] = []
     for _ in range(options.max_views):
         gain = np.linalg.slogdet(known + shares)[1]
@@ -96,9 +107,10 @@ def _max_information(
 
 
 def _information(view: BoardView, camera: Camera) -> Array:
-    """(9,9) information on the intrinsics of one view, with its pose unknown."""
-    _, turn, shift = cv2.solvePnP(view.points_in_board, view.pixels, camera.matrix, camera.dist)
-    pose = rigid(cv2.Rodrigues(turn)[0], np.asarray(shift).ravel())
+    """(P,P) information on the intrinsics of one view, with its pose unknown; none where no pose is found."""
+    pose = pose_of_board(view.points_in_board, view.pixels, camera)
+    if pose is None:
+        return np.zeros((len(intrinsics_of(camera)),) * 2)
     return information(view, camera, pose)[0] / view.sigma_px**2
 
 

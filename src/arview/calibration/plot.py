@@ -38,9 +38,9 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
         columns, rows = 33, 25
         grid = picture_grid(camera.width, camera.height, columns, rows)
         uncertainty = pixel_uncertainty(solution, grid).reshape(rows, columns)
-        if np.isfinite(uncertainty).all():
+        if np.isfinite(uncertainty).any():
             u, v = grid[:, 0].reshape(rows, columns), grid[:, 1].reshape(rows, columns)
-            top = max(float(np.percentile(uncertainty, 98)), 1e-6)
+            top = max(float(np.nanpercentile(uncertainty, 98)), 1e-6)
             levels = np.linspace(0.0, top, 9)
             filled = right.contourf(u, v, uncertainty, levels=levels, cmap="magma_r", extend="max")
             made.colorbar(filled, ax=right, orientation="horizontal", aspect=40, label="U (k = 2), px", format="%.2f")

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from arview.calibration.choose import ChoiceOptions, choose_views
-from arview.calibration.solve import PARAMETERS, K, Solution, SolveOptions, solve
+from arview.calibration.lens_comparison import LensComparison, compare_lenses
+from arview.calibration.projection import CalibratedLens, lens_of
+from arview.calibration.solve import K, Solution, SolveOptions, solve
 from arview.calibration.verdict import CalibrationVerdict, VerdictOptions, assess
-from arview.calibration.views import BoardSightings, find_views
+from arview.calibration.views import BoardSightings, BoardView, find_views
 from arview.camera import Camera
 from arview.camera.profiles import lens_record
 from arview.core.progress import StepProgress
@@ -32,6 +34,7 @@ class Calibration:
         solution: the camera.
         verdict: its grade.
         rejected: why pictures are not used, by name.
+        lenses: whether the other lens model explains the views better.
     """
 
     board: Board
@@ -39,6 +42,7 @@ class Calibration:
     solution: Solution
     verdict: CalibrationVerdict
     rejected: dict[str, str]
+    lenses: LensComparison
 
     @property
     def camera(self) -> Camera:
@@ -58,6 +62,7 @@ def calibrate(
     solving: SolveOptions | None = None,
     limits: VerdictOptions | None = None,
     progress: StepProgress | None = None,
+    lens: CalibratedLens = CalibratedLens.BROWN,
 ) -> Calibration:
     """Calibrate a camera from photos, or one video, of a ChArUco board.
 
@@ -68,6 +73,7 @@ def calibrate(
         solving: how outliers are rejected.
         limits: of the grades.
         progress: called with pictures done and in all.
+        lens: model of the lens.
 
     Raises:
         InputError: nothing can be read, there is no board, there are too few views, or no camera explains them.
@@ -80,13 +86,18 @@ def calibrate(
             f"{sightings.label}: the board is seen in {len(sightings.views)} of {sightings.searched} pictures, at"
             f" least {min_views} are needed, 20 are good" + (f" ({why})" if why else "")
         )
+    size = (sightings.width, sightings.height)
+    views: Sequence[BoardView] = sightings.views
     try:
-        views, left_out = choose_views(sightings.views, sightings.width, sightings.height, choice)
-        solution = solve(views, sightings.width, sightings.height, solving)
+        views, left_out = choose_views(views, *size, choice, lens)
+        solution = solve(views, *size, solving, lens)
     except InputError as error:
-        raise InputError(f"{sightings.label}: {error}") from error
+        advice = compare_lenses(views[: ChoiceOptions.max_views], *size, lens).advice
+        raise InputError(f"{sightings.label}: {error}{f'; {advice}' if advice else ''}") from error
     rejected = sightings.rejected | left_out | solution.rejected
-    return Calibration(board, sightings, solution, assess(solution, limits), rejected)
+    lenses = compare_lenses(views, *size, lens)
+    verdict = assess(solution, limits).with_lenses(lenses.advice)
+    return Calibration(board, sightings, solution, verdict, rejected, lenses)
 
 
 def record_of(calibration: Calibration) -> dict[str, Any]:
@@ -110,9 +121,10 @@ def record_of(calibration: Calibration) -> dict[str, Any]:
             "views_used": len(solution.views),
             "corners_used": sum(len(view.ids) for view in solution.views),
             "rms_px": solution.rms_px,
-            "parameters": list(PARAMETERS),
+            "lens": str(lens_of(solution.camera)),
+            "parameters": list(solution.parameters),
             "uncertainty_k": K,
-            "uncertainty": {name: plain(K * std) for name, std in zip(PARAMETERS, solution.std, strict=True)},
+            "uncertainty": {name: plain(K * std) for name, std in zip(solution.parameters, solution.std, strict=True)},
             "covariance": [[plain(value) for value in row] for row in solution.covariance],
             "focal_uncertainty": plain(verdict.focal_u),
             "pixel_uncertainty_px": {"median": plain(verdict.pixel_u_px[0]), "worst": plain(verdict.pixel_u_px[1])},

@@ -1,9 +1,10 @@
 """The camera from views of a board, without outliers, and its covariance.
 
-OpenCV adjusts intrinsics and poses together (Zhang 2000, A flexible new technique for camera calibration); views and
-corners with outlying residuals are removed, round by round. The covariance is that of the adjustment with the poses
-eliminated, but not smaller than the scatter from view to view (the sandwich estimate of Huber 1967, clustered by view):
-errors of the corners of one picture are correlated by blur, motion and a board that is not quite flat.
+Intrinsics and poses are adjusted together (Zhang 2000, A flexible new technique for camera calibration), by OpenCV for
+a lens with Brown's terms, by `arview.calibration.fisheye` for a fisheye; views and corners with outlying residuals are
+removed, round by round. The covariance is that of the adjustment with the poses eliminated, but not smaller than the
+scatter from view to view (the sandwich estimate of Huber 1967, clustered by view): errors of the corners of one picture
+are correlated by blur, motion and a board that is not quite flat.
 """
 
 from __future__ import annotations
@@ -12,14 +13,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from arview.calibration.fisheye import adjust_fisheye
+from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, lens_of, project
 from arview.calibration.views import MIN_CORNERS, BoardView
 from arview.camera import Camera
+from arview.camera.undistort import UndistortOptions
 from arview.errors import InputError
 from arview.geometry import Array, rigid
 
-PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-"""Names of the intrinsics, in the order of the covariance."""
 K = 2.0
 """Coverage factor of every U in this room: 95 % of a normal distribution."""
 
@@ -45,7 +48,7 @@ class Solution:
 
     Attributes:
         camera: of the sensor's picture.
-        covariance: (9,9) of PARAMETERS; infinite where the views do not determine them.
+        covariance: (P,P) of `parameters`; infinite where the views do not determine them.
         views: those that were used, without rejected corners.
         cams_from_board: (V,4,4) their poses, mm.
         residuals: (N,2) px of each view, found minus projected.
@@ -64,18 +67,30 @@ class Solution:
     corners_left_out: int
 
     @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the P intrinsics, in the order of the covariance."""
+        return PARAMETERS_OF[lens_of(self.camera)]
+
+    @property
     def std(self) -> Array:
-        """(9,) standard uncertainty of PARAMETERS."""
+        """(P,) standard uncertainty of `parameters`."""
         return np.sqrt(np.diag(self.covariance))
 
 
-def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOptions | None = None) -> Solution:
+def solve(
+    views: Sequence[BoardView],
+    width: int,
+    height: int,
+    options: SolveOptions | None = None,
+    lens: CalibratedLens = CalibratedLens.BROWN,
+) -> Solution:
     """Calibrate the camera that took the views.
 
     Args:
         views: of the board.
         width, height: of the sensor's picture, px.
         options: see `SolveOptions`.
+        lens: model of the lens.
 
     Raises:
         InputError: too few views fit together, or the adjustment fails; the message says what to do.
@@ -90,7 +105,7 @@ def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOpt
                 f"only {len(kept)} of {len(views)} views of the board fit together; at least {options.min_views} are"
                 " needed, 20 are good: hold the board flat and still, in focus, and take it from many sides"
             )
-        solution = _adjust(kept, width, height, None if solution is None else solution.camera)
+        solution = adjust(kept, width, height, None if solution is None else solution.camera, lens)
         trimmed = [_trimmed(view, r, options) for view, r in zip(kept, solution.residuals, strict=True)]
         # A wrong corner distorts its view's pose, so views are only rejected once no corner is.
         unchanged = {view.name for view, less in zip(kept, trimmed, strict=True) if len(view.ids) == len(less.ids)}
@@ -108,8 +123,8 @@ def solve(views: Sequence[BoardView], width: int, height: int, options: SolveOpt
 
 
 def information(view: BoardView, camera: Camera, cam_from_board: Array) -> tuple[Array, Array]:
-    """Information (9,9) on PARAMETERS of a view's corners at 1 px with its pose unknown, and their Jacobian (N·2,9)."""
-    _, intrinsics, pose = _project(view.points_in_board, camera, cam_from_board)
+    """Information (P,P) on the intrinsics of a view's corners at 1 px, its pose unknown, and their Jacobian (N·2,P)."""
+    _, intrinsics, pose = project(view.points_in_board, camera, cam_from_board)
     # Changes that a change of the pose explains as well carry no information on the camera.
     basis, _ = np.linalg.qr(pose)
     left = intrinsics - basis @ (basis.T @ intrinsics)
@@ -120,23 +135,38 @@ def pixel_uncertainty(solution: Solution, pixels: Array) -> Array:
     """(N,) expanded uncertainty, px with k = 2 in the worst direction, of where a ray is seen, at pixels (N,2).
 
     The part that a rotation of the camera explains over these pixels is removed, because no application notices it.
+    NaN where a fisheye sees nothing within the angle that the engine uses, see `seen_by_lens`.
     """
     with np.errstate(all="ignore"):  # strong distortion may give no ray for pixels far from all corners
         rays = solution.camera.unproject(pixels)
-        _, intrinsics, pose = _project(rays, solution.camera, np.eye(4))
+        seen = seen_by_lens(solution.camera, rays)
+        if not seen.any():
+            return np.full(len(pixels), np.inf)
+        _, intrinsics, pose = project(rays[seen], solution.camera, np.eye(4))
     if not all(np.isfinite(one).all() for one in (solution.covariance, intrinsics, pose)):
         return np.full(len(pixels), np.inf)
     basis, _ = np.linalg.qr(pose[:, :3])
     field = intrinsics - basis @ (basis.T @ intrinsics)
-    blocks = field.reshape(-1, 2, 9)
+    blocks = field.reshape(-1, 2, intrinsics.shape[1])
     covariance = np.einsum("nij,jk,nlk->nil", blocks, solution.covariance, blocks)
-    return K * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
+    uncertainty = np.full(len(pixels), np.nan)
+    uncertainty[seen] = K * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
+    return uncertainty
+
+
+def seen_by_lens(camera: Camera, rays: Array) -> NDArray[np.bool_]:
+    """(N,) whether rays (N,3) are judged: all of a Brown lens, of a fisheye those that `Undistorter` shows."""
+    if lens_of(camera) is CalibratedLens.BROWN:
+        return np.ones(len(rays), dtype=bool)
+    slope = float(np.tan(np.deg2rad(UndistortOptions.max_half_angle_deg)))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.hypot(rays[:, 0], rays[:, 1]) <= slope)
 
 
 def pixel_difference(camera: Camera, other: Camera, pixels: Array) -> Array:
     """(N,2) px from where ``camera`` sees rays to where ``other`` does, at pixels (N,2), less the best rotation."""
     rays = camera.unproject(pixels)
-    _, _, pose = _project(rays, camera, np.eye(4))
+    _, _, pose = project(rays, camera, np.eye(4))
     basis, _ = np.linalg.qr(pose[:, :3])
     moved = (other.project(rays) - pixels).ravel()
     return np.asarray(moved - basis @ (basis.T @ moved)).reshape(-1, 2)
@@ -151,8 +181,40 @@ def picture_grid(width: int, height: int, columns: int = 9, rows: int = 7) -> Ar
 # --- adjustment ----------------------------------------------------------------------------------------------
 
 
-def _adjust(views: Sequence[BoardView], width: int, height: int, start: Camera | None) -> Solution:
-    """One adjustment of intrinsics and poses by OpenCV. Raises InputError when it fails."""
+def adjust(
+    views: Sequence[BoardView], width: int, height: int, start: Camera | None, lens: CalibratedLens
+) -> Solution:
+    """One adjustment of intrinsics and poses, without any rejection.
+
+    Args:
+        views: of the board.
+        width, height: of the sensor's picture, px.
+        start: a camera near the solution, or None.
+        lens: model of the lens.
+
+    Raises:
+        InputError: no camera explains the views.
+    """
+    solver = adjust_fisheye if lens is CalibratedLens.FISHEYE else _adjust_brown
+    try:
+        found, poses = solver(views, width, height, start)
+    except InputError as error:
+        raise InputError(
+            "no camera explains the views of the board; tilt it by 20° to 45° to all sides, take it from near and"
+            " far, and check that --board is the one in the pictures"
+        ) from error
+    residuals = [
+        view.pixels - project(view.points_in_board, found, pose)[0] for view, pose in zip(views, poses, strict=True)
+    ]
+    covariance = _covariance(views, found, poses, residuals)
+    rms = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
+    return Solution(found, covariance, tuple(views), poses, tuple(residuals), rms, {}, 0)
+
+
+def _adjust_brown(
+    views: Sequence[BoardView], width: int, height: int, start: Camera | None
+) -> tuple[Camera, Array]:
+    """The camera with Brown's terms and the poses (V,4,4), by OpenCV."""
     import cv2
 
     objects = [view.points_in_board.astype(np.float32)[:, None] for view in views]
@@ -166,26 +228,19 @@ def _adjust(views: Sequence[BoardView], width: int, height: int, start: Camera |
         )
         fx, fy, cx, cy = (float(k[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
         found = Camera(width, height, fx, fy, cx, cy, np.ravel(d)[:5])
-    except (cv2.error, InputError, ValueError) as error:
-        raise InputError(
-            "no camera explains the views of the board; tilt it by 20° to 45° to all sides, take it from near and"
-            " far, and check that --board is the one in the pictures"
-        ) from error
+    except (cv2.error, ValueError) as error:
+        raise InputError("OpenCV finds no camera") from error
     poses = np.array([
         rigid(cv2.Rodrigues(np.asarray(turn))[0], np.asarray(shift).ravel())
         for turn, shift in zip(turns, shifts, strict=True)
     ])  # fmt: skip
-    residuals = [
-        view.pixels - _project(view.points_in_board, found, pose)[0] for view, pose in zip(views, poses, strict=True)
-    ]
-    covariance = _covariance(views, found, poses, residuals)
-    rms = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
-    return Solution(found, covariance, tuple(views), poses, tuple(residuals), rms, {}, 0)
+    return found, poses
 
 
 def _covariance(views: Sequence[BoardView], camera: Camera, poses: Array, residuals: Sequence[Array]) -> Array:
-    """(9,9) covariance: for each parameter the larger of the adjustment's and of the scatter between views."""
-    total, scatter, squares = np.zeros((9, 9)), np.zeros((9, 9)), 0.0
+    """(P,P) covariance: for each parameter the larger of the adjustment's and of the scatter between views."""
+    size = len(PARAMETERS_OF[lens_of(camera)])
+    total, scatter, squares = np.zeros((size, size)), np.zeros((size, size)), 0.0
     for view, pose, residual in zip(views, poses, residuals, strict=True):
         one, jacobian = information(view, camera, pose)
         score = jacobian.T @ residual.ravel()
@@ -193,28 +248,17 @@ def _covariance(views: Sequence[BoardView], camera: Camera, poses: Array, residu
         scatter += np.outer(score, score)
         squares += float(np.sum(residual**2))
     count = 2 * sum(len(view.ids) for view in views)
-    freedom = count - 6 * len(views) - 9
-    size = np.sqrt(np.maximum(np.diag(total), 1e-30))
-    values, vectors = np.linalg.eigh(total / np.outer(size, size))
+    freedom = count - 6 * len(views) - size
+    unit = np.sqrt(np.maximum(np.diag(total), 1e-30))
+    values, vectors = np.linalg.eigh(total / np.outer(unit, unit))
     if freedom <= 0 or values[0] < 1e-12:
-        return np.full((9, 9), np.inf)
-    inverse = (vectors / values) @ vectors.T / np.outer(size, size)
+        return np.full((size, size), np.inf)
+    inverse = (vectors / values) @ vectors.T / np.outer(unit, unit)
     own = inverse * squares / freedom
     # Correction for the degrees of freedom, as in HC1 of MacKinnon and White (1985).
-    between = inverse @ scatter @ inverse * len(views) / max(1.0, len(views) - 9.0 / 2.0)
+    between = inverse @ scatter @ inverse * len(views) / max(1.0, len(views) - size / 2.0)
     grow = np.sqrt(np.maximum(1.0, np.diag(between) / np.diag(own)))
     return np.asarray(own * np.outer(grow, grow))
-
-
-def _project(points: Array, camera: Camera, cam_from_points: Array) -> tuple[Array, Array, Array]:
-    """Pixels (N,2) and their derivatives (2N,9) by PARAMETERS and (2N,6) by rotation vector and translation."""
-    import cv2
-
-    turn = cv2.Rodrigues(cam_from_points[:3, :3])[0]
-    pixels, jacobian = cv2.projectPoints(
-        np.asarray(points, dtype=np.float64)[:, None], turn, cam_from_points[:3, 3], camera.matrix, camera.dist
-    )
-    return pixels.reshape(-1, 2), np.asarray(jacobian[:, 6:15]), np.asarray(jacobian[:, :6])
 
 
 def _bad_views(solution: Solution, unchanged: set[str], options: SolveOptions) -> dict[str, str]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
-from arview.calibration.solve import PARAMETERS, K, Solution, picture_grid, pixel_uncertainty
+from arview.calibration.solve import K, Solution, picture_grid, pixel_uncertainty, seen_by_lens
 from arview.geometry import Array
 
 
@@ -45,7 +45,7 @@ class CalibrationVerdict:
         centre_u_px: U of the principal point.
         pixel_u_px: U of where a ray is seen: median and maximum over the picture.
         coverage: share of the picture's 8×6 cells that contain a corner.
-        cells: (6,8) number of corners in each cell.
+        cells: (6,8) number of corners in each cell, NaN where a fisheye sees nothing that is used.
         tilts_deg: smallest, median and largest angle between the board and the picture plane.
         distance_ratio: distance of the farthest over the nearest board.
         reasons: why it is not better.
@@ -63,21 +63,29 @@ class CalibrationVerdict:
     reasons: tuple[str, ...]
     advice: tuple[str, ...]
 
+    def with_lenses(self, advice: str) -> CalibrationVerdict:
+        """The verdict with the advice to use another lens model, with which it is usable at best; as it is if empty."""
+        if not advice:
+            return self
+        grade = Grade.USABLE if self.grade is Grade.GOOD else self.grade
+        reasons = (*self.reasons, "another lens model explains the corners better")
+        return replace(self, grade=grade, reasons=reasons, advice=(advice, *self.advice))
+
 
 def assess(solution: Solution, options: VerdictOptions | None = None) -> CalibrationVerdict:
     """Compare a calibration with the limits, and say what to do if it is not good."""
     options = options or VerdictOptions()
     camera = solution.camera
     diagonal = float(np.hypot(camera.width, camera.height))
-    std = dict(zip(PARAMETERS, solution.std, strict=True))
+    std = dict(zip(solution.parameters, solution.std, strict=True))
     focal_u = K * float(max(std["fx"] / camera.fx, std["fy"] / camera.fy))
     centre_u = K * float(max(std["cx"], std["cy"]))
     pixel_u = pixel_uncertainty(solution, picture_grid(camera.width, camera.height))
     cells = _cells(solution)
-    coverage = float(np.mean(cells > 0))
+    coverage = float(np.mean(cells[~np.isnan(cells)] > 0))
     tilts, sides, distances = _attitudes(solution, options.tilted_deg)
     ratio = float(distances.max() / distances.min())
-    worst = float(pixel_u.max())
+    worst = float(np.nanmax(pixel_u))
 
     grades = [
         _grade(focal_u, options.good_focal, options.usable_focal),
@@ -117,7 +125,7 @@ def assess(solution: Solution, options: VerdictOptions | None = None) -> Calibra
         if not advice:
             advice.append("take more views, tilted to all sides, with the board filling the picture")
     return CalibrationVerdict(
-        grade, focal_u, centre_u, (float(np.median(pixel_u)), worst), coverage, cells,
+        grade, focal_u, centre_u, (float(np.nanmedian(pixel_u)), worst), coverage, cells,
         (float(tilts.min()), float(np.median(tilts)), float(tilts.max())), ratio, tuple(why), tuple(advice),
     )  # fmt: skip
 
@@ -130,13 +138,18 @@ def _grade(value: float, good: float, usable: float) -> Grade:
 
 
 def _cells(solution: Solution) -> Array:
-    """Number of corners in each of 8×6 cells of the picture."""
+    """Number of corners in each of 8×6 cells of the picture; NaN where the lens shows nothing that is judged."""
     pixels = np.concatenate([view.pixels for view in solution.views])
     camera = solution.camera
     sides = (-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5)
     upright = camera.height > camera.width
     shape = (8, 6) if upright else (6, 8)
-    return np.histogram2d(pixels[:, 1], pixels[:, 0], bins=shape, range=sides)[0]
+    cells, rows, columns = np.histogram2d(pixels[:, 1], pixels[:, 0], bins=shape, range=sides)
+    u, v = np.meshgrid(0.5 * (columns[1:] + columns[:-1]), 0.5 * (rows[1:] + rows[:-1]))
+    with np.errstate(all="ignore"):
+        rays = camera.unproject(np.stack([u.ravel(), v.ravel()], axis=-1))
+    cells[(cells == 0) & ~seen_by_lens(camera, rays).reshape(shape)] = np.nan
+    return np.asarray(cells)
 
 
 def _attitudes(solution: Solution, tilted_deg: float) -> tuple[Array, int, Array]:

@@ -8,6 +8,7 @@ field-of-view model that of Devernay and Faugeras (2001), the division model tha
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -70,7 +71,7 @@ class LensDistortion:
     def undistort(self, xd: Array, yd: Array) -> tuple[Array, Array]:
         """Ideal normalised coordinates of distorted ones; NaN where no ray in front of the camera is seen."""
         if self.model is LensModel.RATIONAL:
-            return _solve(self, np.asarray(xd, dtype=np.float64), np.asarray(yd, dtype=np.float64))
+            return undistort_by_newton(self.distort, xd, yd)
         rd = np.hypot(xd, yd)
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(rd > 1e-12, self._ideal_radius(rd) / np.maximum(rd, 1e-300), 1.0 / self._central_scale)
@@ -133,14 +134,23 @@ def _rational(terms: tuple[float, ...], x: Array, y: Array) -> tuple[Array, Arra
     return xd, yd
 
 
-def _solve(lens: LensDistortion, xd: Array, yd: Array) -> tuple[Array, Array]:
-    """Ideal coordinates by Newton's method with damped steps; NaN where it does not come to the distorted ones."""
+def undistort_by_newton(
+    distort: Callable[[Array, Array], tuple[Array, Array]], xd: Array, yd: Array, is_nearest: bool = False
+) -> tuple[Array, Array]:
+    """Ideal coordinates of distorted ones, by Newton's method with damped steps.
+
+    Args:
+        distort: distorted coordinates of ideal ones.
+        xd, yd: distorted coordinates.
+        is_nearest: where no ray is distorted to them, return where the search ended instead of NaN.
+    """
+    xd, yd = np.asarray(xd, dtype=np.float64), np.asarray(yd, dtype=np.float64)
     x, y = xd.copy(), yd.copy()
     step = 1e-6
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
-            xe, ye = lens.distort(x, y)
-            right, up = lens.distort(x + step, y), lens.distort(x, y + step)
+            xe, ye = distort(x, y)
+            right, up = distort(x + step, y), distort(x, y + step)
             a, c = (right[0] - xe) / step, (right[1] - ye) / step
             b, d = (up[0] - xe) / step, (up[1] - ye) / step
             det = a * d - b * c
@@ -152,8 +162,10 @@ def _solve(lens: LensDistortion, xd: Array, yd: Array) -> tuple[Array, Array]:
             x, y = x + shrink * u, y + shrink * v
             if not np.any(length > 1e-13):
                 break
-        xe, ye = lens.distort(x, y)
+        xe, ye = distort(x, y)
         is_found = np.hypot(xe - xd, ye - yd) < 1e-8
+    if is_nearest:
+        is_found |= np.isfinite(x) & np.isfinite(y)
     return np.where(is_found, x, np.nan), np.where(is_found, y, np.nan)
 
 

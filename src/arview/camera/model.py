@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from arview.camera.lens import LensDistortion
+from arview.camera.lens import LensDistortion, undistort_by_newton
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -99,7 +99,7 @@ class Camera:
         return xd, yd
 
     def unproject(self, pixels: ArrayLike) -> Array:
-        """Ideal normalised rays (..., 3) with z = 1 of pixels (..., 2); distortion is removed by iteration.
+        """Ideal normalised rays (..., 3) with z = 1 of pixels (..., 2); distortion is removed by Newton's method.
 
         NaN for pixels where a lens of another model sees nothing less than 90° off the axis.
         """
@@ -110,9 +110,7 @@ class Camera:
         if self.lens is not None:
             x, y = self.lens.undistort(xd, yd)
         elif self.is_distorted:
-            for _ in range(20):
-                xe, ye = self.distort(x, y)
-                x, y = x + xd - xe, y + yd - ye
+            x, y = undistort_by_newton(self.distort, xd, yd, is_nearest=True)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def scaled(self, width: int, height: int) -> Camera:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from arview.camera.lens import LensDistortion, LensModel
 from arview.camera.model import COLMAP_HALF_PX, Camera
 from arview.camera.undistort import require_brown
 from arview.core.atomic import replacing
@@ -28,14 +29,14 @@ def write_camera(
         extra: objects to store beside the intrinsics; only arview's own format stores them.
 
     Raises:
-        InputError: an unknown format or suffix, or a lens model that only arview's own format holds.
+        InputError: an unknown format or suffix, or a lens model that the format does not hold.
         OutputError: the file cannot be written.
     """
     path = Path(path)
     kind = kind or format_of(path)
     if kind not in FORMATS:
         raise InputError(f"camera format {kind!r}: expected one of {', '.join(FORMATS)}")
-    if kind != "arview":
+    if camera.lens is not None and not _holds(kind, camera.lens):
         camera = require_brown(camera, f"camera format {kind}")
     text = _arview(camera, extra) if kind == "arview" else FORMATS[kind](camera)
     try:
@@ -43,6 +44,28 @@ def write_camera(
             file.write(text.encode())
     except OSError as error:
         raise OutputError(f"{path}: cannot write the camera file: {error.strerror or error}") from error
+
+
+_LENSES: dict[str, tuple[LensModel, ...]] = {
+    "bop": (),
+    "opencv": (LensModel.RATIONAL, LensModel.FISHEYE),
+    "opencv-xml": (LensModel.RATIONAL, LensModel.FISHEYE),
+    "opencv-json": (LensModel.RATIONAL, LensModel.FISHEYE),
+    "ros": (LensModel.RATIONAL, LensModel.FISHEYE),
+}
+"""Lens models besides Brown's that a format holds; the others hold all."""
+_ROS_NAMES = {LensModel.RATIONAL: "rational_polynomial", LensModel.FISHEYE: "equidistant"}
+_COLMAP_NAMES = {
+    LensModel.RATIONAL: "FULL_OPENCV",
+    LensModel.FISHEYE: "OPENCV_FISHEYE",
+    LensModel.FOV: "FOV",
+    LensModel.DIVISION: "DIVISION",
+}
+
+
+def _holds(kind: str, lens: LensDistortion) -> bool:
+    has_prism = lens.model is LensModel.RATIONAL and any(lens.terms[8:])
+    return lens.model in _LENSES.get(kind, tuple(LensModel)) and not (kind == "colmap" and has_prism)
 
 
 def format_of(path: Path) -> str:
@@ -97,15 +120,26 @@ def _opencv(suffix: str) -> Callable[[Camera], str]:
         file.write("image_width", camera.width)
         file.write("image_height", camera.height)
         file.write("camera_matrix", camera.matrix)
-        file.write("distortion_coefficients", np.asarray(camera.dist).reshape(1, 5))
+        if camera.lens is not None:
+            file.write("distortion_model", _ROS_NAMES[camera.lens.model])
+        file.write("distortion_coefficients", np.array([_opencv_terms(camera)]))
         return str(file.releaseAndGetString())
 
     return text
 
 
+def _opencv_terms(camera: Camera) -> list[float]:
+    """Distortion terms in OpenCV's order, with as many as the lens model has there."""
+    if camera.lens is None:
+        return [float(value) for value in camera.dist]
+    terms = list(camera.lens.terms)
+    return terms[:8] if camera.lens.model is LensModel.RATIONAL and not any(terms[8:]) else terms
+
+
 def _ros(camera: Camera) -> str:
     """``camera_info`` YAML as camera_calibration_parsers reads it."""
     projection = np.hstack([camera.matrix, np.zeros((3, 1))])
+    terms = _opencv_terms(camera)
 
     def matrix(name: str, values: Any, rows: int, columns: int) -> str:
         numbers = ", ".join(repr(float(value)) for value in np.asarray(values).ravel())
@@ -114,8 +148,8 @@ def _ros(camera: Camera) -> str:
     return (
         f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: camera\n"
         + matrix("camera_matrix", camera.matrix, 3, 3)
-        + "distortion_model: plumb_bob\n"
-        + matrix("distortion_coefficients", camera.dist, 1, 5)
+        + f"distortion_model: {'plumb_bob' if camera.lens is None else _ROS_NAMES[camera.lens.model]}\n"
+        + matrix("distortion_coefficients", terms, 1, len(terms))
         + matrix("rectification_matrix", np.eye(3), 3, 3)
         + matrix("projection_matrix", projection, 3, 4)
     )
@@ -125,7 +159,9 @@ def _colmap(camera: Camera) -> str:
     k1, k2, p1, p2, k3 = (float(value) for value in camera.dist)
     model = "PINHOLE"
     terms: list[float] = []
-    if camera.is_distorted:
+    if camera.lens is not None:
+        model, terms = _COLMAP_NAMES[camera.lens.model], list(camera.lens.terms[:8])
+    elif camera.is_distorted:
         model, terms = ("FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]) if k3 else ("OPENCV", [k1, k2, p1, p2])
     numbers = [camera.fx, camera.fy, camera.cx + COLMAP_HALF_PX, camera.cy + COLMAP_HALF_PX, *terms]
     line = " ".join(repr(float(value)) for value in numbers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -94,6 +94,7 @@ Examples:
   arview calibrate clip.mp4 --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json --plot camera.png
   arview calibrate *.heic --board charuco:11x8:21:16:DICT_5X5_100 --profile
   arview calibrate photos/ --board charuco:9x6:25:18:DICT_4X4_50 -o camera.json -o ros:info.yaml
+  arview calibrate action/ --board charuco:11x8:21:16:DICT_5X5_100 --lens fisheye -o camera.json
 
 \b
 -o may be given several times: .json is arview's own format (with uncertainties, covariance and verdict),
@@ -117,6 +118,8 @@ what took them. `arview calibrate profiles` lists them. An insufficient calibrat
 @click.option("-o", "--output", "outputs", multiple=True, metavar="[FORMAT:]CAMERA", help="Camera file to write.")
 @click.option("--profile", is_flag=False, flag_value="", metavar="[NAME]", help="Also store it as a profile.")
 @click.option("--plot", metavar="PNG", help="Plot corners, residuals and uncertainty over the picture (png, svg, pdf).")
+@click.option("--lens", "lens_model", type=click.Choice(["brown", "fisheye"]), default="brown", show_default=True,
+              help="Lens model: k1 k2 p1 p2 k3, or OpenCV's fisheye; the report says which fits.")  # fmt: skip
 @click.option("--max-views", type=click.IntRange(min=5), default=40, show_default=True, metavar="N",
               help="Views to calibrate from; the most informative ones are chosen.")  # fmt: skip
 @click.option("--anyway", is_flag=True, help="Write the camera even if the views are not enough.")
@@ -126,11 +129,13 @@ def lens(
     outputs: tuple[str, ...],
     profile: str | None,
     plot: str | None,
+    lens_model: str,
     max_views: int,
     anyway: bool,
 ) -> None:
     """Calibrate the camera that took PHOTOS (files, folders, globs), or VIDEO, of a ChArUco board."""
     from arview.calibration.choose import ChoiceOptions
+    from arview.calibration.projection import CalibratedLens
     from arview.calibration.run import calibrate as run
     from arview.calibration.run import record_of
     from arview.camera.profiles import profile_name, profile_path
@@ -149,7 +154,7 @@ def lens(
     one = parse_board(board_spec)
     with progress_bar("looking for the board") as progress:
         choice = ChoiceOptions(max_views=max_views, candidates=max(max_views, ChoiceOptions.candidates))
-        result = run(sources, one, choice, progress=progress)
+        result = run(sources, one, choice, progress=progress, lens=CalibratedLens(lens_model))
     _print(result)
     if picture is not None:
         from arview.calibration.plot import draw
@@ -246,16 +251,19 @@ def _print(result: Calibration) -> None:
 
 
 def _camera_lines(result: Calibration) -> list[str]:
-    camera, verdict = result.camera, result.verdict
-    values: Any = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist]
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    from arview.calibration.projection import intrinsics_of, lens_of
+
+    verdict, solution = result.verdict, result.solution
     cells = [
         f"{name} {value:{form}} ± {2 * std:{form}}"
-        for name, value, std, form in zip(names, values, result.solution.std, [".2f"] * 4 + [".5f"] * 5, strict=True)
-    ]
+        for name, value, std, form in zip(
+            solution.parameters, intrinsics_of(result.camera), solution.std,
+            [".2f"] * 4 + [".5f"] * (len(solution.parameters) - 4), strict=True,
+        )
+    ]  # fmt: skip
     worst = f"{verdict.pixel_u_px[0]:.2f} px in the median, {verdict.pixel_u_px[1]:.2f} px at worst"
     return [
         f"camera: {', '.join(cells[:4])} px",
-        f"lens: {', '.join(cells[4:])}",
+        f"lens ({lens_of(result.camera)}): {', '.join(cells[4:])}",
         f"uncertainty (k = 2): focal length {100 * verdict.focal_u:.2f} %, image position of a ray {worst}",
     ]
