@@ -63,15 +63,11 @@ def test_projection_is_that_of_opencv_and_its_derivatives_are_right() -> None:
     values = intrinsics_of(FISHEYE)
     for k in range(8):
         step = np.eye(8)[k] * 1e-5
-        ends = [
-            project(CORNERS, fisheye_camera(960, 720, values + sign * step), cam_from_board)[0] for sign in (1, -1)
-        ]
+        ends = [project(CORNERS, fisheye_camera(960, 720, values + sign * step), cam_from_board)[0] for sign in (1, -1)]
         np.testing.assert_allclose((ends[0] - ends[1]).ravel() / 2e-5, by_intrinsics[:, k], atol=1e-5)
     for k in range(6):
         step = np.eye(6)[k] * 1e-6
-        moved = [
-            rigid(exp_so3(sign * step[:3]) @ cam_from_board[:3, :3], shift + sign * step[3:]) for sign in (1, -1)
-        ]
+        moved = [rigid(exp_so3(sign * step[:3]) @ cam_from_board[:3, :3], shift + sign * step[3:]) for sign in (1, -1)]
         ends = [project(CORNERS, FISHEYE, one)[0] for one in moved]
         np.testing.assert_allclose((ends[0] - ends[1]).ravel() / 2e-6, by_pose[:, k], atol=1e-4)
 

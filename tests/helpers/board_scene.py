@@ -37,9 +37,7 @@ def _texture(board: Board) -> tuple[NDArray[np.uint8], float]:
 
 
 @cache
-def _rays(
-    width: int, height: int, numbers: tuple[float, ...], lens: LensDistortion | None
-) -> NDArray[np.float32]:
+def _rays(width: int, height: int, numbers: tuple[float, ...], lens: LensDistortion | None) -> NDArray[np.float32]:
     """(H·s, W·s, 2) ideal normalised coordinates of sub-pixels; 1e6 where the lens sees nothing."""
     camera = Camera(width, height, *numbers[:4], np.array(numbers[4:]), lens)
     step = (np.arange(_SUPER) + 0.5) / _SUPER - 0.5

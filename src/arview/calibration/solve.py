@@ -181,9 +181,7 @@ def picture_grid(width: int, height: int, columns: int = 9, rows: int = 7) -> Ar
 # --- adjustment ----------------------------------------------------------------------------------------------
 
 
-def adjust(
-    views: Sequence[BoardView], width: int, height: int, start: Camera | None, lens: CalibratedLens
-) -> Solution:
+def adjust(views: Sequence[BoardView], width: int, height: int, start: Camera | None, lens: CalibratedLens) -> Solution:
     """One adjustment of intrinsics and poses, without any rejection.
 
     Args:
@@ -211,9 +209,7 @@ def adjust(
     return Solution(found, covariance, tuple(views), poses, tuple(residuals), rms, {}, 0)
 
 
-def _adjust_brown(
-    views: Sequence[BoardView], width: int, height: int, start: Camera | None
-) -> tuple[Camera, Array]:
+def _adjust_brown(views: Sequence[BoardView], width: int, height: int, start: Camera | None) -> tuple[Camera, Array]:
     """The camera with Brown's terms and the poses (V,4,4), by OpenCV."""
     import cv2
 
