@@ -713,3 +713,22 @@ def test_no_table_holds_what_the_document_does_not(store: HistoryStore) -> None:
         "model_hash",
         "document",
     }
+
+
+def test_values_of_different_points_are_not_joined(store: HistoryStore, tmp_path: Path) -> None:
+    """Six parts stated for the middle of the box, then four for the centre of mass: only these make a series."""
+    for index in range(10):
+        made = built(index, 0.1 + 0.01 * index)
+        one = made.components[0]
+        assert one.details is not None
+        kind = "box_center" if index < 6 else "volume_centroid"
+        axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)) if index >= 6 else None
+        block = replace(one, details=replace(one.details, measurand=kind, axes=axes))
+        store.add(saved(tmp_path, f"p{index}", replace(made, components=(block,))))
+    found = series_of(store, "block_1", "dx")
+    assert [one.value for one in found.values] == pytest.approx([0.16, 0.17, 0.18, 0.19])
+    assert (
+        "6 stated for another point (centre of the bounding box) than the newest (centre of mass" in found.left_out[-1]
+    )
+    tilt = series_of(store, "block_1", "tilt")
+    assert len(tilt.values) == 4 and "about another axis" in tilt.left_out[-1]

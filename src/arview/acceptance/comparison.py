@@ -162,7 +162,7 @@ def _compare(one: ComponentDeviation, line: ListedComponent, center: Array | Non
 
 
 def _center_of(one: ComponentDeviation, model: Model | None) -> Array | None:
-    """(3,) nominal position of the centre of the component's bounding box, mm, or None."""
+    """(3,) nominal position of the point that the inspection states, mm, or None."""
     if one.details is not None:
         return np.array(one.details.center_mm)
     return None if model is None else np.asarray(model.component(one.name).bounds_in_model.mean(axis=0))

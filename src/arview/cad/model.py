@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.cad.centroid import center_of_mass
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -54,6 +55,20 @@ class Component:
         """(2,3) lowest and highest corner, mm."""
         used = self.vertices_in_model[np.unique(self.faces)]
         return np.stack([used.min(axis=0), used.max(axis=0)])
+
+    @cached_property
+    def _center_of_mass(self) -> tuple[Array, bool]:
+        return center_of_mass(self.vertices_in_model, self.faces)
+
+    @property
+    def centroid_in_model(self) -> Array:
+        """(3,) centre of mass, mm: centroid of the volume of a solid, of the area of a sheet body."""
+        return self._center_of_mass[0]
+
+    @property
+    def is_solid(self) -> bool:
+        """Whether its surface is closed and encloses a volume; otherwise it is a sheet body."""
+        return self._center_of_mass[1]
 
 
 @dataclass(frozen=True)

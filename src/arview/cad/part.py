@@ -15,6 +15,10 @@ from arview.errors import InputError
 Role = Literal["base", "inspect", "ignore"]
 Vector = tuple[float, float, float]
 
+NamedPoint = Literal["mass", "seat", "axis", "hole"]
+"""Points of a component by which its place is stated: centre of mass, middle of the surface on which it stands, foot of
+its axis, centre of its hole."""
+
 DatumFeature = Literal["plane", "hole", "pin", "cylinder", "edge", "point", "fit"]
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Degrees of freedom: rotations about and translations along the axes of the model."""
@@ -30,6 +34,7 @@ class ComponentSettings:
         position_tolerance_mm: largest allowed distance from the nominal place; None: not judged.
         angle_tolerance_deg: largest allowed rotation from nominal; None: not judged.
         symmetry: rotation that cannot be observed, in the model frame.
+        point: the point whose displacement is stated: a named one, or coordinates in the model, mm.
     """
 
     name: str
@@ -37,6 +42,7 @@ class ComponentSettings:
     position_tolerance_mm: float | None = None
     angle_tolerance_deg: float | None = None
     symmetry: Symmetry | None = None
+    point: NamedPoint | Vector = "mass"
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from arview.cad.part import (
     Datum,
     DatumFeature,
     Guide,
+    NamedPoint,
     Part,
     Role,
     Vector,
@@ -30,6 +31,7 @@ from arview.core.checks import PATH, check_type
 from arview.errors import InputError
 
 ROLES = ("base", "inspect", "ignore")
+POINTS = ("mass", "seat", "axis", "hole")
 DATUM_FEATURES = ("plane", "hole", "pin", "cylinder", "edge", "point", "fit")
 
 PART_FILE_EXAMPLE = """\
@@ -85,6 +87,10 @@ color = "#8a8f98"              # sRGB, default: the colour in the CAD
 role = "inspect"
 position_tolerance_mm = 0.5    # largest allowed distance from the nominal place (half of GD&T's zone)
 angle_tolerance_deg = 0.5      # largest allowed rotation from nominal
+# The point whose distance from its nominal place is measured: "mass" (default: centre of the volume of a solid, of the
+# area of a sheet body), "seat" (middle of the surface on which it stands), "axis" (foot of its axis), "hole" (centre of
+# its only hole), or coordinates.
+# point = "seat"               # or [60.0, 40.0, 0.0]
 # A rotation that changes nothing about the component: it cannot be measured and is not judged.
 symmetry = { axis = [0.0, 0.0, 1.0], through_mm = [60.0, 40.0, 0.0], order = "continuous" }
 
@@ -295,9 +301,21 @@ def _read_settings(table: TomlTable, name: str, model: Model, defaults: Componen
         position_tolerance_mm=table.positive("position_tolerance_mm", defaults.position_tolerance_mm),
         angle_tolerance_deg=table.positive("angle_tolerance_deg", defaults.angle_tolerance_deg),
         symmetry=symmetry,
+        point=_read_point(table, defaults.point),
     )
     table.finish()
     return settings
+
+
+def _read_point(table: TomlTable, default: NamedPoint | Vector) -> NamedPoint | Vector:
+    """The point whose displacement is stated: a name, or coordinates."""
+    if not table.known("point"):
+        return default
+    if isinstance(table.content["point"], list):
+        return table.vector("point")
+    if table.content["point"] not in POINTS:
+        table.fail("point", table.content["point"], '"mass", "seat", "axis", "hole", or three numbers [x, y, z]')
+    return cast(NamedPoint, table.content["point"])
 
 
 def _read_symmetry(table: TomlTable, default_through: Vector) -> Symmetry:

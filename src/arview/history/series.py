@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from itertools import pairwise
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from arview.errors import InputError
 from arview.history.store import HistoryStore, StoredResult
+from arview.inspection import MEASURANDS
 
 Quantity = Literal["distance", "dx", "dy", "dz", "tilt", "twist"]
 
@@ -152,6 +153,8 @@ def series_of(
     rows = {row["result_id"]: row for row in store.components([one.id for one in kept], component)}
     if not rows:
         raise InputError(f"{store.name}: {parts[0]!r} has no component {component!r}")
+    kept, others = _of_newest_point(kept, store.details(list(rows), component), quantity)
+    left_out += others
     column = f"{quantity}_{'deg' if quantity in ('tilt', 'twist') else 'mm'}"
     values, absent, undetermined = [], 0, 0
     is_length = column.endswith("mm")
@@ -179,6 +182,34 @@ def series_of(
     return ComponentSeries(
         parts[0], component, quantity, "mm" if is_length else "deg", tuple(values), lower, upper, tuple(left_out)
     )
+
+
+def _of_newest_point(
+    listed: list[StoredResult], details: dict[int, dict[str, Any]], quantity: Quantity
+) -> tuple[list[StoredResult], list[str]]:
+    """The results stated for the same point, or for angles about the same axis, as the newest, and a text on the rest.
+
+    A result without the component says nothing about it, and is kept.
+    """
+    stated = {number: _stated_for(one, quantity) for number, one in details.items()}
+    newest = next((stated[one.id] for one in reversed(listed) if one.id in stated), "")
+    kept = [one for one in listed if stated.get(one.id, newest) == newest]
+    others = sorted({stated[one.id] for one in listed if stated.get(one.id, newest) != newest})
+    if not others:
+        return kept, []
+    what = "about another axis" if quantity in ("tilt", "twist") else "for another point"
+    return kept, [f"{len(listed) - len(kept)} stated {what} ({'; '.join(others)}) than the newest ({newest})"]
+
+
+def _stated_for(details: dict[str, Any], quantity: Quantity) -> str:
+    """What a value is stated for, in words: the point of a displacement, the axis of an angle."""
+    if quantity in ("tilt", "twist"):
+        axes = details.get("axes")
+        return "axis of an older version" if axes is None else f"({', '.join(f'{x + 0.0:.2f}' for x in axes[2])})"
+    kind = details.get("measurand", "box_center")
+    if kind == "given":
+        return f"{MEASURANDS[kind]} ({', '.join(f'{x + 0.0:.3f}' for x in details['center_mm'])})"
+    return MEASURANDS[kind]
 
 
 def _last_of_each_serial(listed: list[StoredResult]) -> list[StoredResult]:

@@ -288,6 +288,17 @@ class HistoryStore:
         for number in ids:
             yield from by_result.get(number, ())
 
+    def details(self, ids: list[int], name: str) -> dict[int, dict[str, Any]]:
+        """The details of a component in the documents of results, by their numbers; empty where there are none."""
+        found: dict[int, dict[str, Any]] = {}
+        query = sa.select(results.c.id, results.c.document).where(results.c.id.in_(ids))
+        with self._begin() as connection:
+            for row in connection.execute(query.execution_options(yield_per=200)):
+                for entry in json.loads(row.document)["components"]:
+                    if entry["name"] == name:
+                        found[int(row.id)] = entry.get("details") or {}
+        return found
+
     def check(self) -> tuple[int, list[str]]:
         """The number of results, and descriptions of those that were altered after they were added."""
         faults = []

@@ -1,12 +1,14 @@
 """Inspection: the measured deviations of one built part, and the file ``inspection.json`` that holds them."""
 
 from arview.inspection.details import (
+    MEASURANDS,
     BudgetLine,
     DatumReport,
     DatumSystem,
     Details,
     DistanceReport,
     DistanceStatistics,
+    FailedDatum,
     ForeignReport,
     MethodAgreement,
     MethodResult,
@@ -17,11 +19,13 @@ from arview.inspection.record import (
     ComponentDeviation,
     Finding,
     Inspection,
+    MeasuredPresence,
     Provenance,
     Verdict,
 )
 
 __all__ = [
+    "MEASURANDS",
     "SCHEMA_VERSION",
     "BudgetLine",
     "ComponentDeviation",
@@ -30,9 +34,11 @@ __all__ = [
     "Details",
     "DistanceReport",
     "DistanceStatistics",
+    "FailedDatum",
     "Finding",
     "ForeignReport",
     "Inspection",
+    "MeasuredPresence",
     "MethodAgreement",
     "MethodResult",
     "Provenance",

@@ -11,6 +11,17 @@ Vector3 = tuple[float, float, float]
 Matrix = tuple[tuple[float, ...], ...]
 T = TypeVar("T")
 
+MEASURANDS = {
+    "volume_centroid": "centre of mass (centroid of the volume)",
+    "area_centroid": "centre of mass (centroid of the area of a sheet body)",
+    "seat": "middle of the surface on which it stands",
+    "axis": "foot of its axis",
+    "hole": "centre of its hole",
+    "given": "point named by the part file",
+    "box_center": "centre of the bounding box",
+}
+"""The points whose displacement is stated, in words; the last one is that of older files."""
+
 
 @dataclass(frozen=True)
 class MethodResult:
@@ -47,13 +58,16 @@ class MethodAgreement:
         methods: their names.
         difference_mm: length of the difference of their displacements.
         joint_mm: bound below which 95 % of such differences are expected.
-        agree: whether the difference is below that bound.
+        agree: whether the methods agree: neither the displacements nor shift and turn together differ by more.
+        ratio: difference of shift and turn in all directions that both determine, divided by the one below which 95 %
+            of such differences are expected.
     """
 
     methods: tuple[str, str]
     difference_mm: float
     joint_mm: float
     agree: bool
+    ratio: float | None = None
 
 
 @dataclass(frozen=True)
@@ -69,11 +83,18 @@ class Details:
     """The full measurement of a component in the datum frame, with the axes of the model; degrees and mm.
 
     Attributes:
-        center_mm: nominal position of the point that ``displacement_mm`` refers to: the centre of the bounding box.
+        center_mm: nominal position of the point that ``displacement_mm`` refers to.
+        measurand: which point that is, a key of `MEASURANDS`; files of older versions state the centre of the box.
         measured_from_nominal: (4,4) row-major pose relative to the nominal one; undetermined directions are nominal.
         covariance: (6,6) covariance of rotation vector (rad) and displacement (mm).
         undetermined: (K,6) orthonormal undetermined directions; rotations are multiplied by ``radius_mm``.
         radius_mm: half the diagonal of the bounding box.
+        axes: (3,3) rows are the component's own axes in the model; tilt and twist are those of the last one.
+        axis_from: what the last own axis is: symmetry, seat (normal of the surface on which it stands), face or model.
+        own_displacement_mm, own_rotation_deg: displacement and rotation vector along the own axes, None where
+            undetermined.
+        tilt_uncertainty_deg: U of the tilt.
+        photos: number of photos that show the component.
         k: coverage factor of U along the displacement.
         interval_mm: ends of the 95 % coverage interval of the distance.
         corrected_distance_mm: most likely true distance; near zero, noise makes the measured one too large (Rice).
@@ -87,10 +108,17 @@ class Details:
     """
 
     center_mm: Vector3
+    measurand: str = "box_center"
     measured_from_nominal: Matrix | None = None
     covariance: Matrix | None = None
     undetermined: Matrix = ()
     radius_mm: float | None = None
+    axes: Matrix | None = None
+    axis_from: str | None = None
+    own_displacement_mm: tuple[float | None, ...] | None = None
+    own_rotation_deg: tuple[float | None, ...] | None = None
+    tilt_uncertainty_deg: float | None = None
+    photos: int | None = None
     k: float | None = None
     interval_mm: tuple[float, float] | None = None
     corrected_distance_mm: float | None = None
@@ -131,6 +159,25 @@ class DatumReport:
 
 
 @dataclass(frozen=True)
+class FailedDatum:
+    """A datum of the part file that could not be measured.
+
+    Attributes:
+        label, feature, component: of the datum.
+        reason: why.
+        instead: features that could be measured instead, best first.
+        directions: degrees of freedom that it would have locked, and that were taken from elsewhere.
+    """
+
+    label: str
+    feature: str
+    component: str
+    reason: str
+    instead: tuple[str, ...] = ()
+    directions: str = ""
+
+
+@dataclass(frozen=True)
 class DatumSystem:
     """The frame of the deviations.
 
@@ -143,6 +190,8 @@ class DatumSystem:
         scale_std: relative standard uncertainty of the scale.
         scale_from: sources of the scale.
         notes: remarks on the alignment.
+        not_measured: datums of the part file that could not be measured.
+        frame: datums, best_fit (the part file has none), or partial: of those datums that could be measured.
     """
 
     datums: tuple[DatumReport, ...]
@@ -153,6 +202,8 @@ class DatumSystem:
     scale_std: float | None = None
     scale_from: str = ""
     notes: tuple[str, ...] = ()
+    not_measured: tuple[FailedDatum, ...] = ()
+    frame: str = "datums"
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from arview.inspection.record import (
     ComponentDeviation,
     Finding,
     Inspection,
+    MeasuredPresence,
     Provenance,
     Verdict,
 )
@@ -79,6 +80,7 @@ def component_from_entry(entry: dict[str, Any]) -> ComponentDeviation:
         tilt_deg=rotation.get("tilt_deg"),
         twist_deg=rotation.get("twist_deg"),
         finding=None if finding is None else Finding(finding),
+        presence=None if entry.get("presence") is None else MeasuredPresence(entry["presence"]),
         details=None if entry.get("details") is None else from_json(Details, entry["details"]),
     )
 
@@ -133,6 +135,8 @@ def _to_entry(component: ComponentDeviation) -> dict[str, Any]:
     }
     if component.finding is not None:
         entry["finding"] = component.finding.value
+    if component.presence is not None:
+        entry["presence"] = component.presence.value
     if component.details is not None:
         entry["details"] = to_json(component.details)
     return entry

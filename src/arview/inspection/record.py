@@ -37,6 +37,18 @@ class Finding(StrEnum):
     MISSING = "missing"
 
 
+class MeasuredPresence(StrEnum):
+    """Whether a component was there when it was measured."""
+
+    PRESENT = "present"
+    MISSING = "missing"
+    """What it would hide was seen."""
+    NOT_SEEN = "not_seen"
+    """Too few photos show its place."""
+    UNKNOWN = "unknown"
+    """Its place was seen, but neither the component nor its absence could be verified."""
+
+
 class RecordError(InputError):
     """Contradictions in a record, each as a text that starts with the name of a field."""
 
@@ -61,6 +73,7 @@ class ComponentDeviation:
         tilt_deg: angle between measured and design axis of the component; None where undetermined.
         twist_deg: rotation about that axis; None where undetermined.
         finding: ``missing`` if the component is absent.
+        presence: whether the component was there; None in files that do not say.
         details: details of the measurement; None in files of version 1.0.
 
     Raises:
@@ -78,6 +91,7 @@ class ComponentDeviation:
     twist_deg: float | None = None
     finding: Finding | None = None
     details: Details | None = None
+    presence: MeasuredPresence | None = None
 
     @property
     def is_present(self) -> bool | None:
@@ -85,6 +99,12 @@ class ComponentDeviation:
         if self.finding is Finding.MISSING:
             return False
         return True if any(self.observable) else None
+
+    @property
+    def _determined_displacement(self) -> tuple[str, tuple[float | None, ...]]:
+        """Field and values of the displacement along the component's own axes, or else along those of the model."""
+        own = None if self.details is None else self.details.own_displacement_mm
+        return ("displacement_mm", self.displacement_mm) if own is None else ("details.own_displacement_mm", own)
 
     @property
     def _has_angle_limit(self) -> bool:
@@ -127,16 +147,17 @@ class ComponentDeviation:
             yield "rotation: is a number, but no rotation is determined by observable"
 
     def _distance_faults(self) -> Iterator[str]:
-        known = [value for value in self.displacement_mm if value is not None]
+        where, values = self._determined_displacement
+        known = [value for value in values if value is not None]
         if not known:
             if self.distance_mm is not None:
                 yield f"distance_mm: is {self.distance_mm}, but no displacement is determined"
             return
         length = math.hypot(*known)
         if self.distance_mm is None:
-            yield f"distance_mm: is null, but displacement_mm has the length {length:.3f} mm"
+            yield f"distance_mm: is null, but {where} has the length {length:.3f} mm"
         elif abs(self.distance_mm - length) > _DISTANCE_SLACK_MM + 1e-3 * length:
-            yield f"distance_mm: is {self.distance_mm}, but displacement_mm has the length {length:.3f} mm"
+            yield f"distance_mm: is {self.distance_mm}, but {where} has the length {length:.3f} mm"
         if self.uncertainty_mm is None:
             yield "uncertainty_mm: is null, but a distance is given; a measured value needs its U"
 
@@ -146,7 +167,11 @@ class ComponentDeviation:
                 yield f"verdict: is {self.verdict}, but the component is missing; expected fail"
             if any(self.observable) or self.distance_mm is not None:
                 yield "displacement_mm: a missing component has no displacement; expected nulls"
+            if self.presence not in (None, MeasuredPresence.MISSING):
+                yield f"presence: is {self.presence}, but the finding is missing"
             return
+        if self.presence is MeasuredPresence.MISSING:
+            yield "presence: is missing, but there is no such finding"
         if self.verdict is Verdict.NOT_MEASURED:
             if any(self.observable) or self.distance_mm is not None:
                 yield "verdict: is not_measured, but the component has measured values"

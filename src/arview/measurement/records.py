@@ -27,6 +27,7 @@ from arview.inspection import (
 )
 from arview.measurement.datums.alignment import Alignment
 from arview.measurement.folder import MetricReconstruction
+from arview.measurement.measurand import Measurand
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.types import Move
 from arview.measurement.uncertainty.budget import MeasuredPlacement, place, relative_twists
@@ -40,35 +41,37 @@ _SOFTWARE = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "nu
 
 
 def component_record(
-    name: str, measured: ComponentMeasurement, alignment: Alignment, poses: PosePropagation | None, part: Part,
-    options: MeasureOptions,
+    name: str, measured: ComponentMeasurement, measurand: Measurand, alignment: Alignment,
+    poses: PosePropagation | None, part: Part, options: MeasureOptions,
 ) -> ComponentDeviation:  # fmt: skip
-    """Position of a component in the datum frame, with its verdict."""
+    """Position of a component's stated point in the datum frame, with its verdict."""
     settings = part.component_settings(name)
     tolerance_mm = settings.position_tolerance_mm or options.tolerance_mm
     component = part.model.component(name)
-    center = component.bounds_in_model.mean(axis=0)
+    center = measurand.point_in_model
     together = combined_of(measured)
     nothing = (False,) * 6
     failures = tuple(MethodResult(f.method, reason=f.reason) for f in measured.failures)
     if together is None or any(f.is_missing for f in measured.failures if f.method != "cloud"):
         is_missing = any(f.is_missing for f in measured.failures)
         reasons = tuple(dict.fromkeys(f.reason for f in measured.failures))
-        details = Details(_three(center), methods=failures, notes=reasons)
+        details = Details(_three(center), measurand.kind, methods=failures, notes=reasons)
         verdict, finding = (Verdict.FAIL, Finding.MISSING) if is_missing else (Verdict.NOT_MEASURED, None)
         return ComponentDeviation(
             name, (None, None, None), None, nothing, None, tolerance_mm, verdict, finding=finding, details=details
         )
     by_poses = None if poses is None else poses.covariance_of(component, center)
+    together = together.at(center)
+    moves = [move.at(center) for move in measured.moves]
     placed = place(together, alignment, by_poses, options.uncertainty)
-    pairs = agreements(measured.moves)
-    notes: list[str] = [note for move in measured.moves for note in move.notes]
+    pairs = agreements(moves)
+    notes: list[str] = [note for move in moves for note in move.notes]
     notes += [_contradiction(pair) for pair in pairs if pair.ratio > 1.0]
     verdict = _verdict(placed, tolerance_mm, settings, options, notes)
     axis = _axis(settings, placed, part)
     tilt_deg, twist_deg = tilt_and_twist(placed, axis)
     displacement = [float(v) if seen else None for v, seen in zip(placed.twist[3:], placed.observable[3:], strict=True)]
-    methods = tuple(_method_result(move, alignment) for move in measured.moves) + failures
+    methods = tuple(_method_result(move, alignment) for move in moves) + failures
     distance = placed.distance
     return ComponentDeviation(
         name=name,
@@ -81,7 +84,7 @@ def component_record(
         tilt_deg=tilt_deg,
         twist_deg=twist_deg,
         details=replace(
-            _details(placed, together, settings), methods=methods, notes=tuple(notes),
+            _details(placed, together, measurand, settings), methods=methods, notes=tuple(notes),
             agreement=tuple(
                 MethodAgreement((p.first, p.second), p.difference_mm, p.joint_mm, p.ratio <= 1.0) for p in pairs
             ),
@@ -116,12 +119,15 @@ def _verdict(
     return verdict if verdicts else Verdict.UNDECIDED
 
 
-def _details(placed: MeasuredPlacement, together: CombinedMove, settings: ComponentSettings) -> Details:
+def _details(
+    placed: MeasuredPlacement, together: CombinedMove, measurand: Measurand, settings: ComponentSettings
+) -> Details:
     """Details of a component's record."""
     rotation = exp_so3(placed.twist[:3])
     center, distance, angle = together.center_in_model, placed.distance, placed.angle
     return Details(
         center_mm=_three(center),
+        measurand=measurand.kind,
         measured_from_nominal=_matrix(rigid(rotation, center - rotation @ center + placed.twist[3:])),
         covariance=_matrix(placed.covariance),
         undetermined=_matrix(placed.undetermined),

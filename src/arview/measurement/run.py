@@ -27,8 +27,10 @@ from arview.measurement.datums.in_cloud import measure_datums_in_cloud
 from arview.measurement.datums.in_photos import measure_datums_in_photos
 from arview.measurement.datums.planes import base_plane
 from arview.measurement.folder import MetricReconstruction, in_model_frame, read_folder
+from arview.measurement.measurand import measurand_of
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.photo import PhotoViews, load_views, measure_components_in_photos
+from arview.measurement.photo.patches import turning_center
 from arview.measurement.records import (
     component_record,
     datum_doubts,
@@ -81,6 +83,7 @@ def _measure(
     names = [name for name in part.inspected if name not in base]
     if not names:
         raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
+    measurands = {name: measurand_of(name, part) for name in names}
     # The views get no covariance of the poses: it is propagated below, relative to the datums.
     reconstruction = in_model_frame(reconstruction, part)
     has_photos = bool(reconstruction.sparse.photos)
@@ -100,7 +103,7 @@ def _measure(
         poses = PosePropagation(reconstruction.sparse, part.model, alignment, base)
     deviations = []
     for done, name in enumerate(names, 1):
-        deviations.append(component_record(name, results[name], alignment, poses, part, options))
+        deviations.append(component_record(name, results[name], measurands[name], alignment, poses, part, options))
         tell("uncertainty", done, len(names))
     foreign: tuple[ForeignReport, ...] = ()
     distances: DistanceReport | None = None
@@ -152,8 +155,11 @@ def measure_all(
                 raise
             measured = [NotMeasured(name, "cloud", str(error)) for name in names]
         for one in measured:
-            if one.component in found:
-                found[one.component].append(one)
+            if one.component not in found:
+                continue
+            # All methods state their moves about the same point.
+            center = turning_center(part.model.component(one.component), part)
+            found[one.component].append(one.at(center) if isinstance(one, Move) else one)
     return {
         name: ComponentMeasurement(
             tuple(one for one in all_of if isinstance(one, Move)),

@@ -7,7 +7,8 @@ vectors, and the translation is the displacement of the centre, which is the pos
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -27,7 +28,7 @@ class Move:
     Attributes:
         component: its name.
         method: method of measurement.
-        center_in_model: (3,) mm, point about which it rotates: centre of the component's bounding box at nominal.
+        center_in_model: (3,) mm, point about which it rotates, at nominal: the centre of mass unless moved by `at`.
         twist: (6,) rotation vector (rad) and translation (mm) in model axes; zero along ``undetermined``.
         covariance: (6,6) of ``twist``, zero along ``undetermined``.
         undetermined: (K,6) orthonormal directions, rotations multiplied by ``radius_mm``, that the data or the
@@ -71,10 +72,40 @@ class Move:
         """(4,4) the inverse: the motion that would bring the component to its nominal position."""
         return invert(self.measured_from_nominal)
 
+    def at(self, point_in_model: Array) -> Move:
+        """The same move, stated for another point (3,) of the component."""
+        twist, covariance, undetermined = moved_to(
+            self.twist, (self.covariance,), self.undetermined, self.radius_mm, point_in_model - self.center_in_model
+        )
+        return replace(
+            self, center_in_model=point_in_model, twist=twist, covariance=covariance[0], undetermined=undetermined
+        )
+
     @property
     def observable(self) -> NDArray[np.bool_]:
         """(6,) which of rx ry rz tx ty tz, in model axes, are orthogonal to all undetermined directions."""
         return np.asarray(~(np.abs(self.undetermined) > 0.05).any(axis=0))
+
+
+def moved_to(
+    twist: Array, covariances: Sequence[Array], undetermined: Array, radius_mm: float, arm: Array
+) -> tuple[Array, list[Array], Array]:
+    """A twist (6,), covariances (6,6) and undetermined directions (K,6) for a point at ``arm`` (3,) from the centre.
+
+    The displacement of the new point has a part of the rotation. Where that is undetermined, so is the part.
+    """
+    x, y, z = arm
+    change = np.eye(6)
+    change[3:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    unit = np.array([radius_mm] * 3 + [1.0] * 3)
+    moved = np.concatenate([twist[:3], twist[3:] + exp_so3(twist[:3]) @ arm - arm])
+    project, free = np.eye(6), undetermined
+    if len(undetermined):
+        _, sizes, basis = np.linalg.svd((undetermined / unit) @ change.T * unit)
+        free = basis[: np.count_nonzero(sizes > 1e-9)]
+        project = (np.eye(6) - free.T @ free) / unit[:, None] * unit
+    both = project @ change
+    return project @ moved, [both @ one @ both.T for one in covariances], free
 
 
 @dataclass(frozen=True)

@@ -254,7 +254,8 @@ def _is_as_measured(
     """Whether a displaced component is seen where it was measured."""
     if deviation is None or presence.model_from_nominal is None or center_in_model is None:
         return False
-    seen = apply(presence.model_from_nominal, center_in_model[None])[0] - center_in_model
+    point = center_in_model if deviation.details is None else np.array(deviation.details.center_mm)
+    seen = apply(presence.model_from_nominal, point[None])[0] - point
     measured = np.array([value or 0.0 for value in deviation.displacement_mm])
     slack = max(_SAME_PLACE_MM, _SAME_PLACE_SHARE * float(np.linalg.norm(seen)))
     return float(np.linalg.norm(seen - measured)) <= slack

@@ -6,19 +6,35 @@ from datetime import UTC, datetime
 from typing import Any
 
 from arview.cad.part import Part
-from arview.inspection import Inspection, MethodResult
+from arview.inspection import MEASURANDS, Inspection, MethodResult
 from arview.inspection.rounding import decimals_of
 from arview.report.formatting import NONE, determined, exact_number, number
 from arview.version import __version__
 
 LEGEND = (
-    "Nominal and measured are the position of the centre of the component's bounding box in the datum frame; deviation"
-    " is measured minus nominal (dx, dy, dz). Distance is the length of the deviation and is compared with the"
+    "Nominal and measured are the position in the datum frame of the component's {point}; deviation is measured minus"
+    " nominal (dx, dy, dz). Distance is the length of the deviation and is compared with the"
     " tolerance, which is a radius. Position Ø is the diameter of the smallest position tolerance zone that contains"
     " the component (ISO 1101), twice the distance, with the allowed diameter in parentheses. U is the expanded"
-    " uncertainty of the distance. Tilt is the angle between measured and design axis, twist the rotation about that"
-    " axis. Undetermined means that the measurement cannot determine the value: it is unknown, not zero."
+    " uncertainty of the distance. Tilt is the angle between measured and design direction of the component's own axis"
+    " (of symmetry, or else the normal of the surface on which it stands), twist the rotation about it. Undetermined"
+    " means that the measurement cannot determine the value: it is unknown, not zero."
 )
+
+
+def legend_of(inspection: Inspection) -> str:
+    """The legend of the table of components, with the points whose positions it states."""
+    names: dict[str, list[str]] = {}
+    for one in inspection.components:
+        kind = "box_center" if one.details is None else one.details.measurand
+        names.setdefault(MEASURANDS[kind], []).append(one.name)
+    if len(names) <= 1:
+        return LEGEND.format(point=next(iter(names), MEASURANDS["volume_centroid"]))
+    common, *others = sorted(names, key=lambda point: -len(names[point]))
+    rest = "; of ".join(f"{', '.join(names[point])} the {point}" for point in others)
+    return LEGEND.format(point=f"{common}, or of {rest}")
+
+
 _DOF = {
     "rx": "rotation about x",
     "ry": "rotation about y",

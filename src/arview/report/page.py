@@ -161,7 +161,11 @@ def _components(evidence: ReportEvidence) -> dict[str, Any]:
             }
         )
     lead = verdict_sentence(evidence.inspection)
-    return {"rows": rows, "components_lead": f"{lead[:1].upper()}{lead[1:]}.", "legend": explanations.LEGEND}
+    return {
+        "rows": rows,
+        "components_lead": f"{lead[:1].upper()}{lead[1:]}.",
+        "legend": explanations.legend_of(evidence.inspection),
+    }
 
 
 def _center(one: ComponentDeviation, evidence: ReportEvidence) -> Array | None:

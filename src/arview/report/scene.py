@@ -79,7 +79,9 @@ def make_scene(
                 "place": None if place is None else np.array(place).ravel().tolist(),
             }
         if model is not None:
-            entry["center"] = model.component(name).bounds_in_model.mean(axis=0).tolist()
+            stated = None if deviation is None or deviation.details is None else deviation.details.center_mm
+            middle = model.component(name).bounds_in_model.mean(axis=0).tolist()
+            entry["center"] = middle if stated is None else list(stated)
         scene["components"].append(entry)
     scene["foreign"] = [
         {"center": list(one.center_mm), "size": list(one.size_mm), "text": one.text}

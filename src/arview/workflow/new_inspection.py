@@ -11,6 +11,7 @@ from arview.acceptance.position_list import ListedComponent
 from arview.cad.part import Part
 from arview.errors import InputError
 from arview.inspection import ComponentDeviation, Details, Inspection, Provenance, Verdict
+from arview.measurement.measurand import measurand_of
 from arview.measurement.uncertainty.decision import decide
 from arview.version import __version__
 
@@ -53,9 +54,9 @@ def new_inspection(
 
 def _component(part: Part, name: str, value: ListedComponent | None, label: str) -> ComponentDeviation:
     tolerance_mm = part.component_settings(name).position_tolerance_mm
-    low, high = part.model.component(name).bounds_in_model
-    center = 0.5 * (low + high)
-    details = Details((float(center[0]), float(center[1]), float(center[2])))
+    measurand = measurand_of(name, part)
+    center = measurand.point_in_model
+    details = Details((float(center[0]), float(center[1]), float(center[2])), measurand.kind)
     moved = np.full(3, np.nan)
     if value is not None:
         moved = value.place - center if np.isnan(value.displacement).all() else value.displacement

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 
+from arview.inspection.details import MEASURANDS
 from arview.inspection.fingerprint import fingerprint
 from arview.inspection.record import ComponentDeviation, Inspection
 from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
@@ -14,7 +15,7 @@ HEADER = (
     "nominal_x_mm", "nominal_y_mm", "nominal_z_mm", "measured_x_mm", "measured_y_mm", "measured_z_mm",
     "dx_mm", "dy_mm", "dz_mm", "distance_mm", "U_mm", "k", "low_95_mm", "high_95_mm", "tolerance_mm",
     "position_diameter_mm", "tilt_deg", "twist_deg", "angle_deg", "angle_U_deg", "angle_tolerance_deg", "notes",
-    "inspection_sha256",
+    "inspection_sha256", "point",
 )  # fmt: skip
 """Columns. Cells of undetermined or unmeasured values are empty."""
 
@@ -33,7 +34,7 @@ def to_csv(inspection: Inspection, sha256: str | None = None) -> str:
     writer = csv.writer(out)
     writer.writerow(HEADER)
     for component in inspection.components:
-        writer.writerow([_text(cell) for cell in (*_row(inspection, component), sha256)])
+        writer.writerow([_text(cell) for cell in (*_row(inspection, component), sha256, _point(component))])
     return out.getvalue()
 
 
@@ -65,6 +66,11 @@ def _row(inspection: Inspection, one: ComponentDeviation) -> list[str]:
         _rounded(angle_u, angle_decimals), _exact(angle_limit),
         "" if details is None else "; ".join(details.notes),
     ]  # fmt: skip
+
+
+def _point(one: ComponentDeviation) -> str:
+    """The point whose position is stated, in words."""
+    return MEASURANDS["box_center" if one.details is None else one.details.measurand]
 
 
 def _rounded(value: float | None, decimals: int) -> str:

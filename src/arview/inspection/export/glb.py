@@ -64,7 +64,8 @@ def to_glb(inspection: Inspection, model: Model, arrow_scale: float | None = Non
             moved[:3, 3] *= _M_PER_MM
             solid = _mesh(component, _COLORS[deviation.verdict])
             _add_node(scene, f"measured/{component.name}", "measured", solid, moved, extras)
-        tail = component.bounds_in_model.mean(axis=0)
+        stated = None if deviation.details is None else deviation.details.center_mm
+        tail = component.bounds_in_model.mean(axis=0) if stated is None else np.array(stated)
         arrow = _arrow(deviation, tail, scale, 0.008 * model.diameter_mm)
         if arrow is not None:
             _add_node(scene, f"arrows/{component.name}", "arrows", arrow, np.eye(4), extras | {"times": scale})

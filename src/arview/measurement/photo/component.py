@@ -8,7 +8,7 @@ from arview.cad.part import Part
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
 from arview.measurement.photo.fit import RigidFit
 from arview.measurement.photo.options import PhotoOptions
-from arview.measurement.photo.patches import free_directions
+from arview.measurement.photo.patches import free_directions, turning_center
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Method, Move
 
@@ -21,7 +21,7 @@ class MeasuredComponent:
     Attributes:
         views, index, options: as given.
         shape: the component's mesh.
-        center: (3,) centre of its bounding box, mm.
+        center: (3,) its centre of mass, mm; on the declared axis of what is round.
         corners: (8,3) corners of its bounding box, mm.
         radius_mm: half the diagonal of the bounding box.
         px_mm: size of a pixel at the component.
@@ -32,7 +32,7 @@ class MeasuredComponent:
         self.views, self.index, self.options = views, index, options
         self.shape = views.model.components[index]
         low, high = self.shape.bounds_in_model
-        self.center = self.shape.bounds_in_model.mean(axis=0)
+        self.center = turning_center(self.shape, part)
         self.corners = low + np.array(list(np.ndindex(2, 2, 2))) * (high - low)
         self.radius_mm = 0.5 * float(np.linalg.norm(np.ptp(self.shape.bounds_in_model, axis=0)))
         self.px_mm = views.mm_per_px(self.center)

@@ -112,15 +112,7 @@ def free_directions(component: Component, part: Part | None, center: Array, radi
 
     These follow from continuous symmetries, found in the mesh or declared in the part file.
     """
-    # Relative to their centres, components of one shape share their symmetries; the cache then serves all of them.
-    local = np.round(component.vertices_in_model - center, 6) + 0.0
-    symmetries = [
-        replace(one, through_in_model=tuple((np.array(one.through_in_model) + center).tolist()))
-        for one in _symmetries(local.tobytes(), component.faces.astype(np.int64).tobytes())
-    ]
-    if part is not None:
-        declared = part.component_settings(component.name).symmetry
-        symmetries += [declared] if declared is not None else []
+    symmetries = symmetries_of(component, part)
     moves = []
     for symmetry in symmetries:
         if symmetry.order is None:
@@ -131,6 +123,36 @@ def free_directions(component: Component, part: Part | None, center: Array, radi
         return np.zeros((0, 6))
     _, size, basis = np.linalg.svd(np.array(moves))
     return np.asarray(basis[: np.count_nonzero(size > 1e-6 * radius_mm)])
+
+
+def symmetries_of(component: Component, part: Part | None) -> list[Symmetry]:
+    """Exact symmetries of a component in the model frame: the declared one, then those found in its mesh.
+
+    Of two with one axis the declared one is kept, unless only the found one is continuous.
+    """
+    # Relative to their centres, components of one shape share their symmetries; the cache then serves all of them.
+    center = component.bounds_in_model.mean(axis=0)
+    local = np.round(component.vertices_in_model - center, 6) + 0.0
+    found = [
+        replace(one, through_in_model=tuple((np.array(one.through_in_model) + center).tolist()))
+        for one in _symmetries(local.tobytes(), component.faces.astype(np.int64).tobytes())
+    ]
+    declared = None if part is None else part.component_settings(component.name).symmetry
+    if declared is None or any(
+        one.order is None and declared.order is not None and one.is_same_axis(declared) for one in found
+    ):
+        return found
+    return [declared, *(one for one in found if not one.is_same_axis(declared))]
+
+
+def turning_center(component: Component, part: Part | None) -> Array:
+    """(3,) point about which the moves of all methods turn: the centre of mass, on the declared axis if it is round."""
+    center = component.centroid_in_model
+    declared = None if part is None else part.component_settings(component.name).symmetry
+    if declared is None or declared.order is not None:
+        return center
+    axis, through = np.array(declared.axis_in_model), np.array(declared.through_in_model)
+    return np.asarray(through + axis * (axis @ (center - through)))
 
 
 @lru_cache(maxsize=64)

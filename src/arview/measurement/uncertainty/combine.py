@@ -10,7 +10,7 @@ import numpy as np
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.measurement.types import Method, Move
+from arview.measurement.types import Method, Move, moved_to
 
 _PARTS = (slice(0, 3), slice(3, 6))
 
@@ -55,6 +55,16 @@ class CombinedMove:
     undetermined: Array
     radius_mm: float
     center_in_model: Array
+
+    def at(self, point_in_model: Array) -> CombinedMove:
+        """The same move, stated for another point (3,) of the component."""
+        names = tuple(self.covariances)
+        twist, parts, undetermined = moved_to(
+            self.twist, [*self.covariances.values(), self.disagreement], self.undetermined, self.radius_mm,
+            point_in_model - self.center_in_model,
+        )  # fmt: skip
+        covariances = dict(zip(names, parts[:-1], strict=True))
+        return CombinedMove(twist, covariances, parts[-1], undetermined, self.radius_mm, point_in_model)
 
 
 def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove:

@@ -133,7 +133,7 @@ class PosePropagation:
         if is_fit:
             center = points[0]
             arms = rows[:, :3] - np.cross(center, rows[:, 3:6])
-            name = min(self.model.components, key=lambda c: float(np.linalg.norm(c.bounds_in_model.mean(0) - center)))
+            name = min(self.model.components, key=lambda c: float(np.linalg.norm(c.centroid_in_model - center)))
             return np.concatenate([arms, rows[:, 3:6]], axis=1) @ self._twist(name, center)
         normals = rows[:, 3:6]
         # Neighbouring points of a datum are visible in much the same photos, so some of them represent the others.
