@@ -62,7 +62,9 @@ INSPECTION_distances: coloured PLY, a picture, histograms.""",
     },
 )
 @click.argument("folder", metavar="[OUT]", required=False)
-@click.option("--cloud", "cloud_path", metavar="FILE", help="Measure a cloud instead: PLY, in mm, in any frame.")
+@click.option("--cloud", "cloud_path", metavar="FILE",
+              help="Measure a cloud instead, in any frame: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ or E57.")  # fmt: skip
+@click.option("--cloud-unit", metavar="UNIT", help="Unit of the cloud: mm, cm, m, inch, ft, um; default: by its size.")
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
 @click.option("-o", "--output", metavar="INSPECTION", help="File to write; default: inspection.json in OUT.")
 @click.option("--photos", metavar="FOLDER", help="Folder of the photos, if they were moved.")
@@ -83,6 +85,7 @@ INSPECTION_distances: coloured PLY, a picture, histograms.""",
 def measure(
     folder: str | None,
     cloud_path: str | None,
+    cloud_unit: str | None,
     part_path: str,
     output: str | None,
     photos: str | None,
@@ -108,6 +111,8 @@ def measure(
 
     if (folder is None) == (cloud_path is None):
         raise InputError("give either OUT, the folder of `arview reconstruct`, or --cloud FILE")
+    if cloud_unit is not None and cloud_path is None:
+        raise InputError("--cloud-unit is the unit of the file given with --cloud")
     place = Path(folder) if folder is not None else Path(cloud_path or "").parent
     target = output_path(output or str(place / "inspection.json"), [part_path])
     part = load_part(part_path, unit)
@@ -120,7 +125,10 @@ def measure(
         uncertainty=UncertaintyOptions(monte_carlo=not no_monte_carlo, seed=seed),
         decision=DecisionOptions(guard),
     )
-    reconstruction = read_cloud(cloud_path or "") if folder is None else read_folder(folder, photos, "cloud" in methods)
+    if folder is None:
+        reconstruction = read_cloud(cloud_path or "", part.model, cloud_unit)
+    else:
+        reconstruction = read_folder(folder, photos, "cloud" in methods)
     with stage_bar() as progress:
         inspection = run.measure(reconstruction, part, options, progress=progress)
     save_inspection(inspection, target)

@@ -9,13 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from arview.cad.model import Model
 from arview.cad.part import Part
 from arview.camera import Camera
 from arview.errors import InputError
+from arview.measurement.cloud.global_registration import find_model_in_cloud
+from arview.measurement.cloud.placing import cloud_in_mm, moved_to_model, orient_normals, place_cloud, scaled
+from arview.measurement.cloud.reading import UNITS_MM, possible_units, read_points, unit_of_option
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of
 from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import DenseCloud, Photo, SparseModel
 
+_NORMALS_WITHIN_MM = 3.0
+"""Distance from the CAD within which the side of a cloud's normals is compared with the surface's."""
 _SCALE_STD = 1e-3
 """Relative standard deviation of a scale that follows from the shape of the cloud alone; datums improve it."""
 
@@ -28,11 +34,13 @@ class MetricReconstruction:
         sparse: poses and points.
         scale: the scale and what it comes from.
         cloud: the dense cloud, or None.
+        cloud_factors: of a cloud whose unit its size leaves open, factors that are to be tried.
     """
 
     sparse: SparseModel
     scale: ScaleResult
     cloud: DenseCloud | None
+    cloud_factors: tuple[float, ...] = ()
 
 
 def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud: bool = True) -> MetricReconstruction:
@@ -76,49 +84,60 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
     return MetricReconstruction(sparse, scale, cloud)
 
 
-def read_cloud(path: str | Path) -> MetricReconstruction:
-    """Read a cloud without photos, in mm, in any frame, from a PLY file with or without normals.
+def read_cloud(path: str | Path, model: Model | None = None, unit: str | None = None) -> MetricReconstruction:
+    """Read a cloud without photos, in any frame, with or without normals.
+
+    Args:
+        path: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ or E57.
+        model: the CAD, by whose size the unit is found; without it the unit is mm.
+        unit: of the file, see `measurement.cloud.reading.UNITS_MM`; None: as the file declares it, or by size.
 
     Raises:
-        InputError: the file is not PLY, or holds no points.
+        InputError: the file cannot be read, holds no points, or has the size of the CAD in no unit.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give a cloud as PLY, in mm")
+    given = None if unit is None else unit_of_option(unit)
+    own = _own_ply(path)
+    if own is not None:
+        factor = 1.0 if given is None else UNITS_MM[given]
+        return _cloud_alone(scaled(own, factor), (), ())
+    raw = read_points(path)
+    known = given or raw.unit
+    units = [known or "mm"]
+    if known is None and model is not None:
+        units = possible_units(raw, model.diameter_mm, str(path))
+    warnings = [f"cloud: {note}" for note in raw.notes]
+    if given is None and units[0] != "mm":
+        how = "declared by the file" if raw.unit else "by its size beside the CAD's"
+        warnings.append(f"the cloud is in {units[0]} ({how})")
+    cloud = cloud_in_mm(raw, units[0])
+    if len(cloud.points) < len(raw):
+        warnings.append(f"the {len(raw)} points of the cloud were averaged to {len(cloud.points)}")
+    factors = tuple(UNITS_MM[one] / UNITS_MM[units[0]] for one in units)
+    return _cloud_alone(cloud, tuple(warnings), factors if len(factors) > 1 else ())
+
+
+def _own_ply(path: Path) -> DenseCloud | None:
+    """The cloud of a PLY file that arview wrote, which is in mm, else None."""
+    from arview.reconstruction.dense import read_ply
+
+    try:
+        with path.open("rb") as file:
+            is_own = b"property float sigma_mm" in file.read(1024)
+        return read_ply(path) if is_own else None
+    except (OSError, InputError):
+        return None
+
+
+def _cloud_alone(cloud: DenseCloud, warnings: tuple[str, ...], factors: tuple[float, ...]) -> MetricReconstruction:
+    """A reconstruction without photos."""
     none = np.zeros(0)
     empty = SparseModel(
         (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none.astype(np.int32),
         np.zeros((0, 2)),
     )  # fmt: skip
-    scale = ScaleResult(1.0, None, None, None, (), (), "a cloud without photos", Consistency(True, ""))
-    return MetricReconstruction(empty, scale, _any_ply(path))
-
-
-def _any_ply(path: Path) -> DenseCloud:
-    """The cloud of a PLY file that arview or another program wrote."""
-    from arview.reconstruction.dense import read_ply
-
-    try:
-        return read_ply(path)
-    except InputError:
-        pass
-    import trimesh
-
-    try:
-        with path.open("rb") as file:
-            content = trimesh.exchange.ply.load_ply(file)
-        points = np.asarray(content["vertices"], dtype=np.float64).reshape(-1, 3)
-        rows = content.get("metadata", {}).get("_ply_raw", {}).get("vertex", {}).get("data")
-        names = getattr(getattr(rows, "dtype", None), "names", None) or ()
-    except Exception as error:  # a damaged file may make the reader raise anything
-        raise InputError(f"{path}: is not a PLY file with points ({error})") from error
-    has_normals = {"nx", "ny", "nz"} <= set(names)
-    normals = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], axis=1) if has_normals else 0.0 * points
-    count = len(points)
-    return DenseCloud(
-        points, normals.astype(np.float32), np.zeros((count, 3), np.uint8), np.full(count, np.nan, np.float32),
-        np.zeros(count, np.uint8),
-    )  # fmt: skip
+    scale = ScaleResult(1.0, None, None, None, (), warnings, "a cloud without photos", Consistency(True, ""))
+    return MetricReconstruction(empty, scale, cloud, factors)
 
 
 def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricReconstruction:
@@ -127,8 +146,6 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
     Raises:
         InputError: the part is not found in the cloud, or the scale is unknown and no two datums have a distance.
     """
-    from arview.measurement.cloud.global_registration import find_model_in_cloud
-
     scale, cloud = reconstruction.scale, reconstruction.cloud
     if scale.model_from_scan is not None or cloud is None:
         return reconstruction
@@ -137,12 +154,17 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
             "cloud: lengths are in an arbitrary unit, and the part file has no two datums whose distance gives the "
             "scale; reconstruct with a board, a tag or a scale bar"
         )
-    found = find_model_in_cloud(cloud, part.model, None if scale.scale is None else 1.0)
-    normals = np.asarray(cloud.normals @ found.model_from_scan[:3, :3].T, dtype=np.float32)
-    moved = replace(
-        cloud, points=found.points_in_model(np.asarray(cloud.points, dtype=np.float64)), normals=normals,
-        sigma=np.asarray(cloud.sigma * found.scale, dtype=np.float32),
-    )  # fmt: skip
+    warnings = [*scale.warnings, "the part was found by the shape of the cloud alone"]
+    if scale.scale is None:
+        found = find_model_in_cloud(cloud, part.model, None)
+    else:
+        found, factor = place_cloud(cloud, part.model, reconstruction.cloud_factors or (1.0,))
+        cloud = scaled(cloud, factor)
+        if factor != 1.0:
+            warnings.append(f"the part was found in the cloud times {factor:g} only: this is its unit")
+    moved, turned = orient_normals(moved_to_model(cloud, found), part.model, _NORMALS_WITHIN_MM)
+    if turned:
+        warnings.append(turned)
     evidence = scale.evidence
     std = scale.scale_std
     if scale.scale is None:
@@ -150,7 +172,7 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
         evidence = (ScaleEvidence("cad", found.scale, std, "the cloud's shape"),)
     scale = replace(
         scale, scale=found.scale * (scale.scale or 1.0), scale_std=std, model_from_scan=found.model_from_scan,
-        evidence=evidence, warnings=(*scale.warnings, "the part was found by the shape of the cloud alone"),
+        evidence=evidence, warnings=tuple(warnings),
     )  # fmt: skip
     return MetricReconstruction(reconstruction.sparse.transformed(found.scale, found.model_from_scan), scale, moved)
 

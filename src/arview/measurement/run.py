@@ -86,6 +86,7 @@ def _measure(
     measurands = {name: measurand_of(name, part) for name in names}
     # The views get no covariance of the poses: it is propagated below, relative to the datums.
     reconstruction = in_model_frame(reconstruction, part)
+    warnings += [one for one in reconstruction.scale.warnings if one not in warnings]
     has_photos = bool(reconstruction.sparse.photos)
     if not has_photos and "cloud" not in options.methods:
         raise InputError("a cloud without photos can only be measured by the method 'cloud'")

@@ -1,0 +1,7 @@
+"""Reading clouds of scanners and other programs: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ and E57."""
+
+from arview.measurement.cloud.reading.files import SUFFIXES, read_points
+from arview.measurement.cloud.reading.raw_points import RawPoints, ReadOptions
+from arview.measurement.cloud.reading.units import UNITS_MM, possible_units, unit_of_option
+
+__all__ = ["SUFFIXES", "UNITS_MM", "RawPoints", "ReadOptions", "possible_units", "read_points", "unit_of_option"]

@@ -1,0 +1,241 @@
+"""Clouds as text: XYZ, PTS, CSV and their relatives, with any separator, decimal point or comma.
+
+Blocks of lines are parsed at once. A block in which a line has another number of fields is parsed line by line, so that
+a few damaged lines are left out and counted, and a file full of them is refused.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.errors import InputError
+from arview.geometry import Array
+from arview.measurement.cloud.reading.raw_points import PointCollector, RawPoints, ReadOptions
+
+_SNIFFED_BYTES = 65_536
+"""Beginning of a file from which its layout is found."""
+_MAX_LINE = 4096
+"""Longest line of a text file."""
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE)
+_UNIT = re.compile(r"[\[(]\s*(mm|cm|m|inch|in|ft)\s*[\])]", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How the lines of a file are to be read.
+
+    Attributes:
+        table: (256,) translation of bytes that makes every separator a space and every decimal mark a point.
+        columns: number of fields of a line.
+        point: columns of x y z.
+        normal: columns of the normal, or None.
+        skipped: number of lines before the first point.
+        unit: declared in the header, or None.
+    """
+
+    table: bytes
+    columns: int
+    point: tuple[int, int, int]
+    normal: tuple[int, int, int] | None
+    skipped: int
+    unit: str | None
+
+
+def read_text(path: Path, options: ReadOptions | None = None) -> RawPoints:
+    """Read the points of a text file.
+
+    Raises:
+        InputError: the file cannot be read, is not text, has no columns of coordinates, or too many damaged lines.
+    """
+    o = options or ReadOptions()
+    try:
+        with path.open("rb") as file:
+            start = file.read(_SNIFFED_BYTES)
+            if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
+                raise InputError(f"{path}: is UTF-16; save it as UTF-8")
+            if b"\0" in start:
+                raise InputError(f"{path}: is not a text file")
+            layout = _layout(path, start.removeprefix(b"\xef\xbb\xbf"), o)
+            file.seek(3 if start[:3] == b"\xef\xbb\xbf" else 0)
+            return _read(path, file, layout, o)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def _read(path: Path, file: BinaryIO, layout: _Layout, o: ReadOptions) -> RawPoints:
+    """All points of an open file."""
+    collector = PointCollector(path, o)
+    lines = bad = 0
+    first_bad = ""
+    for block in _blocks(path, file, layout, o):
+        values = _parse_block(block, layout.columns)
+        if values is None:
+            values, wrong, text = _parse_lines(block, layout.columns)
+            first_bad = first_bad or text
+            bad += wrong
+            lines += wrong
+        lines += len(values)
+        if bad > max(o.min_bad_lines, o.max_bad_share * lines):
+            raise InputError(
+                f"{path}: {bad} of its first {lines} lines do not hold {layout.columns} numbers, as {first_bad!r}"
+            )
+        normals = None if layout.normal is None else values[:, layout.normal]
+        collector.add(values[:, layout.point], normals)
+    return collector.result(layout.unit, (f"{bad} unreadable lines were left out",) if bad else ())
+
+
+def _blocks(path: Path, file: BinaryIO, layout: _Layout, o: ReadOptions) -> Iterator[bytes]:
+    """The lines after the header in blocks, with spaces as separators and decimal points."""
+    for _ in range(layout.skipped):
+        file.readline(_MAX_LINE)
+    rest = b""
+    while True:
+        read = file.read(o.block_bytes)
+        block = rest + read
+        if not read:  # what is left is the last line
+            if len(block) > _MAX_LINE:
+                raise InputError(f"{path}: has a line of more than {_MAX_LINE} characters; it is not a cloud")
+            if block.strip():
+                yield block.translate(layout.table)
+            return
+        end = block.rfind(b"\n") + 1 or block.rfind(b"\r") + 1
+        if end == 0:
+            if len(block) > _MAX_LINE:
+                raise InputError(f"{path}: has a line of more than {_MAX_LINE} characters; it is not a cloud")
+            rest = block
+            continue
+        rest = block[end:]
+        yield block[:end].translate(layout.table)
+
+
+def _parse_block(block: bytes, columns: int) -> Array | None:
+    """(N,columns) numbers of a block, or None if a line does not have as many."""
+    codes = np.frombuffer(block, dtype=np.uint8)
+    is_end = codes == 10
+    is_gap = is_end | (codes == 32)
+    starts = ~is_gap
+    starts[1:] &= is_gap[:-1]
+    ends = np.cumsum(starts, dtype=np.int64)[is_end]
+    fields = np.diff(ends, prepend=0)
+    if not is_end[-1:].all():
+        fields = np.append(fields, int(starts.sum()) - (int(ends[-1]) if len(ends) else 0))
+    fields = fields[fields > 0]
+    if len(fields) == 0:
+        return np.zeros((0, columns))
+    if (fields != columns).any():
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            values = np.fromstring(block.decode("latin-1"), dtype=np.float64, sep=" ")
+        except (ValueError, DeprecationWarning):
+            return None
+    return values.reshape(-1, columns) if len(values) == columns * len(fields) else None
+
+
+def _parse_lines(block: bytes, columns: int) -> tuple[Array, int, str]:
+    """Numbers of the sound lines, number of the others, and the text of the first of them."""
+    rows, bad, text = [], 0, ""
+    for line in block.decode("latin-1").splitlines():
+        fields = line.split()
+        if not fields:
+            continue
+        try:
+            row = [float(field) for field in fields]
+        except ValueError:
+            row = []
+        if len(row) == columns:
+            rows.append(row)
+        else:
+            bad += 1
+            text = text or line[:60].strip()
+    return np.array(rows, dtype=np.float64).reshape(-1, columns), bad, text
+
+
+def _layout(path: Path, start: bytes, o: ReadOptions) -> _Layout:
+    """Separators, columns and header of a file from its first lines."""
+    text = start.decode("latin-1")
+    lines = re.split(r"\r\n|\n|\r", text)
+    lines = lines[:-1] if len(start) >= _SNIFFED_BYTES else lines
+    header: list[str] = []
+    for index, line in enumerate(lines[: o.max_header_lines]):
+        rows = [row for row in lines[index : index + 40] if row.strip()]
+        marks = _marks(rows)
+        if len(_numbers(line, marks)) >= 3:
+            break
+        header.append(line)
+    else:
+        raise InputError(f"{path}: no line with three numbers was found in its first {len(header) or 1} lines")
+    rows_of = [_numbers(row, marks) for row in rows]
+    columns = len(rows_of[0])
+    if columns > o.max_columns:
+        raise InputError(f"{path}: {columns} numbers in a line; at most {o.max_columns} are read")
+    table = bytearray(range(256))
+    for mark in ";\t|\r":
+        table[ord(mark)] = ord("\n") if mark == "\r" else 32
+    table[ord(",")] = ord(".") if "," in marks else 32
+    if "\r\n" in text or "\r" not in text:
+        table[13] = 32
+    values = np.array([row for row in rows_of if len(row) == columns])
+    names = next((fields for fields in map(_names, reversed(header)) if len(fields) >= 3), [])
+    point, normal = _columns_by_name(names, columns) if names else ((0, 1, 2), None)
+    if normal is None and not names:
+        normal = _columns_of_normals(values)
+    found = next((_UNIT.search(line) for line in reversed(header) if _UNIT.search(line)), None)
+    unit = None if found is None else {"in": "inch"}.get(found[1].lower(), found[1].lower())
+    return _Layout(bytes(table), columns, point, normal, len(header), unit)
+
+
+def _marks(rows: list[str]) -> str:
+    """The decimal comma, if lines have one, else nothing."""
+    joined = "\n".join(rows)
+    if "," not in joined:
+        return ""
+    if ";" in joined or "\t" in joined:
+        return ","
+    fields = [row.split() for row in rows]
+    is_decimal = all(len(row) >= 3 and all(re.fullmatch(r"[-+]?\d+(,\d+)?", f) for f in row) for row in fields)
+    return "," if is_decimal else ""
+
+
+def _numbers(line: str, marks: str) -> list[float]:
+    """Numbers of a line, or none if a field is not a number."""
+    separators = r"[;\s|]+" if "," in marks else r"[,;\s|]+"
+    fields = [f.replace(",", ".") for f in re.split(separators, line.strip()) if f]
+    return [float(f) for f in fields] if fields and all(_NUMBER.fullmatch(f) for f in fields) else []
+
+
+def _names(line: str) -> list[str]:
+    """Names of columns in a header line, lower case and without units."""
+    line = re.sub(r"[\[(][^\])]*[\])]", "", line.strip().lstrip("#/ "))
+    return [name.strip(" \"'").lower() for name in re.split(r"[,;\t|]|\s+", line) if name.strip(" \"'")]
+
+
+def _columns_by_name(
+    names: list[str], columns: int
+) -> tuple[tuple[int, int, int], tuple[int, int, int] | None]:  # fmt: skip
+    """Columns of x y z and of the normal by their names."""
+
+    def places(wanted: tuple[str, ...]) -> tuple[int, int, int] | None:
+        found = [names.index(name) for name in wanted if name in names and names.index(name) < columns]
+        return (found[0], found[1], found[2]) if len(found) == 3 else None
+
+    point = places(("x", "y", "z")) or places(("//x", "y", "z")) or (0, 1, 2)
+    return point, places(("nx", "ny", "nz")) or places(("normal_x", "normal_y", "normal_z"))
+
+
+def _columns_of_normals(values: NDArray[np.float64]) -> tuple[int, int, int] | None:
+    """Three columns after the first three whose rows have unit length, or None."""
+    for start in range(3, values.shape[1] - 2):
+        length = np.linalg.norm(values[:, start : start + 3], axis=1)
+        if np.abs(length - 1.0).max() < 0.02:
+            return start, start + 1, start + 2
+    return None
