@@ -41,11 +41,29 @@ def svg(made: Any, label: str) -> str:
     text = out.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = _without_styles(text)
     # Clip paths and markers are referenced by id, which must be unique among the charts of a page.
     salt = f"c{zlib.crc32(label.encode()):08x}"
     text = re.sub(r'\bid="([^"]+)"', rf'id="{salt}-\1"', text)
     text = re.sub(r'(url\(#|href="#)', rf"\1{salt}-", text)
     return text.replace("<svg ", f'<svg role="img" aria-label="{_escaped(label)}" ', 1)
+
+
+def _without_styles(text: str) -> str:
+    """An SVG of Matplotlib with presentation attributes instead of styles, which the policy of the page forbids."""
+    text = re.sub(r"<style[^>]*>.*?</style>", "", text, flags=re.DOTALL)
+    text = text.replace("<svg ", '<svg stroke-linejoin="round" stroke-linecap="butt" ', 1)
+    return re.sub(r'\bstyle="([^"]*)"', lambda found: _attributes(found.group(1)), text)
+
+
+def _attributes(style: str) -> str:
+    """Presentation attributes that say the same as a style."""
+    pairs = [declaration.partition(":")[::2] for declaration in style.split(";") if declaration.strip()]
+    values = {name.strip(): value.strip() for name, value in pairs}
+    if found := re.match(r"(.*?)([\d.]+px) (.+)", values.pop("font", "")):  # the shorthand is no attribute
+        weight, values["font-size"], values["font-family"] = found.groups()
+        values |= {"font-weight": weight.strip()} if weight.strip().isdigit() else {}
+    return " ".join(f'{name}="{value}"' for name, value in values.items())
 
 
 def tolerance_chart(components: Sequence[ComponentDeviation]) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import resources
@@ -39,6 +41,10 @@ from arview.report.scene import SceneOptions, make_scene, scene_json
 from arview.version import __version__
 
 _FONTS = (("Inter", "400", "inter-400"), ("Inter", "600", "inter-600"), ('"Inter Greek"', "400", "inter-greek-400"))
+_GRADIENT = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in COLOR_STOPS)
+_PRINT_SCRIPT = (
+    'addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((d) => { d.open = true; }));'
+)
 _EXAGGERATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -110,18 +116,40 @@ def render(context: dict[str, Any], for_print: bool) -> str:
     here = resources.files("arview.report")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.ChainableUndefined, trim_blocks=True)
     template = environment.from_string((here / "template.html").read_text(encoding="utf-8"))
-    fonts = [
-        {"family": Markup(family), "weight": weight, "url": Markup(_data_url(font(name), "font/woff2"))}
+    faces = [
+        f"@font-face {{ font-family: {family}; font-weight: {weight}; font-style: normal; "
+        f'src: url({_data_url(font(name), "font/woff2")}) format("woff2"); }}'
         for family, weight, name in _FONTS
     ]
+    gradient = f".gradient {{ background: linear-gradient(to right, {_GRADIENT}); }}"
+    css = "\n".join(["", *faces, (here / "report.css").read_text(encoding="utf-8"), gradient, ""])
+    scripts = three_js(), (here / "viewer.js").read_text(encoding="utf-8"), _PRINT_SCRIPT
     return template.render(
         context,
         for_print=for_print,
-        css=Markup((here / "report.css").read_text(encoding="utf-8")),
-        fonts=fonts,
+        policy=None if for_print else _policy(css, scripts),
+        css=Markup(css),
         hex={verdict.value: color for verdict, color in charts.VERDICT_HEX.items()},
-        three=Markup(three_js()),
-        viewer=Markup((here / "viewer.js").read_text(encoding="utf-8")),
+        three=Markup(scripts[0]),
+        viewer=Markup(scripts[1]),
+        print_script=Markup(scripts[2]),
+    )
+
+
+def _policy(css: str, scripts: Sequence[str]) -> str:
+    """The Content-Security-Policy of the page: nothing is loaded, and only these scripts and styles are used.
+
+    They are named by their hashes (CSP Level 3, 6.7.3.3), taken from what arview brings, never from the finished page,
+    so that a script that got into a text of the inspection would not run.
+    """
+
+    def hashes(texts: Sequence[str]) -> str:
+        digests = (hashlib.sha256(text.encode("utf-8")).digest() for text in texts)
+        return " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
+
+    return (
+        f"default-src 'none'; script-src {hashes(scripts)}; style-src {hashes([css])}; img-src data:; font-src data:; "
+        "base-uri 'none'; form-action 'none'"
     )
 
 
@@ -229,7 +257,6 @@ def _crop(crop: Crop, options: ReportOptions, what: str = "overlay: design posit
 def _distance_map(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
     report = evidence.inspection.distance_map
     context: dict[str, Any] = {
-        "gradient": Markup(", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in COLOR_STOPS)),
         "map_limit": f"{options.map_limit_mm:g}",
     }
     if report is not None:
