@@ -19,7 +19,7 @@ from helpers.live_sample import INSPECTION, PART
 WATCH = """
 window.violations = [];
 document.addEventListener("securitypolicyviolation", (event) => {
-  window.violations.push(`${event.violatedDirective} ${event.blockedURI} ${event.sample} ${event.sourceFile}:${event.lineNumber}`);
+  window.violations.push(`${event.violatedDirective} ${event.blockedURI} ${event.sample}`);
 });
 """
 
