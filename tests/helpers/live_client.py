@@ -23,7 +23,7 @@ from arview.live.security.addresses import LOOPBACK
 from arview.live.server.hub import Hub
 from arview.live.server.live_server import LiveServer, open_endpoint
 from arview.live.stream.stamp import read_stamp, stamped
-from arview.live.stream.subject import Subject
+from arview.live.stream.subjects import Subjects
 from arview.live.transport.receiving import reduce_latency, restrict_candidates
 from arview.video import Image
 
@@ -48,7 +48,7 @@ class Running:
 
 
 @contextmanager
-def running(options: LiveOptions, load: Callable[[], Subject], until_ready: bool = True) -> Iterator[Running]:
+def running(options: LiveOptions, load: Callable[[], Subjects], until_ready: bool = True) -> Iterator[Running]:
     """A server at a free port of the loopback interface, which is stopped at the end of the block."""
     server = LiveServer(options, open_endpoint(None, 0, is_plain=True))
     ready = threading.Event()

@@ -12,8 +12,8 @@ import numpy as np
 
 from arview.geometry import Array
 from arview.live.options import ConnectionLimits, LiveOptions, RequestLimits, WebrtcOptions
-from arview.live.server.loading import load_subject
-from arview.live.stream.subject import Subject
+from arview.live.server.loading import load_subjects
+from arview.live.stream.subjects import Subjects
 from arview.video import Image, open_source
 from helpers.paths import SAMPLES
 
@@ -47,19 +47,21 @@ def there_and_back() -> list[int]:
 def options(**more: Any) -> LiveOptions:
     """Options of a server that shows the sample to phones, without rate limits and with long timeouts."""
     usual: dict[str, Any] = {
-        "camera": str(CAMERA), "inspection": INSPECTION, "width": WIDTH, "height": HEIGHT,
+        "camera": str(CAMERA), "inspections": (INSPECTION,), "width": WIDTH, "height": HEIGHT,
         "requests": RequestLimits(
             per_s=1e6, burst=1e6, strangers_per_s=1e6, strangers_burst=1e6, joins_per_s=1e6, joins_burst=1e6
         ),
         "connections": ConnectionLimits(handshakes_per_s=1e6, handshakes_burst=1e6),
         "jpeg_silence_s": 120.0, "webrtc": WebrtcOptions(connect_timeout_s=60.0),  # tests share their cores
     }  # fmt: skip
+    if "inspection" in more:
+        more["inspections"] = () if (path := more.pop("inspection")) is None else (path,)
     return LiveOptions(**{**usual, **more})
 
 
-def loader(chosen: LiveOptions) -> Callable[[], Subject]:
-    """A function that loads the part of the sample."""
-    return lambda: load_subject(str(PART), None, None, chosen)
+def loader(chosen: LiveOptions, instances: int = 1) -> Callable[[], Subjects]:
+    """A function that loads the part of the sample, or several specimens of it."""
+    return lambda: load_subjects([str(PART)], None, None, chosen, instances=instances)
 
 
 def errors(answer: dict[str, Any], cam_from_model: Array) -> tuple[float, float]:

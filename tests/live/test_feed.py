@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -44,48 +45,50 @@ from helpers.live_sample import INSPECTION, PART, options
 class Session:
     """A session with a given duration per frame, a constant pose and a failure on demand."""
 
+    camera = estimate = None
+
     def __init__(self, subject: Scripted) -> None:
         self.subject = subject
 
-    @property
-    def identity(self) -> Session:
-        return self
+    def expect(self, serials: list[SerialNumbers | None]) -> None:
+        self.subject.expected += serials
 
-    def expect(self, serials: SerialNumbers | None) -> None:
-        self.subject.expected.append(serials)
-
-    def confirm(self) -> None:
+    def confirm(self, part: int | None) -> None:
         self.subject.confirmed += 1
 
-    def reset(self) -> None:
+    def reset(self, part: int | None) -> None:
         self.subject.resets += 1
 
-    def process(self, image: Image, index: int, time_s: float) -> Pose:
+    def finish(self) -> None:
+        pass
+
+    def process(self, image: Image, index: int, time_s: float) -> tuple[Pose, ...]:
         time.sleep(self.subject.pause_s)
         if self.subject.fail_at == index:
             raise RuntimeError("a bug")
         place = np.eye(4)
         place[2, 3] = 500.0
-        return Pose(place, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.0)
+        return (Pose(place, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.0),)
 
 
 class Overlay:
     """Draws the index of the frame into the picture."""
 
-    def draw(self, image: Image, pose: Pose) -> Image:
+    def draw(self, image: Image, poses: tuple[Pose, ...]) -> Image:
         drawn = image.copy()
-        drawn[:8, :8] = pose.index % 250
+        drawn[:8, :8] = poses[0].index % 250
         return drawn
 
 
-class Scripted:
-    """A subject without a part."""
+class Scripted(list[Any]):
+    """One subject without a part."""
 
     def __init__(self, pause_s: float = 0.0, fail_at: int | None = None) -> None:
+        super().__init__([SimpleNamespace(name="")])
         self.pause_s, self.fail_at = pause_s, fail_at
         self.revision = 1
         self.resets = self.sessions = self.overlays = self.confirmed = 0
-        self.serial_numbers: SerialNumbers | None = None
+        self.serial_numbers: list[SerialNumbers | None] = [None]
         self.expected: list[SerialNumbers | None] = []
         self.options = options()
 
@@ -126,7 +129,7 @@ def test_a_confirmation_and_another_serial_number_reach_the_session(closing: Cal
     feed.put(frame(0))
     assert wait(lambda: feed.newest is not None and feed.newest.frame.frame_id == 0)
     assert (subject.confirmed, subject.expected) == (0, [None])
-    subject.serial_numbers = SerialNumbers("BP-0042")
+    subject.serial_numbers = [SerialNumbers("BP-0042")]
     feed.confirm()
     for number in (1, 2):
         feed.put(frame(number))
@@ -267,7 +270,7 @@ def test_inbox_brings_the_newest_from_threads_to_a_task() -> None:
 def tracked_frame(number: int = 0, shape: tuple[int, int] = (120, 160)) -> TrackedFrame:
     picture = DecodedFrame(number, np.full((*shape, 3), 50, dtype=np.uint8))
     pose = Pose(None, None, 0.0, TrackingState.SEARCHING, 0.0, number, 0.0, "too dark")
-    return TrackedFrame(picture, pose, guess_camera(shape[1], shape[0]), 1.0, 1.01, 1.03, 3, 1, number)
+    return TrackedFrame(picture, (pose,), guess_camera(shape[1], shape[0]), 1.0, 1.01, 1.03, 3, 1, number)
 
 
 def test_a_frame_is_drawn_once_for_each_style() -> None:
@@ -326,6 +329,10 @@ def test_recording_fits_in_pictures_of_another_shape(tmp_path: Path, closing: Ca
         time.sleep(0.1)
     assert recorder.stop()
     shown = [one.image for one in open_source(tmp_path / "out.mp4")]
+    poses = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert [one["index"] for one in poses] == list(range(len(shown)))
+    assert poses[0]["time_s"] == 0.0 and 0.3 < poses[-1]["time_s"] < 60.0
+    assert (poses[0]["state"], poses[0]["cam_from_model"][2][3]) == ("tracked", 500.0)
     assert 4 <= len(shown) <= 8 and all(image.shape == (120, 160, 3) for image in shown)
     assert shown[0][60, 5].min() > 150 and shown[-1][60, 5].max() < 60  # bars beside the upright picture
     upright = _fitted(np.full((160, 120, 3), 200, dtype=np.uint8), 160, 120)
@@ -368,6 +375,7 @@ def test_a_recording_ends_before_the_disk_is_full(
     feed.put(frame(2))
     wait(lambda: not recorder.is_running)
     assert recorder.stop() and len(list(open_source(tmp_path / "out.mp4"))) == 1
+    assert len((tmp_path / "out.jsonl").read_text().splitlines()) == 1
 
 
 # --- the inspection file --------------------------------------------------------------------------------

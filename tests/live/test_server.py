@@ -109,7 +109,15 @@ def test_control_changes_state_and_an_invalid_request_changes_nothing(page: Http
     path = f"/api/clients/{name}/control"
     status, answer = page.json("POST", path, {"mode": "video", "style": {"opacity": 0.2, "only": "post_1"}})
     assert status == 200 and answer["mode"] == "video"
-    style = {"ghost": True, "edges": "visible", "labels": True, "opacity": 0.2, "only": "post_1", "status": True}
+    style = {
+        "ghost": True,
+        "edges": "visible",
+        "labels": True,
+        "opacity": 0.2,
+        "only": "post_1",
+        "status": True,
+        "only_part": 0,
+    }
     assert answer["style"] == style
     for wrong in (
         {"mode": "sideways"}, {"mode": 3}, {"style": {"opacity": 7}}, {"style": {"opacity": True}}, {"unknown": 1},
@@ -202,8 +210,8 @@ def test_model_glb_holds_the_cad_in_mm(page: Http, phones: Running) -> None:
     assert (status, headers["content-type"]) == (200, "model/gltf-binary")
     assert page.ask("GET", "/api/model.glb", If_None_Match=headers["etag"])[0] == 304
     scene = trimesh.load(io.BytesIO(content), file_type="glb")
-    assert phones.hub.subject is not None
-    components = phones.hub.subject.part.model.components
+    assert phones.hub.subjects is not None
+    components = phones.hub.subjects[0].part.model.components
     assert len(components) > 10
     for index, component in enumerate(components):
         mesh, lines = scene.geometry[f"c{index}"], scene.geometry[f"e{index}"]
@@ -260,7 +268,7 @@ def codes(page: Http) -> list[str]:
 
 @pytest.mark.slow
 def test_inspection_is_reloaded_and_garbage_keeps_the_last_good_one(page: Http, phones: Running) -> None:
-    path = phones.server.options.inspection
+    path = phones.server.options.inspections[0]
     assert path is not None
     good = json.loads(path.read_text())
     before = page.json("GET", "/api/part")[1]
@@ -356,7 +364,13 @@ def test_every_phone_is_recorded_from_its_first_picture(tmp_path: Path) -> None:
             time.sleep(0.2)
         assert pages[0].ask("DELETE", f"/api/clients/{names[0]}")[0] == 204
         assert pages[1].json("GET", f"/api/clients/{names[1]}/status")[1]["recording"]["finished"] == [0]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out-2.mp4", "out-3.mp4", "out.mp4"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "out-2.mp4",
+        "out-3.jsonl",
+        "out-3.mp4",
+        "out.jsonl",
+        "out.mp4",
+    ]
     assert (tmp_path / "out-2.mp4").read_bytes() == b"of another day"
     for name in ("out.mp4", "out-3.mp4"):
         assert 1 <= len(list(open_source(tmp_path / name))) <= 3

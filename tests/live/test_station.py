@@ -225,8 +225,10 @@ def test_recording_of_a_station_from_the_start(clip: Path, tmp_path: Path) -> No
     with running(chosen, loader(chosen)) as server:
         wait(lambda: (feed := server.hub.watched()) and feed[0].newest and feed[0].newest.serial > 12)
         assert server.hub.status(None)["recording"]["is_on"]
-    assert [path.name for path in tmp_path.iterdir()] == ["out.mp4"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.jsonl", "out.mp4"]
     shown = list(open_source(tmp_path / "out.mp4"))
+    poses = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert [one["index"] for one in poses] == list(range(len(shown))) and "camera" in poses[0]
     assert len(shown) >= 5 and shown[0].image.shape == (HEIGHT, WIDTH, 3)
 
 

@@ -19,13 +19,14 @@ from arview.cli.common import (
     main,
     output_path,
     progress_bar,
+    refuse_for_several,
     say,
     session_options,
 )
 from arview.cli.exit_codes import ExitCode, finding_exit_code, presence_exit_code
 from arview.cli.guessed_camera import check_profile, likely_cause, report_estimate
 from arview.core.atomic import unfinished_path, writing_process
-from arview.errors import InputError, OutputError
+from arview.errors import OutputError
 
 if TYPE_CHECKING:
     from arview.annotation import AnnotateSummary, Overlay, Result, Session
@@ -257,7 +258,7 @@ def annotate(
         say(f"no -o or --poses given: writing {output}")
     specimens = load_specimens(part_paths, instances, inspection_paths, unit)
     if len(specimens) > 1:
-        _refuse_for_several({"--init": init, "--learned": learned_path, "--guideviews": views_path})
+        refuse_for_several({"--init": init, "--learned": learned_path, "--guideviews": views_path})
     part = specimens[0].part
     guide_name = init.removeprefix(GUIDE_PREFIX) if init and init.startswith(GUIDE_PREFIX) else None
     init_path = init if guide_name is None else None
@@ -293,13 +294,6 @@ def annotate(
     _save_learned(session, outputs.learned)
     _exit_if_interrupted(ctx, summary)
     ctx.exit(presence_exit_code(summary) if check_presence else finding_exit_code(summary))
-
-
-def _refuse_for_several(options: dict[str, str | None]) -> None:
-    """Refuse options, by their names, that are of one specimen."""
-    for name, value in options.items():
-        if value:
-            raise InputError(f"{name} is for one part; leave it out, or give one --part without --instances")
 
 
 def _annotate_one(

@@ -372,3 +372,10 @@ def write_bytes(path: Path, content: bytes) -> None:
             file.write(content)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def refuse_for_several(options: dict[str, str | None]) -> None:
+    """Refuse options, by their names, that are of one specimen."""
+    for name, value in options.items():
+        if value:
+            raise InputError(f"{name} is for one part; leave it out, or give one --part without --instances")

@@ -9,21 +9,21 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, say
+from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, refuse_for_several, say
 from arview.cli.exit_codes import ExitCode
 from arview.cli.guessed_camera import check_profile
 from arview.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
-    from arview.live.options import LiveOptions
     from arview.live.server.hub import Hub
     from arview.live.server.live_server import LiveServer
-    from arview.live.stream.subject import Subject
+    from arview.live.stream.subjects import Subjects
 
 EXTRA = ("aiortc", "starlette", "uvicorn", "cryptography", "segno")
 _AGES_S = {"min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -61,6 +61,8 @@ Examples:
   arview live --part part.toml --source 0 --camera webcam.json
   arview live --part part.toml --source rtsp://camera.local/1 --camera station.json
   arview live --part part.toml --source clip.mp4 --camera camera.json --http
+  arview live --part a.toml --part b.toml --inspection a.json --inspection b.json --camera phone.json
+  arview live --part part.toml --instances 2 --camera phone.json
 
 \b
 Point a phone in the same network at the printed code. The first time, the phone has to be told to trust
@@ -86,14 +88,24 @@ withheld until the followed one is seen again, a code on the part gives the seri
 "This is the part" (key C) is pressed.
 
 \b
+Several at once. --part may be given again, and --instances N shows N specimens of each part. Each has a name
+(the part's, with #1, #2 where several have the same), a colour and a mark of its own on labels and ghost, a line
+with its state, and its own button to confirm it (keys 1 to 9). Inspections belong to the specimens in their order.
+A camera that is not given is guessed and not estimated then.
+
+\b
 The page reloads inspection.json when it changes, and warns when it is older than --max-age or has another
 serial number than the part file (or --serial). Recordings made from the page are put in the folder of
---record, or in the current one. Ctrl-C ends the run and finishes the files.""",
+--record, or in the current one. Beside each video is a file of its poses that ends in .jsonl, see annotate; its
+lines have the numbers of the frames in the video. Ctrl-C ends the run and finishes the files.""",
     exit_codes={ExitCode.INTERRUPTED: "ended by Ctrl-C; files are finished"},
 )
-@click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
+@click.option("--part", "part_paths", required=True, multiple=True, metavar="PART",
+              help="Part file or CAD file; again for further parts.")  # fmt: skip
+@click.option("--instances", type=click.IntRange(min=1), default=1, metavar="N", help="Specimens of each part in view.")
 @click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
-@click.option("--inspection", "inspection_path", metavar="FILE", help="inspection.json whose values are shown.")
+@click.option("--inspection", "inspection_paths", multiple=True, metavar="FILE",
+              help="inspection.json whose values are shown; again for further specimens, in their order.")  # fmt: skip
 @click.option(
     "--source", default="phone", show_default=True, metavar="SOURCE", help="Camera or video to show; see below."
 )
@@ -122,9 +134,10 @@ serial number than the part file (or --serial). Recordings made from the page ar
 @click.pass_context
 def live(
     ctx: click.Context,
-    part_path: str,
+    part_paths: tuple[str, ...],
+    instances: int,
     views_path: str | None,
-    inspection_path: str | None,
+    inspection_paths: tuple[str, ...],
     source: str,
     camera_spec: str | None,
     profile: str | None,
@@ -143,7 +156,7 @@ def live(
     renderer: str,
     unit: str | None,
 ) -> None:
-    """Serve the overlay of PART to phones and screens in the local network."""
+    """Serve the overlay of PART, or of several, to phones and screens in the local network."""
     import asyncio
 
     require_extra()
@@ -153,22 +166,27 @@ def live(
     from arview.video.sources import check_source
 
     check_profile(profile, camera_spec)
-    find_part_file(part_path)
+    for path in part_paths:
+        find_part_file(path)
+    if instances * len(part_paths) > 1:
+        refuse_for_several({"--init": init, "--guideviews": views_path, "--serial": serial, "--save-profile": profile})
     if init is not None and not init.startswith("guide:"):
         raise InputError(f"--init {init}: expected guide:NAME")
     if (cert is None) != (key is None):
         raise InputError("--cert and --key belong together; give both or none")
-    inputs = [part_path, views_path, inspection_path, camera_spec, source]
+    inputs = [*part_paths, views_path, *inspection_paths, camera_spec, source]
     record_path = output_path(record, inputs) if record else None
     if record_path is not None and record_path.suffix.lower() not in (".mp4", ".m4v", ".mov"):
         raise InputError(f"--record {record}: the name of the video must end in .mp4, .m4v or .mov")
+    if record_path is not None:
+        output_path(str(record_path.with_suffix(".jsonl")), inputs)
     if source != "phone":
         check_source(source)
     options = LiveOptions(
         source=source,
         camera=camera_spec,
         profile=profile,
-        inspection=Path(inspection_path) if inspection_path else None,
+        inspections=tuple(Path(path) for path in inspection_paths),
         serial=serial,
         max_age_s=max_age,
         guide=init.removeprefix("guide:") if init else None,
@@ -181,7 +199,16 @@ def live(
     )
     _tell_logs()
     server = LiveServer(options, open_endpoint(host, port, is_plain, cert, key))
-    asyncio.run(_serve(server, options, part_path, views_path, renderer, unit))
+    from arview.guideviews import GuideViewOptions
+    from arview.live.server.loading import load_subjects
+
+    def load() -> Subjects:
+        with progress_bar("guide views") as progress:
+            return load_subjects(
+                part_paths, unit, views_path, options, GuideViewOptions(renderer=renderer), progress, instances
+            )
+
+    asyncio.run(_serve(server, load))
     say("ended; files are finished")
     _leave_threads()
     ctx.exit(ExitCode.INTERRUPTED)
@@ -208,13 +235,10 @@ def require_extra() -> None:
         )
 
 
-async def _serve(
-    server: LiveServer, options: LiveOptions, part_path: str, views_path: str | None, renderer: str, unit: str | None
-) -> None:
+async def _serve(server: LiveServer, load: Callable[[], Subjects]) -> None:
     import asyncio
 
-    from arview.guideviews import GuideViewOptions
-    from arview.live.server.loading import load_subject, warm_up
+    from arview.live.server.loading import warm_up
 
     loop = asyncio.get_running_loop()
 
@@ -226,18 +250,14 @@ async def _serve(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, end, number)
 
-    def load() -> Subject:
-        with progress_bar("guide views") as progress:
-            return load_subject(part_path, unit, views_path, options, GuideViewOptions(renderer=renderer), progress)
-
     def ready(hub: Hub) -> None:
         gc.collect()
         gc.freeze()  # what is loaded stays: the collector need not visit it again while phones wait
         _print_welcome(server)
-        if hub.subject is not None:
-            for notice in hub.subject.notices():
+        if hub.subjects is not None:
+            for notice in hub.subjects.notices():
                 say(f"{notice.level}: {notice.text}")
-            warm_up(hub.subject)
+            warm_up(hub.subjects)
 
     await server.serve(load, ready)
 

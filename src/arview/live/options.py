@@ -104,7 +104,7 @@ class LiveOptions:
     source: str = PHONE  # "phone": each page sends its own camera; else a source of arview.video.open_source
     camera: str | None = None  # camera of arview.camera.read.load_camera; None: guessed, and the page says so
     profile: str | None = None  # name of the profile in which an estimated camera is kept; None: it is not kept
-    inspection: Path | None = None  # inspection.json, read again whenever it changes
+    inspections: tuple[Path, ...] = ()  # inspection.json of the parts, in their order, read again when they change
     serial: str | None = None  # serial number of the part at the station; None: that of the part file, if any
     max_age_s: float | None = 86400.0  # age above which the page calls an inspection old; None: never
     guide: str | None = None  # name of a guide view to align with; None: the part is searched for

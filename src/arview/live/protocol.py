@@ -19,10 +19,11 @@ need the ``Origin`` header that browsers send. JSON is sent as ``application/jso
     ``multipart/x-mixed-replace`` of annotated JPEGs without strip: of the station camera, or of the phone that joined
     last. At most 15 per second; 503 ``busy`` when too many screens watch.
 ``GET /api/part``
-    The part to show: see *Part*. It changes when ``revision`` does.
-``GET /api/model.glb``
-    The CAD model in **mm in the model frame** (units and axes are not converted). Component i of the part document is
-    node ``c<i>`` (triangles with flat normals) and node ``e<i>`` (its design edges, LINES). The response has an ETag.
+    The parts to show: see *Part*. It changes when ``revision`` does.
+``GET /api/model.glb?part=N``
+    The CAD model of part N, without ``part`` of the first, in **mm in the model frame** (units and axes are not
+    converted). Component i of the part document is node ``c<i>`` (triangles with flat normals) and node ``e<i>`` (its
+    design edges, LINES). The response has an ETag.
 ``GET /api/status``
     See *Status*.
 ``POST /api/clients`` with *Join*
@@ -45,7 +46,7 @@ need the ``Origin`` header that browsers send. JSON is sent as ``application/jso
     its data as JSON. 404 ``no_such_frame`` when the frame is no longer kept: the last 12 tracked frames and the held
     one are.
 ``GET /api/recordings/N``
-    A finished recording of this run, ``video/mp4``, as a download.
+    The video of a finished recording of this run, ``video/mp4``, as a download. Its poses stay at the station.
 
 WebRTC
 ======
@@ -71,6 +72,10 @@ that the page sends there are ignored.
 
 Messages
 ========
+**Several parts.** *Part* and *Pose* describe one part. Where several parts, or specimens of one, are shown, they
+describe the first one, and have ``parts`` in addition: a list of all of them, each with its number ``id`` (from 0) and
+the keys that are marked ``(part)`` below. This is version 2 of the protocol; a page of version 1 shows the first part.
+
 Join::
 
     {"transport": "webrtc" | "jpeg", "mode": "poses" | "video", "offer": {"type": "offer", "sdp": …},
@@ -79,7 +84,7 @@ Join::
 Pose::
 
     {"type": "pose", "id": N, "revision": of the part document,
-     "state": "searching" | "tracked" | "critical" | "lost", "quality": 0 to 1, "reason": text,
+     (part) "state": "searching" | "tracked" | "critical" | "lost", "quality": 0 to 1, "reason": text,
      "remark": the reason, or of a tracked part what has not been seen yet,
      "mismatches": [words], "unverified": [components not seen yet], "ambiguous": how many other poses fit as well,
      "completeness": "COMPLETE", "INCOMPLETE: 1 missing", "NOT YET CHECKED" or empty,
@@ -92,6 +97,7 @@ Pose::
                  "is_dimmed": measured, but not seen so here, "is_urgent": bool,
                  "model_from_nominal": [16] | null}],     only of components that differ from *Part*
      "cam_from_model": [16] | null, "guide_cam_from_model": [16] | null,      guide: while it waits to be aligned with
+     (all)
      "camera": {"width", "height", "fx", "fy", "cx", "cy", "dist": [5]},   intrinsics for the picture on the page
      "wait_ms": arrival to start of tracking, "track_ms": tracking, "server_ms": arrival to this response,
      "dropped": frames dropped by the feed so far, "scale": received over sent size, 1 when unscaled}
@@ -110,16 +116,20 @@ Control, every key and every key of ``style`` may be absent::
 
     {"mode": "poses" | "video",
      "style": {"ghost": bool, "edges": "none" | "visible" | "all", "labels": bool, "opacity": 0 to 1,
-               "only": name of the only component to draw | null, "status": bool},     for the server
-     "reset": true,               search for the part again
-     "confirm": true,             the part in view is the one to which the labels belong: see withheld of *Pose*
+               "only": name of the only component to draw | null, "only_part": its part's id, without it 0,
+               "status": bool},     for the server
+     "reset": true | id,          search again for all parts, or for one
+     "confirm": true | id,        the part in view is the one to which the labels belong: see withheld of *Pose*; true
+                                  where there is one part only
      "hold": frame id | null,     keep this frame for a snapshot; 404 no_such_frame when it is no longer kept
      "record": bool}
 
 Part::
 
-    {"revision": N, "state": "loading" | "ready" | "failed", "text": text,
+    {"protocol": 2, "revision": N, "state": "loading" | "ready" | "failed", "text": text,
      "source": "phone" | "station", "source_name": text, "wanted": {"width", "height", "fps"},     for a phone's camera
+     (part)
+     "name": of the specimen, "mark": sign of its labels, "tag_color": "#rrggbb" of that sign,     only in ``parts``
      "part": {"name", "serial", "model_hash", "diameter_mm",
               "center_in_model": [3], "bounds_in_model": [[3], [3]]} | null,
      "components": [{"name", "color": "#rrggbb", "anchor_in_model": [3], "rank": by urgency | null,
@@ -147,6 +157,8 @@ from typing import Final, Literal
 Transport = Literal["webrtc", "jpeg"]
 ViewMode = Literal["poses", "video"]
 
+PROTOCOL: Final = 2
+"""Version of the protocol: 2 since there may be several parts."""
 COOKIE: Final = "arview"
 ANSWER_HEADER: Final = "X-Arview-Answer"
 CHANNEL: Final = "arview"

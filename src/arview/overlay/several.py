@@ -30,6 +30,11 @@ def specimen_rgb(number: int) -> Rgb:
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
+def specimen_mark(number: int) -> str:
+    """Mark of the tag of a specimen, by its number from 0; it comes again after six."""
+    return _MARK[number % len(_MARK)]
+
+
 class SeveralOverlay:
     """Draws specimens, each with ghost, labels and status line of its own, and a tag with its name.
 
@@ -61,7 +66,7 @@ class SeveralOverlay:
             status_px += one.status_height_px
             one.stack(status_px, bottom_px)
         self._bottom_px = bottom_px
-        self._marks = {name: _MARK[number % len(_MARK)] for number, name in enumerate(self.renderers)}
+        self._marks = {name: specimen_mark(number) for number, name in enumerate(self.renderers)}
         self._tags = {name: self._tag(number, name) for number, name in enumerate(self.renderers)}
         most = sum(one.options.max_labels for one in self.renderers.values())
         self._annotations = Annotations(self.camera, self._size_px, [], most, bottom_px)

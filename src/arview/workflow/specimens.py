@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -52,6 +51,7 @@ def load_specimens(
     """
     from arview.cad import load_part
     from arview.inspection import load_inspection
+    from arview.tracking.several.specimens import specimen_names
 
     parts = [part for path in part_paths for part in [load_part(path, unit)] * instances]
     if len(inspection_paths) > len(parts):
@@ -63,16 +63,6 @@ def load_specimens(
     inspections = [*found, *[None] * (len(parts) - len(found))]
     names = specimen_names([part.name for part in parts])
     return [Specimen(*of) for of in zip(names, parts, inspections, strict=True)]
-
-
-def specimen_names(part_names: Sequence[str]) -> list[str]:
-    """Names of specimens: that of the part, with a number where several have the same: ``plate#1``, ``plate#2``."""
-    total, seen = Counter(part_names), Counter[str]()
-    names = []
-    for name in part_names:
-        seen[name] += 1
-        names.append(f"{name}#{seen[name]}" if total[name] > 1 else name)
-    return names
 
 
 def make_sessions(

@@ -101,13 +101,14 @@ class Handlers:
         return _json_response(await self._hub.part())
 
     async def model(self, request: Request) -> Response:
-        """The CAD model as GLB."""
-        subject, _ = self._hub.ready()
-        tag = f'"{subject.part.model.source_hash}"'
+        """The CAD model of a part as GLB."""
+        subjects, _ = self._hub.ready()
+        part = _number(request, "part", len(subjects), 0)
+        tag = f'"{subjects[part].part.model.source_hash}"'
         headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
         if request.headers.get("if-none-match") == tag:
             return Response(status_code=304, headers=headers)
-        return Response(await self._hub.glb(), media_type="model/gltf-binary", headers=headers)
+        return Response(await self._hub.glb(part), media_type="model/gltf-binary", headers=headers)
 
     async def status(self, request: Request) -> Response:
         """The *Status* document without a client."""
@@ -190,12 +191,12 @@ class Handlers:
         """A snapshot: the PNG of a frame with its overlay."""
         client = self._client(request)
         self._snapshots.check(client.name)
-        subject, _ = self._hub.ready()
+        subjects, _ = self._hub.ready()
         wants_newest = "id" not in request.query_params
         tracked = client.feed.newest if wants_newest else client.find(_number(request, "id", FRAME_IDS))
         if tracked is None:
             raise Refusal(404, "no_such_frame", "that frame is no longer kept")
-        png = await asyncio.to_thread(annotated_png, subject, client.annotator, tracked)
+        png = await asyncio.to_thread(annotated_png, subjects, client.annotator, tracked)
         return Response(png, media_type="image/png")
 
     async def recording(self, request: Request) -> Response:

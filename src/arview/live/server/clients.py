@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -23,6 +24,7 @@ _STYLE_TYPES: dict[str, tuple[type, ...]] = {
     "labels": (bool,),
     "opacity": (int, float),
     "only": (str, type(None)),
+    "only_part": (int,),
     "status": (bool,),
 }
 
@@ -84,18 +86,27 @@ def choice_of(value: Any, kind: Any, name: str) -> Any:
     return value
 
 
-def check_control(control: dict[str, Any], style: OverlayStyle, components: tuple[str, ...]) -> OverlayStyle:
+def check_control(control: dict[str, Any], style: OverlayStyle, components: Sequence[Sequence[str]]) -> OverlayStyle:
     """The overlay style after a *Control* request, all of which is checked.
+
+    Args:
+        control: the request.
+        style: overlay style so far.
+        components: names of the components of each part.
 
     Raises:
         Refusal: an unknown key, or a wrong type or value.
     """
+
+    def is_part(value: Any) -> bool:
+        return type(value) is int and 0 <= value < len(components)
+
     for key, value in control.items():
         is_good = {
             "mode": isinstance(value, str) and value in get_args(ViewMode),
             "style": isinstance(value, dict),
-            "reset": isinstance(value, bool),
-            "confirm": isinstance(value, bool),
+            "reset": isinstance(value, bool) or is_part(value),
+            "confirm": (isinstance(value, bool) and (len(components) == 1 or not value)) or is_part(value),
             "record": isinstance(value, bool),
             "hold": value is None or (type(value) is int and 0 <= value < FRAME_IDS),
         }.get(key, False)
@@ -106,9 +117,11 @@ def check_control(control: dict[str, Any], style: OverlayStyle, components: tupl
         kinds = _STYLE_TYPES.get(key)
         if kinds is None or not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
             raise Refusal(400, "bad_control", f"style: {key[:40]!r} is unknown or has a wrong value")
-    if wanted.get("only") is not None and wanted["only"] not in components:
+    if "only_part" in wanted and not is_part(wanted["only_part"]):
+        raise Refusal(400, "bad_control", "style: only_part is not the number of a part")
+    if wanted.get("only") is not None and wanted["only"] not in components[wanted.get("only_part", 0)]:
         raise Refusal(400, "bad_control", "style: only is no component of the part")
     try:
-        return replace(style, **wanted)
+        return replace(style, **{"only_part": 0, **wanted} if "only" in wanted else wanted)
     except InputError as error:
         raise Refusal(400, "bad_control", str(error)) from error

@@ -1,4 +1,4 @@
-"""The hub: the state that all pages share. Subject, clients with their feeds, station camera, recordings."""
+"""The hub: the state that all pages share. Parts, clients with their feeds, station camera, recordings."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from arview.live.stream.documents import (
     feed_document,
     loading_document,
     notice_documents,
-    part_document,
+    parts_document,
     style_document,
+    with_ages,
 )
 from arview.live.stream.feed import Feed
 from arview.live.stream.notices import Notice
 from arview.live.stream.recording import Recordings
 from arview.live.stream.station import StationCamera
-from arview.live.stream.subject import Subject
+from arview.live.stream.subjects import Subjects
 from arview.live.transport.webrtc import Connection
 
 logger = logging.getLogger("arview.live")
@@ -44,20 +45,20 @@ class Hub:
         addresses: addresses at which WebRTC is offered.
 
     Attributes:
-        subject, recordings: None while the part is being loaded.
+        subjects, recordings: None while the parts are being loaded.
         clients: the pages that take part, by name.
         watchers: number of screens that only watch.
     """
 
     def __init__(self, options: LiveOptions, addresses: Sequence[str]) -> None:
         self.options, self._addresses = options, addresses
-        self.subject: Subject | None = None
+        self.subjects: Subjects | None = None
         self.recordings: Recordings | None = None
         self.clients: dict[str, Client] = {}
         self.watchers = 0
         self._loading = loading_document(options, "loading", "the part is being loaded")
         self._part: tuple[int, Document] | None = None
-        self._glb: asyncio.Task[bytes] | None = None
+        self._glb: dict[str, asyncio.Task[bytes]] = {}
         self._station: StationCamera | None = None
         self._shared: tuple[Feed, FrameAnnotator] | None = None
         self._recorded: set[Path] = set()
@@ -67,47 +68,44 @@ class Hub:
 
     # --- the part -------------------------------------------------------------------------------------
 
-    def begin(self, subject: Subject) -> None:
-        """Start with the loaded subject: open the station camera and admit pages."""
-        self.subject = subject
-        self.recordings = Recordings(self.options.record_folder, subject.part.name, self.options.recording)
+    def begin(self, subjects: Subjects) -> None:
+        """Start with the loaded parts: open the station camera and admit pages."""
+        self.subjects = subjects
+        self.recordings = Recordings(self.options.record_folder, subjects.file_name, self.options.recording)
         if not self.options.is_phone:
-            feed, annotator = Feed(subject, "station"), FrameAnnotator(subject)
+            feed, annotator = Feed(subjects, "station"), FrameAnnotator(subjects)
             self._shared = feed, annotator
             self._station = StationCamera(self.options.source, feed, self.options.station)
             if self.options.record is not None:
                 self.recordings.start(feed, annotator, self.options.record)
         self._ticker = asyncio.ensure_future(self._run_ticker())
 
-    def ready(self) -> tuple[Subject, Recordings]:
-        """The subject and the recordings.
+    def ready(self) -> tuple[Subjects, Recordings]:
+        """The parts and the recordings.
 
         Raises:
             Refusal: the part is still being loaded.
         """
-        if self.subject is None or self.recordings is None:
+        if self.subjects is None or self.recordings is None:
             raise Refusal(503, "loading", "the part is being loaded; wait a moment", {"Retry-After": "1"})
-        return self.subject, self.recordings
+        return self.subjects, self.recordings
 
     async def part(self) -> Document:
         """The *Part* document."""
-        if self.subject is None:
+        if self.subjects is None:
             return self._loading
-        revision = self.subject.revision
+        revision = self.subjects.revision
         if self._part is None or self._part[0] != revision:
-            self._part = revision, await asyncio.to_thread(part_document, self.subject)
-        document = self._part[1]
-        inspection = self.subject.inspection
-        if inspection is not None and document["inspection"] is not None:
-            document = {**document, "inspection": {**document["inspection"], "age_s": round(inspection.age_s())}}
-        return document
+            self._part = revision, await asyncio.to_thread(parts_document, self.subjects)
+        return with_ages(self._part[1], self.subjects)
 
-    async def glb(self) -> bytes:
-        """The CAD model as GLB, made once."""
-        subject, _ = self.ready()
-        if self._glb is None:
-            self._glb = asyncio.ensure_future(asyncio.to_thread(model_glb, subject.part.model))
-        return await asyncio.shield(self._glb)
+    async def glb(self, part: int) -> bytes:
+        """The CAD model of a part as GLB, made once."""
+        subjects, _ = self.ready()
+        model = subjects[part].part.model
+        if model.source_hash not in self._glb:
+            self._glb[model.source_hash] = asyncio.ensure_future(asyncio.to_thread(model_glb, model))
+        return await asyncio.shield(self._glb[model.source_hash])
 
     # --- clients --------------------------------------------------------------------------------------
 
@@ -117,7 +115,7 @@ class Hub:
         Raises:
             Refusal: the part is being loaded, too many pages take part, or the offer cannot be used.
         """
-        subject, recordings = self.ready()
+        subjects, recordings = self.ready()
         transport: Transport = choice_of(request.get("transport"), Transport, "transport")
         mode: ViewMode = choice_of(request.get("mode", "poses"), ViewMode, "mode")
         offer = request.get("offer")
@@ -131,7 +129,7 @@ class Hub:
             raise Refusal(503, "busy", f"busy: {count} of {self.options.max_clients} pages take part")
         self._joining += 1
         try:
-            feed, annotator = self._shared or (Feed(subject, "phone"), FrameAnnotator(subject))
+            feed, annotator = self._shared or (Feed(subjects, "phone"), FrameAnnotator(subjects))
             client = Client(feed, annotator, transport, mode)
             answer = await self._connect(client, str(sdp)) if transport == "webrtc" else None
         finally:
@@ -169,8 +167,8 @@ class Hub:
         Raises:
             Refusal: an unknown key or a wrong value; then nothing is changed.
         """
-        subject, recordings = self.ready()
-        names = tuple(component.name for component in subject.part.model.components)
+        subjects, recordings = self.ready()
+        names = [[component.name for component in one.part.model.components] for one in subjects]
         style = check_control(request, client.annotator.style, names)
         held = None
         if request.get("hold") is not None:
@@ -179,10 +177,9 @@ class Hub:
                 raise Refusal(404, "no_such_frame", "that frame is no longer kept")
         client.annotator.style = style
         client.mode = request.get("mode", client.mode)
-        if request.get("reset"):
-            client.feed.reset()
-        if request.get("confirm"):
-            client.feed.confirm()
+        for what, act in (("reset", client.feed.reset), ("confirm", client.feed.confirm)):
+            if (wanted := request.get(what, False)) is not False:
+                act(None if wanted is True else wanted)
         if "hold" in request:
             client.held = held
         if request.get("record") is True:
@@ -211,7 +208,7 @@ class Hub:
         recorder = self.recordings.of(feed) if self.recordings is not None and feed is not None else None
         return {
             "type": "status",
-            "revision": self.subject.revision if self.subject is not None else 0,
+            "revision": self.subjects.revision if self.subjects is not None else 0,
             "mode": client.mode if client is not None else None,
             "style": style_document(client.annotator.style) if client is not None else None,
             "feed": described,
@@ -280,7 +277,7 @@ class Hub:
         recordings.start(client.feed, client.annotator, target)
 
     def _notices(self, feed: Feed | None) -> list[Notice]:
-        notices = self.subject.notices() if self.subject is not None else []
+        notices = self.subjects.notices() if self.subjects is not None else []
         if self._station is not None:
             notices = [*notices, *self._station.notices()]
         if feed is not None:
@@ -298,9 +295,9 @@ class Hub:
             await asyncio.sleep(self.options.tick_s)
             try:
                 now_s = time.monotonic()
-                if now_s - reloaded_s >= self.options.reload_interval_s and self.subject is not None:
+                if now_s - reloaded_s >= self.options.reload_interval_s and self.subjects is not None:
                     reloaded_s = now_s
-                    await asyncio.to_thread(self.subject.reload)
+                    await asyncio.to_thread(self.subjects.reload)
                 for client in list(self.clients.values()):
                     if self._is_gone(client, now_s):
                         await self.leave(client.name)

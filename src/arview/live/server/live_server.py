@@ -27,7 +27,7 @@ from arview.live.security.trust_page import trust_app
 from arview.live.server.app import make_app
 from arview.live.server.hub import Hub
 from arview.live.server.uvicorn_server import UvicornServer
-from arview.live.stream.subject import Subject
+from arview.live.stream.subjects import Subjects
 from arview.live.transport.webrtc import raise_bitrates
 
 logger = logging.getLogger("arview.live")
@@ -97,7 +97,7 @@ def open_endpoint(
 
 
 class LiveServer:
-    """Serves the pages of one part.
+    """Serves the pages of one part, or of several in one picture.
 
     Args:
         options: what is served, and within which limits.
@@ -132,12 +132,12 @@ class LiveServer:
             with suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._stop.set)
 
-    async def serve(self, load: Callable[[], Subject], on_ready: Callable[[Hub], None] = lambda hub: None) -> None:
+    async def serve(self, load: Callable[[], Subjects], on_ready: Callable[[Hub], None] = lambda hub: None) -> None:
         """Serve until `stop`, then finish the files.
 
         Args:
-            load: loads the part, in a thread, while the pages show that it is being loaded. What it raises is raised
-                here.
+            load: loads the parts, in a thread, while the pages show that they are being loaded. What it raises is
+                raised here.
             on_ready: called with the hub when pages can take part.
         """
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()

@@ -10,8 +10,8 @@ from functools import cached_property
 from arview.camera import Camera
 from arview.live.stream.feed import TrackedFrame
 from arview.live.stream.frames import to_jpeg
-from arview.live.stream.subject import OverlayStyle, Subject
-from arview.overlay import OverlayRenderer
+from arview.live.stream.subject import OverlayStyle
+from arview.live.stream.subjects import FrameOverlay, Subjects
 from arview.video import Image
 
 
@@ -36,21 +36,21 @@ class AnnotatedFrame:
 class _StyleRenderer:
     """Draws in one style and keeps the last annotated frame."""
 
-    def __init__(self, subject: Subject, style: OverlayStyle) -> None:
-        self._subject, self._style = subject, style
-        self._overlay: OverlayRenderer | None = None
+    def __init__(self, subjects: Subjects, style: OverlayStyle) -> None:
+        self._subjects, self._style = subjects, style
+        self._overlay: FrameOverlay | None = None
         self._made_for: tuple[Camera, int] | None = None
         self._last: AnnotatedFrame | None = None
 
     def draw(self, tracked: TrackedFrame) -> AnnotatedFrame:
         if self._last is not None and self._last.tracked is tracked:
             return self._last
-        revision, camera = self._subject.revision, tracked.camera
+        revision, camera = self._subjects.revision, tracked.camera
         made_for = self._made_for
         if self._overlay is None or made_for is None or made_for[0] is not camera or made_for[1] != revision:
-            self._overlay = self._subject.overlay(camera, self._style)
+            self._overlay = self._subjects.overlay(camera, self._style)
             self._made_for = camera, revision
-        self._last = AnnotatedFrame(tracked, self._overlay.draw(tracked.frame.image, tracked.pose))
+        self._last = AnnotatedFrame(tracked, self._overlay.draw(tracked.frame.image, tracked.poses))
         return self._last
 
 
@@ -63,9 +63,9 @@ class FrameAnnotator:
         style: overlay style that the pages of the feed have chosen.
     """
 
-    def __init__(self, subject: Subject) -> None:
+    def __init__(self, subjects: Subjects) -> None:
         self.style = OverlayStyle()
-        self._subject = subject
+        self._subjects = subjects
         self._lock = threading.Lock()
         self._renderers: OrderedDict[OverlayStyle, _StyleRenderer] = OrderedDict()
 
@@ -78,9 +78,9 @@ class FrameAnnotator:
         """
         wanted = style or self.style
         with self._lock:
-            renderer = self._renderers.pop(wanted, None) or _StyleRenderer(self._subject, wanted)
+            renderer = self._renderers.pop(wanted, None) or _StyleRenderer(self._subjects, wanted)
             self._renderers[wanted] = renderer
-            if len(self._renderers) > self._subject.options.feed.kept_styles:
+            if len(self._renderers) > self._subjects.options.feed.kept_styles:
                 self._renderers.popitem(last=False)
             return renderer.draw(tracked)
 

@@ -8,14 +8,17 @@ from typing import Any
 from arview.camera import Camera
 from arview.inspection import ComponentDeviation, Finding, Inspection
 from arview.live.options import LiveOptions
+from arview.live.protocol import PROTOCOL
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.notices import Notice
 from arview.live.stream.subject import OverlayStyle, Subject
+from arview.live.stream.subjects import Subjects
 from arview.overlay.evidence import DrawnEvidence, evidence_of, presence_of
 from arview.overlay.labels import arrow_scale, by_urgency, detail_text, inspection_doubt, label_text, value_text
 from arview.overlay.legend import legend_entries, withheld_title
 from arview.overlay.mesh import anchor_in_model, topology
 from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, OverlayOptions
+from arview.overlay.several import specimen_mark, specimen_rgb
 from arview.overlay.status import completeness_text
 from arview.pose import Pose
 
@@ -24,30 +27,44 @@ Document = dict[str, Any]
 
 def pose_document(tracked: TrackedFrame, now_s: float) -> Document:
     """*Pose*: the result of a frame; ``now_s`` is the monotonic time of the response."""
-    pose = tracked.pose
-    guide = pose.guide_cam_from_model
+    subjects: list[Subject | None] = [None] * len(tracked.poses) if tracked.subjects is None else [*tracked.subjects]
+    parts = [_part_pose_document(*of) for of in zip(tracked.poses, subjects, strict=True)]
     return {
         "type": "pose",
         "id": tracked.frame.frame_id,
         "revision": tracked.revision,
-        "state": str(pose.state),
-        "quality": round(pose.quality, 3),
-        "reason": pose.reason,
-        "remark": pose.remark,
-        "mismatches": list(pose.mismatches),
-        "unverified": list(pose.unverified),
-        **evidence_document(pose, tracked.subject),
-        "identity": str(pose.identity),
-        "serial": pose.serial,
-        "ambiguous": len(pose.alternatives),
-        "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.ravel().tolist(),
-        "guide_cam_from_model": None if guide is None else guide.ravel().tolist(),
+        **parts[0],
+        **_list_of_several(parts),
         "camera": camera_document(tracked.camera),
         "wait_ms": _ms(tracked.started_s - tracked.arrived_s),
         "track_ms": _ms(tracked.done_s - tracked.started_s),
         "server_ms": _ms(now_s - tracked.arrived_s),
         "dropped": tracked.dropped,
         "scale": round(tracked.frame.scale, 3),
+    }
+
+
+def _list_of_several(parts: list[Document]) -> Document:
+    """The ``parts`` of *Part* and *Pose*: each part with its number; nothing where there is only one."""
+    return {"parts": [{"id": number, **one} for number, one in enumerate(parts)]} if len(parts) > 1 else {}
+
+
+def _part_pose_document(pose: Pose, subject: Subject | None) -> Document:
+    """What *Pose* says of one part."""
+    guide = pose.guide_cam_from_model
+    return {
+        "state": str(pose.state),
+        "quality": round(pose.quality, 3),
+        "reason": pose.reason,
+        "remark": pose.remark,
+        "mismatches": list(pose.mismatches),
+        "unverified": list(pose.unverified),
+        **evidence_document(pose, subject),
+        "identity": str(pose.identity),
+        "serial": pose.serial,
+        "ambiguous": len(pose.alternatives),
+        "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.ravel().tolist(),
+        "guide_cam_from_model": None if guide is None else guide.ravel().tolist(),
     }
 
 
@@ -115,6 +132,7 @@ def camera_document(camera: Camera) -> Document:
 def loading_document(options: LiveOptions, state: str, text: str) -> Document:
     """*Part* while the part is not loaded."""
     return {
+        "protocol": PROTOCOL,
         "revision": 0,
         "state": state,
         "text": text,
@@ -128,8 +146,36 @@ def loading_document(options: LiveOptions, state: str, text: str) -> Document:
     }
 
 
+def parts_document(subjects: Subjects) -> Document:
+    """*Part*: the parts, their components and their measured deviations."""
+    parts = [part_document(subject) for subject in subjects]
+    names = [
+        {"name": one.name, "mark": specimen_mark(number), "tag_color": _hex(specimen_rgb(number))}
+        for number, one in enumerate(subjects)
+    ]
+    return {
+        **loading_document(subjects.options, "ready", ""),
+        "revision": subjects.revision,
+        **parts[0],
+        **_list_of_several([{**of, **one} for of, one in zip(names, parts, strict=True)]),
+    }
+
+
+def with_ages(document: Document, subjects: Subjects) -> Document:
+    """*Part* with the present ages of the inspections."""
+
+    def with_age(part: Document, subject: Subject) -> Document:
+        inspection = subject.inspection
+        if inspection is None or part["inspection"] is None:
+            return part
+        return {**part, "inspection": {**part["inspection"], "age_s": round(inspection.age_s())}}
+
+    parts = [with_age(part, one) for part, one in zip(document.get("parts", []), subjects, strict=False)]
+    return {**with_age(document, subjects[0]), **({"parts": parts} if parts else {})}
+
+
 def part_document(subject: Subject) -> Document:
-    """*Part*: the part, its components and their measured deviations."""
+    """What *Part* says of one part."""
     model, inspection = subject.part.model, subject.inspection
     ranks = {one.name: rank for rank, one in enumerate(by_urgency(inspection))} if inspection else {}
     components = []
@@ -145,8 +191,6 @@ def part_document(subject: Subject) -> Document:
             }
         )
     return {
-        **loading_document(subject.options, "ready", ""),
-        "revision": subject.revision,
         "part": {
             "name": subject.part.name,
             "serial": subject.serial or "",
@@ -193,6 +237,7 @@ def style_document(style: OverlayStyle) -> Document:
         "labels": style.labels,
         "opacity": style.opacity,
         "only": style.only,
+        "only_part": style.only_part,
         "status": style.status,
     }
 

@@ -19,11 +19,10 @@ from arview.errors import ArviewError
 from arview.live.stream.frames import DecodedFrame, IncomingFrame, to_jpeg
 from arview.live.stream.newest import NewestSlot
 from arview.live.stream.notices import Notice, without_folder
-from arview.live.stream.subject import Subject
+from arview.live.stream.sessions import FeedSession
+from arview.live.stream.subjects import Subjects
 from arview.pose import Pose, TrackingState
-from arview.tracking import TrackingSession
 from arview.tracking.self_calibration.profile import keep_profile
-from arview.tracking.self_calibration.session import SelfCalibratingSession
 
 logger = logging.getLogger("arview.live")
 
@@ -34,17 +33,17 @@ class TrackedFrame:
 
     Attributes:
         frame: the frame that was tracked.
-        pose: pose of the part in that frame.
+        poses: pose of each part in that frame.
         camera: intrinsics of the frame.
         arrived_s, started_s, done_s: monotonic times of its arrival, and of the start and end of its tracking.
         dropped: number of frames that the feed had dropped by then.
         revision: revision of the part document.
         serial: number of the frame among the tracked frames of the feed; frame ids may wrap around or repeat.
-        subject: the part that is tracked, from which labels get their texts.
+        subjects: the parts that are tracked, from which labels get their texts.
     """
 
     frame: DecodedFrame
-    pose: Pose
+    poses: tuple[Pose, ...]
     camera: Camera
     arrived_s: float
     started_s: float
@@ -52,7 +51,12 @@ class TrackedFrame:
     dropped: int
     revision: int
     serial: int
-    subject: Subject | None = None
+    subjects: Subjects | None = None
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of the first part."""
+        return self.poses[0]
 
     @cached_property
     def jpeg(self) -> bytes:
@@ -86,21 +90,22 @@ class Feed:
         newest: the last tracked frame.
     """
 
-    def __init__(self, subject: Subject, kind: str) -> None:
+    def __init__(self, subjects: Subjects, kind: str) -> None:
         self.kind = kind
         self.received = self.unreadable = self.failures = 0
         self.newest: TrackedFrame | None = None
-        self.options = subject.options.feed
+        self.options = subjects.options.feed
         self.received_rate = _EventRate(self.options.rate_window_s)
         self.tracked_rate = _EventRate(self.options.rate_window_s)
-        self._subject = subject
+        self._subjects = subjects
         self._slot: NewestSlot[IncomingFrame] = NewestSlot()
         self._listeners: list[Callable[[TrackedFrame], None]] = []
         self._kept: deque[TrackedFrame] = deque(maxlen=self.options.kept_frames)
         self._arrived_s: float | None = None
-        self._session: TrackingSession | SelfCalibratingSession | None = None
+        self._session: FeedSession | None = None
         self._view: FrameView | None = None
-        self._wants_reset = self._wants_confirmation = False
+        self._wanted: deque[tuple[str, int | None]] = deque()
+        self._camera: Camera
         self._refused: Notice | None = None
         self._shape: tuple[int, int, int] | None = None
         self._unreadable_in_a_row = 0
@@ -124,13 +129,13 @@ class Feed:
         if listener in self._listeners:
             self._listeners.remove(listener)
 
-    def reset(self) -> None:
-        """Search for the part again, from the next frame on."""
-        self._wants_reset = True
+    def reset(self, part: int | None = None) -> None:
+        """Search for a part again, by its number, or for all of them, from the next frame on."""
+        self._wanted.append(("reset", part))
 
-    def confirm(self) -> None:
-        """The user says that the part in view is the one to which the labels belong, from the next frame on."""
-        self._wants_confirmation = True
+    def confirm(self, part: int | None = None) -> None:
+        """The user says that a part in view is the one to which its labels belong, from the next frame on."""
+        self._wanted.append(("confirm", part))
 
     def find(self, frame_id: int) -> TrackedFrame | None:
         """The tracked frame with this id, if it is still kept."""
@@ -164,8 +169,7 @@ class Feed:
     def notices(self) -> list[Notice]:
         """Conditions of this feed that its viewers have to know of."""
         notices = [self._refused] if self._refused else []
-        session = self._session
-        estimate = session.estimate if isinstance(session, SelfCalibratingSession) else None
+        estimate = None if self._session is None else self._session.estimate
         if estimate is not None and estimate.is_determined:
             notices.append(Notice("camera_estimated", "info", estimate.text))
         newest = self.newest
@@ -185,15 +189,15 @@ class Feed:
 
     def _tell_estimate(self) -> None:
         """Report the estimate of a session that ends, and keep it as a profile if one was asked for."""
-        session, profile = self._session, self._subject.options.profile
-        if not isinstance(session, SelfCalibratingSession):
+        profile = self._subjects.options.profile
+        estimate = None if self._session is None else self._session.finish()
+        if estimate is None:
             return
-        estimate = session.finish()
         logger.info("%s", estimate.text)
         if profile is None or not estimate.is_determined or self._shape is None:
             return
         try:
-            path = keep_profile(estimate, profile, self._subject.options.source, self._shape[2])
+            path = keep_profile(estimate, profile, self._subjects.options.source, self._shape[2])
             logger.info("wrote %s; use it with --camera profile:%s", path, profile)
         except ArviewError as error:
             logger.error("%s", error)
@@ -231,11 +235,8 @@ class Feed:
         shape = width, height, frame.quarter_turns_clockwise
         if shape != self._shape:
             self._start_session(shape, frame.unsquared_size)
-        if self._wants_reset and self._session is not None:
-            self._wants_reset = False
-            self._session.reset()
         if self._session is not None:
-            self._identify(self._session)
+            self._prepare(self._session)
         if self._view is not None and self._view.is_resampling:
             picture = self._view.picture(np.ascontiguousarray(frame.image), frame.frame_id)
             frame = replace(frame, image=picture)
@@ -243,29 +244,32 @@ class Feed:
         if self._session is None:
             reason = self._refused.text if self._refused else ""
             pose = Pose(None, None, 0.0, TrackingState.SEARCHING, arrived_s, frame.frame_id, 0.0, reason)
+            poses = tuple(replace(pose, instance=one.name) for one in self._subjects)
         else:
-            pose = self._session.process(np.ascontiguousarray(frame.image), frame.frame_id, arrived_s)
-            if isinstance(self._session, SelfCalibratingSession):
-                self._camera = self._session.camera
+            poses = self._session.process(np.ascontiguousarray(frame.image), frame.frame_id, arrived_s)
+            self._camera = self._session.camera or self._camera
         return TrackedFrame(
             frame=frame,
-            pose=pose,
+            poses=poses,
             camera=self._camera,
             arrived_s=arrived_s,
             started_s=started_s,
             done_s=time.monotonic(),
             dropped=self.dropped,
-            revision=self._subject.revision,
+            revision=self._subjects.revision,
             serial=self._serial,
-            subject=self._subject,
+            subjects=self._subjects,
         )
 
-    def _identify(self, session: TrackingSession | SelfCalibratingSession) -> None:
-        """Tell a session of which serial number the labels are, and that the user has confirmed the part in view."""
-        session.identity.expect(self._subject.serial_numbers)
-        if self._wants_confirmation:
-            self._wants_confirmation = False
-            session.confirm()
+    def _prepare(self, session: FeedSession) -> None:
+        """Tell a session of which serial numbers the labels are, and what the user has asked for since."""
+        session.expect(self._subjects.serial_numbers)
+        while self._wanted:
+            what, part = self._wanted.popleft()
+            if what == "reset":
+                session.reset(part)
+            else:
+                session.confirm(part)
 
     def _start_session(self, shape: tuple[int, int, int], unsquared_size: tuple[int, int] | None) -> None:
         """Start a session for frames of another size or orientation, or note why there is none."""
@@ -273,14 +277,14 @@ class Feed:
         self._tell_estimate()
         self._shape, self._session, self._view, self._refused = shape, None, None, None
         try:
-            camera = self._subject.camera(width, height, turns, unsquared_size)
+            camera = self._subjects.camera(width, height, turns, unsquared_size)
             if self.kind == "phone":  # whose page shows the picture of the phone as it is
                 camera = require_brown(camera, "pictures of a phone")
             self._view = FrameView(camera, self.options.undistort)
             self._camera = self._view.tracked_camera
-            self._session = self._subject.session(self._camera)
+            self._session = self._subjects.session(self._camera)
         except ArviewError as error:
             self._camera = guess_camera(width, height)
             self._refused = Notice(
-                "size_refused", "error", without_folder(str(error), self._subject.options.camera or "")
+                "size_refused", "error", without_folder(str(error), self._subjects.options.camera or "")
             )

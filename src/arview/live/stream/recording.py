@@ -1,4 +1,4 @@
-"""Video recordings: a thread draws the overlay on the newest frames of a feed and writes them to a file."""
+"""Recordings: a thread draws the overlay on the newest frames of a feed, and writes them and their poses to files."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 import shutil
 import threading
 import time
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.newest import NewestSlot
 from arview.live.stream.notices import Notice
+from arview.pose_file import PoseWriter
 from arview.video import Image, VideoSink
 
 logger = logging.getLogger("arview.live")
@@ -28,7 +30,8 @@ class Recorder:
     """Records one feed until `stop`; frames that arrive while another is being drawn are dropped.
 
     The first frame sets the size of the video. Later frames of another size (a phone that was rotated) are fitted in
-    with black bars.
+    with black bars. The poses stand beside the video, in a file of the same name that ends in ``.jsonl``, a line for
+    each part in each frame, see `PoseWriter`; their index is the number of the frame in the video.
 
     Args:
         feed: the feed to record.
@@ -48,6 +51,8 @@ class Recorder:
         self._feed, self._annotator = feed, annotator
         self._slot: NewestSlot[TrackedFrame] = NewestSlot()
         self._sink: VideoSink | None = None
+        self._poses: PoseWriter | None = None
+        self._frames, self._first_s = 0, 0.0
         self._began_s = time.monotonic()
         self._disk_checked_s = 0.0
         self._thread = threading.Thread(target=self._run, name="arview-recorder", daemon=True)
@@ -78,24 +83,32 @@ class Recorder:
         try:
             while (tracked := self._slot.take()) is not None and self._may_continue():
                 self._write(tracked)
-            if self._sink is not None:
+            if self._sink is not None and self._poses is not None:
                 self._sink.close()
+                self._poses.close()
         except Exception as error:
             if not isinstance(error, ArviewError):
                 logger.exception("recording failed")
             self.fault = str(error) or type(error).__name__
             if self._sink is not None:
                 self._sink.abort()
+            if self._poses is not None:
+                self._poses.abort()
         self._feed.unlisten(self._slot.put)
         self._slot.close()
 
     def _write(self, tracked: TrackedFrame) -> None:
         image = self._annotator.draw_with_status(tracked).image
-        if self._sink is None:
+        if self._sink is None or self._poses is None:
             height, width = image.shape[:2]
-            self._size = width, height
+            self._size, self._first_s = (width, height), tracked.arrived_s
             self._sink = VideoSink(self.path, width, height)
+            self._poses = PoseWriter(self.path.with_suffix(".jsonl"), lambda index: self._camera)
         self._sink.write(_fitted(image, *self._size), tracked.arrived_s)
+        self._camera = tracked.camera
+        for pose in tracked.poses:
+            self._poses.write(replace(pose, index=self._frames, time_s=tracked.arrived_s - self._first_s))
+        self._frames += 1
 
     def _may_continue(self) -> bool:
         if time.monotonic() - self._disk_checked_s < self._options.check_interval_s:

@@ -1,14 +1,15 @@
-"""The subject: the part that is shown, with its guide views and its inspection."""
+"""A subject: a part that is shown, with its guide views and its inspection."""
 
 from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 from arview.cad.part import Part
 from arview.camera import Camera
-from arview.camera.read import guess_camera, load_camera
+from arview.camera.read import guess_camera
 from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
@@ -21,11 +22,8 @@ from arview.overlay.options import EdgeMode
 from arview.tracking import TrackingSession
 from arview.tracking.guide_pose import guide_pose
 from arview.tracking.self_calibration.session import SelfCalibratingSession
-from arview.video.intrinsics import load_square_camera
 
 _SECONDS_PER_DAY = 86400.0
-PHONE_FOV = "fov:66"
-"""Camera assumed for phones: field of view along the longer side. Their main cameras have 65 to 72° (24 to 28 mm)."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +39,7 @@ class OverlayStyle:
     labels: bool = True
     opacity: float = OverlayOptions.opacity
     only: str | None = None  # the only component that is drawn and labelled; None: all
+    only_part: int = 0  # number of the part to which that component belongs
     status: bool = True  # the status line at the lower edge; the page shows the same as text
 
     def __post_init__(self) -> None:
@@ -58,12 +57,14 @@ class OverlayStyle:
 
 
 class Subject:
-    """The part and its inspection; safe to use from several threads.
+    """A part and its inspection; safe to use from several threads.
 
     Args:
         part: the part with its model.
         views: guide views of that model.
         options: options of the server.
+        name: that tells it from the others, see `Pose.instance`; empty for the only one.
+        inspection_path: of its inspection, or None.
 
     Attributes:
         serial: serial number of the part at the station, or None.
@@ -74,14 +75,21 @@ class Subject:
             not exist.
     """
 
-    def __init__(self, part: Part, views: GuideViewSet, options: LiveOptions) -> None:
-        self.part, self.views, self.options = part, views, options
+    def __init__(
+        self,
+        part: Part,
+        views: GuideViewSet,
+        options: LiveOptions,
+        name: str = "",
+        inspection_path: Path | None = None,
+    ) -> None:
+        self.part, self.views, self.options, self.name = part, views, options, name
         self.serial = options.serial or part.serial
         self.revision = 1
         self._lock = threading.Lock()
         self._file: InspectionFile | None = None
-        if options.inspection is not None:
-            self._file = InspectionFile(options.inspection, part.model, self.serial, options.max_age_s)
+        if inspection_path is not None:
+            self._file = InspectionFile(inspection_path, part.model, self.serial, options.max_age_s)
         if options.guide is not None:
             guide_pose(options.guide, part, views.view_range, guess_camera(options.width, options.height))
 
@@ -113,35 +121,10 @@ class Subject:
         return True
 
     def notices(self) -> list[Notice]:
-        """The notices about camera and inspection."""
-        notices = [] if self._file is None else self._file.notices()
+        """The notices about the inspection."""
         if self._file is None:
-            notices.append(Notice("inspection_none", "info", "no inspection: nothing has been measured"))
-        if self.options.camera is None:
-            notices.append(
-                Notice("camera_guessed", "warning", "camera not calibrated: distances to the part are only rough")
-            )
-        return notices
-
-    def camera(
-        self,
-        width: int,
-        height: int,
-        quarter_turns_clockwise: int = 0,
-        unsquared_size: tuple[int, int] | None = None,
-    ) -> Camera:
-        """Intrinsics for the frames of a feed, whose pixels may have been made square.
-
-        Raises:
-            InputError, MismatchError: the camera file cannot be read or is for frames of another aspect ratio.
-        """
-        spec, source = self.options.camera, self.options.source
-        if spec is not None:
-            size = (width, height)
-            return load_square_camera(spec, size, unsquared_size, quarter_turns_clockwise, source)
-        if self.options.is_phone:
-            return load_camera(PHONE_FOV, width, height)
-        return guess_camera(width, height)
+            return [Notice("inspection_none", "info", "no inspection: nothing has been measured")]
+        return self._file.notices()
 
     def session(self, camera: Camera) -> TrackingSession | SelfCalibratingSession:
         """A new tracking session for a feed with this camera, which is replaced while it runs if it is guessed."""
@@ -163,11 +146,16 @@ class Subject:
             return make_session(camera, None)
         return SelfCalibratingSession(make_session, self.views, camera)
 
-    def overlay(self, camera: Camera, style: OverlayStyle) -> OverlayRenderer:
-        """A renderer of the overlay for a feed with this camera."""
+    def session_beside(self, camera: Camera, like: TrackingSession | None) -> TrackingSession:
+        """A session among others of the same stream, which shares the detector of one of the same part if given."""
+        return TrackingSession(self.views, camera, self.part.model, like=like, serials=self.serial_numbers)
+
+    def overlay(self, camera: Camera, style: OverlayStyle, number: int = 0) -> OverlayRenderer:
+        """A renderer of the overlay for a feed with this camera; ``number`` is that of this part."""
         inspection = self.inspection
         if inspection is not None and style.only is not None:
-            wanted = tuple(one for one in inspection.components if one.name == style.only)
+            is_of_it = number == style.only_part
+            wanted = tuple(one for one in inspection.components if is_of_it and one.name == style.only)
             inspection = replace(inspection, components=wanted)
         options = replace(style.overlay_options(), max_age_days=self.label_options.max_age_days)
         return OverlayRenderer(self.part.model, camera, inspection, options, serial=self.serial)

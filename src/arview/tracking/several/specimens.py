@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,6 +35,16 @@ class SpecimenOptions:
 
 
 DEFAULT = SpecimenOptions()
+
+
+def specimen_names(part_names: Sequence[str]) -> list[str]:
+    """Names of specimens: that of the part, with a number where several have the same: ``plate#1``, ``plate#2``."""
+    total, seen = Counter(part_names), Counter[str]()
+    names = []
+    for name in part_names:
+        seen[name] += 1
+        names.append(f"{name}#{seen[name]}" if total[name] > 1 else name)
+    return names
 
 
 def is_same_specimen(one: Array, other: Array, views: GuideViewSet, options: SpecimenOptions = DEFAULT) -> bool:
