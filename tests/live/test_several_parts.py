@@ -99,7 +99,7 @@ def test_pictures_and_their_data_show_all_parts(subjects: Subjects, tracked: Tra
             1,
             2,
             subjects,
-        )  # fmt: skip
+        )
     ).image
     assert (both != alone).any(axis=2).mean() > 0.03
     data = _frame_data(subjects, tracked)

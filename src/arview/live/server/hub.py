@@ -270,7 +270,7 @@ class Hub:
     def _record_phone(self, recordings: Recordings, client: Client, path: Path) -> None:
         """Record a phone from its first frame: to OUT.mp4, else to the first free one of OUT-2.mp4, OUT-3.mp4, ..."""
         target, number = path, 1
-        while target in self._recorded or (number > 1 and target.exists()):
+        while target in self._recorded or (number > 1 and (target.exists() or target.with_suffix(".jsonl").exists())):
             number += 1
             target = path.with_name(f"{path.stem}-{number}{path.suffix}")
         self._recorded.add(target)
