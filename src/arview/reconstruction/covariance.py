@@ -68,9 +68,19 @@ def reprojection_residuals(sparse: SparseModel) -> Array:
 
 def free_frame_projection(sparse: SparseModel) -> Array:
     """(6M,6M) projection that removes a rotation, translation or scaling of the whole frame from left twists."""
+    gauge, weights = gauge_of(sparse)
+    weighed = gauge * weights[:, None]
+    return np.eye(len(gauge)) - (gauge @ np.linalg.pinv(weighed)) * weights[None, :]
+
+
+def gauge_of(sparse: SparseModel) -> tuple[Array, Array]:
+    """(6M,7) left twists of all photos for each free motion of the whole frame, and (6M,) weights of their entries.
+
+    The motions are rotations, translations and a scaling about the frame's origin. The weights convert lengths to
+    angles by the extent of the cameras' positions.
+    """
     blocks = []
     for photo in sparse.photos:
-        # Left twists equivalent to a small rotation, translation and scaling of the scan frame about its origin.
         rotation, translation = photo.cam_from_scan[:3, :3], photo.cam_from_scan[:3, 3]
         block = np.zeros((6, 7))
         block[:3, :3] = rotation
@@ -78,10 +88,7 @@ def free_frame_projection(sparse: SparseModel) -> Array:
         block[3:, 3:6] = rotation
         block[3:, 6] = translation
         blocks.append(block)
-    gauge = np.concatenate(blocks)
     centres = np.array([photo.centre_in_scan for photo in sparse.photos])
     unit = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
-    # Lengths are converted to angles by the extent of the cameras' positions.
     weights = np.tile([1.0, 1.0, 1.0, 1.0 / unit, 1.0 / unit, 1.0 / unit], len(sparse.photos))
-    weighed = gauge * weights[:, None]
-    return np.eye(len(gauge)) - (gauge @ np.linalg.pinv(weighed)) * weights[None, :]
+    return np.concatenate(blocks), weights

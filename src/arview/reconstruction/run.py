@@ -34,6 +34,7 @@ from arview.geometry import Array
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of, write_model
 from arview.reconstruction.coverage import Coverage, coverage
 from arview.reconstruction.dense import Cad, DenseOptions, read_ply, reconstruct_dense, write_ply
+from arview.reconstruction.groups import groups_warning
 from arview.reconstruction.intake import (
     Intake,
     VideoIntakeOptions,
@@ -157,7 +158,7 @@ class _ReconstructionRun:
         if last >= 2 and sparse is not None:
             part_key = None if self.part is None else (self.part.model.source_hash, self.part.effective_view_range)
             key = key_of(key, part_key, self.options.sources, self.options.scale)
-            scale = self._scale(sparse, key)
+            scale = self._scale(intake.photos, sparse, key)
             sparse, cad = self._metric(sparse, scale)
             cover = self._coverage(sparse, cad)
         if last >= 3 and sparse is not None:
@@ -206,13 +207,16 @@ class _ReconstructionRun:
         self._record_time("sparse", began)
         return sparse
 
-    def _scale(self, sparse: SparseModel, key: str) -> ScaleResult:
+    def _scale(self, photos: tuple[Photo, ...], sparse: SparseModel, key: str) -> ScaleResult:
         began = time.perf_counter()
         path = self.folder / "scale.json"
         if self.stages.is_finished("scale", key):
             return ScaleResult.from_provenance(json.loads(path.read_text(encoding="utf-8")))
         self.stages.restart("scale")
         scale = find_scale(sparse, self.part, self.options.sources, self.options.scale, progress=self.tell)
+        # The scale's file carries all doubts about the reconstruction to the measurement and its report.
+        apart = groups_warning([photo.name for photo in photos], sparse.groups)
+        scale = replace(scale, warnings=(*((apart,) if apart else ()), *scale.warnings))
         write_json(path, scale.provenance())
         self.stages.finish("scale", key)
         self._record_time("scale", began)
@@ -254,6 +258,7 @@ class _ReconstructionRun:
 def _write_sparse(folder: Path, sparse: SparseModel) -> None:
     """Write what COLMAP's model, which is already in the folder, does not contain."""
     write_json(folder / "unplaced.json", dict(sparse.unplaced))
+    write_json(folder / "groups.json", [list(group) for group in sparse.groups])
     try:
         if sparse.pose_covariance is not None:
             with replacing(folder / "covariance.npy") as file:
@@ -268,9 +273,11 @@ def _read_sparse(folder: Path, photos: tuple[Photo, ...]) -> SparseModel:
     """Read what `reconstruct_sparse` and `_write_sparse` wrote. Raises InputError when files are missing."""
     try:
         unplaced = json.loads((folder / "unplaced.json").read_text(encoding="utf-8"))
+        groups = json.loads((folder / "groups.json").read_text(encoding="utf-8"))
         sparse = sparse_model_of(read_reconstruction(folder / "model"), photos, tuple(unplaced.items()))
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{folder}: files are missing or damaged ({error}); run again with --force") from error
+    sparse = replace(sparse, groups=tuple(tuple(group) for group in groups))
     path = folder / "covariance.npy"
     return replace(sparse, pose_covariance=np.load(path)) if path.exists() else sparse
 
@@ -323,6 +330,7 @@ def summary(result: Reconstruction) -> dict[str, Any]:
     if sparse is not None:
         deviations = pose_deviations(sparse)
         content["unplaced"] = dict(sparse.unplaced)
+        content["groups"] = [list(group) for group in sparse.groups]
         content["photos"] = {
             photo.name: {
                 "camera": camera_summary(photo.camera),

@@ -26,6 +26,7 @@ from arview.geometry import Array, invert, skew
 from arview.reconstruction.colmap import CALIBRATED_MODEL, HALF_PX, colmap_camera, import_pycolmap, sparse_model_of
 from arview.reconstruction.covariance import pose_covariance
 from arview.reconstruction.features import FeatureOptions, Features, find_all_features
+from arview.reconstruction.groups import GroupOptions, linked_groups
 from arview.reconstruction.matching import Matches, epipolar_inliers, match_along_lines, match_descriptors
 from arview.reconstruction.types import Photo, SparseModel
 
@@ -48,6 +49,7 @@ class SparseOptions:
     max_error_px: float = 2.0  # observations with larger errors are left out of the last adjustment
     min_centre_move: float = 0.001  # of the longer side; smaller moves of the principal point are not significant …
     max_centre_move: float = 0.05  # … and larger ones mean that the views do not determine it
+    groups: GroupOptions = field(default_factory=GroupOptions)
     min_angle_deg: float = 1.5  # between two rays to a point; smaller angles do not determine depth
     seed: int = 0
     threads: int = 0  # 0: all cores
@@ -73,14 +75,15 @@ def reconstruct_sparse(
     if not models or max(model.num_reg_images() for model in models) < 3:
         raise CannotMeasureError(_why_nothing(photos, features, pairs))
     chosen = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    unplaced = _unplaced(photos, features, pairs, models, chosen)
     matches = _match_along_lines(chosen, photos, features, options, threads, tell)
     _write_matches(database_path, matches)
     chosen, adjuster = _triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
+    sparse, split = _largest_group(chosen, adjuster, photos, options, threads)
     _color(chosen, features)
     chosen.write(str(_emptied(folder / "model")))
-    sparse = sparse_model_of(chosen, photos, unplaced)
-    return replace(sparse, pose_covariance=pose_covariance(sparse, chosen, adjuster))
+    groups = _all_groups(sparse, split, models)
+    unplaced = _unplaced(photos, features, pairs, groups)
+    return replace(sparse, unplaced=tuple(unplaced), groups=groups)
 
 
 # --- first pass ------------------------------------------------------------------------------------------
@@ -315,6 +318,47 @@ def _adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> boo
     return False
 
 
+def _largest_group(
+    model: Any, adjuster: Any, photos: Sequence[Photo], options: SparseOptions, threads: int
+) -> tuple[SparseModel, list[list[str]]]:
+    """The photos that are placed relative to each other, adjusted alone; and the names of the other groups.
+
+    The mapper places photos by the first pass's matches; where few of them join two groups, the second pass may find
+    none, and then nothing holds the groups together.
+    """
+    split: list[list[str]] = []
+    while True:
+        sparse = sparse_model_of(model, photos)
+        sparse = replace(sparse, pose_covariance=pose_covariance(sparse, model, adjuster))
+        kept, *others = linked_groups(sparse, options.groups)
+        if len(kept) < 3:
+            raise CannotMeasureError(
+                f"photos: no three of the {len(sparse.photos)} share enough points to be placed relative to each "
+                "other; take more, 10 to 20 degrees apart"
+            )
+        if not others:
+            return sparse, split
+        split += [[sparse.photos[i].name for i in members] for members in others]
+        dropped = {name for names in split for name in names}
+        for image_id in list(model.reg_image_ids()):
+            if model.images[image_id].name in dropped:
+                model.deregister_frame(model.images[image_id].frame_id)
+        model.tear_down()  # without it, frames that have no pose stay, of which a covariance would be asked
+        adjuster = adjust(model, threads, refines_centre=False)
+
+
+def _all_groups(sparse: SparseModel, split: list[list[str]], models: Sequence[Any]) -> tuple[tuple[str, ...], ...]:
+    """Names of the photos of each group, the used one first: of the model that was split, and the mapper's others."""
+    groups = [tuple(photo.name for photo in sparse.photos), *(tuple(names) for names in split)]
+    known = {name for group in groups for name in group}
+    for model in sorted(models, key=lambda one: -one.num_reg_images()):
+        rest = tuple(sorted(_names(model) - known))
+        if len(rest) > 1:
+            groups.append(rest)
+            known |= set(rest)
+    return tuple(groups)
+
+
 def _color(model: Any, features: Sequence[Features]) -> None:
     """Give every point the colour of the place where it was first seen."""
     for point in model.points3D.values():
@@ -361,25 +405,25 @@ def _unplaced(
     photos: Sequence[Photo],
     features: Sequence[Features],
     pairs: dict[Pair, Matches],
-    models: Sequence[Any],
-    chosen: Any,
+    groups: Sequence[Sequence[str]],
 ) -> list[tuple[str, str]]:
-    """(name, reason) of every photo that is not in the chosen model."""
-    groups = [_names(model) for model in models]
-    placed = _names(chosen)
+    """(name, reason) of every photo that is not in the first group."""
+    placed = set(groups[0])
     reasons = []
     for index, photo in enumerate(photos):
         if photo.name in placed:
             continue
         partners = {photos[other].name for pair in pairs for other in pair if index in pair and other != index}
-        group = next((names for names in groups if photo.name in names and names != placed), set())
+        group = set(next((names for names in groups[1:] if photo.name in names), ()))
         if len(features[index]) < FEW_FEATURES:
             reason = f"only {len(features[index])} features: blurred, too dark, or nothing but bare surfaces in view"
+        elif len(group) > 1:
+            company = _some(group - {photo.name})
+            reason = f"has points in common only with {company}, but none, or too few, with the {len(placed)} used"
         elif not partners:
             reason = "nothing in common with the other photos: another part, or a view too far from the others"
         elif not partners & placed:
-            company = _some((group or partners) - {photo.name})
-            reason = f"has something in common only with {company}, but not with the other {len(placed)}"
+            reason = f"has something in common only with {_some(partners)}, but not with the other {len(placed)}"
         else:
             reason = "too little in common with the placed photos: take more photos between this view and theirs"
         reasons.append((photo.name, reason))

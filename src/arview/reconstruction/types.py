@@ -66,6 +66,8 @@ class SparseModel:
         observed_point, observed_photo: (K,) int32 indices, one entry for each observation.
         observed_px: (K,2) observed pixel in the distorted photo; integers are pixel centres.
         unplaced: (name, reason) of photos that could not be placed.
+        groups: names of the photos of each group that is placed in itself, but not relative to the others; the first
+            holds ``photos``. One group, or none where that is not known, is the usual case.
         pose_covariance: (6M,6M) joint covariance of the poses from bundle adjustment: for each photo a twist (rad,
             unit) applied on the left of ``cam_from_scan``, in the scan frame in which the cameras together vary least.
     """
@@ -79,6 +81,7 @@ class SparseModel:
     observed_px: Array
     unplaced: tuple[tuple[str, str], ...] = field(default=())
     pose_covariance: Array | None = None
+    groups: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.observed_point) != len(self.observed_photo) or len(self.observed_point) != len(self.observed_px):
