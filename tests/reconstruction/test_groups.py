@@ -52,26 +52,26 @@ def moved_part(sparse: SparseModel, members: list[int], std: Array) -> SparseMod
 
 
 def test_photos_that_share_points_are_one_group() -> None:
-    sparse = model_of([(range(0, 5), range(200)), (range(3, 8), range(150, 400))])
+    sparse = model_of([(range(5), range(200)), (range(3, 8), range(150, 400))])
     assert linked_groups(sparse) == (tuple(range(8)),)
     assert shared_points(sparse)[0, 4] == 200 and shared_points(sparse)[0, 7] == 50
 
 
 def test_groups_without_a_common_point() -> None:
-    sparse = model_of([(range(0, 3), range(200)), (range(3, 8), range(200, 400))])
+    sparse = model_of([(range(3), range(200)), (range(3, 8), range(200, 400))])
     assert linked_groups(sparse) == ((3, 4, 5, 6, 7), (0, 1, 2))
 
 
 def test_too_few_common_points_are_no_link() -> None:
     """Ten points that two photos of the two groups both see may be due to chance."""
-    sparse = model_of([(range(0, 4), range(210)), (range(4, 8), range(200, 400))])
+    sparse = model_of([(range(4), range(210)), (range(4, 8), range(200, 400))])
     assert linked_groups(sparse) == ((0, 1, 2, 3), (4, 5, 6, 7))
     assert len(linked_groups(sparse, GroupOptions(min_shared_points=10))) == 1
 
 
 def test_a_link_that_leaves_the_groups_free_to_move() -> None:
     """Forty common points, but by the covariance one group may turn against the other: not one frame."""
-    sparse = model_of([(range(0, 5), range(240)), (range(5, 8), range(200, 400))])
+    sparse = model_of([(range(5), range(240)), (range(5, 8), range(200, 400))])
     free = np.array([1e-1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert len(linked_groups(moved_part(sparse, [5, 6, 7], 1e-3 * free))) == 1
     assert linked_groups(moved_part(sparse, [5, 6, 7], free)) == ((0, 1, 2, 3, 4), (5, 6, 7))
@@ -79,7 +79,7 @@ def test_a_link_that_leaves_the_groups_free_to_move() -> None:
 
 def test_relative_deviation_is_that_of_the_pixels() -> None:
     """Against a Monte Carlo of the smaller part's common move, seen in its photos."""
-    sparse = model_of([(range(0, 5), range(240)), (range(5, 8), range(200, 400))], pose_std=1e-9)
+    sparse = model_of([(range(5), range(240)), (range(5, 8), range(200, 400))], pose_std=1e-9)
     std = np.array([2e-3, 3e-3, 1e-3, 0.5, 0.2, 0.8, 2e-3])
     sparse = moved_part(sparse, [5, 6, 7], std)
     predicted = relative_px(sparse, ((0, 1, 2, 3, 4), (5, 6, 7)), GroupOptions(points_of_photo=400))

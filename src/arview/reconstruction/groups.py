@@ -27,7 +27,7 @@ class GroupOptions:
     """When photos count as placed relative to each other."""
 
     min_shared_points: int = 15  # across a cut; fewer can be due to chance
-    maxrelative_px: float = 1.0  # standard deviation of one side's view of the other; more is not a common frame
+    max_relative_px: float = 1.0  # standard deviation of one side's view of the other; more is not a common frame
     points_of_photo: int = 60  # points of a photo in which that deviation is evaluated
 
 
@@ -79,7 +79,9 @@ def _weakest_cut(
     cuts = []
     for edge in zip(*tree.nonzero(), strict=True):
         one = _side(tree, edge)
-        cuts.append((len(_common(sparse, index[one], index[~one])), [tuple(index[s].tolist()) for s in (one, ~one)]))
+        cuts.append(
+            (len(_seen_by_both(sparse, index[one], index[~one])), [tuple(index[s].tolist()) for s in (one, ~one)])
+        )
     # The cut with the fewest points is the weak link: others on either side of it are loose for its sake only.
     for across, parts in sorted(cuts):
         if across < options.min_shared_points or relative_px(sparse, parts, options) > options.max_relative_px:
@@ -97,7 +99,7 @@ def _side(tree: scipy.sparse.csr_matrix, edge: tuple[int, int]) -> NDArray[np.bo
     return np.asarray(labels == labels[edge[0]])
 
 
-def _common(sparse: SparseModel, ones: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.int32]:
+def _seen_by_both(sparse: SparseModel, ones: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.int32]:
     """Points that photos of both sides see."""
     sides = [np.unique(sparse.observed_point[np.isin(sparse.observed_photo, side)]) for side in (ones, others)]
     return np.intersect1d(*sides)

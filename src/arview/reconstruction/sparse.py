@@ -78,7 +78,7 @@ def reconstruct_sparse(
     matches = _match_along_lines(chosen, photos, features, options, threads, tell)
     _write_matches(database_path, matches)
     chosen, adjuster = _triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
-    sparse, split = _largest_group(chosen, adjuster, photos, options, threads)
+    sparse, split = _main_group(chosen, adjuster, photos, options, threads)
     _color(chosen, features)
     chosen.write(str(_emptied(folder / "model")))
     groups = _all_groups(sparse, split, models)
@@ -318,7 +318,7 @@ def _adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> boo
     return False
 
 
-def _largest_group(
+def _main_group(
     model: Any, adjuster: Any, photos: Sequence[Photo], options: SparseOptions, threads: int
 ) -> tuple[SparseModel, list[list[str]]]:
     """The photos that are placed relative to each other, adjusted alone; and the names of the other groups.
