@@ -101,8 +101,8 @@ def _side(tree: scipy.sparse.csr_matrix, edge: tuple[int, int]) -> NDArray[np.bo
 
 def _seen_by_both(sparse: SparseModel, ones: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.int32]:
     """Points that photos of both sides see."""
-    sides = [np.unique(sparse.observed_point[np.isin(sparse.observed_photo, side)]) for side in (ones, others)]
-    return np.intersect1d(*sides)
+    first, second = (sparse.observed_point[np.isin(sparse.observed_photo, side)] for side in (ones, others))
+    return np.intersect1d(first, second)
 
 
 def _points_of(sparse: SparseModel, members: Sequence[int]) -> int:
