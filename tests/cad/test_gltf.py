@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from arview.cad.fitness import inspect_mesh
+from arview.cad.formats.draco import decode_draco
+from arview.cad.formats.limited_process import ProcessLimits
 from arview.cad.formats.meshopt import _filtered
 from arview.cad.load import load_cad, load_model
 from arview.errors import InputError
@@ -248,7 +251,10 @@ def test_a_buffer_elsewhere_is_never_read(uri: str, tmp_path: Path) -> None:
         load_model(path)
 
 
-DRACO = {"attributes": {"POSITION": 0}, "extensions": {"KHR_draco_mesh_compression": {"bufferView": 0}}}
+DRACO = {
+    "attributes": {"POSITION": 0},
+    "extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}},
+}
 
 
 def meshopt(**entries: object) -> list[dict[str, Any]]:
@@ -267,7 +273,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"buffers": [{"uri": "points.bin", "byteLength": 30}]}, "truncated: a mesh ends at byte 36 of 30"),
     ({"nodes": [{"mesh": 0, "children": [0]}]}, "nested in a circle"),
     ({"nodes": [{"children": [i + 1] * 10} for i in range(9)] + [{"mesh": 0}]}, "more than 10,000 components"),
-    ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, r"requires Draco compression \(KHR_draco"),
     (
         {"extensionsRequired": ["KHR_meshopt_compression", "X_y"]},
         r"requires meshopt compression \(KHR.*, X_y, which is",
@@ -275,7 +280,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"meshes": [{"primitives": [DRACO]}], "accessors": [{**accessor()[0], "bufferView": 9}]}, "broken"),
     (
         {"meshes": [{"primitives": [DRACO]}], "accessors": [{"componentType": 5126, "count": 3, "type": "VEC3"}]},
-        "uses Draco compression, which is not read",
+        r"broken or truncated Draco data \(0 FileTypeException",
     ),
     (
         {"bufferViews": meshopt(byteLength=36, byteStride=12, count=3, mode="ATTRIBUTES")},
@@ -295,6 +300,89 @@ def test_hostile_files_are_refused_at_once(changes: dict[str, Any], expected: st
         load_model(path)
     assert time.process_time() - start < 2.0
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def draco_glb(path: Path, *, count: int = 1, cut: int | None = None, position: int = 0) -> Path:
+    """A GLB of boxes of 10 × 20 × 30 mm whose meshes hold nothing but Draco data, with green vertices."""
+    import DracoPy
+
+    vertices, faces = box((0, 0, 0), (0.01, 0.02, 0.03))
+    colors = np.tile(np.array([[0, 255, 0]], dtype=np.uint8), (8, 1))
+    coded = DracoPy.encode(vertices, faces=faces, quantization_bits=16, colors=colors)
+    ids = {one["attribute_type"]: one["unique_id"] for one in DracoPy.decode(coded).attributes}
+    coded = coded if cut is None else coded[:cut]
+    binary = coded + b"\0" * (-len(coded) % 4)
+    numbers = {"POSITION": ids[0] + position, "COLOR_0": ids[2]}
+    primitive = {
+        "attributes": {"POSITION": 0, "COLOR_0": 2},
+        "indices": 1,
+        "extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": numbers}},
+    }
+    tree: dict[str, object] = {
+        "nodes": [{"name": f"lug_{k}", "mesh": k, "translation": [0.1 * k, 0, 0]} for k in range(count)],
+        "scenes": [{"nodes": list(range(count))}],
+        "meshes": [{"primitives": [primitive]} for _ in range(count)],
+        "accessors": [
+            {"componentType": 5126, "count": 8, "type": "VEC3"},
+            {"componentType": 5125, "count": 36, "type": "SCALAR"},
+            {"componentType": 5121, "count": 8, "type": "VEC3", "normalized": True},
+        ],
+        "bufferViews": [{"buffer": 0, "byteLength": len(coded)}],
+        "buffers": [{"byteLength": len(binary)}],
+        "extensionsRequired": ["KHR_draco_mesh_compression"],
+    }
+    return write_glb(path, tree, binary)
+
+
+@pytest.mark.slow
+def test_draco_compression(tmp_path: Path) -> None:
+    model = load_model(draco_glb(tmp_path / "d.glb", count=3))
+    assert [component.name for component in model.components] == ["lug_0", "lug_1", "lug_2"]
+    for k, component in enumerate(model.components):
+        assert len(component.faces) == 12
+        np.testing.assert_allclose(component.bounds_in_model - [100.0 * k, 0, 0], [[0, 0, 0], SIZE_MM], atol=2e-3)
+        assert component.color == pytest.approx((0.0, 1.0, 0.0))
+        assert inspect_mesh(component).volume_mm3 == pytest.approx(6000.0, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("changes", [{"cut": 40}, {"cut": 90}, {"position": 7}])
+def test_damaged_draco_data_is_refused(changes: dict[str, int], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"d\.glb: .*(Draco|no data)"):
+        load_model(draco_glb(tmp_path / "d.glb", **changes))
+
+
+@pytest.mark.slow
+def test_mutated_draco_data_is_read_or_refused(tmp_path: Path) -> None:
+    import DracoPy
+
+    vertices, faces = box((0, 0, 0), (1.0, 2.0, 3.0))
+    coded = bytearray(DracoPy.encode(vertices, faces=faces))
+    rng = np.random.default_rng(3)
+    refused = 0
+    for _ in range(12):
+        other = coded.copy()
+        for place in rng.integers(11, len(other), 3):
+            other[place] = rng.integers(0, 256)
+        try:
+            decode_draco([(bytes(other), {"POSITION": 0})], tmp_path / "d.glb")
+        except InputError as error:
+            assert "Draco" in str(error) or "triangles" in str(error)
+            refused += 1
+    assert refused
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        (ProcessLimits(cpu_s=20.0, wall_factor=1e-4), "its Draco data take more than 20 s"),
+        (ProcessLimits(memory_mb=150.0), "broken or truncated Draco data"),
+    ],
+)
+def test_limits_of_draco(limits: ProcessLimits, expected: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=expected):
+        decode_draco([(b"DRACO", {"POSITION": 0})], tmp_path / "d.glb", limits)
 
 
 def test_deeply_nested_json_is_refused(tmp_path: Path) -> None:

@@ -116,8 +116,8 @@ REFUSED = [
     (text_file("t.gltf", '{"asset": {"version": "1.0"}}'), r"glTF version 1\.0"),
     (text_file("t.gltf", '{"asset": {"version": "2.0"}}'), "no triangles"),
     (
-        text_file("d.gltf", '{"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]}'),
-        "Draco",
+        text_file("d.gltf", '{"asset": {"version": "2.0"}, "extensionsRequired": ["EXT_structural_metadata"]}'),
+        "requires EXT_structural_metadata, which is not read",
     ),
     (text_file("t.step"), "not a STEP file"),
     (truncated_step, r"broken or truncated STEP \(.*unexpected end of file"),
@@ -133,7 +133,23 @@ REFUSED = [
     (text_file("t.stl"), "STL|no triangles"),
     (text_file("n.stl", "solid x\nfacet normal a b c\nouter loop\nvertex 0 0 0\nvertex 1 z 0\n"), "STL|no triangles"),
     (text_file("o.obj", "v 0 0 0\nv 1e300 0 0\nv 0 1e300 1e308\nf 1 2 3\n"), "NaN|is it really|degenerate"),
-    (truncated_stl, "broken or truncated STL"),
+    (truncated_stl, "broken or truncated STL \\(400 of 684 bytes"),
+    (
+        text_file(
+            "h.stl",
+            "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n"
+            "endfacet\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n",
+        ),
+        r"truncated STL \(its last solid or facet",
+    ),
+    (
+        text_file(
+            "q.stl",
+            "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+            "vertex 1 1 0\nendloop\nendfacet\nendsolid a\n",
+        ),
+        "a facet has 4 corners",
+    ),
     (huge_stl, "more than 5,000,000 triangles; decimate"),
     (text_file("t.ply"), "broken or truncated PLY"),
     (truncated_ply, "broken or truncated PLY"),

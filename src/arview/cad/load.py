@@ -14,9 +14,9 @@ import numpy as np
 from arview.cad.fitness import clean_mesh, wrong_winding
 from arview.cad.formats.gltf import read_gltf
 from arview.cad.formats.obj import read_obj
-from arview.cad.formats.raw import UNIT_MM, RawComponent, RawModel, check_triangle_count, unique_names
+from arview.cad.formats.raw import UNIT_MM, RawComponent, RawModel, unique_names
 from arview.cad.formats.step import read_step
-from arview.cad.formats.text_encoding import decode_text
+from arview.cad.formats.stl import read_stl
 from arview.cad.formats.threemf import read_3mf
 from arview.cad.model import Component, Model, make_model
 from arview.cad.view_range import Up
@@ -153,27 +153,22 @@ def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float,
         return read_obj(path)
     if suffix == ".3mf":
         return read_3mf(path)
-    return _read_mesh_file(path, suffix)
+    if suffix == ".stl":
+        return read_stl(path)
+    return _read_ply(path)
 
 
-def _read_mesh_file(path: Path, suffix: str) -> RawModel:
-    """An STL or PLY file read by trimesh: one mesh without a unit, for ASCII STL one for each solid."""
+def _read_ply(path: Path) -> RawModel:
+    """A PLY file read by trimesh: one mesh without a unit."""
     import trimesh
 
-    size = path.stat().st_size
-    if suffix == ".stl":
-        with path.open("rb") as file:
-            head = file.read(84)
-        count = int.from_bytes(head[80:84], "little")
-        if 84 + 50 * count == size:
-            check_triangle_count(count, path)
     try:
         with _quiet_trimesh():
-            scene = trimesh.load_scene(_mesh_bytes(path, suffix), file_type=suffix[1:], process=False)
+            scene = trimesh.load_scene(BytesIO(path.read_bytes()), file_type="ply", process=False)
     except Exception as error:  # trimesh raises whatever its parsers stumble over
-        kind, printed = suffix[1:].upper(), next(iter(str(error).splitlines()), "")
+        printed = next(iter(str(error).splitlines()), "")
         raise InputError(
-            f"{path}: broken or truncated {kind} ({type(error).__name__}: {printed}); export it again"
+            f"{path}: broken or truncated PLY ({type(error).__name__}: {printed}); export it again"
         ) from error
     raw = RawModel()
     several = len(scene.geometry) > 1
@@ -191,15 +186,6 @@ def _read_mesh_file(path: Path, suffix: str) -> RawModel:
             color = (float(red), float(green), float(blue))
         raw.add(RawComponent((str(name),) if several else (), vertices, faces, color), path)
     return raw
-
-
-def _mesh_bytes(path: Path, suffix: str) -> BytesIO:
-    """The content of an STL or PLY file; ASCII STL, whose names may be in any encoding, in UTF-8."""
-    data = path.read_bytes()
-    is_text = suffix == ".stl" and len(data) != 84 + 50 * int.from_bytes(data[80:84], "little")
-    if is_text and data[:5].lower() == b"solid" and not data.isascii():
-        data = decode_text(data).encode("utf-8")
-    return BytesIO(data)
 
 
 @contextmanager

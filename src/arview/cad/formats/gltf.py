@@ -1,8 +1,8 @@
 """Reader of glTF 2.0 (.glb, .gltf): named nodes, nested transforms, instances, colours.
 
-Source: Khronos glTF 2.0 specification, EXT_mesh_gpu_instancing, KHR_mesh_quantization, EXT_meshopt_compression. Written
-for CAD, so that every node that carries a mesh stays one component under its own name; skins, morph targets and
-textures are ignored.
+Source: Khronos glTF 2.0 specification, EXT_mesh_gpu_instancing, KHR_mesh_quantization, EXT_meshopt_compression,
+KHR_draco_mesh_compression. Written for CAD, so that every node that carries a mesh stays one component under its own
+name; skins, morph targets and textures are ignored.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.cad.formats import draco
 from arview.cad.formats.gltf_data import GltfData
 from arview.cad.formats.raw import RawComponent, RawModel, check_instance_count, check_triangle_count, place, unit_in_mm
 from arview.errors import InputError
 from arview.geometry import Array
 
 _COMPRESSED = {
-    "KHR_draco_mesh_compression": "Draco compression",
+    draco.EXTENSION: "Draco compression",
     "KHR_meshopt_compression": "meshopt compression",
 }
-_SUPPORTED = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing", "EXT_meshopt_compression")
+_SUPPORTED = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing", "EXT_meshopt_compression", draco.EXTENSION)
 _WITHOUT_GEOMETRY = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp_")
 """Beginnings of the names of extensions that concern appearance only."""
 _MAX_DEPTH = 200
@@ -181,21 +182,16 @@ class _Gltf:
             mode = primitive.get("mode", 4)
             if mode not in (4, 5, 6):
                 continue
-            points = self.data.accessor(primitive["attributes"]["POSITION"], _compression(primitive))
-            points = points.astype(np.float64)
+            decoded = self.data.draco_mesh(primitive)
+            points = self.data.values(primitive, "POSITION", decoded).astype(np.float64)
             if points.shape[1] != 3:
                 raise ValueError(f"the positions of {'/'.join(path)!r} have {points.shape[1]} coordinates")
-            corners = (
-                self.data.accessor(primitive["indices"], _compression(primitive)).astype(np.int64).ravel()
-                if "indices" in primitive
-                else np.arange(len(points), dtype=np.int64)
-            )
-            triangles = _triangles(corners, mode)
+            triangles = _triangles(self._corners(primitive, len(points)), mode) if decoded is None else decoded.faces
             if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(points):
                 raise ValueError(f"a triangle of {'/'.join(path)!r} refers to a vertex that does not exist")
             triangle_count += len(triangles)
             check_triangle_count(triangle_count, self.path)
-            color = self._color(primitive)
+            color = self._color(primitive, decoded)
             if color is not None:
                 a, b, c = points[triangles].transpose(1, 0, 2)
                 area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
@@ -213,7 +209,13 @@ class _Gltf:
             raise ValueError(f"vertices of {'/'.join(path)!r} are NaN or infinite")
         return _GltfMesh(points[used], corners.reshape(-1, 3), color)
 
-    def _color(self, primitive: dict[str, Any]) -> Color | None:
+    def _corners(self, primitive: dict[str, Any], count: int) -> NDArray[np.int64]:
+        """Vertex indices of a primitive; all vertices in order where it has none."""
+        if "indices" not in primitive:
+            return np.arange(count, dtype=np.int64)
+        return self.data.accessor(primitive["indices"]).astype(np.int64).ravel()
+
+    def _color(self, primitive: dict[str, Any], decoded: draco.DracoMesh | None) -> Color | None:
         """Base colour of a primitive's material, times its mean vertex colour, as sRGB."""
         linear = np.ones(3)
         known = False
@@ -222,7 +224,7 @@ class _Gltf:
             known = "baseColorFactor" in pbr or "baseColorTexture" not in pbr
             linear = np.array(pbr.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])[:3], dtype=np.float64)
         if "COLOR_0" in primitive["attributes"]:
-            linear = linear * self.data.accessor(primitive["attributes"]["COLOR_0"])[:, :3].mean(axis=0)
+            linear = linear * self.data.values(primitive, "COLOR_0", decoded)[:, :3].mean(axis=0)
             known = True
         if not known:
             return None
@@ -253,11 +255,6 @@ def _check_extensions(tree: dict[str, Any], path: Path) -> None:
     if missing:
         told = ", ".join(f"{_COMPRESSED[name]} ({name})" if name in _COMPRESSED else name for name in missing)
         raise InputError(f"{path}: requires {told}, which is not read; export it without")
-
-
-def _compression(primitive: dict[str, Any]) -> str | None:
-    """Name of the compression of a primitive without uncompressed data, for messages."""
-    return next((_COMPRESSED[name] for name in primitive.get("extensions", {}) if name in _COMPRESSED), None)
 
 
 def _node_matrix(node: dict[str, Any]) -> Array:

@@ -10,12 +10,14 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.cad.formats.draco import EXTENSION, DracoMesh, decode_draco
 from arview.cad.formats.meshopt import decode_meshopt
 from arview.cad.formats.raw import MAX_TRIANGLES
 from arview.errors import InputError
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_DRACO_ATTRIBUTES = ("POSITION", "COLOR_0")
 _MAX_SPARSE_COUNT = 1_000_000
 """Largest number of elements of an accessor that starts as zeros: they take memory without any bytes in the file."""
 
@@ -33,12 +35,10 @@ class GltfData:
         self.path = path
         self.buffers: dict[int, bytes] = {}
         self.decoded: dict[int, bytes] = {}
+        self.draco: dict[int, DracoMesh] | None = None
 
-    def accessor(self, index: int, compression: str | None = None) -> NDArray[Any]:
-        """(count, width) values of an accessor, integers scaled to floats where marked ``normalized``.
-
-        ``compression`` names that of the mesh, which is told when the accessor has no data of its own.
-        """
+    def accessor(self, index: int) -> NDArray[Any]:
+        """(count, width) values of an accessor, integers scaled to floats where marked ``normalized``."""
         accessor = self.tree["accessors"][_natural(index, "accessor")]
         dtype, width = _DTYPES[accessor["componentType"]], _WIDTHS[accessor["type"]]
         count = _natural(accessor["count"], "accessor count")
@@ -47,17 +47,57 @@ class GltfData:
         sparse = accessor.get("sparse")
         if "bufferView" in accessor:
             values = np.array(self._view(accessor["bufferView"], accessor.get("byteOffset", 0), count, dtype, width))
-        elif sparse is None and compression:
-            raise InputError(f"{self.path}: uses {compression}, which is not read; export it without")
         elif sparse is None or count > _MAX_SPARSE_COUNT:
             raise InputError(f"{self.path}: an accessor of {count:,} elements has no data; export it again")
         else:
             values = np.zeros((count, width), dtype=dtype)
         if sparse is not None:
             self._replace(values, sparse, dtype, width)
-        if accessor.get("normalized") and values.dtype.kind in "iu":
-            return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
-        return values
+        return _scaled(values, accessor)
+
+    def values(self, primitive: dict[str, Any], name: str, decoded: DracoMesh | None) -> NDArray[Any]:
+        """(count, width) values of an attribute of a primitive, those of its Draco data where it has some."""
+        index = primitive["attributes"][name]
+        if decoded is None or name not in decoded.attributes:
+            return self.accessor(index)
+        return _scaled(decoded.attributes[name], self.tree["accessors"][_natural(index, "accessor")])
+
+    def draco_mesh(self, primitive: dict[str, Any]) -> DracoMesh | None:
+        """The decoded mesh of a primitive; None without Draco data, or where it has the same uncompressed.
+
+        All meshes of the file are decoded at the first call.
+        """
+        compressed = self._draco_of(primitive)
+        if compressed is None:
+            return None
+        if self.draco is None:
+            wanted: dict[int, tuple[bytes, dict[str, int]]] = {}
+            for mesh in self.tree.get("meshes", []):
+                for one in mesh.get("primitives", []):
+                    found = self._draco_of(one)
+                    if found is not None:
+                        view = _natural(found["bufferView"], "bufferView")
+                        numbers = {k: _natural(v, k) for k, v in found["attributes"].items() if k in _DRACO_ATTRIBUTES}
+                        wanted[view] = self._bytes_of(view), wanted.get(view, (b"", {}))[1] | numbers
+            self.draco = dict(zip(wanted, decode_draco(list(wanted.values()), self.path), strict=True))
+        return self.draco[compressed["bufferView"]]
+
+    def _draco_of(self, primitive: dict[str, Any]) -> dict[str, Any] | None:
+        """The Draco extension of a primitive whose positions are in no buffer of their own."""
+        found = primitive.get("extensions", {}).get(EXTENSION)
+        if found is None:
+            return None
+        position = self.tree["accessors"][_natural(primitive["attributes"]["POSITION"], "accessor")]
+        return None if "bufferView" in position else dict(found)
+
+    def _bytes_of(self, view_index: int) -> bytes:
+        """The bytes of a buffer view; raises InputError where it would reach beyond the data."""
+        view = self.tree["bufferViews"][view_index]
+        start, length = _natural(view.get("byteOffset", 0), "byteOffset"), _natural(view["byteLength"], "byteLength")
+        data = self._buffer(_natural(view["buffer"], "buffer"))
+        if start + length > len(data):
+            raise InputError(f"{self.path}: truncated: a mesh ends at byte {start + length} of {len(data)}")
+        return data[start : start + length]
 
     def _replace(self, values: NDArray[Any], sparse: dict[str, Any], dtype: str, width: int) -> None:
         """Overwrite the elements that a sparse accessor lists."""
@@ -124,6 +164,13 @@ class GltfData:
             raise InputError(f"{self.path}: its buffer file {self.path.parent / name} is missing")
         with other.open("rb") as file:
             return file.read(length)
+
+
+def _scaled(values: NDArray[Any], accessor: dict[str, Any]) -> NDArray[Any]:
+    """Values of an accessor, integers scaled to floats where it is marked ``normalized``."""
+    if accessor.get("normalized") and values.dtype.kind in "iu":
+        return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
+    return values
 
 
 def _natural(value: object, what: str) -> int:

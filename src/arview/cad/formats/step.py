@@ -2,62 +2,26 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from arview.cad.formats.gltf import parse_gltf
+from arview.cad.formats.limited_process import TIMED_OUT, ProcessLimits, run_limited
 from arview.cad.formats.raw import RawComponent, RawModel
 from arview.cad.formats.step_text import prepare_step, step_unit_mm
 from arview.errors import InputError, MissingDependencyError
 
-
-@dataclass(frozen=True)
-class StepLimits:
-    """Limits of the process that reads a STEP file: fixed shares, and shares that grow with the size of the file.
-
-    Attributes:
-        cpu_s: seconds of computing.
-        cpu_s_per_mb: further seconds for each megabyte.
-        max_cpu_s: seconds at most.
-        wall_factor: seconds of waiting for one of computing, on a machine that is shared.
-        memory_mb: address space, MB, of which the libraries take 400.
-        memory_mb_per_mb: further address space for each megabyte.
-        output_mb: largest file of triangles, MB.
-    """
-
-    cpu_s: float = 5.0
-    cpu_s_per_mb: float = 20.0
-    max_cpu_s: float = 600.0
-    wall_factor: float = 4.0
-    memory_mb: float = 1500.0
-    memory_mb_per_mb: float = 100.0
-    output_mb: float = 1000.0
-
-
+StepLimits = ProcessLimits
 DEFAULT = StepLimits()
 _OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "failed to map", "Cannot allocate memory")
 
-# OpenCASCADE writes to the terminal, and may abort on malformed files: it runs in a process of its own.
 # trimesh, for which cascadio only registers a glTF extension, is left out, so that the process starts faster.
 _STEP_TO_GLB = """
-import sys
 sys.modules["trimesh"] = None
-source, target, linear, angular, cpu_s, memory, output = sys.argv[1:]
-try:
-    import resource
-    for kind, limit in ((resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_AS, memory), (resource.RLIMIT_FSIZE, output)):
-        hard = resource.getrlimit(kind)[1]
-        limit = int(limit) if hard == resource.RLIM_INFINITY else min(int(limit), hard)
-        resource.setrlimit(kind, (limit, limit))
-except (ImportError, ValueError, OSError):
-    pass
+source, target, linear, angular = sys.argv[1:]
 import cascadio
 with open(source, "rb") as f: step = f.read()
 glb = cascadio.load(step, file_type="step", tol_linear=float(linear), tol_angular=float(angular))
@@ -101,41 +65,23 @@ def read_step(
 def _triangulated(data: bytes, path: Path, tol_linear_mm: float, tol_angular_deg: float, limits: StepLimits) -> bytes:
     """The GLB that OpenCASCADE makes of a STEP file."""
     size_mb = len(data) / 1e6
-    cpu_s = min(limits.cpu_s + limits.cpu_s_per_mb * size_mb, limits.max_cpu_s)
-    memory_mb = limits.memory_mb + limits.memory_mb_per_mb * size_mb
-    with tempfile.TemporaryDirectory(prefix="arview-step-") as folder:
-        source, target, log = (Path(folder) / name for name in ("source.step", "tessellated.glb", "log.txt"))
+    with tempfile.TemporaryDirectory(prefix="arview-step-") as name:
+        folder = Path(name)
+        source, target = folder / "source.step", folder / "tessellated.glb"
         source.write_bytes(data)
-        numbers = [tol_linear_mm, float(np.deg2rad(tol_angular_deg)), np.ceil(cpu_s), 1e6 * memory_mb]
-        arguments = [str(source), str(target), *(repr(float(value)) for value in numbers[:2])]
-        arguments += [str(int(value)) for value in (*numbers[2:], 1e6 * limits.output_mb)]
-        # Without the limit each thread reserves an arena of address space, which counts as memory.
-        environment = {**os.environ, "MALLOC_ARENA_MAX": "2"}
-        with log.open("wb") as output:
-            try:
-                code = subprocess.run(
-                    [sys.executable, "-c", _STEP_TO_GLB, *arguments],
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=subprocess.STDOUT,
-                    env=environment,
-                    timeout=limits.wall_factor * cpu_s,
-                ).returncode
-            except subprocess.TimeoutExpired:
-                code = -24
+        numbers = [repr(float(tol_linear_mm)), repr(float(np.deg2rad(tol_angular_deg)))]
+        code, printed = run_limited(_STEP_TO_GLB, [str(source), str(target), *numbers], folder, size_mb, limits)
         glb = target.read_bytes() if target.is_file() and code == 0 else b""
-        with log.open("rb") as output:
-            printed = output.read(100_000).decode("utf-8", errors="replace")
-    if code in (-24, -9):
+    if code in (TIMED_OUT, -9):
         raise InputError(
-            f"{path}: OpenCASCADE did not read it in {cpu_s:.0f} s of computing; is it broken? "
+            f"{path}: OpenCASCADE did not read it in {limits.cpu_of(size_mb):.0f} s of computing; is it broken? "
             "Else raise tol_linear_mm, or export simpler geometry"
         )
     if not glb:
         lines = re.sub(r"\x1b\[[0-9;]*m", "", printed).splitlines()
         reason = next((line.strip(" *") for line in lines if "ERR" in line), "")
         if not reason and any(word in printed for word in _OUT_OF_MEMORY):
-            reason = f"it needs more than {memory_mb / 1000:.1f} GB of memory"
+            reason = f"it needs more than {limits.memory_of(size_mb) / 1000:.1f} GB of memory"
         reason = reason or (f"OpenCASCADE crashed, code {code}" if code else "no shape in it")
         raise InputError(f"{path}: broken or truncated STEP ({reason}); export it again")
     return glb

@@ -1,0 +1,91 @@
+"""A Python script in a process of its own, with limits of time and memory, for native readers of unknown files."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+TIMED_OUT = -24
+"""Exit code of a process that took too much time: SIGXCPU."""
+
+# Native readers write to the terminal, reserve gigabytes or abort on malformed files.
+_LIMITED = """
+import sys
+cpu_s, memory, output = sys.argv[1:4]
+del sys.argv[1:4]
+try:
+    import resource
+    for kind, limit in ((resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_AS, memory), (resource.RLIMIT_FSIZE, output)):
+        hard = resource.getrlimit(kind)[1]
+        limit = int(limit) if hard == resource.RLIM_INFINITY else min(int(limit), hard)
+        resource.setrlimit(kind, (limit, limit))
+except (ImportError, ValueError, OSError):
+    pass
+"""
+
+
+@dataclass(frozen=True)
+class ProcessLimits:
+    """Limits of a reading process: fixed shares, and shares that grow with the size of the file.
+
+    Attributes:
+        cpu_s: seconds of computing.
+        cpu_s_per_mb: further seconds for each megabyte.
+        max_cpu_s: seconds at most.
+        wall_factor: seconds of waiting for one of computing, on a machine that is shared.
+        memory_mb: address space, MB, of which the libraries take 400.
+        memory_mb_per_mb: further address space for each megabyte.
+        output_mb: largest file that it writes, MB.
+    """
+
+    cpu_s: float = 5.0
+    cpu_s_per_mb: float = 20.0
+    max_cpu_s: float = 600.0
+    wall_factor: float = 4.0
+    memory_mb: float = 1500.0
+    memory_mb_per_mb: float = 100.0
+    output_mb: float = 1000.0
+
+    def cpu_of(self, size_mb: float) -> float:
+        """Seconds of computing for a file of that size."""
+        return min(self.cpu_s + self.cpu_s_per_mb * size_mb, self.max_cpu_s)
+
+    def memory_of(self, size_mb: float) -> float:
+        """Address space, MB, for a file of that size."""
+        return self.memory_mb + self.memory_mb_per_mb * size_mb
+
+
+def run_limited(
+    script: str, arguments: list[str], folder: Path, size_mb: float, limits: ProcessLimits
+) -> tuple[int, str]:
+    """Run a script with limits; returns its exit code, TIMED_OUT after too much time, and what it printed.
+
+    Args:
+        script: Python text, whose ``sys.argv[1:]`` are the arguments.
+        arguments: of the script.
+        folder: for the log of what is printed.
+        size_mb: size of what it reads.
+        limits: see `ProcessLimits`.
+    """
+    cpu_s = limits.cpu_of(size_mb)
+    numbers = [cpu_s, 1e6 * limits.memory_of(size_mb), 1e6 * limits.output_mb]
+    # Without the limit each thread reserves an arena of address space, which counts as memory.
+    environment = {**os.environ, "MALLOC_ARENA_MAX": "2", "OPENBLAS_NUM_THREADS": "1"}
+    log = folder / "log.txt"
+    with log.open("wb") as output:
+        try:
+            code = subprocess.run(
+                [sys.executable, "-c", _LIMITED + script, *(str(int(-(-n // 1))) for n in numbers), *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                timeout=limits.wall_factor * cpu_s,
+            ).returncode
+        except subprocess.TimeoutExpired:
+            code = TIMED_OUT
+    with log.open("rb") as file:
+        return code, file.read(100_000).decode("utf-8", errors="replace")
