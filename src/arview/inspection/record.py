@@ -98,7 +98,7 @@ class ComponentDeviation:
         """Whether the component is there: False if missing, True if anything of it was measured, None if unknown."""
         if self.finding is Finding.MISSING:
             return False
-        return True if any(self.observable) else None
+        return True if any(self.observable) or self.distance_mm is not None else None
 
     @property
     def _determined_displacement(self) -> tuple[str, tuple[float | None, ...]]:
@@ -143,7 +143,9 @@ class ComponentDeviation:
                 )
             if value is None and is_observable:
                 yield (f"displacement_mm[{index}]: is null, but d{axis} is determined by observable[{index + 3}]")
-        if not any(self.observable[:3]) and (self.tilt_deg is not None or self.twist_deg is not None):
+        own = None if self.details is None else self.details.own_rotation_deg
+        is_turned = any(self.observable[:3]) if own is None else any(value is not None for value in own)
+        if not is_turned and (self.tilt_deg is not None or self.twist_deg is not None):
             yield "rotation: is a number, but no rotation is determined by observable"
 
     def _distance_faults(self) -> Iterator[str]:

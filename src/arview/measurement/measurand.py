@@ -43,6 +43,18 @@ class Measurand:
     axes: Array
     axis_from: str
 
+    def axes_for(self, undetermined: Array) -> Array:
+        """The own axes (3,3), turned about the last so that one is along what of (K,6) is undetermined across it."""
+        axis = self.axes[2]
+        across = np.concatenate([undetermined[:, 3:], undetermined[:, :3]])
+        across = across - (across @ axis)[:, None] * axis
+        sizes = np.linalg.norm(across, axis=1)
+        if not len(sizes) or sizes.max() < 0.05:
+            return self.axes
+        first = across[np.argmax(sizes > 0.05)]
+        first = first / np.linalg.norm(first)
+        return np.stack([first, np.cross(axis, first), axis])
+
 
 def measurand_of(name: str, part: Part, options: MeasurandOptions | None = None) -> Measurand:
     """The measurand of a component by the part file; its centre of mass unless another point is named.

@@ -29,9 +29,10 @@ from arview.measurement.datums.alignment import Alignment
 from arview.measurement.folder import MetricReconstruction
 from arview.measurement.measurand import Measurand
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
+from arview.measurement.photo.patches import free_directions
 from arview.measurement.types import Move
 from arview.measurement.uncertainty.budget import MeasuredPlacement, place, relative_twists
-from arview.measurement.uncertainty.combine import Agreement, CombinedMove, agreements
+from arview.measurement.uncertainty.combine import Agreement, CombinedMove, agreements, quantile_of_length
 from arview.measurement.uncertainty.decision import decide, worst, zone_diameter_mm
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
 from arview.version import __version__
@@ -63,13 +64,19 @@ def component_record(
     by_poses = None if poses is None else poses.covariance_of(component, center)
     together = together.at(center)
     moves = [move.at(center) for move in measured.moves]
-    placed = place(together, alignment, by_poses, options.uncertainty)
+    axes = measurand.axes_for(together.undetermined)
+    placed = place(together, alignment, by_poses, options.uncertainty, axes)
     pairs = agreements(moves)
     notes: list[str] = [note for move in moves for note in move.notes]
-    notes += [_contradiction(pair) for pair in pairs if pair.ratio > 1.0]
-    verdict = _verdict(placed, tolerance_mm, settings, options, notes)
-    axis = _axis(settings, placed, part)
-    tilt_deg, twist_deg = tilt_and_twist(placed, axis)
+    notes += [_difference(pair) for pair in pairs if pair.ratio > 1.0 or pair.is_contradiction]
+    # The cloud is for comparison where there are photos, and does not count.
+    counted = {move.method for move in moves if move.method != "cloud"}
+    is_open = any(pair.is_contradiction and {pair.first, pair.second} <= counted for pair in pairs)
+    free = free_directions(component, part, center, together.radius_mm)
+    verdict = _verdict(placed, tolerance_mm, settings, free, options, notes)
+    if is_open and verdict is Verdict.PASS:
+        verdict = Verdict.UNDECIDED
+    tilt_deg, twist_deg = tilt_and_twist(placed)
     displacement = [float(v) if seen else None for v, seen in zip(placed.twist[3:], placed.observable[3:], strict=True)]
     methods = tuple(_method_result(move, alignment) for move in moves) + failures
     distance = placed.distance
@@ -86,17 +93,23 @@ def component_record(
         details=replace(
             _details(placed, together, measurand, settings), methods=methods, notes=tuple(notes),
             agreement=tuple(
-                MethodAgreement((p.first, p.second), p.difference_mm, p.joint_mm, p.ratio <= 1.0) for p in pairs
+                MethodAgreement(
+                    (p.first, p.second), p.difference_mm, p.joint_mm, max(p.ratio, p.mixed_ratio) <= 1.0, p.mixed_ratio
+                )
+                for p in pairs
             ),
         ),
     )  # fmt: skip
 
 
 def _verdict(
-    placed: MeasuredPlacement, tolerance_mm: float | None, settings: ComponentSettings, options: MeasureOptions,
-    notes: list[str],
+    placed: MeasuredPlacement, tolerance_mm: float | None, settings: ComponentSettings, free: Array,
+    options: MeasureOptions, notes: list[str],
 ) -> Verdict:  # fmt: skip
-    """Verdict on the position and, where it has a tolerance, the angle; undetermined displacements cannot pass."""
+    """Verdict on the position and, where it has a tolerance, the angle; what could not be judged cannot pass.
+
+    Rotations that the component's symmetry leaves free (K,6) are not judged.
+    """
     guard, distance, angle = options.decision.guard, placed.distance, placed.angle
     verdicts = []
     if distance is not None:
@@ -112,11 +125,37 @@ def _verdict(
         if verdicts[-1] is Verdict.FAIL:
             notes.append(f"turned by {np.rad2deg(angle.value):.2f}°, {settings.angle_tolerance_deg:g}° allowed")
     verdict = worst(verdicts)
-    hidden = [axis for axis, seen in zip("xyz", placed.observable[3:], strict=True) if not seen]
-    if hidden:
-        notes.append(f"the displacement along {' '.join(hidden)} is undetermined")
-        verdict = Verdict.UNDECIDED if verdict is Verdict.PASS else verdict
+    unjudged = _unjudged(placed, free, settings.angle_tolerance_deg)
+    notes += unjudged
+    if unjudged and verdict is Verdict.PASS:
+        verdict = Verdict.UNDECIDED
     return verdict if verdicts else Verdict.UNDECIDED
+
+
+def _unjudged(placed: MeasuredPlacement, free: Array, angle_tolerance_deg: float | None) -> list[str]:
+    """Texts on the own axes along or about which a tolerance could not be judged."""
+    texts = []
+    hidden = placed.axes[~placed.own_observable[3:]]
+    if len(hidden):
+        texts.append(f"the displacement along {' and '.join(_direction_text(axis) for axis in hidden)} is undetermined")
+    turned = [
+        axis for axis in placed.axes[~placed.own_observable[:3]]
+        if not len(free) or np.linalg.norm(axis - np.linalg.pinv(free[:, :3]) @ free[:, :3] @ axis) > 0.05
+    ]  # fmt: skip
+    if turned and angle_tolerance_deg is not None:
+        axes = " and ".join(_direction_text(axis) for axis in turned)
+        texts.append(
+            f"the rotation about {axes} is undetermined: the angle tolerance of {angle_tolerance_deg:g}° is not judged"
+        )
+    return texts
+
+
+def _direction_text(axis: Array) -> str:
+    """A direction as ``x``, or as a vector."""
+    for name, value in zip("xyz", axis, strict=True):
+        if abs(value) > 0.9986:
+            return name
+    return f"({', '.join(f'{value + 0.0:.2f}' for value in axis)})"
 
 
 def _details(
@@ -125,6 +164,10 @@ def _details(
     """Details of a component's record."""
     rotation = exp_so3(placed.twist[:3])
     center, distance, angle = together.center_in_model, placed.distance, placed.angle
+    own = np.concatenate([np.rad2deg(placed.axes @ placed.twist[:3]), placed.axes @ placed.twist[3:]])
+    stated = [float(value) if seen else None for value, seen in zip(own, placed.own_observable, strict=True)]
+    across = placed.covariance[:3, :3]
+    tilt = placed.axes[:2] @ across @ placed.axes[:2].T if placed.own_observable[:2].all() else None
     return Details(
         center_mm=_three(center),
         measurand=measurand.kind,
@@ -132,6 +175,11 @@ def _details(
         covariance=_matrix(placed.covariance),
         undetermined=_matrix(placed.undetermined),
         radius_mm=together.radius_mm,
+        axes=_matrix(placed.axes),
+        axis_from=measurand.axis_from,
+        own_displacement_mm=tuple(stated[3:]),
+        own_rotation_deg=tuple(stated[:3]),
+        tilt_uncertainty_deg=None if tilt is None else float(np.rad2deg(quantile_of_length(tilt))),
         k=None if distance is None else distance.k,
         interval_mm=None if distance is None else (distance.low, distance.high),
         corrected_distance_mm=None if distance is None else distance.corrected,
@@ -159,34 +207,22 @@ def _method_result(move: Move, alignment: Alignment) -> MethodResult:
     )  # fmt: skip
 
 
-def _axis(settings: ComponentSettings, placed: MeasuredPlacement, part: Part) -> Array:
-    """Axis for tilt and twist: that of symmetry, else the normal of the first datum plane, else +Z."""
-    if settings.symmetry is not None:
-        return np.array(settings.symmetry.axis_in_model)
-    turns = [row[:3] / np.linalg.norm(row[:3]) for row in placed.undetermined if np.linalg.norm(row[:3]) > 0.95]
-    if len(turns) == 1:
-        axis = turns[0]
-        return np.asarray(axis if axis[np.argmax(np.abs(axis))] > 0 else -axis)
-    planes = [np.array(datum.direction_in_model) for datum in part.datums if datum.feature == "plane"]
-    return planes[0] if planes else np.array([0.0, 0.0, 1.0])
-
-
-def tilt_and_twist(placed: MeasuredPlacement, axis: Array) -> tuple[float | None, float | None]:
-    """Angle in degrees between a component's axis (3,) and its nominal direction, and rotation about it; or None."""
-    if not placed.observable[:3].any():
-        return None, None
-    turns = placed.undetermined[:, :3]
-    across = turns - (turns @ axis)[:, None] * axis
+def tilt_and_twist(placed: MeasuredPlacement) -> tuple[float | None, float | None]:
+    """Angle in degrees between a component's own axis and its nominal direction, and rotation about it; or None."""
+    axis, seen = placed.axes[2], placed.own_observable[:3]
     rotation = exp_so3(placed.twist[:3])
     tilt = float(np.arctan2(np.linalg.norm(np.cross(axis, rotation @ axis)), axis @ rotation @ axis))
     twist = float(placed.twist[:3] @ axis)
-    is_tilt = bool((np.linalg.norm(across, axis=1) < 0.05).all())
-    is_twist = bool((np.abs(turns @ axis) < 0.05).all())
-    return (float(np.rad2deg(tilt)) if is_tilt else None), (float(np.rad2deg(twist)) if is_twist else None)
+    return (float(np.rad2deg(tilt)) if seen[:2].all() else None), (float(np.rad2deg(twist)) if seen[2] else None)
 
 
-def _contradiction(pair: Agreement) -> str:
-    """Message about two methods that contradict each other."""
+def _difference(pair: Agreement) -> str:
+    """Message about two methods that differ, or contradict each other."""
+    if pair.is_contradiction:
+        return (
+            f"{pair.first} and {pair.second} contradict each other: {pair.difference_mm:.3f} mm and"
+            f" {pair.turn_deg:.2f}° apart, {pair.mixed_ratio:.1f} times what their uncertainties allow"
+        )
     return (
         f"{pair.first} and {pair.second} differ by {pair.difference_mm:.3f} mm, more than their uncertainties allow"
         f" ({pair.joint_mm:.3f} mm)"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.errors import InputError
-from arview.geometry import Array
+from arview.geometry import Array, exp_so3
 from arview.measurement.datums.alignment import Alignment
 from arview.measurement.uncertainty.combine import CombinedMove, quantile_of_length
 from arview.measurement.uncertainty.rice import rice_estimate
@@ -89,9 +89,11 @@ class MeasuredPlacement:
         covariance: (6,6) sum of all contributions.
         contributions: the budget.
         undetermined: (K,6) scaled directions.
-        observable: (6,) which of rx ry rz tx ty tz are determined.
-        distance: of the centre from nominal, along determined axes; None without any.
-        angle: of the determined rotation, rad; None without any.
+        observable: (6,) which of rx ry rz tx ty tz, about the axes of the model, are determined.
+        axes: (3,3) rows: the component's own axes.
+        own_observable: (6,) the same about the own axes.
+        distance: of the stated point from nominal, along the own axes that are determined; None without any.
+        angle: of the rotation about the own axes that are determined, rad; None without any.
     """
 
     twist: Array
@@ -99,12 +101,15 @@ class MeasuredPlacement:
     contributions: tuple[Contribution, ...]
     undetermined: Array
     observable: NDArray[np.bool_]
+    axes: Array
+    own_observable: NDArray[np.bool_]
     distance: Length | None
     angle: Length | None
 
     def budget(self) -> tuple[tuple[str, float], ...]:
         """(name, standard uncertainty of the distance in mm), largest first; the squares add up to the total's."""
-        direction = _direction(self.twist[3:], self.covariance[3:, 3:], self.observable[3:])
+        held = projector(self.axes, self.own_observable[3:])
+        direction = _direction(held @ self.twist[3:], held @ self.covariance[3:, 3:] @ held)
         parts = [(c.name, _along(c.covariance[3:, 3:], direction)) for c in self.contributions]
         return tuple(sorted(parts, key=lambda part: -part[1]))
 
@@ -113,8 +118,9 @@ class MeasuredPlacement:
 
 
 def place(
-    combined: CombinedMove, alignment: Alignment, poses: Array | None = None, options: UncertaintyOptions | None = None
-) -> MeasuredPlacement:
+    combined: CombinedMove, alignment: Alignment, poses: Array | None = None,
+    options: UncertaintyOptions | None = None, axes: Array | None = None,
+) -> MeasuredPlacement:  # fmt: skip
     """Position of a component relative to the datum frame, with every contribution to its uncertainty.
 
     Args:
@@ -122,8 +128,10 @@ def place(
         alignment: the datum frame.
         poses: (6,6) covariance of the twist relative to the datums due to the camera poses, see `PosePropagation`.
         options: see `UncertaintyOptions`.
+        axes: (3,3) rows: the component's own axes; default: those of the model.
     """
     options = options or UncertaintyOptions()
+    axes = np.eye(3) if axes is None else axes
     from_frame = alignment.twist_from_move(combined.center_in_model)
     unit = np.array([combined.radius_mm] * 3 + [1.0] * 3)
     project = np.eye(6) - combined.undetermined.T @ combined.undetermined
@@ -141,7 +149,9 @@ def place(
         for c in [*own, *(Contribution(f.name, from_frame @ f.covariance @ from_frame.T) for f in frame)]
     )
     covariance = np.sum([c.covariance for c in contributions], axis=0)
-    observable = np.count_nonzero(np.abs(combined.undetermined) > 0.05, axis=0) == 0
+    # What is undetermined is stated at nominal by some methods, and by others where they measured the component.
+    turned = axes @ exp_so3(combined.twist[:3]).T
+    own_observable = observable_axes(combined.undetermined, axes) | observable_axes(combined.undetermined, turned)
     deviations = None
     if options.monte_carlo:
         moves = combined.twist + _draw(own, options)
@@ -149,16 +159,36 @@ def place(
         deviations = relative_twists(moves, frames, combined, alignment) @ project.T - twist
     lengths: list[Length | None] = []
     for part in (slice(3, 6), slice(0, 3)):
-        seen = observable[part]
+        seen = own_observable[part]
         if not seen.any():
             lengths.append(None)
             continue
-        some = None if deviations is None else deviations[:, part] * seen
-        block = covariance[part, part] * np.outer(seen, seen)
-        lengths.append(length_of(twist[part] * seen, block, some, int(seen.sum()), options))
+        held = projector(axes, seen)
+        some = None if deviations is None else deviations[:, part] @ held
+        block = held @ covariance[part, part] @ held
+        lengths.append(length_of(held @ twist[part], block, some, int(seen.sum()), options))
     return MeasuredPlacement(
-        twist, covariance, contributions, combined.undetermined, observable, lengths[0], lengths[1]
-    )
+        twist, covariance, contributions, combined.undetermined, observable_axes(combined.undetermined, np.eye(3)),
+        axes, own_observable, lengths[0], lengths[1],
+    )  # fmt: skip
+
+
+def observable_axes(undetermined: Array, axes: Array, tolerance: float = 0.05) -> NDArray[np.bool_]:
+    """(6,) for rotation about and translation along each of the axes (3,3): is it orthogonal to what is undetermined.
+
+    Args:
+        undetermined: (K,6) orthonormal, scaled directions.
+        axes: rows are unit vectors.
+        tolerance: sine of the largest angle that counts as none.
+    """
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = axes
+    return np.asarray((np.abs(undetermined @ both.T) <= tolerance).all(axis=0))
+
+
+def projector(axes: Array, seen: NDArray[np.bool_]) -> Array:
+    """(3,3) projection onto those of the axes (3,3) that are seen."""
+    return np.asarray(axes[seen].T @ axes[seen])
 
 
 def relative_twists(moves: Array, frames: Array, combined: CombinedMove, alignment: Alignment) -> Array:
@@ -196,7 +226,7 @@ def length_of(
         options: coverage.
     """
     value = float(np.linalg.norm(vector))
-    direction = _direction(vector, covariance, np.ones(3, dtype=bool))
+    direction = _direction(vector, covariance)
     along = _along(covariance, direction)
     sigma = float(np.sqrt(max(0.0, np.trace(covariance)) / axes))
     corrected = rice_estimate(value, sigma, axes) if sigma > 0 else value
@@ -216,9 +246,8 @@ def length_of(
     return Length(value, uncertainty, k, max(0.0, value - uncertainty), value + uncertainty, corrected)
 
 
-def _direction(vector: Array, covariance: Array, seen: NDArray[np.bool_]) -> Array:
+def _direction(vector: Array, covariance: Array) -> Array:
     """Unit vector along a displacement; where noise explains it, the direction of largest uncertainty."""
-    vector, covariance = vector * seen, covariance * np.outer(seen, seen)
     length = float(np.linalg.norm(vector))
     values, vectors = np.linalg.eigh(covariance)
     if length**2 > 4.0 * max(0.0, values[-1]) and length > 0:

@@ -23,17 +23,32 @@ class Agreement:
         first, second: the methods.
         difference_mm: length of the difference of their displacements, along directions that both determine.
         joint_mm: length that 95 % of such differences do not exceed if both covariances are right.
+        turn_deg: angle of the difference of their rotations, along directions that both determine.
+        mixed_ratio: length of the difference of shift and turn together in all directions that both determine, in units
+            of their joint covariance, divided by that which 95 % of such differences do not exceed.
+        is_contradiction: whether that length is beyond what chance explains, see `CombineOptions`.
     """
 
     first: Method
     second: Method
     difference_mm: float
     joint_mm: float
+    turn_deg: float = 0.0
+    mixed_ratio: float = 0.0
+    is_contradiction: bool = False
 
     @property
     def ratio(self) -> float:
-        """Normalised difference; above 1 the methods contradict each other."""
+        """Normalised difference of the displacements; above 1 the methods differ."""
         return self.difference_mm / self.joint_mm if self.joint_mm > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class CombineOptions:
+    """When a direction is undetermined, and when two methods contradict each other."""
+
+    undetermined_mm: float = 0.3  # largest standard deviation of a determined direction; rotations at the radius
+    contradiction: float = 0.99  # share of differences that chance keeps below a contradiction
 
 
 @dataclass(frozen=True)
@@ -67,23 +82,25 @@ class CombinedMove:
         return CombinedMove(twist, covariances, parts[-1], undetermined, self.radius_mm, point_in_model)
 
 
-def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove:
+def combine(moves: Sequence[Move], options: CombineOptions | None = None) -> CombinedMove:
     """Weighted mean of moves of one component by independent methods.
 
     Methods that differ by more than their covariances allow have an error that neither of them knows. For rotations and
     translations separately, the covariance is then inflated until it explains the difference (Birge 1932), and the
-    scatter of the methods about the mean is added along the difference. A direction that only one method determines is
-    taken from that method.
+    scatter of the methods about the mean is added along the difference. Where shift and turn together differ by more
+    than chance explains, in any mixed direction, the truth may be anywhere between the two methods: a rectangular
+    distribution between them is added. A direction that only one method determines is taken from that method.
 
     Args:
         moves: at least one, all about the same centre.
-        undetermined_mm: a direction with a larger standard deviation, rotations scaled by the radius, is undetermined.
+        options: see `CombineOptions`.
 
     Raises:
         InputError: there are no moves, or they are of different components.
     """
     if not moves or any(move.component != moves[0].component for move in moves):
         raise InputError("combine: expected at least one move, and all of one component")
+    options = options or CombineOptions()
     radius = moves[0].radius_mm
     unit = np.array([radius] * 3 + [1.0] * 3)
     scaled = np.outer(unit, unit)
@@ -95,7 +112,7 @@ def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove
         inside = basis.T @ covariance @ basis
         weights.append(basis @ np.linalg.pinv(inside, rcond=1e-12, hermitian=True) @ basis.T)
     values, vectors = np.linalg.eigh(np.sum(weights, axis=0))
-    known = values > 1.0 / undetermined_mm**2
+    known = values > 1.0 / options.undetermined_mm**2
     inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
     gains = [inverse @ weight for weight in weights]
     twist = np.sum([gain @ one for gain, one in zip(gains, twists, strict=True)], axis=0)
@@ -106,6 +123,10 @@ def combine(moves: Sequence[Move], undetermined_mm: float = 0.3) -> CombinedMove
             disagreement += _beyond_chance(
                 twists[i] - twists[j], noise[i] + noise[j], gains[i], gains[j], inverse, axes
             )
+        axes = _intersection(bases[i], bases[j])
+        squares = _squared_difference(axes.T @ (twists[i] - twists[j]), axes.T @ (noise[i] + noise[j]) @ axes)
+        if squares > chi2_quantile(axes.shape[1], options.contradiction):
+            disagreement += axes @ _between(axes.T @ twists[i], axes.T @ twists[j], axes.T @ twist) @ axes.T
     shares = [gain @ one @ gain.T / scaled for gain, one in zip(gains, noise, strict=True)]
     return CombinedMove(
         twist / unit, {move.method: share for move, share in zip(moves, shares, strict=True)},
@@ -132,17 +153,47 @@ def _beyond_chance(
     return np.asarray(scatter + (squares - 1.0) * project @ combined @ project)
 
 
-def agreements(moves: Sequence[Move]) -> tuple[Agreement, ...]:
-    """Compare each pair of methods where both determine the displacement."""
+def _between(first: Array, second: Array, mean: Array) -> Array:
+    """(K,K) second moment about a mean (K,) of a rectangular distribution between two values (K,)."""
+    off = mean - 0.5 * (first + second)
+    return np.outer(first - second, first - second) / 12.0 + np.outer(off, off)
+
+
+def _squared_difference(difference: Array, joint: Array) -> float:
+    """Square of a difference (K,) in units of its covariance (K,K)."""
+    if not len(difference):
+        return 0.0
+    return float(difference @ np.linalg.pinv(joint, rcond=1e-12, hermitian=True) @ difference)
+
+
+def chi2_quantile(freedom: int, probability: float) -> float:
+    """Quantile of the χ² distribution."""
+    from scipy.special import gammaincinv
+
+    return float(2.0 * gammaincinv(0.5 * freedom, probability)) if freedom else float("inf")
+
+
+def agreements(moves: Sequence[Move], options: CombineOptions | None = None) -> tuple[Agreement, ...]:
+    """Compare each pair of methods in the directions that both determine."""
+    options = options or CombineOptions()
     found = []
     for a, b in combinations(moves, 2):
-        basis = _intersection(_orthogonal_complement(a.undetermined), _orthogonal_complement(b.undetermined))
-        project = basis @ basis.T
-        difference = (project @ (a.twist - b.twist))[3:]
-        joint = (project @ (a.covariance + b.covariance) @ project)[3:, 3:]
-        if np.trace(joint) > 0:
-            length = float(np.linalg.norm(difference))
-            found.append(Agreement(a.method, b.method, length, quantile_of_length(joint)))
+        unit = np.array([a.radius_mm] * 3 + [1.0] * 3)
+        shared = _intersection(_orthogonal_complement(a.undetermined), _orthogonal_complement(b.undetermined))
+        apart = shared.T @ ((a.twist - b.twist) * unit)
+        joint = shared.T @ ((a.covariance + b.covariance) * np.outer(unit, unit)) @ shared
+        squares, freedom = _squared_difference(apart, joint), shared.shape[1]
+        if squares > 0:
+            turn, shift = np.split(shared @ apart, 2)
+            found.append(
+                Agreement(
+                    a.method, b.method, float(np.linalg.norm(shift)),
+                    quantile_of_length((shared @ joint @ shared.T)[3:, 3:]),
+                    float(np.rad2deg(np.linalg.norm(turn) / a.radius_mm)),
+                    float(np.sqrt(squares / chi2_quantile(freedom, 0.95))),
+                    squares > chi2_quantile(freedom, options.contradiction),
+                )
+            )  # fmt: skip
     return tuple(found)
 
 
