@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import NoneType
 
 import numpy as np
 
+from arview.cad.assembly_tree import tree_lines
 from arview.cad.component_remarks import Remark, Severity, gathered, listed, mesh_remarks, size_remarks
 from arview.cad.datum_check import datum_problems
+from arview.cad.equal_shapes import ShapeSymmetries
 from arview.cad.fitness import MeshFitness, inspect_mesh
 from arview.cad.model import Component
 from arview.cad.part import ComponentSettings, Part
 from arview.cad.symmetry import FoundSymmetry, Symmetry, find_symmetries
+from arview.cad.tolerance_check import tolerance_remarks, untold_tolerances
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
 from arview.core.checks import check_type
@@ -29,6 +34,10 @@ MOVING_SHARE = 0.02
 
 MANY_TRIANGLES = 200_000
 """Number of triangles above which guide views are rendered slowly, without any gain."""
+
+
+GATHERED_ROWS = 40
+"""Number of components from which equal rows of the table become one."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +114,10 @@ class PartCheck:
             f"{self.camera.width}×{self.camera.height}, focal length {self.camera.fx:.0f} px",
         ]
         lines += [f"  datum {datum.label}: {datum.feature} of {datum.component}" for datum in self.part.datums]
+        tree = tree_lines(self.part.paths)
+        lines += ["", *tree] if tree else []
+        if tree:
+            lines.append('  settings for all of an assembly: [components."NAME/*"] in the part file')
         lines += ["", *self._table(), ""]
         lines += [f"{finding.severity}: {finding.text}" for finding in self.findings]
         if not self.findings:
@@ -122,7 +135,7 @@ class PartCheck:
             "px far-near",
             "own symmetry",
         )
-        rows = [head]
+        rows: list[tuple[str, ...]] = [head]
         for check in self.components:
             component = check.component
             far, near = check.pixels_across
@@ -138,10 +151,22 @@ class PartCheck:
                     listed([found.symmetry.describe() for found in check.symmetries], 2, "; ") or "-",
                 )
             )
+        rows = [head, *_gathered_rows(rows[1:])] if len(rows) > GATHERED_ROWS else rows
         ignored = [settings.name for settings in self.part.settings if settings.role == "ignore"]
         widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
         table = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
         return [*table, *([f"ignored: {', '.join(ignored)}"] if ignored else [])]
+
+
+def _gathered_rows(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Rows of the table, those that differ in the numbers of their names only as one."""
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for row in rows:
+        groups.setdefault((re.sub(r"\d+", "#", row[0]), *row[1:]), []).append(row[0])
+    return [
+        (names[0] if len(names) == 1 else f"{names[0]} … {names[-1]} ({len(names)})", *key[1:])
+        for key, names in groups.items()
+    ]
 
 
 def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
@@ -160,7 +185,10 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
     if part.view_range is None:
         # Nobody means to inspect a part as far away as it can be found.
         sized_range = ViewRange((view_range.distance_mm[0], USUAL_DIAMETERS * part.model.diameter_mm))
-    components = tuple(_check_component(part, component, camera, sized_range) for component in part.model.components)
+    shapes = ShapeSymmetries()
+    components = tuple(
+        _check_component(part, component, camera, sized_range, shapes) for component in part.model.components
+    )
     vertices, faces, owners = part.model.mesh
     symmetries = find_symmetries(vertices, faces.astype(np.int64), owners.astype(np.int64))
     findings = [
@@ -170,10 +198,11 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
     ]
     findings += _role_findings(part)
     findings += [PartFinding("warning", text) for text in datum_problems(part)]
-    remarks = [remark for check in components for remark in _remarks(check, sized_range)]
+    mm_per_px = sized_range.distance_mm[0] / camera.fx
+    remarks = [remark for check in components for remark in _remarks(check, sized_range, mm_per_px)]
     findings += [PartFinding(severity, text) for severity, text in gathered(remarks)]
     findings += _own_symmetry_findings(components)
-    findings += _tolerance_findings(part)
+    findings += [PartFinding("note", text) for text in untold_tolerances(part)]
     return PartCheck(
         part=part,
         camera=camera,
@@ -190,7 +219,9 @@ def _sorted(findings: list[PartFinding]) -> tuple[PartFinding, ...]:
     return tuple(sorted(findings, key=lambda finding: order.index(finding.severity)))
 
 
-def _check_component(part: Part, component: Component, camera: Camera, view_range: ViewRange) -> ComponentCheck:
+def _check_component(
+    part: Part, component: Component, camera: Camera, view_range: ViewRange, shapes: ShapeSymmetries
+) -> ComponentCheck:
     fitness = inspect_mesh(component)
     near_mm, far_mm = view_range.distance_mm
     middle_mm = fitness.extents_mm[1]
@@ -199,7 +230,7 @@ def _check_component(part: Part, component: Component, camera: Camera, view_rang
         settings=part.component_settings(component.name),
         fitness=fitness,
         pixels_across=(camera.fx * middle_mm / far_mm, camera.fx * middle_mm / near_mm),
-        symmetries=find_symmetries(component.vertices_in_model, component.faces.astype(np.int64), near_share=0.0),
+        symmetries=shapes.of(component),
     )
 
 
@@ -212,7 +243,8 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Pa
             PartFinding(
                 "problem",
                 f"the nearest distance {near_mm:.0f} mm lies inside the part (half its diameter is "
-                f"{0.5 * diameter_mm:.0f} mm); distance_mm is from the camera to the part's middle",
+                f"{0.5 * diameter_mm:.0f} mm); distance_mm is from the camera to the part's middle"
+                + (", in mm: is it given in metres?" if far_mm < 0.5 * diameter_mm else ""),
             )
         )
     elif camera.fx * diameter_mm / near_mm > 2.0 * max(camera.width, camera.height):
@@ -343,10 +375,11 @@ def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[PartFindi
     return findings
 
 
-def _remarks(check: ComponentCheck, view_range: ViewRange) -> list[Remark]:
+def _remarks(check: ComponentCheck, view_range: ViewRange, mm_per_px: float) -> list[Remark]:
     name, is_inspected = check.component.name, check.settings.role == "inspect"
     sizes = size_remarks(name, check.pixels_across, check.fitness.extents_mm, view_range.distance_mm, is_inspected)
-    return [*sizes, *mesh_remarks(name, check.fitness)]
+    tolerances = tolerance_remarks(check.settings, check.fitness.extents_mm, mm_per_px)
+    return [*sizes, *mesh_remarks(name, check.fitness), *tolerances]
 
 
 def _role_findings(part: Part) -> list[PartFinding]:
@@ -371,14 +404,6 @@ def _role_findings(part: Part) -> list[PartFinding]:
     if not part.inspected:
         findings.append(PartFinding("warning", "no component has the role inspect: nothing is measured"))
     return findings
-
-
-def _tolerance_findings(part: Part) -> list[PartFinding]:
-    open_ended = [name for name in part.inspected if part.component_settings(name).position_tolerance_mm is None]
-    if not open_ended:
-        return []
-    names = listed(open_ended, 6)
-    return [PartFinding("note", f"no position_tolerance_mm, so measured but not judged: {names}")]
 
 
 def _covers(wide: Symmetry, narrow: Symmetry) -> bool:

@@ -98,6 +98,7 @@ class Part:
             the serial number, see `arview.fiducials.serial_code.SerialNumbers`.
         up: axis of the model that is up; the part file's, else the format's.
         notes: remarks of the loader on renamed or empty components.
+        paths: of each component of ``settings``, its names in the assembly from the root on; empty if not known.
     """
 
     name: str
@@ -113,6 +114,7 @@ class Part:
     serial_pattern: str = ""
     up: Up = "z"
     notes: tuple[str, ...] = ()
+    paths: tuple[tuple[str, ...], ...] = ()
 
     def __repr__(self) -> str:
         serial = f" {self.serial}" if self.serial else ""

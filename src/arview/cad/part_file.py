@@ -151,7 +151,7 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
     if path.suffix.lower() != ".toml":
         cad = load_cad(path, unit)
         settings = tuple(ComponentSettings(component.name) for component in cad.model.components)
-        return Part(path.stem, path, path, cad.model, settings, up=cad.up, notes=cad.notes)
+        return Part(path.stem, path, path, cad.model, settings, up=cad.up, notes=cad.notes, paths=cad.paths)
     try:
         content = tomllib.loads(path.read_bytes().decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -219,6 +219,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
         serial_pattern=serial_pattern,
         up=up,
         notes=cad.notes,
+        paths=cad.paths,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from arview.cli.common import UNIT, Command, main
+from arview.errors import InputError
 
 
 class _CheckCommand(Command):
@@ -44,5 +45,8 @@ def check(part: str, unit: str | None, camera_spec: str | None) -> None:
     if camera_spec is not None:
         size = (1280, 720) if camera_spec.startswith("fov:") else (None, None)
         camera = load_camera(camera_spec, *size)
-    findings = uniqueness_findings(loaded.model, loaded.effective_view_range)
+    try:
+        findings = uniqueness_findings(loaded.model, loaded.effective_view_range)
+    except InputError:  # a range of views that cannot be used, which the check of the part explains
+        findings = []
     click.echo(check_part(loaded, camera).with_findings(findings).format())
