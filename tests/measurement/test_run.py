@@ -16,7 +16,7 @@ from arview.cad.part_file import load_part
 from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.geometry import apply, exp_so3, invert, rigid
-from arview.inspection import Inspection, Verdict, load_inspection
+from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.summary import overall_verdict
 from arview.measurement import folder as folder_module
 from arview.measurement import run
@@ -77,6 +77,37 @@ def test_displacements_against_truth(inspection: Inspection) -> None:
         place = np.array(details.measured_from_nominal)
         center = np.array(details.center_mm)
         assert place[:3, :3] @ center + place[:3, 3] - center == pytest.approx(found.displacement_mm, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_a_datum_that_fails_does_not_stop_the_rest(reconstruction: MetricReconstruction, tmp_path: Path) -> None:
+    """Datum A is the underside, which no photo shows: it is named with the top face, and all else is measured."""
+    whole = part()
+    underside = replace(whole.datums[0], point_in_model=(0.0, 0.0, -8.0), direction_in_model=(0.0, 0.0, -1.0))
+    found = measure(
+        reconstruction,
+        replace(whole, datums=(underside, *whole.datums[1:])),
+        MeasureOptions(methods=("sweep", "edges")),
+    )
+    system = found.datum_system
+    assert system is not None and system.frame == "partial" and [one.label for one in system.not_measured] == ["A"]
+    failed = system.not_measured[0]
+    assert "points on it could be measured" in failed.reason and failed.feature == "plane"
+    assert failed.instead[0].startswith("plane at (") and failed.instead[0].endswith(", 0)"), failed.instead
+    assert "best fit of plate" in failed.instead[-1]
+    assert any(
+        text.startswith("datum A (plane): ") and "Could be measured: plane at" in text for text in found.warnings
+    )
+    assert {datum.label: datum.locked for datum in system.datums} == {"plate": "rx ry tz", "B": "tx ty", "C": "rz"}
+    for name, (shift, _) in TRUTH.items():
+        one = found.find(name)
+        assert one is not None and one.distance_mm is not None and one.uncertainty_mm is not None
+        error = np.array(one.displacement_mm, dtype=float) - shift
+        assert np.linalg.norm(error) < 0.15 and abs(one.distance_mm - np.linalg.norm(shift)) < one.uncertainty_mm
+    verdicts = {one.name: one.verdict for one in found.components}
+    assert verdicts["block_2"] is Verdict.UNDECIDED and verdicts["block_1"] is verdicts["block_4"] is Verdict.FAIL
+    save_inspection(found, tmp_path / "partial.json")
+    assert load_inspection(tmp_path / "partial.json") == found
 
 
 @pytest.mark.slow

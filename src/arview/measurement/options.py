@@ -26,6 +26,7 @@ class MeasureOptions:
     tolerance_mm: float | None = None  # for components without a tolerance in the part file; None: no verdict
     corrects_bias: bool = False  # decide on the most likely true distance instead of the measured one
     uses_inconsistent: bool = False  # continue though the reconstruction does not have the shape of the CAD
+    rough_std_mm: float = 0.3  # standard uncertainty of the rough frame, where neither datums nor base give a frame
     maps_folder: Path | None = None  # where pictures and PLY of the distance map are written; None: nowhere
     photo: PhotoOptions = field(default_factory=PhotoOptions)
     datums: DatumOptions = field(default_factory=DatumOptions)

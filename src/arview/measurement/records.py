@@ -19,6 +19,7 @@ from arview.inspection import (
     DatumReport,
     DatumSystem,
     Details,
+    FailedDatum,
     Finding,
     MethodAgreement,
     MethodResult,
@@ -242,8 +243,9 @@ def datum_doubts(alignment: Alignment) -> list[str]:
 
 
 def datum_record(
-    alignment: Alignment, part: Part, base: Sequence[str], reconstruction: MetricReconstruction
-) -> DatumSystem:
+    alignment: Alignment, part: Part, base: Sequence[str], reconstruction: MetricReconstruction,
+    failed: tuple[FailedDatum, ...] = (),
+) -> DatumSystem:  # fmt: skip
     """The datum system of an inspection."""
     components = {datum.label: datum.component for datum in part.datums}
     methods = dict.fromkeys(("plane", "point", "cylinder"), "sweep") | dict.fromkeys(("hole", "pin", "edge"), "edges")
@@ -262,8 +264,26 @@ def datum_record(
     used = [evidence.detail for evidence in scale.evidence if evidence.is_used]
     return DatumSystem(
         reports, _matrix(alignment.rough_from_datum), _matrix(alignment.covariance), _three(alignment.origin_in_model),
-        scale.scale, scale.scale_std, "; ".join(used), notes,
+        scale.scale, scale.scale_std, "; ".join(used), notes, failed,
+        "partial" if failed else "datums" if part.datums else "best_fit",
     )  # fmt: skip
+
+
+def failed_datum_text(one: FailedDatum) -> str:
+    """Warning about a datum that could not be measured: why, what could be measured instead, and what it means."""
+    instead = f" Could be measured: {'; '.join(one.instead)}." if one.instead else ""
+    taken = f" The base's best fit takes its place for {one.directions}." if one.directions else ""
+    return f"datum {one.label} ({one.feature}): {one.reason}.{instead}{taken} The frame is not that of the part file."
+
+
+def in_partial_frame(record: ComponentDeviation, failed: Sequence[FailedDatum]) -> ComponentDeviation:
+    """The record of a component in a frame that lacks datums: what would pass is undecided."""
+    if not failed or record.verdict is Verdict.NOT_MEASURED or record.details is None:
+        return record
+    labels = ", ".join(one.label for one in failed)
+    note = f"stated in a frame without datum {labels}"
+    verdict = Verdict.UNDECIDED if record.verdict is Verdict.PASS else record.verdict
+    return replace(record, verdict=verdict, details=replace(record.details, notes=(*record.details.notes, note)))
 
 
 def provenance_of(reconstruction: MetricReconstruction, options: MeasureOptions, cpu_s: float) -> Provenance:

@@ -13,18 +13,19 @@ import scipy.linalg  # noqa: F401  its BLAS is loaded before threads are limited
 from threadpoolctl import threadpool_limits
 
 from arview.cad.model import Model
-from arview.cad.part import Part
+from arview.cad.part import Datum, Part
 from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.inspection import DistanceReport, ForeignReport, Inspection
+from arview.inspection import DistanceReport, FailedDatum, ForeignReport, Inspection
 from arview.measurement.cloud_report import inspect_cloud
 from arview.measurement.datums.alignment import Alignment, align
 from arview.measurement.datums.datum_fit import check_covered
 from arview.measurement.datums.equations import DatumEquations, move_equations
 from arview.measurement.datums.in_cloud import measure_datums_in_cloud
 from arview.measurement.datums.in_photos import measure_datums_in_photos
+from arview.measurement.datums.partial import MeasureDatum, measure_each
 from arview.measurement.datums.planes import base_plane
 from arview.measurement.folder import MetricReconstruction, in_model_frame, read_folder
 from arview.measurement.measurand import measurand_of
@@ -35,6 +36,8 @@ from arview.measurement.records import (
     component_record,
     datum_doubts,
     datum_record,
+    failed_datum_text,
+    in_partial_frame,
     provenance_of,
 )
 from arview.measurement.types import Move, NotMeasured
@@ -93,8 +96,8 @@ def _measure(
     views = load_views(replace(reconstruction.sparse, pose_covariance=None), part.model) if has_photos else None
     results = measure_all(reconstruction, views, part, [*base, *names], options, tell)
     tell("datums", 0, 1)
-    alignment = align_to_datums(reconstruction, views, part, base, results, options)
-    warnings += datum_doubts(alignment)
+    alignment, failed = align_to_datums(reconstruction, views, part, base, results, options)
+    warnings += [*(failed_datum_text(one) for one in failed), *datum_doubts(alignment)]
     poses = None
     if views is None:
         warnings.append("a cloud without photos: U does not include errors of its scale and its deformation")
@@ -104,7 +107,8 @@ def _measure(
         poses = PosePropagation(reconstruction.sparse, part.model, alignment, base)
     deviations = []
     for done, name in enumerate(names, 1):
-        deviations.append(component_record(name, results[name], measurands[name], alignment, poses, part, options))
+        record = component_record(name, results[name], measurands[name], alignment, poses, part, options)
+        deviations.append(in_partial_frame(record, failed))
         tell("uncertainty", done, len(names))
     foreign: tuple[ForeignReport, ...] = ()
     distances: DistanceReport | None = None
@@ -118,7 +122,7 @@ def _measure(
         created=datetime.now(UTC),
         components=tuple(deviations),
         provenance=provenance_of(reconstruction, options, time.process_time() - began),
-        datum_system=datum_record(alignment, part, base, reconstruction),
+        datum_system=datum_record(alignment, part, base, reconstruction, failed),
         warnings=tuple(warnings),
         foreign_objects=foreign,
         distance_map=distances,
@@ -173,24 +177,31 @@ def measure_all(
 def align_to_datums(
     reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, base: Sequence[str],
     results: Mapping[str, ComponentMeasurement], options: MeasureOptions,
-) -> Alignment:  # fmt: skip
-    """The datum frame of the part file; what it leaves free follows from the base's fit, as does all without datums."""
+) -> tuple[Alignment, tuple[FailedDatum, ...]]:  # fmt: skip
+    """The datum frame of the part file, and the datums that could not be measured.
+
+    What they leave free follows from the base's fit, as does all without datums.
+    """
     fitted = {}
     for name in [*base, *(datum.component for datum in part.datums)]:
         together = combined_of(results[name]) if name in results else None
         if together is not None:
             fitted[name] = _as_move(name, together)
-    if views is None:
-        assert reconstruction.cloud is not None
-        equations = measure_datums_in_cloud(part.datums, part.model, reconstruction.cloud, fitted, options.datums)
-    else:
-        equations = measure_datums_in_photos(part.datums, views, fitted, options.datums)
+    fits = {name: _rest_of_base(results[name], fitted[name], part) for name in base if name in fitted}
+    rest = next(iter(fits.values()), None)
+    found = measure_each(
+        part.datums, _datum_measurement(reconstruction, views, part, fitted, options), part.model, rest,
+        options.alignment,
+    )  # fmt: skip
+    equations = found.equations
     if not part.datums and views is not None:
         equations = _plane_of_base(views, part.model, base, options)
-    rest = next((_rest_of_base(results[name], fitted[name], equations) for name in base if name in fitted), None)
+        if equations and base[0] in fitted:
+            rest = _rest_of_base(results[base[0]], fitted[base[0]], part, is_flat=True)
     if rest is None and not equations:
         reasons = "; ".join(f.reason for name in base for f in results[name].failures)
-        raise InputError(f"{', '.join(base)}: could not be measured, so there is no frame: {reasons}")
+        named = "".join(f" datum {one.label} ({one.feature}): {one.reason};" for one in found.failed)
+        raise InputError(f"{', '.join(base)}: could not be measured, so there is no frame:{named} {reasons}")
     holes = [datum for datum in part.datums if datum.feature in ("hole", "pin", "cylinder")]
     if part.datums:
         origin = np.array((holes or part.datums)[0].point_in_model)
@@ -200,7 +211,32 @@ def align_to_datums(
     kinds = {evidence.kind for evidence in reconstruction.scale.evidence if evidence.is_used}
     scale_std = reconstruction.scale.scale_std or 0.0
     finds_scale = bool(kinds) and kinds <= {"cad"}
-    return align(equations, origin, size_mm, rest, scale_std, finds_scale, options.alignment)
+    if found.failed and rest is None:
+        rest = _rough_frame(origin, size_mm, options)
+    return align(equations, origin, size_mm, rest, scale_std, finds_scale, options.alignment), found.failed
+
+
+def _datum_measurement(
+    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, fitted: Mapping[str, Move],
+    options: MeasureOptions,
+) -> MeasureDatum:  # fmt: skip
+    """The function that measures one datum, in the photos or in the cloud."""
+
+    def measure_one(datum: Datum) -> DatumEquations:
+        if views is not None:
+            return measure_datums_in_photos((datum,), views, fitted, options.datums)[0]
+        assert reconstruction.cloud is not None
+        return measure_datums_in_cloud((datum,), part.model, reconstruction.cloud, fitted, options.datums)[0]
+
+    return measure_one
+
+
+def _rough_frame(origin: Array, size_mm: float, options: MeasureOptions) -> DatumEquations:
+    """Equations of the rough frame of the reconstruction, for what neither datums nor base determine."""
+    std = options.rough_std_mm
+    covariance = np.diag([(std / size_mm) ** 2] * 3 + [std**2] * 3)
+    move = Move("part", "sweep", origin, np.zeros(6), covariance, np.zeros((0, 6)), size_mm, 0, 0.0, 1.0)
+    return move_equations("the rough frame", move)[0]
 
 
 def _plane_of_base(
@@ -219,10 +255,13 @@ def _plane_of_base(
     return equations
 
 
-def _rest_of_base(measured: ComponentMeasurement, fitted: Move, datums: Sequence[DatumEquations]) -> DatumEquations:
+def _rest_of_base(
+    measured: ComponentMeasurement, fitted: Move, part: Part, is_flat: bool | None = None
+) -> DatumEquations:
     """Equations of the base's best fit; beside a datum plane only that by edges, because narrow sides tell little."""
     edges = [move for move in measured.moves if move.method == "edges"]
-    is_flat = any(datum.feature == "plane" for datum in datums)
+    if is_flat is None:
+        is_flat = any(datum.feature == "plane" for datum in part.datums)
     return move_equations(fitted.component, edges[0] if edges and is_flat else fitted)[0]
 
 

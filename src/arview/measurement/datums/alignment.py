@@ -22,6 +22,7 @@ from arview.measurement.datums.directions import (
     intersection,
     observable_directions,
     orthogonal_complement,
+    shared_directions,
     shift_origin,
 )
 from arview.measurement.datums.equations import DOF_NAMES, AlignmentOptions, DatumEquations, point_from_move
@@ -129,6 +130,8 @@ def align(
         rows = one.rows - one.rows[:, 3:6] @ shift_origin(origin)
         allowed = free if is_base else intersection(free, np.eye(6)[:, [name in one.locks for name in DOF_NAMES]])
         trusted = np.ones(len(rows)) if one.feature == "fit" else fit.weights
+        if one.directions is not None:
+            allowed = shared_directions(allowed, one.directions)
         columns = observable_directions(rows[:, :6] * unit, allowed, trusted) * unit[:, None]
         if columns.shape[1] == 0:
             raise InputError(f"datum {one.label}: all that it could lock is already locked by the datums before it")

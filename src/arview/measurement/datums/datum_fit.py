@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.datums.directions import shift_origin
-from arview.measurement.datums.equations import AlignmentOptions, DatumEquations
+from arview.measurement.datums.equations import AlignmentOptions, DatumEquations, DatumNotMeasuredError
 
 _TUKEY = 4.685
 """Cut-off of Tukey's biweight in standard deviations: 95 % efficiency for normal errors."""
@@ -164,18 +163,18 @@ def block_factor(points: Array, residuals: Array, rank: int, blocks: int = 12) -
 
 
 def check_covered(one: DatumEquations, options: AlignmentOptions) -> None:
-    """Check that enough of a datum was measured. Raises InputError, which names the datum, when it was not."""
+    """Check that enough of a datum was measured. Raises DatumNotMeasuredError, which names the datum."""
     check_fit_covered(one, fit_datum(one, is_exact=False), options)
 
 
 def check_fit_covered(one: DatumEquations, fit: DatumFit, options: AlignmentOptions) -> None:
-    """Check coverage and accuracy of a fitted datum. Raises InputError, which names the datum."""
+    """Check coverage and accuracy of a fitted datum. Raises DatumNotMeasuredError, which names the datum."""
     used, name = int(fit.inliers.sum()), f"datum {one.label} ({one.feature})"
     if one.feature == "fit":
         return
     needed = {"point": 1, "edge": 4}.get(one.feature, options.min_points)
     if used < max(needed, round(options.min_share * one.of)):
-        raise InputError(
+        raise DatumNotMeasuredError(
             f"{name}: only {used} of {one.of} points on it could be measured; photograph it from more sides, in better"
             " light, or name another feature in the part file"
         )
@@ -193,6 +192,6 @@ def check_fit_covered(one: DatumEquations, fit: DatumFit, options: AlignmentOpti
     kept = values > 1e-9 * values[-1]
     worst = float(np.sqrt((((watched @ vectors[:, kept]) ** 2) / values[kept]).sum(axis=1).max()))
     if worst > options.max_std_mm:
-        raise InputError(
+        raise DatumNotMeasuredError(
             f"{name}: its position is uncertain by {worst:.2f} mm; photograph it from more sides, or in better light"
         )

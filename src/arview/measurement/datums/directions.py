@@ -37,6 +37,12 @@ def intersection(a: Array, b: Array) -> Array:
     return a @ left[:, values > 1.0 - 1e-9]
 
 
+def shared_directions(a: Array, b: Array) -> Array:
+    """As `intersection`, to within a degree, for directions that were measured or follow from other axes."""
+    left, values, _ = np.linalg.svd(a.T @ b, full_matrices=False)
+    return a @ left[:, values > 0.9998]
+
+
 def orthogonal_complement(free: Array, columns: Array) -> Array:
     """Orthonormal basis of the part of ``free`` (6,F) that is orthogonal to the orthonormal ``columns`` (6,K)."""
     columns = columns[:, np.abs(columns).max(axis=0) > 0]

@@ -12,8 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.types import Move
+
+
+class DatumNotMeasuredError(InputError):
+    """A datum that is in the CAD, but could not be measured; the message names it and says why."""
+
 
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Degrees of freedom of a rigid motion, in the order of a twist."""
@@ -34,6 +40,7 @@ class DatumEquations:
         by_radius: (N,) derivative of the offsets by the radius of a round feature, which is estimated and discarded
             because wear and rounded edges change it; None for other features.
         locks: degrees of freedom that the datum may lock.
+        directions: (6,K) directions within which it may lock, about its origin and the axes of the model; None: all.
         form_mm: additional standard uncertainty of its position that the residuals do not show.
     """
 
@@ -47,6 +54,7 @@ class DatumEquations:
     by_radius: Array | None = None
     locks: tuple[str, ...] = DOF_NAMES
     form_mm: float = 0.0
+    directions: Array | None = None
 
 
 @dataclass(frozen=True)

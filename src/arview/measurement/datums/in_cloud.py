@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.cad.part import Datum
-from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
@@ -18,6 +17,7 @@ from arview.measurement.datums.cad_features import edge_line, flat_faces, round_
 from arview.measurement.datums.datum_fit import robust_weights
 from arview.measurement.datums.equations import (
     DatumEquations,
+    DatumNotMeasuredError,
     move_equations,
     surface_equations,
 )
@@ -69,7 +69,7 @@ def _measure(
     """Offsets of one datum, by the method for its feature."""
     if datum.feature == "fit":
         if datum.component not in moves:
-            raise InputError(f"datum {datum.label}: {datum.component!r} could not be measured as a whole")
+            raise DatumNotMeasuredError(f"datum {datum.label}: {datum.component!r} could not be measured as a whole")
         return move_equations(datum.label, moves[datum.component], datum.locks)[0]
     component = model.component(datum.component)
     if datum.feature == "edge":
@@ -158,7 +158,7 @@ def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints, o: DatumOption
 def _check(datum: Datum, count: int) -> None:
     """Raise InputError when too few points of the cloud are on a datum."""
     if count < _MIN_POINTS:
-        raise InputError(
+        raise DatumNotMeasuredError(
             f"datum {datum.label} ({datum.feature}): {count} points of the cloud are on it, {_MIN_POINTS} are needed;"
             " uncover it, or name another feature in the part file"
         )

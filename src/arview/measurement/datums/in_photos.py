@@ -17,6 +17,7 @@ from arview.measurement.datums.cad_features import edge_line, round_faces
 from arview.measurement.datums.datum_fit import robust_weights
 from arview.measurement.datums.equations import (
     DatumEquations,
+    DatumNotMeasuredError,
     move_equations,
     surface_equations,
 )
@@ -55,7 +56,7 @@ def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move], o: Datu
     """Offsets of one datum, by the method for its feature."""
     if datum.feature == "fit":
         if datum.component not in moves:
-            raise InputError(f"datum {datum.label}: {datum.component!r} could not be measured as a whole")
+            raise DatumNotMeasuredError(f"datum {datum.label}: {datum.component!r} could not be measured as a whole")
         return move_equations(datum.label, moves[datum.component], datum.locks)[0]
     if datum.feature in ("hole", "pin"):
         return _measure_rim(datum, views, o)
@@ -108,7 +109,9 @@ def _measure_rim(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquat
     seen_from = _rim_views(views, rim, points, radial, o)
     which, view = np.nonzero(seen_from)
     if len(np.unique(view)) < 3:
-        raise InputError(f"datum {datum.label} ({datum.feature}): fewer than 3 photos show it; photograph it too")
+        raise DatumNotMeasuredError(
+            f"datum {datum.label} ({datum.feature}): fewer than 3 photos show it; photograph it too"
+        )
     px_mm = views.mm_per_px(rim.center)
 
     def edges_at(found: Array) -> tuple[EdgePoints, Array]:
@@ -171,7 +174,7 @@ def _find_steps(
         found = edge_offsets(edges, inside, views, reach_px, o.edges)
         ok = found.seen & (found.slopes != 0.0)
         if np.count_nonzero(ok) < o.edges.min_points:
-            raise InputError(
+            raise DatumNotMeasuredError(
                 f"datum {datum.label} ({datum.feature}): its edge was found at only {np.count_nonzero(ok)} of"
                 f" {len(ok)} places; is it filled, or covered?"
             )
@@ -215,7 +218,9 @@ def _measure_cylinder(datum: Datum, views: PhotoViews, o: DatumOptions) -> Datum
     apart = ~near_others(samples.points, views.model, index, o.min_clear_mm)
     samples = samples.of(apart & ~near_edges(samples.points, component, o.sweep.edge_px * px_mm))
     if len(samples.points) < o.sweep.min_samples:
-        raise InputError(f"datum {datum.label} (cylinder): too little of it is clear of edges and other components")
+        raise DatumNotMeasuredError(
+            f"datum {datum.label} (cylinder): too little of it is clear of edges and other components"
+        )
     found = sweep_offsets(samples.points, samples.normals, views, o.reach_mm, o.sweep, index)
     ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= o.sweep.min_views))
     axis = np.array(datum.direction_in_model)
@@ -243,7 +248,7 @@ def _measure_edge(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEqua
             seen[:, index] = views.visible(index, views.window(index, None, np.eye(4), groups[:, 0]), groups)
     which, view = np.nonzero(seen)
     if len(np.unique(view)) < 3:
-        raise InputError(f"datum {datum.label} (edge): fewer than 3 photos show it; photograph it too")
+        raise DatumNotMeasuredError(f"datum {datum.label} (edge): fewer than 3 photos show it; photograph it too")
     project = np.eye(3) - np.outer(line.direction, line.direction)
     inside = 0.5 * (line.start + line.end) - 10.0 * line.normals.sum(axis=0)
     tangents = np.tile(line.direction, (len(which), 1))
