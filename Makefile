@@ -6,13 +6,14 @@ SAMPLE := samples/plate
 # A worker for each core; each test file goes to one worker, in the order of tests/conftest.py.
 PARALLEL := -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: help demo test test-fast check bench evaluate soak clean
+.PHONY: help demo test test-fast check docs bench evaluate soak clean
 
 help:
 	@echo "make demo      inspect the sample plate: report and annotated video in out/demo"
 	@echo "make test      formatting, linting, types, all tests: ten minutes on two cores"
 	@echo "make test-fast the quick tests of every room: a minute"
 	@echo "make check     formatting, linting, types"
+	@echo "make docs      the documentation as a site: out/docs/index.html"
 	@echo "make bench     measure speed: out/bench.json"
 	@echo "make evaluate  measure accuracy on the recorded sequences: out/evaluation.json, out/evaluation.md"
 	@echo "make soak      run the live server for ten minutes, and check its memory and the age of frames"
@@ -35,6 +36,9 @@ test-fast: $(READY)
 
 check: $(READY)
 	tools/check
+
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --quiet --strict -f tools/docs/mkdocs.yml
 
 bench: $(READY)
 	.venv/bin/python tools/benchmarks/bench.py --json out/bench.json

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from arview.cli.common import UNIT, main, output_path, say, write_bytes
-from arview.errors import InputError
+from arview.errors import InputError, OutputError
 
 FORMATS = ("csv", "qif", "dfq", "glb", "html", "pdf")
 
@@ -96,13 +96,18 @@ def export(
 
 
 def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_path: str | None) -> dict[str, Path]:
-    """The file of each format."""
+    """The file of each format; a folder that is not there is made where the name ends in / or has no ending."""
     inputs = [source, part_path]
-    if output is not None and not Path(output).is_dir():
-        if len(formats) > 1:
-            raise InputError(f"{output}: {len(formats)} formats need a folder that exists, not one file")
-        return {formats[0]: output_path(output, inputs)}
     folder = source.parent if output is None else Path(output)
+    if output is not None and not folder.is_dir():
+        if not output.endswith("/") and (len(formats) == 1 or folder.suffix or folder.exists()):
+            if len(formats) > 1:
+                raise InputError(f"{output}: {len(formats)} formats need a folder, not one file")
+            return {formats[0]: output_path(output, inputs)}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{output}: the folder cannot be made ({error.strerror})") from error
     return {name: output_path(str(folder / f"{source.stem}.{name}"), inputs) for name in formats}
 
 

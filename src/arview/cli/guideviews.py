@@ -14,9 +14,9 @@ from arview.errors import OutputError
     short_help="Render the guide views of a part into a file.",
     epilog="""\b
 Examples:
-  arview guideviews part.toml -o bracket.guideviews
-  arview guideviews part.toml -o bracket.guideviews --preview sheet.png
-  arview guideviews part.toml -o post.guideviews --component post_1""",
+  arview guideviews part.toml -o bracket.gv
+  arview guideviews part.toml -o bracket.gv --preview sheet.png
+  arview guideviews part.toml -o post.gv --component post_1""",
 )
 @click.argument("part")
 @click.option("-o", "--output", required=True, metavar="SET", help="File to write.")

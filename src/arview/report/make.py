@@ -28,7 +28,8 @@ def make_report(
 
     Args:
         inspection: ``inspection.json``, beside the files that `arview measure` wrote.
-        html, pdf: files to write.
+        html: page to write, or None.
+        pdf: PDF to write, or None.
         part: the part that was inspected; without it the report has no pictures and no CAD model.
         folder: folder of a reconstruction; default: the folder of the inspection, if it contains one.
         photos: folder of the photos if they were moved.
