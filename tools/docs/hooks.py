@@ -39,7 +39,7 @@ def generated_pages() -> Iterator[tuple[str, str]]:
     yield "reference/commands.md", "\n".join(command_page())
     yield (
         "reference/part-file.md",
-        "# Part file\n\nA part file adds to a CAD file what it does not say. Everything but `cad` has a default. Keys that "
+        "# Part file\n\nA part file adds to a CAD file what it does not say. All but `cad` has a default. Keys that "
         f"are not known are an error.\n\n```toml\n{PART_FILE_EXAMPLE}```\n",
     )
     yield "reference/inspection-json.md", schema_markdown().replace("[matrix](#matrix)", "matrix")
