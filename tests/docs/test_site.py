@@ -1,7 +1,7 @@
 """The documentation: the site builds without a warning, and every command and every Python example on its pages runs.
 
-Blocks marked ``sh`` and ``python`` are run in their order, each page in a folder of its own that has `samples` in it;
-files shown with a title are written there. Blocks marked ``console`` need a phone, minutes or a network, and are not run.
+Blocks marked ``sh`` and ``python`` are run in their order, each page in a folder of its own with `samples` in it. Files
+that a page shows with a title are written there. Blocks marked ``console`` need a phone, minutes or a network.
 """
 
 from __future__ import annotations
