@@ -292,8 +292,8 @@ def test_pool_and_order_give_the_same_views(views: GuideViewSet) -> None:
 
 @pytest.fixture
 def saved(views: GuideViewSet, tmp_path: Path) -> Path:
-    views.save(tmp_path / "a.guideviews")
-    return tmp_path / "a.guideviews"
+    views.save(tmp_path / "a.gv")
+    return tmp_path / "a.gv"
 
 
 def test_a_set_comes_back_equal_and_mapped(views: GuideViewSet, saved: Path) -> None:
@@ -326,7 +326,7 @@ def test_a_truncated_file_is_refused(saved: Path, keep: float) -> None:
 
 
 def test_garbage_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "x.guideviews"
+    path = tmp_path / "x.gv"
     path.write_bytes(np.random.default_rng(0).bytes(5000))
     with pytest.raises(InputError, match="not a guide-view set"):
         load_guide_views(path)
@@ -334,14 +334,14 @@ def test_garbage_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="damaged"):
         load_guide_views(path)
     with pytest.raises(InputError, match="cannot be read"):
-        load_guide_views(tmp_path / "absent.guideviews")
+        load_guide_views(tmp_path / "absent.gv")
 
 
 @pytest.mark.parametrize(
     "header", ["[]", "{}", '{"meta": {}, "arrays": 3}', '{"meta": {"format_version": 2}, "arrays": {}}']
 )
 def test_a_header_without_sense_is_refused(tmp_path: Path, header: str) -> None:
-    path = tmp_path / "x.guideviews"
+    path = tmp_path / "x.gv"
     path.write_bytes(b"ARVIEW-GUIDEVIEWS\n" + len(header).to_bytes(8, "little") + header.encode() + b"\0" * 64)
     with pytest.raises(InputError, match="damaged"):
         load_guide_views(path)
