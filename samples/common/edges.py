@@ -8,10 +8,10 @@ import numpy as np
 REACH_PX = 6.0
 
 
-def crease_points(meshes, base: str) -> np.ndarray:
+def crease_points(meshes, base: str, lowest_mm: float = 2.5) -> np.ndarray:
     """(N,2,3) points and unit directions every 2 mm along the sharp edges of name → vertices, faces.
 
-    Edges on the plate's top are hidden by weld beads and left out, except those of the ``base`` itself.
+    Edges below ``lowest_mm`` are hidden by weld beads and left out, except those of the ``base`` itself.
     """
     points = []
     for name, (vertices, faces) in meshes.items():
@@ -29,7 +29,7 @@ def crease_points(meshes, base: str) -> np.ndarray:
             if len(users) != 2 or normal[users[0][2]] @ normal[users[1][2]] > 0.8:
                 continue
             start, end = vertices[users[0][0]], vertices[users[0][1]]
-            if name != base and max(start[2], end[2]) < 2.5:
+            if name != base and max(start[2], end[2]) < lowest_mm:
                 continue
             length = np.linalg.norm(end - start)
             count = max(1, int(length / 2))

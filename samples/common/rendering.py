@@ -166,15 +166,29 @@ def undistortion_maps(camera: dict, film: tuple[int, int]):
     return map_x.astype(np.float32), map_y.astype(np.float32)
 
 
-def develop(linear: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
-    """Linear light to an 8-bit BGR picture: exposure, vignetting, sensor noise, tone curve, sharpening."""
+def metered(linear: np.ndarray) -> float:
+    """The exposure that a phone's meter chooses, which looks most at the middle of the picture."""
+    height, width = linear.shape[:2]
+    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    weight = np.exp(-2.0 * (x**2 + y**2))
+    light = np.maximum(linear.mean(axis=2), 0)
+    middle = np.exp((weight * np.log(light + 1e-3 * light.mean())).sum() / weight.sum())
+    # No more than the 97th percentile may come to the tone curve's shoulder.
+    return float(min(0.22 / middle, 0.95 / max(np.percentile(light, 97), 1e-6)))
+
+
+def develop(linear: np.ndarray, gain: float, rng: np.random.Generator, noise_gain: float = 1.0) -> np.ndarray:
+    """Linear light to an 8-bit BGR picture: exposure, vignetting, sensor noise, tone curve, sharpening.
+
+    ``noise_gain`` multiplies the noise's variance: 10 is that of ten times the ISO value.
+    """
     height, width = linear.shape[:2]
     y, x = np.mgrid[:height, :width]
     radius = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
     light = np.maximum(linear, 0) * (1.0 - 0.10 * radius)[..., None] * gain
     noise = rng.normal(size=light.shape).astype(np.float32)
     noise = 0.75 * noise + 0.5 * cv2.GaussianBlur(noise, (0, 0), 0.8)
-    light = np.maximum(light + noise * np.sqrt(2.2e-5 + 1.3e-4 * light), 0)
+    light = np.maximum(light + noise * np.sqrt(noise_gain * (2.2e-5 + 1.3e-4 * light)), 0)
     # A soft shoulder above 0.7, then the sRGB curve.
     light = np.where(light > 0.7, 0.7 + 0.3 * np.tanh((light - 0.7) / 0.6), light)
     tone = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-6) ** (1 / 2.4) - 0.055)

@@ -47,3 +47,55 @@ def tessellated(components, linear_mm: float = 0.02, angular_rad: float = 0.12) 
         vertices, faces = shape.tessellate(linear_mm, angular_rad)
         meshes[name] = np.array([tuple(v) for v in vertices]), np.array(faces)
     return meshes
+
+
+def seated(origin, normal, right=(1.0, 0.0, 0.0)) -> bd.Location:
+    """A seat: +Z along its normal, +X as near to ``right`` as it can be."""
+    normal, right = np.asarray(normal, float), np.asarray(right, float)
+    normal = normal / np.linalg.norm(normal)
+    across = right - (right @ normal) * normal
+    return bd.Plane(tuple(map(float, origin)), tuple(across), tuple(normal)).location
+
+
+def matrix(location: bd.Location) -> np.ndarray:
+    """A location as a (4,4) matrix."""
+    transform = location.wrapped.Transformation()
+    return np.array([[transform.Value(i, j) for j in range(1, 5)] for i in range(1, 4)] + [[0.0, 0.0, 0.0, 1.0]])
+
+
+def turned(*profile) -> bd.Part:
+    """Solid of revolution about Z of (radius, height) points."""
+    outline = bd.make_face(bd.Polyline(*((float(r), 0.0, float(z)) for r, z in profile), close=True))
+    return bd.revolve(outline, bd.Axis.Z)
+
+
+def hexagon(across_flats: float, height: float) -> bd.Part:
+    """Hexagonal prism standing on z = 0."""
+    return bd.extrude(bd.RegularPolygon(across_flats / 2, 6, major_radius=False), height)
+
+
+def clip(length: float, width: float, rise: float, thickness: float) -> bd.Part:
+    """Saddle clip of sheet, standing on z = 0: two feet along X, a half-round arch between, a hole in each foot."""
+    radius = rise
+    arch = bd.Cylinder(radius, width, rotation=(90, 0, 0)) - bd.Cylinder(
+        radius - thickness, 3 * width, rotation=(90, 0, 0)
+    )
+    arch -= bd.Pos(0, 0, -radius) * bd.Box(4 * radius, 3 * width, 2 * radius)
+    foot = length / 2 - radius + thickness
+    part = arch
+    for side in (-1, 1):
+        middle = side * (length - foot) / 2
+        part += bd.Pos(middle, 0, 0) * box(foot, width, thickness)
+        part -= bd.Pos(side * (length / 2 - 0.45 * foot), 0, 0) * bd.Cylinder(0.18 * width, 4 * thickness)
+    return part
+
+
+def angle(width: float, foot: float, height: float, thickness: float, hole: float, bend: float = 0.0) -> bd.Part:
+    """Angle bracket: foot along +Y, wall in the XZ plane with one hole, ``bend`` the outer radius between them."""
+    part = bd.Pos(0, foot / 2, 0) * box(width, foot, thickness) + bd.Pos(0, thickness / 2, 0) * box(
+        width, thickness, height
+    )
+    if bend:
+        outer = part.edges().filter_by(bd.Axis.X).filter_by(lambda e: abs(e.center().Y) + abs(e.center().Z) < 1e-6)
+        part = bd.fillet(outer, bend)
+    return part - bd.Pos(0, 0, 0.62 * height) * bd.Rot(90, 0, 0) * bd.Cylinder(hole / 2, 20)

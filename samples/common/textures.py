@@ -105,6 +105,44 @@ def zinc(height: int, width: int, rng):
     return color, rough, bump
 
 
+def cast(height: int, width: int, rng):
+    """Sand-cast grey iron, blasted: one grey with the fine grain of the mould, and hardly anything else."""
+    cloud = fft_noise(height, width, 1.4, rng)
+    grain = fft_noise(height, width, 0.25, rng)
+    color = np.ones((height, width, 3)) * (0.235, 0.237, 0.238)
+    color = color * (0.95 + 0.1 * cloud + 0.12 * (grain - 0.5))[..., None]
+    return color, np.clip(0.62 + 0.1 * (grain - 0.5), 0.3, 0.9), grain
+
+
+def coat(height: int, width: int, rng, tint):
+    """Fresh paint of one colour, with a little orange peel and dust: nearly without texture."""
+    cloud = fft_noise(height, width, 1.5, rng)
+    peel = fft_noise(height, width, 0.8, rng)
+    dust = specks(height, width, 0.8, rng) * smoothstep(fft_noise(height, width, 0.9, rng), 0.62, 0.8)
+    color = np.ones((height, width, 3)) * np.asarray(tint) * (0.985 + 0.03 * cloud)[..., None]
+    color = _mix(color, (0.5, 0.49, 0.46), 0.12 * dust)
+    return color, np.clip(0.3 + 0.12 * cloud + 0.1 * dust, 0.15, 0.8), 0.4 * peel
+
+
+def chrome(height: int, width: int, rng):
+    """Bright plating: a mirror with a few fine marks."""
+    cloud = fft_noise(height, width, 1.3, rng)
+    marks = scratches(height, width, height * width // 20000, rng)
+    color = np.ones((height, width, 3)) * (0.62, 0.63, 0.64)
+    color = _mix(color, (0.5, 0.5, 0.5), 0.3 * marks)
+    return color, np.clip(0.1 + 0.08 * cloud + 0.1 * marks, 0.06, 0.4), -0.3 * marks
+
+
+def rust(height: int, width: int, rng):
+    """Steel that stood in the rain: brown and orange all over, with pits."""
+    color, rough, bump = mill_scale(height, width, rng)
+    red = smoothstep(fft_noise(height, width, 1.1, rng), 0.30, 0.52)
+    grain = fft_noise(height, width, 0.5, rng)
+    color = _mix(color, (0.17, 0.07, 0.03), red)
+    color = _mix(color, (0.33, 0.13, 0.04), red * smoothstep(grain, 0.48, 0.62))
+    return color, np.clip(rough + 0.4 * red, 0.3, 0.95), bump + 0.6 * grain * red
+
+
 def _drilled(color, rough, px_per_mm: float, rng):
     """A breadboard's 25 mm grid of holes with bright rims."""
     height, width = rough.shape

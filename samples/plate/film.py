@@ -6,7 +6,9 @@ import cv2
 import mitsuba as mi
 import numpy as np
 import shots
+from kinds import SetOptions
 from rendering import denoise, develop, sensor, to_world, undistortion_maps
+from sample import KIND
 from scipy.spatial.transform import Rotation
 
 FRAMES, FPS = 96, 24
@@ -18,7 +20,7 @@ SAMPLES = 3  # path samples per pixel; the result is denoised. The picture moves
 
 def camera(seed: int) -> dict:
     """Intrinsics of the clip: those of the photos, scaled."""
-    photo = shots.camera(seed)
+    photo = shots.camera(SetOptions(seed))
     scale = WIDTH / photo["width"]
     cx, cy = ((photo[key] + 0.5) * scale - 0.5 for key in ("cx", "cy"))
     return {**photo, "width": WIDTH, "height": HEIGHT, "fx": photo["fx"] * scale, "fy": photo["fy"] * scale,
@@ -57,11 +59,11 @@ class Shoot:
     """Takes the frames of the clip of one seed."""
 
     def __init__(self, seed: int):
-        import scene
+        import studio
 
-        self.seed, self.camera, self.exposure = seed, camera(seed), scene.EXPOSURE
-        film = sensor(FILM, self.camera["fx"], scene.APERTURE_MM, 690.0)
-        self.scene = scene.build(seed, shots.camera(seed), film)
+        self.seed, self.camera, self.exposure = seed, camera(seed), KIND.exposure
+        film = sensor(FILM, self.camera["fx"], studio.APERTURE_MM, 690.0)
+        self.scene = studio.build(KIND, SetOptions(seed), film)
         self.params = mi.traverse(self.scene)
         self.light = mi.load_dict({"type": "path", "max_depth": 4, "rr_depth": 3})
         self.guides = mi.load_dict({"type": "aov", "aovs": "alb:albedo,nn:sh_normal"})
