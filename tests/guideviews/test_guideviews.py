@@ -14,7 +14,7 @@ from arview.cad.view_range import ViewRange
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, invert
 from arview.guideviews import GuideViewOptions, GuideViewSet, load_guide_views, make_guide_views
-from arview.guideviews.findings import confusable_pair, uniqueness_findings
+from arview.guideviews.findings import assessed_guide_views, confusable_pair, uniqueness_findings
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_CREASE, EDGE_SHARP, EDGE_SILHOUETTE
 from arview.guideviews.sheet import CONFUSABLE_COLOR, CONTOUR_COLOR, PLAIN_COLOR, contact_sheet
 from arview.guideviews.sphere import icosphere_directions, view_poses
@@ -404,6 +404,17 @@ def test_findings_name_the_block_a_problem_and_the_assembly_none() -> None:
     (finding,) = uniqueness_findings(assembly(), ViewRange((400.0, 700.0), elevation_deg=(10.0, 90.0)))
     assert finding.severity == "note"
     assert "score 1.00" in finding.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("elevation_deg", [(-90.0, 90.0), (10.0, 90.0), (55.0, 70.0)])
+def test_the_shares_do_not_depend_on_the_number_of_views(elevation_deg: tuple[float, float]) -> None:
+    """`check` renders few views, `guideviews` many and a margin around the range: both state the same shares."""
+    view_range = ViewRange((400.0, 700.0), elevation_deg=elevation_deg)
+    few = assess(assessed_guide_views(assembly(), view_range))
+    many = assess(make_guide_views(assembly(), view_range, GuideViewOptions(subdivisions=4, renderer="zbuffer")))
+    assert len(many.distinct_lines) > 3 * len(few.distinct_lines) >= 90
+    assert (many.reason, many.score) == (few.reason, few.score)
 
 
 # --- Contact sheet --------------------------------------------------------------------------------------

@@ -8,15 +8,9 @@ from arview.cad.check import PartFinding
 from arview.cad.model import Model
 from arview.cad.view_range import ViewRange
 from arview.geometry import Array
+from arview.guideviews.sphere import ASSESSED_SUBDIVISIONS, MIN_ASSESSED_VIEWS, directions_in_range
 from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, Uniqueness, assess
 from arview.guideviews.views import GuideViewOptions, GuideViewSet, make_guide_views
-
-COARSE_OPTIONS = GuideViewOptions(subdivisions=2, margin_deg=0.0, renderer="zbuffer")
-"""162 views on the full sphere, about 16° apart: enough to assess a part in a few seconds."""
-FINER_OPTIONS = GuideViewOptions(subdivisions=3, margin_deg=0.0, renderer="zbuffer")
-"""642 views on the full sphere, for narrow ranges."""
-MIN_VIEWS = 40
-"""Number of coarse views below which a narrow range is assessed by finer ones."""
 
 
 def azimuths_deg(views: GuideViewSet) -> Array:
@@ -46,11 +40,19 @@ def confusable_pair(views: GuideViewSet, unique: Uniqueness) -> str:
     )
 
 
+def assessed_guide_views(model: Model, view_range: ViewRange) -> GuideViewSet:
+    """The guide views by which a part is assessed, rendered now: the fewest that give the shares of the whole set."""
+    subdivisions = ASSESSED_SUBDIVISIONS
+    if len(directions_in_range(view_range, subdivisions, 0.0)) < MIN_ASSESSED_VIEWS:
+        subdivisions += 1
+    return make_guide_views(
+        model, view_range, GuideViewOptions(subdivisions=subdivisions, margin_deg=0.0, renderer="zbuffer")
+    )
+
+
 def uniqueness_findings(model: Model, view_range: ViewRange) -> list[PartFinding]:
     """Findings of a coarse set of guide views, rendered now, for `PartCheck.with_findings`."""
-    views = make_guide_views(model, view_range, COARSE_OPTIONS)
-    if len(views) < MIN_VIEWS:
-        views = make_guide_views(model, view_range, FINER_OPTIONS)
+    views = assessed_guide_views(model, view_range)
     unique = assess(views)
     alike = confusable_pair(views, unique)
     text = f"guide views {unique.reason} (score {unique.score:.2f}{f'; {alike}' if alike else ''})"

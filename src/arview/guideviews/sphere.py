@@ -8,6 +8,11 @@ from numpy.typing import ArrayLike
 from arview.cad.view_range import ViewRange
 from arview.geometry import Array, look_at
 
+ASSESSED_SUBDIVISIONS = 2
+"""Subdivisions of the icosphere of the views by which a part is assessed: 162 on the full sphere, in a few seconds."""
+MIN_ASSESSED_VIEWS = 40
+"""Number of such views in a range below which the next finer icosphere is taken."""
+
 
 def icosphere_directions(subdivisions: int) -> Array:
     """(10 · 4^n + 2, 3) unit vectors of an icosahedron subdivided n times: 4 gives 2,562, about 4° apart."""
@@ -53,3 +58,15 @@ def directions_in_range(view_range: ViewRange, subdivisions: int, margin_deg: fl
     if inside.any():
         return directions[inside]
     return view_range.direction(0.5 * sum(view_range.azimuth_deg), 0.5 * sum(view_range.elevation_deg))[None]
+
+
+def assessed_directions(view_range: ViewRange) -> Array:
+    """Directions (N,3) of the views by which a part is assessed: about 16° apart in the declared range, 8° in a narrow one.
+
+    They are vertices of the finer icospheres, too, so that a set of guide views contains them, and the same shares of
+    weak views are found however many views there are beside.
+    """
+    directions = directions_in_range(view_range, ASSESSED_SUBDIVISIONS, 0.0)
+    if len(directions) >= MIN_ASSESSED_VIEWS:
+        return directions
+    return directions_in_range(view_range, ASSESSED_SUBDIVISIONS + 1, 0.0)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.guideviews.sphere import assessed_directions
 from arview.guideviews.views import GuideView, GuideViewSet
 
 PLAIN_LINES = 12.0
@@ -23,6 +24,8 @@ MAX_WEAK_SHARE = 0.6
 """Largest share of plain or of confusable views of a sufficient set; many parts are plain from below."""
 CONFUSABLE_LIKENESS = 0.94
 """Likeness from which two views cannot be distinguished in a picture with noise."""
+SAME_DIRECTION_COSINE = 1.0 - 1e-9
+"""Cosine of the angle between two directions from which they are the same."""
 APART_DEG = 30.0
 """Angle between two views below which their likeness does not count."""
 _RADII, _ANGLES, _ORIENTATIONS = 6, 36, 6
@@ -36,6 +39,7 @@ class Uniqueness:
         distinct_lines: (N,) of each view.
         likeness: (N,) 0–1, to the most similar view from another side; NaN where no view is far enough away.
         confused_with: (N,) index of that view; -1 where there is none.
+        assessed: indices of the views by which the set was assessed; all others have the values of the nearest of them.
         is_sufficient: the part can be detected without being confused with something else.
         reason: one sentence.
     """
@@ -43,6 +47,7 @@ class Uniqueness:
     distinct_lines: Array
     likeness: Array
     confused_with: NDArray[np.int64]
+    assessed: NDArray[np.int64]
     is_sufficient: bool
     reason: str
 
@@ -50,7 +55,7 @@ class Uniqueness:
     def score(self) -> float:
         """Share of views that are neither plain nor confusable, 0–1."""
         fine = (self.distinct_lines >= PLAIN_LINES) & ~(self.likeness >= CONFUSABLE_LIKENESS)
-        return float(np.mean(fine))
+        return float(np.mean(fine[self.assessed]))
 
 
 def view_lines(view: GuideView, diameter_mm: float) -> float:
@@ -66,10 +71,12 @@ def view_lines(view: GuideView, diameter_mm: float) -> float:
     return float(np.exp(-np.sum(share * np.log(share))))
 
 
-def assess(views: GuideViewSet, max_views: int = 642) -> Uniqueness:
-    """Assess a set, of which about ``max_views`` views at most are compared with each other."""
-    step = max(1, len(views) // max_views)
-    index = np.arange(0, len(views), step)
+def assess(views: GuideViewSet) -> Uniqueness:
+    """Assess a set by its views in the `assessed_directions` of the declared range; all others get what the nearest has.
+
+    A set without these directions is assessed by all of its views.
+    """
+    index = _assessed_views(views)
     some_views = [views.view(int(i)) for i in index]
     lines = np.array([view_lines(view, views.diameter_mm) for view in some_views])
     likeness, partner = _likeness(
@@ -98,9 +105,19 @@ def assess(views: GuideViewSet, max_views: int = 642) -> Uniqueness:
         distinct_lines=lines[nearest],
         likeness=likeness[nearest],
         confused_with=confused,
+        assessed=index,
         is_sufficient=plain_share <= MAX_WEAK_SHARE and confusable <= MAX_WEAK_SHARE,
         reason=reason,
     )
+
+
+def _assessed_views(views: GuideViewSet) -> NDArray[np.int64]:
+    """Indices of the views by which a set is assessed."""
+    cosine = assessed_directions(views.view_range) @ views.directions.T
+    index = np.argmax(cosine, axis=1)
+    if np.all(cosine[np.arange(len(index)), index] > SAME_DIRECTION_COSINE):
+        return index.astype(np.int64)
+    return np.arange(len(views), dtype=np.int64)
 
 
 def _edge_picture(view: GuideView, diameter_mm: float) -> tuple[Array, Array]:
