@@ -61,7 +61,7 @@ def directions_in_range(view_range: ViewRange, subdivisions: int, margin_deg: fl
 
 
 def assessed_directions(view_range: ViewRange) -> Array:
-    """Directions (N,3) of the views by which a part is assessed: about 16° apart in the declared range, 8° in a narrow one.
+    """Directions (N,3) of the views by which a part is assessed: 16° apart in the declared range, 8° in a narrow one.
 
     They are vertices of the finer icospheres, too, so that a set of guide views contains them, and the same shares of
     weak views are found however many views there are beside.
