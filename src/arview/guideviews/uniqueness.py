@@ -72,7 +72,7 @@ def view_lines(view: GuideView, diameter_mm: float) -> float:
 
 
 def assess(views: GuideViewSet) -> Uniqueness:
-    """Assess a set by its views in the `assessed_directions` of the declared range; others get the values of the nearest.
+    """Assess a set by its views in the `assessed_directions` of the range; others get the values of the nearest.
 
     A set without these directions is assessed by all of its views.
     """
