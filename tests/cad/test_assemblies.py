@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from arview.cad.assembly_tree import MAX_LINES, tree_lines
 from arview.cad.check import GATHERED_ROWS, check_part
-from arview.cad.equal_shapes import ShapeSymmetries
+from arview.cad.equal_shapes import ShapeSearchOptions, ShapeSymmetries
 from arview.cad.model import Component, make_model
 from arview.cad.part import ComponentSettings, Part
 from arview.cad.part_file import load_part
@@ -99,6 +99,16 @@ def test_symmetries_of_equal_shapes_are_moved_along() -> None:
         )
         assert b.symmetry.through_in_model[0] - a.symmetry.through_in_model[0] == pytest.approx(12.0, abs=1e-4)
     np.testing.assert_allclose(third[0].symmetry.through_in_model, turned.bounds_in_model.mean(axis=0), atol=1e-6)
+
+
+def test_the_search_for_symmetries_is_limited_and_says_so() -> None:
+    one, other = assembly(2).model.components
+    wide = replace(other, name="wide", vertices_in_model=other.vertices_in_model * [2.0, 1.0, 1.0])
+    shapes = ShapeSymmetries(ShapeSearchOptions(max_shapes=1))
+    assert shapes.of(one)
+    assert shapes.of(other)
+    assert shapes.of(wide) == ()
+    assert shapes.skipped == ["wide"]
 
 
 @pytest.mark.parametrize(("changes", "expected"), [

@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -223,6 +224,37 @@ def test_lenses_of_colmap(tmp_path: Path, line: str, lens: LensDistortion) -> No
     assert (camera.lens, camera.cx, camera.cy) == (lens, 319.5, 239.5)
 
 
+def test_inverse_brown_of_realsense(tmp_path: Path) -> None:
+    terms = [-0.055, 0.061, 0.001, -0.0005, -0.02]
+    camera = load_camera(write(tmp_path, PLAIN | {"model": "distortion.inverse_brown_conrady", "coeffs": terms}))
+    assert camera.lens == LensDistortion(LensModel.INVERSE_BROWN, tuple(terms))
+    save_camera(camera, tmp_path / "again.json")
+    assert load_camera(tmp_path / "again.json").lens == camera.lens
+
+
+def test_colmap_binary(tmp_path: Path) -> None:
+    one = struct.pack("<iiQQ8d", 1, 4, 1280, 720, 900, 901, 640, 360, 0.1, 0.01, 1e-3, 0)
+    wide = struct.pack("<iiQQ12d", 7, 10, 640, 480, 300, 301, 320, 240, 0.01, 0, 1e-3, 0, 0, 0, 2e-3, 0)
+    path = tmp_path / "cameras.bin"
+    path.write_bytes(struct.pack("<Q", 1) + one)
+    camera = load_camera(path)
+    assert (camera.width, camera.fx, camera.cx) == (1280, 900.0, 639.5)
+    np.testing.assert_allclose(camera.dist, [0.1, 0.01, 1e-3, 0, 0])
+    path.write_bytes(struct.pack("<Q", 2) + one + wide)
+    with pytest.raises(ArviewError, match=r"holds 2 different cameras \(1, 7\); name one of them"):
+        load_camera(path)
+    other = load_camera(f"{path}:7")
+    assert other.lens == LensDistortion(LensModel.THIN_PRISM_FISHEYE, (0.01, 0, 1e-3, 0, 0, 0, 2e-3, 0))
+    for data in (
+        path.read_bytes()[:-3],
+        struct.pack("<Q", 2**60) + one,
+        struct.pack("<Q", 1) + wide[:4] + b"\x63" + wide[5:],
+    ):
+        path.write_bytes(data)
+        with pytest.raises(ArviewError, match="is not a text file"):
+            load_camera(path)
+
+
 def test_rational_polynomial_of_ros(tmp_path: Path) -> None:
     terms = [0.51, -2.73, 0.0007, -0.0002, 1.55, 0.39, -2.55, 1.47]
     text = ROI[: ROI.index("roi:")].replace("plumb_bob", "rational_polynomial")
@@ -280,7 +312,7 @@ BAD = {
     "unknown model": (PLAIN | {"camera_model": "mei"}, "lens model 'mei' is not supported"),
     "models": (PLAIN | {"camera_model": "fisheye", "model": "plumb_bob", "D": [0.1, 0, 0, 0]}, "contradict"),
     "none with terms": (PLAIN | {"model": "none", "coeffs": [0.1, 0, 0, 0, 0]}, "terms that are not zero"),
-    "inverse": (PLAIN | {"model": "inverse_brown_conrady", "coeffs": [0.1, 0, 0, 0, 0]}, "other way round"),
+    "omni": (PLAIN | {"camera_model": "omni", "coeffs": [0.1, 0, 0, 0]}, "lens model 'omni' is not supported"),
     "k3 k4": (PLAIN | {"k1": 0.1, "k2": 0.1, "k3": 0.1, "k4": 0.1}, "fisheye or Brown"),
     "fisheye p1": (PLAIN | {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "p1": 0.1}, "p1 is 0.1, which is not a term"),
     "fisheye bare": (PLAIN | {"camera_model": "fisheye"}, "no distortion terms"),

@@ -16,7 +16,12 @@ RATIONAL = LensDistortion(LensModel.RATIONAL, (0.51, -2.73, 0.0007, -0.0002, 1.5
 THIN_PRISM = LensDistortion(LensModel.RATIONAL, (*RATIONAL.terms[:8], 1e-3, -2e-3, 5e-4, 1e-4))
 FOV = LensDistortion(LensModel.FOV, (0.9,))
 DIVISION = LensDistortion(LensModel.DIVISION, (-0.2,))
-LENSES = {"fisheye": FISHEYE, "rational": RATIONAL, "thin prism": THIN_PRISM, "fov": FOV, "division": DIVISION}
+PRISM_FISHEYE = LensDistortion(LensModel.THIN_PRISM_FISHEYE, (-0.02, 0.006, 1e-3, -5e-4, -0.003, 7e-4, 8e-4, -6e-4))
+INVERSE_BROWN = LensDistortion(LensModel.INVERSE_BROWN, (-0.055, 0.061, 1e-3, -5e-4, -0.02))
+LENSES = {
+    "fisheye": FISHEYE, "rational": RATIONAL, "thin prism": THIN_PRISM, "fov": FOV, "division": DIVISION,
+    "thin prism fisheye": PRISM_FISHEYE,
+}  # fmt: skip
 
 
 def camera_with(lens: LensDistortion) -> Camera:
@@ -50,6 +55,21 @@ def test_lens_is_that_of_opencv_and_colmap(name: str) -> None:
     assert np.isfinite(rays).all()
     np.testing.assert_allclose(camera.project(rays), pixels(), rtol=0, atol=1e-6)
     np.testing.assert_allclose(reference(camera, rays), pixels(), rtol=0, atol=1e-6)
+
+
+def test_inverse_brown_is_brown_from_distorted_to_ideal() -> None:
+    """librealsense's rs2_deproject_pixel_to_point: OpenCV's formula, applied to the distorted coordinates."""
+    camera = camera_with(INVERSE_BROWN)
+    rays = camera.unproject(pixels())
+    normalised = np.column_stack([(pixels() - [645.5, 357.5]) / [620.0, 621.0], np.ones(len(pixels()))])
+    expected = cv2.projectPoints(
+        normalised[:, None], np.zeros(3), np.zeros(3), np.eye(3), np.array(INVERSE_BROWN.terms)
+    )[0][:, 0]
+    np.testing.assert_allclose(rays[:, :2], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(camera.project(rays), pixels(), rtol=0, atol=1e-6)
+    x, y, z = rays.T
+    turned = camera.rotated(1).project(np.stack([-y, x, z], axis=-1))
+    np.testing.assert_allclose(turned, np.stack([719 - pixels()[:, 1], pixels()[:, 0]], axis=-1), atol=1e-6)
 
 
 @pytest.mark.parametrize("dist", [[0.2, 0.3], [-0.3, 0.09], [-0.28, 0.07, 1e-3, -2e-3, 0.01]])

@@ -201,7 +201,10 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
     mm_per_px = sized_range.distance_mm[0] / camera.fx
     remarks = [remark for check in components for remark in _remarks(check, sized_range, mm_per_px)]
     findings += [PartFinding(severity, text) for severity, text in gathered(remarks)]
-    findings += _own_symmetry_findings(components)
+    findings += _own_symmetry_findings(components, shapes.skipped)
+    if shapes.skipped:
+        text = f"own symmetries were not searched, to save time, of {len(shapes.skipped)} components: "
+        findings.append(PartFinding("note", text + listed(shapes.skipped, 4)))
     findings += [PartFinding("note", text) for text in untold_tolerances(part)]
     return PartCheck(
         part=part,
@@ -356,14 +359,15 @@ def _angle_about_deg(axes: Array, start: Array, end: Array) -> Array:
     return np.asarray(np.rad2deg(np.arctan2(sine, np.einsum("ij,ij->i", start, end))))
 
 
-def _own_symmetry_findings(checks: tuple[ComponentCheck, ...]) -> list[PartFinding]:
+def _own_symmetry_findings(checks: tuple[ComponentCheck, ...], skipped: Sequence[str]) -> list[PartFinding]:
     """Inspected bodies of revolution without a declared symmetry, and declared symmetries missing in the geometry."""
     findings = []
     spinning = []
     for check in checks:
         declared = check.settings.symmetry
         exact = [found.symmetry for found in check.symmetries]
-        if declared is not None and not any(_covers(symmetry, declared) for symmetry in exact):
+        is_searched = check.component.name not in skipped
+        if declared is not None and is_searched and not any(_covers(symmetry, declared) for symmetry in exact):
             name, what = check.component.name, declared.describe()
             findings.append(PartFinding("warning", f"{name}: the declared symmetry, {what}, is not in its geometry"))
         spins = [symmetry for symmetry in exact if symmetry.order is None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,11 +14,32 @@ _SAME_SHARE = 1e-4
 """Largest distance between the vertices of equal shapes, as a share of their diameter."""
 
 
-class ShapeSymmetries:
-    """Symmetries of components, searched once for all of equal shape."""
+@dataclass(frozen=True)
+class ShapeSearchOptions:
+    """Effort of the search.
 
-    def __init__(self) -> None:
+    Attributes:
+        max_faces: triangles of all shapes that are searched, in the order of the part; it takes a second for some
+            thousands of them.
+        max_shapes: shapes that are searched.
+    """
+
+    max_faces: int = 400_000
+    max_shapes: int = 120
+
+
+class ShapeSymmetries:
+    """Symmetries of components, searched once for all of equal shape, and for a limited number of shapes.
+
+    Attributes:
+        skipped: names of components whose symmetries were not searched.
+    """
+
+    def __init__(self, options: ShapeSearchOptions | None = None) -> None:
+        self._options = options or ShapeSearchOptions()
         self._known: dict[tuple[int, int], list[tuple[Component, tuple[FoundSymmetry, ...]]]] = {}
+        self._shapes = self._faces = 0
+        self.skipped: list[str] = []
 
     def of(self, component: Component) -> tuple[FoundSymmetry, ...]:
         """The exact symmetries of a component alone."""
@@ -27,6 +48,11 @@ class ShapeSymmetries:
             shift = _translation(other, component)
             if shift is not None:
                 return tuple(_moved(found, shift) for found in symmetries)
+        self._shapes += 1
+        self._faces += len(component.faces)
+        if self._shapes > self._options.max_shapes or self._faces > self._options.max_faces:
+            self.skipped.append(component.name)
+            return ()
         found = find_symmetries(component.vertices_in_model, component.faces.astype(np.int64), near_share=0.0)
         alike.append((component, found))
         return found

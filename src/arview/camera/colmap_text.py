@@ -1,8 +1,9 @@
-"""Cameras of COLMAP's ``cameras.txt``."""
+"""Cameras of COLMAP's ``cameras.txt`` and ``cameras.bin``."""
 
 from __future__ import annotations
 
 import re
+import struct
 
 from arview.camera.entry import CameraEntry
 from arview.camera.lens import LensDistortion, LensModel
@@ -25,10 +26,18 @@ _LENS_MODELS: dict[str, tuple[tuple[int, ...], tuple[int, ...], LensModel]] = {
     "SIMPLE_RADIAL_FISHEYE": ((0, 0, 1, 2), (3,), LensModel.FISHEYE),
     "RADIAL_FISHEYE": ((0, 0, 1, 2), (3, 4), LensModel.FISHEYE),
     "OPENCV_FISHEYE": ((0, 1, 2, 3), (4, 5, 6, 7), LensModel.FISHEYE),
+    "THIN_PRISM_FISHEYE": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11), LensModel.THIN_PRISM_FISHEYE),
     "FOV": ((0, 1, 2, 3), (4,), LensModel.FOV),
     "SIMPLE_DIVISION": ((0, 0, 1, 2), (3,), LensModel.DIVISION),
     "DIVISION": ((0, 1, 2, 3), (4,), LensModel.DIVISION),
 }
+_BINARY_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}  # fmt: skip
+"""Names and numbers of parameters of the models in a binary file."""
+_MIN_CAMERA_BYTES = 48
 _COLMAP_LINE = re.compile(r"^\d+\s+[A-Z][A-Z_0-9]+\s+\d+\s+\d+\s")
 
 
@@ -54,6 +63,28 @@ def entries_from_colmap(text: str, name: str = "") -> list[CameraEntry]:
     if twice is not None:
         raise InputError(f"holds camera {twice} twice; keep one of them")
     return entries
+
+
+def colmap_text_of_binary(data: bytes) -> str | None:
+    """The text of a ``cameras.bin``, all of whose bytes are cameras; None for other data.
+
+    A camera is its id, its model, width and height, and the parameters of the model.
+    """
+    if len(data) < 8:
+        return None
+    (count,) = struct.unpack_from("<Q", data)
+    lines, start = [], 8
+    for _ in range(min(count, len(data) // _MIN_CAMERA_BYTES)):
+        if start + 24 > len(data):
+            return None
+        number, model, width, height = struct.unpack_from("<iiQQ", data, start)
+        name, parameters = _BINARY_MODELS.get(model, ("", 0))
+        start += 24 + 8 * parameters
+        if not name or start > len(data):
+            return None
+        values = struct.unpack_from(f"<{parameters}d", data, start - 8 * parameters)
+        lines.append(f"{number} {name} {width} {height} {' '.join(map(repr, values))}")
+    return "\n".join(lines) if count == len(lines) and start == len(data) and lines else None
 
 
 def _data_lines(text: str) -> list[str]:

@@ -1,8 +1,10 @@
-"""Lens models beyond Brown's five terms: rational, fisheye, field of view and division.
+"""Lens models beyond Brown's five terms: rational, fisheye (with thin prism), field of view, division, inverse Brown.
 
 A lens maps ideal normalised coordinates (x, y), those of a pinhole camera, to distorted ones. The formulas are those of
 OpenCV (``cv2.projectPoints``, ``cv2.fisheye``) and COLMAP; the fisheye is that of Kannala and Brandt (PAMI 2006), the
-field-of-view model that of Devernay and Faugeras (2001), the division model that of Fitzgibbon (CVPR 2001).
+field-of-view model that of Devernay and Faugeras (2001), the division model that of Fitzgibbon (CVPR 2001). The fisheye
+with thin prism (COLMAP) applies Brown's and prism terms to the angle; librealsense's inverse Brown has Brown's formula
+from distorted to ideal coordinates.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ class LensModel(StrEnum):
     FISHEYE = "fisheye"
     FOV = "fov"
     DIVISION = "division"
+    THIN_PRISM_FISHEYE = "thin_prism_fisheye"
+    INVERSE_BROWN = "inverse_brown"
 
 
 TERM_NAMES: dict[LensModel, tuple[str, ...]] = {
@@ -34,6 +38,8 @@ TERM_NAMES: dict[LensModel, tuple[str, ...]] = {
     LensModel.FISHEYE: ("k1", "k2", "k3", "k4"),
     LensModel.FOV: ("omega",),
     LensModel.DIVISION: ("k",),
+    LensModel.THIN_PRISM_FISHEYE: ("k1", "k2", "p1", "p2", "k3", "k4", "s1", "s3"),
+    LensModel.INVERSE_BROWN: ("k1", "k2", "p1", "p2", "k3"),
 }
 """Names of the terms of each model, in their order."""
 
@@ -63,7 +69,12 @@ class LensDistortion:
         """Distorted normalised coordinates of ideal ones."""
         if self.model is LensModel.RATIONAL:
             return _rational(self.terms, x, y)
+        if self.model is LensModel.INVERSE_BROWN:
+            return undistort_by_newton(self._brown, x, y)
         r = np.hypot(x, y)
+        if self.model is LensModel.THIN_PRISM_FISHEYE:
+            scale = np.where(r > 1e-12, np.arctan(r) / np.maximum(r, 1e-300), 1.0)
+            return self._thin_prism(x * scale, y * scale)
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(r > 1e-12, self._distorted_radius(r) / np.maximum(r, 1e-300), self._central_scale)
         return x * scale, y * scale
@@ -72,6 +83,15 @@ class LensDistortion:
         """Ideal normalised coordinates of distorted ones; NaN where no ray in front of the camera is seen."""
         if self.model is LensModel.RATIONAL:
             return undistort_by_newton(self.distort, xd, yd)
+        if self.model is LensModel.INVERSE_BROWN:
+            return self._brown(np.asarray(xd, dtype=np.float64), np.asarray(yd, dtype=np.float64))
+        if self.model is LensModel.THIN_PRISM_FISHEYE:
+            a, b = undistort_by_newton(self._thin_prism, xd, yd)
+            theta = np.hypot(a, b)
+            with np.errstate(invalid="ignore"):
+                scale = np.where(theta > 1e-12, np.tan(theta) / np.maximum(theta, 1e-300), 1.0)
+                scale = np.where(theta < 0.5 * math.pi, scale, np.nan)
+            return a * scale, b * scale
         rd = np.hypot(xd, yd)
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(rd > 1e-12, self._ideal_radius(rd) / np.maximum(rd, 1e-300), 1.0 / self._central_scale)
@@ -79,10 +99,30 @@ class LensDistortion:
 
     def turned_clockwise(self) -> LensDistortion:
         """The lens for a picture turned clockwise by a quarter turn."""
+        if self.model is LensModel.INVERSE_BROWN:
+            k1, k2, p1, p2, k3 = self.terms
+            return LensDistortion(self.model, (k1, k2, p2, -p1, k3))
+        if self.model is LensModel.THIN_PRISM_FISHEYE:
+            k1, k2, p1, p2, k3, k4, s1, s3 = self.terms
+            return LensDistortion(self.model, (k1, k2, p2, -p1, k3, k4, -s3, s1))
         if self.model is not LensModel.RATIONAL:
             return self
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self.terms
         return LensDistortion(self.model, (k1, k2, p2, -p1, k3, k4, k5, k6, -s3, -s4, s1, s2))
+
+    def _brown(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Brown's formula with the first five terms."""
+        return _rational(self.terms[:5] + (0.0,) * 7, x, y)
+
+    def _thin_prism(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Distorted coordinates of those of an equidistant lens."""
+        k1, k2, p1, p2, k3, k4, s1, s3 = self.terms
+        r2 = x * x + y * y
+        with np.errstate(over="ignore", invalid="ignore"):
+            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+            xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + s1 * r2
+            yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + s3 * r2
+        return xd, yd
 
     @property
     def _central_scale(self) -> float:

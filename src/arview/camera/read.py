@@ -2,8 +2,8 @@
 
 The format is recognised by the content of the file, not by its name: arview's JSON, BOP ``camera.json`` and
 ``scene_camera.json``, OpenCV FileStorage (YAML, XML, JSON), ROS ``camera_info``, Kalibr camchain, COLMAP
-``cameras.txt``, RealSense intrinsics as JSON, nerfstudio ``transforms.json``. Of several cameras in a file that differ,
-one is asked for as ``FILE:NAME``.
+``cameras.txt`` and ``cameras.bin``, RealSense intrinsics as JSON, nerfstudio ``transforms.json``. Of several cameras
+in a file that differ, one is asked for as ``FILE:NAME``.
 ``fov:DEG``, ``exif``, ``profile`` and ``profile:NAME`` name cameras without a file.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from arview.camera.colmap_text import entries_from_colmap, is_colmap
+from arview.camera.colmap_text import colmap_text_of_binary, entries_from_colmap, is_colmap
 from arview.camera.entry import CameraEntry
 from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, focal_length_px, read_exif
 from arview.camera.formats import FORMATS, entries_from_trees
@@ -218,7 +218,8 @@ def _read_entries(path: Path, name: str) -> list[CameraEntry]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: is larger than {MAX_BYTES / 1e6:.0f} MB; expected {FORMATS}")
-        text = path.read_text(encoding="utf-8-sig")
+        data = path.read_bytes()
+        text = colmap_text_of_binary(data) or data.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(
             f"{path}: camera file not found; give a camera file, fov:DEG (for example fov:65) or exif"

@@ -10,7 +10,8 @@ from arview.camera.lens import TERM_NAMES, LensDistortion, LensModel
 from arview.errors import InputError
 
 SUPPORTED = (
-    "pinhole, Brown (plumb_bob, radtan, brown_conrady), rational_polynomial, fisheye (equidistant), fov, division"
+    "pinhole, Brown (plumb_bob, radtan, brown_conrady, inverse_brown_conrady), rational_polynomial, fisheye "
+    "(equidistant), thin_prism_fisheye, fov, division"
 )
 """Lens models for messages, by their common names."""
 
@@ -27,6 +28,7 @@ class _Kind(StrEnum):
     FISHEYE = "fisheye"
     FOV = "fov"
     DIVISION = "division"
+    THIN_PRISM_FISHEYE = "fisheye with thin prism"
 
 
 _KINDS = {
@@ -36,14 +38,21 @@ _KINDS = {
                   "pinholeradtan"),
     _Kind.OPENCV: ("rationalpolynomial", "rational", "thinprism"),
     _Kind.SKEWED_BROWN: ("modifiedbrownconrady",),
-    _Kind.INVERSE_BROWN: ("inversebrownconrady",),
+    _Kind.INVERSE_BROWN: ("inversebrownconrady", "inversebrown"),
+    _Kind.THIN_PRISM_FISHEYE: ("thinprismfisheye",),
     _Kind.FISHEYE: ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4", "kb4",
                     "simplefisheye", "simpleradialfisheye", "radialfisheye", "pinholeequi"),
     _Kind.FOV: ("fov", "ftheta", "pinholefov"),
     _Kind.DIVISION: ("division", "simpledivision"),
 }  # fmt: skip
 _KIND_OF_NAME = {name: kind for kind, names in _KINDS.items() for name in names}
-_LENS_OF_KIND = {_Kind.FISHEYE: LensModel.FISHEYE, _Kind.FOV: LensModel.FOV, _Kind.DIVISION: LensModel.DIVISION}
+_LENS_OF_KIND = {
+    _Kind.FISHEYE: LensModel.FISHEYE,
+    _Kind.FOV: LensModel.FOV,
+    _Kind.DIVISION: LensModel.DIVISION,
+    _Kind.THIN_PRISM_FISHEYE: LensModel.THIN_PRISM_FISHEYE,
+    _Kind.INVERSE_BROWN: LensModel.INVERSE_BROWN,
+}
 _OPENCV_COUNTS = (0, 1, 2, 4, 5, 8, 12, 14)
 """Lengths of a list of OpenCV's terms; the last two of 14 tilt the sensor."""
 _BROWN_TERMS = 5
@@ -84,7 +93,9 @@ def simplest(lens: LensDistortion) -> tuple[tuple[float, ...], LensDistortion | 
     none = (0.0,) * _BROWN_TERMS
     if lens.model is LensModel.RATIONAL:
         return (none, lens) if any(lens.terms[_BROWN_TERMS:]) else (lens.terms[:_BROWN_TERMS], None)
-    if lens.model is not LensModel.FISHEYE and lens.terms[0] == 0.0:
+    if lens.model is LensModel.THIN_PRISM_FISHEYE and not any(lens.terms[i] for i in (2, 3, 6, 7)):
+        return none, LensDistortion(LensModel.FISHEYE, tuple(lens.terms[i] for i in (0, 1, 4, 5)))
+    if lens.model in (LensModel.FOV, LensModel.DIVISION, LensModel.INVERSE_BROWN) and not any(lens.terms):
         return none, None
     return none, lens
 
@@ -134,8 +145,6 @@ def _check_kind(kind: _Kind, terms: Sequence[float], name: str) -> None:
         raise InputError(f"lens model {name}, but distortion terms that are not zero; correct one of them")
     if kind is _Kind.BROWN and any(terms[_BROWN_TERMS:]):
         raise InputError(f"{name} has only k1 k2 p1 p2 k3, but the file gives further terms; is it another lens model?")
-    if kind is _Kind.INVERSE_BROWN and any(terms):
-        raise InputError(f"lens model {name} maps the other way round and is not supported; calibrate with OpenCV")
     if kind is _Kind.SKEWED_BROWN and any(terms[2:4]):
         raise InputError(f"lens model {name} with tangential terms is not supported; calibrate with OpenCV")
 

@@ -52,6 +52,7 @@ _LENSES: dict[str, tuple[LensModel, ...]] = {
     "opencv-xml": (LensModel.RATIONAL, LensModel.FISHEYE),
     "opencv-json": (LensModel.RATIONAL, LensModel.FISHEYE),
     "ros": (LensModel.RATIONAL, LensModel.FISHEYE),
+    "colmap": tuple(model for model in LensModel if model is not LensModel.INVERSE_BROWN),
 }
 """Lens models besides Brown's that a format holds; the others hold all."""
 _ROS_NAMES = {LensModel.RATIONAL: "rational_polynomial", LensModel.FISHEYE: "equidistant"}
@@ -60,6 +61,7 @@ _COLMAP_NAMES = {
     LensModel.FISHEYE: "OPENCV_FISHEYE",
     LensModel.FOV: "FOV",
     LensModel.DIVISION: "DIVISION",
+    LensModel.THIN_PRISM_FISHEYE: "THIN_PRISM_FISHEYE",
 }
 
 
