@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -25,16 +24,13 @@ from helpers import live_browser
 from helpers.live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
 from helpers.live_client import Running, running
 from helpers.live_sample import INSPECTION, loader, options
+from helpers.page import WATCH, opened, until
 from helpers.told_session import TOLD, Told
 
 WIDTH, HEIGHT, FPS = 640, 360, 5
 COLOUR_GAP_PX = 7
 """A video has its colours at half the resolution, and its encoder smooths them: in narrower slots and holes the ghost
 and what is seen through it are one."""
-TIMEOUT_S = 120.0
-"""Chromium without a GPU, the tracker and the tests share two cores."""
-VIEWPORT = {"width": 680, "height": 640}
-"""Here the picture is shown a little larger than it is."""
 MEDIAN_PX, MAX_PX = 1.5, 4.0
 """Of the ghost's outline; of the part itself nothing may be further off in nineteen of twenty places."""
 
@@ -88,44 +84,6 @@ def server(inspection: Path) -> Iterator[Running]:
     chosen = options(inspection=inspection, clients=1, record_folder=inspection.parent)
     with running(chosen, loader(chosen)) as one:
         yield one
-
-
-@contextmanager
-def opened(chromium: Any, server: Running, script: str = "", viewport: dict[str, int] = VIEWPORT) -> Iterator[Any]:
-    """The open page; at the end it is checked that it raised no errors."""
-    context = chromium.new_context(viewport=viewport, accept_downloads=True)
-    page = context.new_page()
-    troubles: list[str] = []
-    page.on("pageerror", lambda error: troubles.append(f"error: {error}"))
-    page.on("console", lambda said: troubles.append(said.text) if "Content Security" in said.text else None)
-    if script:
-        page.add_init_script(script)
-    try:
-        page.goto(f"http://127.0.0.1:{server.port}/?token={server.token}")
-        yield page
-    finally:
-        context.close()
-    assert not troubles
-
-
-def until(page: Any, condition: str | Callable[[], Any], timeout_s: float = TIMEOUT_S) -> Any:
-    """Wait until an expression of the page, or a function, is true; returns its value."""
-    end_s = time.monotonic() + timeout_s
-    while True:
-        value = page.evaluate(condition) if isinstance(condition, str) else condition()
-        if value:
-            return value
-        if time.monotonic() > end_s:
-            state = page.inner_text("#state"), page.inner_text("#link-state"), page.inner_text("#message")
-            raise AssertionError(f"not within {timeout_s:.0f} s: {condition}; the page says {state}")
-        page.wait_for_timeout(150)
-
-
-WATCH = """
-window.drawn = null;
-window.draws = 0;
-document.addEventListener("arview:drawn", (event) => { window.drawn = event.detail; window.draws += 1; });
-"""
 
 
 def choose(page: Any, transport: str, link: str, mode: str) -> None:
@@ -237,12 +195,12 @@ def test_labels_and_parts_say_what_is_seen(chromium: Any, inspection: Path, monk
         by_name = {name: text for text in texts for name in kinds if name in text[0]}
         assert "changed since measured" in by_name["post_1"][0] and "mm" not in by_name["post_1"][0]
         assert "≈ 35 mm away" in by_name["bracket_1"][0] and "PASS" not in by_name["bracket_1"][0]
-        rows = {row.get_attribute("data-name"): row.text_content() for row in page.locator("#components button").all()}
+        rows = {row.get_attribute("data-name"): row.text_content() for row in page.locator(".components button").all()}
         assert "MISSING" in rows["post_1"] and "FAIL" not in rows["post_1"]
         assert "PASS, measured, not verified here" in rows["boss_1"]
         legend = page.locator("#labels .legend").text_content()
         assert all(text in legend for text in ("missing here", "displaced", "not verified here"))
-        assert "INCOMPLETE: 1 missing, 1 displaced" in page.locator("#tally").text_content()
+        assert "INCOMPLETE: 1 missing, 1 displaced" in page.locator(".tally").text_content()
 
         more = {"identity": Identity.UNCONFIRMED, "identity_reason": "two plates are in view"}
         monkeypatch.setitem(TOLD, "more", more)
@@ -250,7 +208,7 @@ def test_labels_and_parts_say_what_is_seen(chromium: Any, inspection: Path, monk
         assert page.evaluate(f"{shown}.length") == 0
         assert "two plates are in view" in page.locator("#labels .banner").text_content()
         assert "PASS" not in page.locator("#parts").text_content()
-        assert " mm" not in page.locator("#components").text_content()
+        assert " mm" not in page.locator(".components").text_content()
 
 
 def test_the_user_confirms_the_part(chromium: Any, inspection: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,8 +246,8 @@ def test_labels_and_parts_say_what_was_measured(chromium: Any, server: Running) 
     record = {one["name"]: one for one in json.loads(INSPECTION.read_text())["components"]}
     words = {"pass": "PASS", "fail": "FAIL", "undecided": "UNDECIDED"}
     with opened(chromium, server, WATCH) as page:
-        until(page, "document.querySelectorAll('#components button').length === 11")
-        rows = {row.get_attribute("data-name"): row.text_content() for row in page.locator("#components button").all()}
+        until(page, "document.querySelectorAll('.components button').length === 11")
+        rows = {row.get_attribute("data-name"): row.text_content() for row in page.locator(".components button").all()}
         for name, one in record.items():
             for text in (f"{one['distance_mm']:.2f} mm", f"U {one['uncertainty_mm']:.2f}", words[one["verdict"]]):
                 assert text in rows[name], (text, rows[name])
@@ -307,7 +265,7 @@ def test_labels_and_parts_say_what_was_measured(chromium: Any, server: Running) 
                 assert text in said, (text, said)
             assert sign == f"icon-{one['verdict']}", "a shape says the verdict too"
 
-        page.locator("#components button[data-name=nut_1]").evaluate("e => e.click()")
+        page.locator(".components button[data-name=nut_1]").evaluate("e => e.click()")
         card = page.locator("#card")
         assert all(
             text in card.inner_text() for text in ("nut_1", "UNDECIDED", "0.45 mm", "U 0.12 mm", "tolerance 0.50 mm")
@@ -407,7 +365,7 @@ def test_inspection_changes(chromium: Any, tmp_path: Path) -> None:
     write_inspection(path, timedelta(minutes=5))
     chosen = options(inspection=path)
     with running(chosen, loader(chosen)) as one, opened(chromium, one) as page:
-        row = page.locator("#components button[data-name=post_1]")
+        row = page.locator(".components button[data-name=post_1]")
         until(page, lambda: row.count() and "1.36 mm" in row.text_content())
         assert page.locator(".notice.strong").count() == 0
         record = json.loads(INSPECTION.read_text())

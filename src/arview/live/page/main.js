@@ -3,9 +3,11 @@
 import { Camera, quarterTurns } from "./camera.js";
 import { Connection } from "./transport/connection.js";
 import { icon } from "./icons.js";
-import { Parts, tally } from "./parts.js";
+import { PartLists, tally } from "./parts.js";
 import { Player } from "./player.js";
+import { Specimens, reasonOf, summaryOf } from "./specimens.js";
 import { Stage } from "./scene/stage.js";
+import { partsOf } from "./transport/api.js";
 import { Message, Notices, StatusBar, Toast } from "./status.js";
 
 const FIGURES_EVERY_MS = 500, STYLE_DELAY_MS = 150;
@@ -14,7 +16,7 @@ const find = (id) => document.getElementById(id);
 history.replaceState(null, "", location.pathname); // the token stays out of bookmarks and shared links
 for (const sign of document.querySelectorAll("[data-icon]")) sign.append(icon(sign.dataset.icon));
 
-const style = { ghost: true, edges: "visible", labels: true, opacity: 0.42, only: null, status: false };
+const style = { ghost: true, edges: "visible", labels: true, opacity: 0.42, only: null, only_part: 0, status: false };
 const state = { phase: { name: "loading", text: "" }, part: null, status: null, trouble: "", latencies: [], isRecording: false };
 
 let player = null, isDrawAsked = false;
@@ -24,10 +26,8 @@ const bar = new StatusBar({
   meter: find("quality-meter"), latency: find("latency"), age: find("age"), body: document.body,
 });
 const notices = new Notices(find("notices")), message = new Message(find("message")), toast = new Toast(find("toast"));
-const parts = new Parts(
-  { name: find("part-name"), tally: find("tally"), list: find("components"), provenance: find("provenance"), card: find("card") },
-  isolate,
-);
+const parts = new PartLists(find("panels"), find("card"), isolate);
+const specimens = new Specimens({ list: find("specimens"), confirms: find("confirms"), confirm: find("confirm") }, confirmPart);
 const stage = new Stage({
   stage: find("stage"), canvas: find("picture"), leaders: find("leaders"), labels: find("labels"),
   obstacles: [find("bar"), find("notices"), find("actions"), find("card"), find("side")],
@@ -46,10 +46,12 @@ const connection = new Connection(find("remote"), {
     state.part = part;
     player ??= new Player(part.source === "phone");
     document.body.dataset.source = part.source;
-    document.title = `${part.part.name} ${part.part.serial} · arview`;
-    parts.setPart(part);
+    const all = partsOf(part);
+    document.title = `${titleOf(all)} · arview`;
+    parts.setParts(all);
+    specimens.setParts(all);
     find("open-parts").querySelector(".badge")?.remove();
-    const bad = tally(part.components).find((one) => one.classList.contains("fail") || one.classList.contains("undecided"));
+    const bad = tally(all.flatMap((one) => one.components)).find((one) => one.classList.contains("fail") || one.classList.contains("undecided"));
     if (bad) {
       const badge = document.createElement("span");
       badge.className = `badge ${bad.classList[1]}`;
@@ -57,12 +59,12 @@ const connection = new Connection(find("remote"), {
       find("open-parts").append(badge);
     }
     stage.setPart(part);
-    if (style.only && !part.components.some((one) => one.name === style.only)) isolate(null);
+    if (style.only && !all[style.only_part]?.components.some((one) => one.name === style.only)) isolate(null);
     if (part.source === "phone" && !camera.isOn && !state.trouble) camera.start(part.wanted);
     requestDraw();
   },
-  async onModel(buffer, part) {
-    await stage.setModel(buffer, part);
+  async onModels(buffers, part) {
+    await stage.setModels(buffers, part);
   },
   onOpen() {
     player.mode = connection.mode;
@@ -141,7 +143,7 @@ function refreshState(shown = player?.shown) {
   const { phase, trouble, status, part } = state;
   const nowMs = performance.now();
   const isLive = !player?.isFrozen && phase.name === "connected" && player.isAnswered(nowMs);
-  if (!isLive) find("confirm").hidden = true;
+  specimens.show(isLive ? shown?.pose ?? player.answer : null);
   if (player?.isFrozen) {
     const ago = Math.round((Date.now() - player.frozenAt) / 1000);
     return bar.show("frozen", `picture taken ${ago < 2 ? "just now" : `${ago} s ago`}; press Resume to continue`);
@@ -156,16 +158,8 @@ function refreshState(shown = player?.shown) {
   if (answer.guide_cam_from_model && !answer.cam_from_model) {
     return bar.show("align", "align the part with the yellow outline");
   }
-  const defaults = {
-    critical: "the pose is uncertain",
-    searching: "for the part in the picture",
-    lost: "the part is no longer found",
-  }[answer.state];
-  const reason = answer.remark || defaults;
-  const found = answer.completeness.startsWith("INCOMPLETE") ? ["INCOMPLETE"] : [];
-  const { withheld } = answer;
-  find("confirm").hidden = !withheld;
-  bar.show(answer.state, [...found, ...(withheld ? [`${withheld.title}: ${withheld.text}`] : []), ...(reason ? [reason] : []), ...answer.mismatches].join("; "));
+  if (specimens.isSeveral && answer.parts.length > 1) return bar.show(...summaryOf(answer.parts, specimens.names));
+  bar.show(answer.state, reasonOf(answer));
 }
 
 const retryText = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);
@@ -216,7 +210,7 @@ setInterval(() => {
   const sorted = state.latencies.map((one) => one.ms).sort((a, b) => a - b);
   const pose = player?.shown?.pose;
   bar.figures({
-    quality: pose ? pose.quality : null,
+    quality: pose?.isPosed ? Math.min(...pose.parts.filter((one) => one.cam_from_model).map((one) => one.quality)) : pose?.quality ?? null,
     latencyMs: sorted.length ? sorted[sorted.length >> 1] : null,
     ageMs: drawn.frame ? nowMs - drawn.takenMs : null,
   });
@@ -226,9 +220,9 @@ setInterval(() => {
 
 // --- controls ---------------------------------------------------------------------------------------
 
-function isolate(name) {
-  style.only = name;
-  parts.show(name);
+function isolate(name, part = 0) {
+  Object.assign(style, { only: name, only_part: name ? part : 0 });
+  parts.show(name, part);
   changeStyle();
 }
 
@@ -275,9 +269,8 @@ async function snapshot() {
     await connection.ask({ hold: frame.id, style });
     const answer = await fetch(`/api/clients/${link.client}/snapshot.png?id=${frame.id}`, { cache: "no-store" });
     if (!answer.ok) throw new Error((await answer.json()).message);
-    const { name, serial } = state.part.part;
     const moment = new Date().toISOString().slice(0, 19).replaceAll(":", "");
-    const file = [name, state.part.inspection?.serial || serial, moment].filter(Boolean).join("_").replace(/[^\w.-]+/g, "-");
+    const file = [titleOf(partsOf(state.part)).replaceAll(", ", "_").replaceAll(" ", "_"), moment].filter(Boolean).join("_").replace(/[^\w.-]+/g, "-");
     save(await answer.blob(), `${file}.png`);
     toast.show("Snapshot saved, with its measurements inside");
   } catch (error) {
@@ -285,6 +278,11 @@ async function snapshot() {
   } finally {
     if (!player.isFrozen) connection.ask({ hold: null });
   }
+}
+
+/** Names and serial numbers of the parts. */
+function titleOf(all) {
+  return all.map(({ part, inspection, name }) => [name || part.name, inspection?.serial || part.serial].filter(Boolean).join(" ")).join(", ");
 }
 
 function save(blob, name) {
@@ -332,13 +330,19 @@ find("opacity").addEventListener("input", (event) => {
 find("search-again").addEventListener("click", async () => {
   toast.show((await connection.ask({ reset: true })) || "Searching for the part again");
 });
-/** The user says that the part in view is the one to which the labels belong. */
-async function confirmPart() {
-  if (find("confirm").hidden) return;
-  toast.show((await connection.ask({ confirm: true })) || "Confirmed: the labels belong to this part");
+/** The user says that a part in view is the one to which its labels belong. */
+async function confirmPart(part, name = "this part") {
+  if (!specimens.waiting.includes(part)) return;
+  toast.show((await connection.ask({ confirm: specimens.isSeveral ? part : true })) || `Confirmed: the labels belong to ${name}`);
 }
 
-find("confirm").addEventListener("click", confirmPart);
+/** Confirm the part that waits for it; of several, the user has to choose. */
+function confirmWaiting() {
+  const { waiting, names } = specimens;
+  if (waiting.length === 1) confirmPart(waiting[0], specimens.isSeveral ? names[waiting[0]] : undefined);
+  else if (waiting.length > 1) toast.show(`Which one? Press ${waiting.map((id) => `${id + 1} for ${names[id]}`).join(", ")}`);
+}
+
 find("transports").addEventListener("change", (event) => {
   connection.choose(event.target.value);
   if (player) player.mode = connection.mode;
@@ -354,11 +358,12 @@ document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const isTyping = ["INPUT", "SELECT"].includes(event.target.tagName), isButton = event.target.tagName === "BUTTON";
   const keys = {
-    c: confirmPart, s: snapshot, r: record, g: () => toggle("ghost"), e: () => toggle("edges"), l: () => toggle("labels"),
+    c: confirmWaiting, s: snapshot, r: record, g: () => toggle("ghost"), e: () => toggle("edges"), l: () => toggle("labels"),
     Escape: () => (document.body.dataset.side ? openSide("") : isolate(null)),
-    ArrowRight: () => isolate(parts.neighbour(1)), ArrowLeft: () => isolate(parts.neighbour(-1)),
+    ArrowRight: () => parts.step(1), ArrowLeft: () => parts.step(-1),
     " ": freeze,
   };
+  for (const id of specimens.waiting) if (specimens.isSeveral) keys[id + 1] = () => confirmPart(id, specimens.names[id]);
   const act = keys[event.key.length === 1 ? event.key.toLowerCase() : event.key];
   if (!act || (isTyping && event.key !== "Escape") || (isButton && event.key === " ") || event.repeat) return;
   event.preventDefault();

@@ -16,38 +16,97 @@ export function ageText(seconds) {
   return seconds >= 60 ? `${Math.round(seconds / 60)} min ago` : "just now";
 }
 
-export class Parts {
+/** The lists of all parts, and one card. */
+export class PartLists {
+  #lists = [];
+
   /**
-   * @param elements {name, tally, list, provenance, card}
-   * @param onPick called with the name of a component, or null for all of them.
+   * @param box element of the lists.
+   * @param card element of the card.
+   * @param onPick called with name and part of a component, or with null for all of them.
    */
-  constructor(elements, onPick) {
-    Object.assign(this, elements, { onPick });
+  constructor(box, card, onPick) {
+    Object.assign(this, { box, card, onPick });
+    this.only = { name: null, part: 0 };
+  }
+
+  /** Show the parts of a part document. */
+  setParts(parts) {
+    if (parts.length !== this.#lists.length) {
+      const pick = (id) => (name) => this.onPick(name, id);
+      this.#lists = parts.map(({ id }) => new PartList(pick(id), (step) => this.step(step)));
+      this.box.replaceChildren(...this.#lists.map((list) => list.section));
+    }
+    parts.forEach((part, id) => this.#lists[id].setPart(part));
+    this.show(this.only.name, this.only.part);
+  }
+
+  /** Take over what a pose says of the components of all parts. */
+  setEvidence(pose) {
+    for (const { id, ...part } of pose?.parts ?? []) if (this.#lists[id]?.setEvidence(part)) this.show(this.only.name, this.only.part);
+  }
+
+  /** Mark the isolated component and show its card; null for none. */
+  show(name, part = 0) {
+    const list = this.#lists[part], isThere = Boolean(list?.components.some((one) => one.name === name));
+    this.only = { name: isThere ? name : null, part };
+    this.#lists.forEach((one, id) => one.mark(id === part ? this.only.name : null));
+    this.card.hidden = !isThere;
+    this.card.replaceChildren(...(isThere ? list.details(name) : []));
+    this.card.className = isThere ? list.kindOf(name) : "none";
+  }
+
+  /** Isolate the inspected component after (step 1) or before (step -1) the isolated one, of all parts. */
+  step(by) {
+    const all = this.#lists.flatMap((list, part) => (list.inspected.length ? list.inspected : list.components).map(({ name }) => ({ name, part })));
+    if (!all.length) return;
+    const at = all.findIndex((one) => one.name === this.only.name && one.part === this.only.part);
+    const { name, part } = all[(at + by + all.length) % all.length];
+    this.onPick(name, part);
+  }
+}
+
+/** The list of the components of one part. */
+class PartList {
+  /**
+   * @param onPick called with the name of a component, or null for all of them.
+   * @param onStep called with 1 or -1 for the next or previous component.
+   */
+  constructor(onPick, onStep) {
+    Object.assign(this, { onPick, onStep });
+    this.name = make("p", "part-name");
+    this.tally = make("div", "tally");
+    this.list = make("ul", "components");
+    this.provenance = make("p", "provenance");
+    this.section = make("div", "panel", [this.name, this.tally, this.list, this.provenance]);
     this.only = null;
     this.components = [];
     this.seen = new Map();
     this.withheld = null;
   }
 
-  /** Take over what a pose says of the components: a verdict stands only beside what is seen now. */
+  /** Take over what a pose says of the components: a verdict stands only beside what is seen now; returns whether it is new. */
   setEvidence(pose) {
-    if (!pose?.cam_from_model) return;
+    if (!pose.cam_from_model) return false;
     const key = JSON.stringify([pose.labels, pose.withheld, pose.completeness]);
-    if (key === this.key) return;
+    if (key === this.key) return false;
     this.key = key;
     this.withheld = pose.withheld;
     this.completeness = pose.completeness;
     this.seen = new Map(pose.labels.map((one) => [this.names[one.index], one]));
     this.#list();
+    return true;
   }
 
-  /** Show a part document. */
-  setPart({ part, components, inspection }) {
+  /** Show a part of a part document. */
+  setPart({ part, components, inspection, name, mark, tag_color }) {
     const rank = (one) => one.rank ?? Infinity;
     this.components = [...components].sort((a, b) => rank(a) - rank(b));
     this.inspected = this.components.filter((one) => one.rank !== null);
     const serial = inspection?.serial || part.serial;
-    this.name.replaceChildren(make("b", "", [part.name]), serial ? ` ${serial}` : "");
+    const sign = mark ? [make("span", "mark", [mark])] : [];
+    for (const one of sign) one.style.color = tag_color;
+    this.name.replaceChildren(...sign, make("b", "", [name || part.name]), serial ? ` ${serial}` : "");
     const provenance = inspection ? `Inspected ${ageText(inspection.age_s)}${inspection.method ? `, ${inspection.method}` : ""}` : "Not inspected yet";
     this.provenance.replaceChildren(provenance);
     this.names = components.map((one) => one.name);
@@ -61,7 +120,6 @@ export class Parts {
     if (this.completeness) counts.push(make("span", `count ${COMPLETENESS[this.completeness.split(":")[0]]}`, [this.completeness]));
     this.tally.replaceChildren(...counts);
     this.list.replaceChildren(...this.components.map((one) => this.#row(one)));
-    this.show(this.components.some((one) => one.name === this.only) ? this.only : null);
   }
 
   /** Classes, value, U, word and notes of a component, by what was measured and what is seen. */
@@ -74,23 +132,26 @@ export class Parts {
     return { kind: seen.evidence, value: seen.value, u: null, word: seen.word, notes: seen.notes };
   }
 
-  /** Mark the isolated component and show its card; null for none. */
-  show(name) {
+  /** Mark the isolated component; null for none. */
+  mark(name) {
     this.only = name;
     for (const row of this.list.querySelectorAll("button")) {
       row.setAttribute("aria-pressed", String(row.dataset.name === name));
     }
-    const component = this.components.find((one) => one.name === name);
-    this.card.hidden = !component;
-    this.card.replaceChildren(...(component ? this.#details(component) : []));
-    this.card.className = component ? this.#state(component).kind : "none";
   }
 
-  /** Name of the inspected component after (step 1) or before (step -1) the isolated one. */
-  neighbour(step) {
-    const list = this.inspected.length ? this.inspected : this.components;
-    const at = list.findIndex((one) => one.name === this.only);
-    return list.length ? list[(at + step + list.length) % list.length].name : null;
+  /** Classes of the card of a component. */
+  kindOf(name) {
+    return this.#state(this.#find(name)).kind;
+  }
+
+  /** Content of the card of a component. */
+  details(name) {
+    return this.#details(this.#find(name));
+  }
+
+  #find(name) {
+    return this.components.find((one) => one.name === name);
   }
 
   #row(one) {
@@ -111,12 +172,12 @@ export class Parts {
       made.addEventListener("click", onClick);
       return made;
     };
-    const forward = button("back", "Next component", () => this.onPick(this.neighbour(1)));
+    const forward = button("back", "Next component", () => this.onStep(1));
     forward.classList.add("forward");
     const { kind, word, value, notes } = this.#state(one);
     const remark = notes.length ? [make("p", "axes", [make("span", "", [notes.join(", ")])])] : [];
     const head = make("div", "head", [
-      button("back", "Previous component", () => this.onPick(this.neighbour(-1))),
+      button("back", "Previous component", () => this.onStep(-1)),
       make("span", "title", [make("b", "", [one.name]), make("span", "verdict", [icon(kind.split(" ")[0]), word])]),
       forward, button("close", "Show all components", () => this.onPick(null)),
     ]);

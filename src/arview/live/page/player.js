@@ -2,6 +2,7 @@
 
 import { FrameRing } from "./transport/frames.js";
 import { Intrinsics } from "./scene/projection.js";
+import { partsOf } from "./transport/api.js";
 import { FRAME_IDS, isNewer } from "./transport/stamp.js";
 
 const KEPT_FRAMES = 20, KEPT_POSES = 60, KEPT_TIMES = 300;
@@ -51,6 +52,8 @@ export class Player {
   takePose(pose, nowMs) {
     if (!this.camera?.isSame(pose.camera)) this.camera = new Intrinsics(pose.camera);
     pose.lens = this.camera;
+    pose.parts = partsOf(pose);
+    pose.isPosed = pose.parts.some((one) => one.cam_from_model);
     this.poses.set(pose.id, pose);
     if (this.poses.size > KEPT_POSES) this.poses.delete(this.poses.keys().next().value);
     // After STALE_MS an older id is accepted, too: the server may have started to count again.
@@ -80,14 +83,14 @@ export class Player {
       frame: (this.isPhone ? this.own : this.sent).newest, pose: null, guide: answer?.guide_cam_from_model ? answer : null,
       isAnnotated: false,
     };
-    if (!answer?.cam_from_model) return plain;
+    if (!answer?.isPosed) return plain;
     if (this.mode === "video") {
       const frame = this.sent.newest;
       if (!frame || nowMs - frame.takenMs > 4 * STALE_MS) return plain;
       return { frame, pose: this.poses.get(frame.id) ?? null, guide: null, isAnnotated: true };
     }
     const ring = this.isPhone ? this.own : this.sent;
-    const frame = ring.newestWhere((id) => Boolean(this.poses.get(id)?.cam_from_model));
+    const frame = ring.newestWhere((id) => Boolean(this.poses.get(id)?.isPosed));
     if (!frame || nowMs - frame.takenMs > 4 * STALE_MS) return plain;
     return { frame, pose: this.poses.get(frame.id), guide: null, isAnnotated: false };
   }

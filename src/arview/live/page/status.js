@@ -2,7 +2,7 @@
 
 import { icon, make } from "./icons.js";
 
-const STATES = {
+export const STATES = {
   tracked: ["tracked", "Tracked"],
   critical: ["critical", "Critical"],
   searching: ["searching", "Searching"],

@@ -1,11 +1,14 @@
-// Draws picture and ghost (the transparent CAD model) in one WebGL canvas, so that they cannot drift apart.
+// Draws picture and ghosts (the transparent CAD models) in one WebGL canvas, so that they cannot drift apart.
 //
-// The model is rendered into a texture by an ideal lens; the texture is then distorted like the real lens and drawn over
+// The models are rendered into a texture by an ideal lens; the texture is then distorted like the real lens and drawn over
 // the picture.
 
 import { SAMPLES } from "../graphics.js";
 import { distortionGrid, eyeInModel, glProjection, glView, multiplied, toCam } from "./projection.js";
 import { MeshEdges, welded } from "./mesh_edges.js";
+import {
+  LINE_FRAGMENT, LINE_VERTEX, NUMBER_FRAGMENT, QUAD_FRAGMENT, QUAD_VERTEX, SURFACE_FRAGMENT, SURFACE_VERTEX,
+} from "./shaders.js";
 
 const THREE = globalThis.THREE;
 
@@ -13,95 +16,6 @@ const BOX_MARGIN_PX = 8;
 const CELLS_ACROSS = 160; // columns of the map of visible components
 const CRITICAL_DIMMING = 0.55;
 const GUIDE_RGB = [1, 0.867, 0.341], HALO_RGB = [0.063, 0.078, 0.106];
-
-const SURFACE_VERTEX = `
-precision highp float;
-in vec3 position;
-uniform mat4 view, projection;
-out vec3 v_place;
-void main() {
-  vec4 place = view * vec4(position, 1.0);
-  v_place = place.xyz;
-  gl_Position = projection * place;
-}`;
-// Faces at grazing angles are a little denser, like glass; faces towards the camera are brighter.
-const SURFACE_FRAGMENT = `
-precision highp float;
-in vec3 v_place;
-uniform vec4 color;
-uniform float dimming, width, pattern;
-out vec4 result;
-// Hatched ghosts: pattern 1 has stripes, pattern 2 crossed lines, and both are faint in between.
-float hatch() {
-  if (pattern < 0.5) return 1.0;
-  float period = max(6.0, 7.0 * width), u = mod(gl_FragCoord.x + gl_FragCoord.y, period);
-  float v = mod(gl_FragCoord.x - gl_FragCoord.y, period);
-  bool isOn = pattern < 1.5 ? u < 0.5 * period : u < 0.25 * period || v < 0.25 * period;
-  return isOn ? 1.0 : 0.2;
-}
-void main() {
-  float facing = abs(dot(normalize(cross(dFdx(v_place), dFdy(v_place))), normalize(v_place)));
-  float alpha = min(1.0, color.a * dimming * hatch() * (1.25 - 0.35 * facing));
-  result = vec4(color.rgb * (0.45 + 0.55 * facing) * alpha, alpha);
-}`;
-// A line is a rectangle with the length of the edge and the given width on the screen plus one pixel, over which it
-// fades. It is drawn nearer than it is by a thousandth of its distance, so that adjacent faces do not cover it.
-const LINE_VERTEX = `
-precision highp float;
-in vec3 position, otherEnd;
-in vec2 corner;
-uniform mat4 view, projection;
-uniform vec2 viewport;
-uniform float width;
-out float v_aside, v_steep;
-void main() {
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-  v_aside = v_steep = 0.0;
-  vec3 here = (view * vec4(position, 1.0)).xyz, there = (view * vec4(otherEnd, 1.0)).xyz;
-  if (here.z > -1.0 && there.z > -1.0) return;
-  if (here.z > -1.0) here = mix(there, here, (-1.0 - there.z) / (here.z - there.z));
-  if (there.z > -1.0) there = mix(here, there, (-1.0 - here.z) / (there.z - here.z));
-  vec4 place = projection * vec4(0.999 * here, 1.0), other = projection * vec4(0.999 * there, 1.0);
-  vec2 along = (other.xy / other.w - place.xy / place.w) * viewport * corner.x;
-  float length_px = length(along);
-  along = length_px > 1e-4 ? along / length_px : vec2(1.0, 0.0);
-  v_aside = corner.y * 0.5 * (width + 1.0);
-  v_steep = abs(along.y) > abs(along.x) ? 1.0 : 0.0;
-  vec2 offset_px = vec2(-along.y, along.x) * v_aside - along * corner.x * 0.25 * width;
-  gl_Position = place + vec4(2.0 * offset_px / viewport * place.w, 0.0, 0.0);
-}`;
-const LINE_FRAGMENT = `
-precision highp float;
-in float v_aside, v_steep;
-uniform vec4 color;
-uniform float dimming, width, dashed;
-out vec4 result;
-void main() {
-  // Dashes are counted along the major axis of the line, so that short pieces of a curve are dashed, too.
-  float along = v_steep > 0.5 ? gl_FragCoord.y : gl_FragCoord.x;
-  if (dashed > 0.5 && mod(floor(along / (2.0 + 3.0 * width)), 2.0) > 0.5) discard;
-  float cover = clamp(0.5 * (width + 1.0) - abs(v_aside), 0.0, 1.0);
-  result = vec4(color.rgb, 1.0) * color.a * dimming * cover;
-}`;
-const NUMBER_FRAGMENT = `
-precision highp float;
-uniform vec2 number;
-out vec4 result;
-void main() { result = vec4(number, 0.0, 1.0); }`;
-const QUAD_VERTEX = `
-precision highp float;
-in vec2 position, uv;
-out vec2 v_uv;
-void main() {
-  v_uv = uv;
-  gl_Position = vec4(2.0 * position.x - 1.0, 1.0 - 2.0 * position.y, 0.0, 1.0);
-}`;
-const QUAD_FRAGMENT = `
-precision highp float;
-in vec2 v_uv;
-uniform sampler2D image;
-out vec4 result;
-void main() { result = texture(image, v_uv); }`;
 
 export class Ghost {
   /** Throws an Error when the browser does not support WebGL 2. */
@@ -121,7 +35,8 @@ export class Ghost {
       dimming: { value: 1 },
     };
     this.unusedCamera = new THREE.Camera(); // the shaders have their own matrices
-    this.components = []; // {surface, lines, number, edges, center_in_model, corners_in_model}
+    this.parts = [{ view: this.shared.view, dimming: this.shared.dimming, pose: null }]; // in one scene, so that they hide each other
+    this.components = []; // of all parts: {part, surface, lines, number, edges, center_in_model, corners_in_model}
     this.model = new THREE.Scene();
     this.numbers = new THREE.Scene();
     this.picture = this.#quad();
@@ -136,10 +51,10 @@ export class Ghost {
     this.camera = null;
   }
 
-  /** Load the model from a GLB, in which component i is node c<i>. */
-  async load(buffer, count) {
-    const gltf = await new THREE.GLTFLoader().parseAsync(buffer, "");
-    gltf.scene.updateMatrixWorld(true);
+  /** Load the models of the parts, {buffer, count} each: a GLB, in which component i is node c<i>. */
+  async load(models) {
+    const shapes = new Map(); // of each GLB, which specimens of a part share
+    for (const { buffer, count } of models) if (!shapes.has(buffer)) shapes.set(buffer, await shapesOf(buffer, count));
     for (const { surface, lines, number, moved } of this.components) {
       this.model.remove(surface, lines);
       if (moved) {
@@ -151,11 +66,10 @@ export class Ghost {
       lines.geometry.dispose();
     }
     this.components = [];
-    for (let i = 0; i < count; i++) {
-      const mesh = gltf.scene.getObjectByName(`c${i}`);
-      if (!mesh?.isMesh) throw new Error(`the model has no component ${i}`);
-      this.components.push(this.#component(mesh.geometry.applyMatrix4(mesh.matrixWorld), i));
-    }
+    this.parts = models.map((_, id) => this.parts[id] ?? { view: { value: new THREE.Matrix4() }, dimming: { value: 1 }, pose: null });
+    models.forEach(({ buffer }, id) => {
+      for (const shape of shapes.get(buffer)) this.components.push(this.#component(shape, this.parts[id], this.components.length));
+    });
   }
 
   /**
@@ -165,15 +79,15 @@ export class Ghost {
    */
   style(styles) {
     this.components.forEach((component, i) => {
-      const { surface, lines, number } = component;
+      const { surface, lines } = component;
       const { ghost, edges, isShown, pattern, isDashed } = styles[i];
       surface.material.uniforms.pattern.value = pattern;
       lines.material.uniforms.dashed.value = isDashed ? 1 : 0;
       this.#move(component, styles[i]);
       surface.material.uniforms.color.value.set(...ghost);
       lines.material.uniforms.color.value.set(...edges);
-      surface.visible = number.visible = isShown;
-      lines.visible = isShown && edges[3] > 0;
+      component.isShown = isShown;
+      component.hasLines = edges[3] > 0;
       // Surfaces without a colour only occlude. They are drawn first, so that they do not erase others.
       surface.material.colorWrite = ghost[3] > 0;
     });
@@ -186,24 +100,29 @@ export class Ghost {
   }
 
   /**
-   * Draw a picture and, over it, the model.
+   * Draw a picture and, over it, the models.
    * @param source canvas with the picture; null leaves it black.
-   * @param pose cam_from_model, 16 numbers row-major, or null.
-   * @param guide pose of the outline to align the part with, or null.
+   * @param poses {cam_from_model, isCritical} of each part; cam_from_model is 16 numbers row-major, or null.
+   * @param guide pose of the outline to align the first part with, or null.
    * @param camera Intrinsics of the picture, needed with a pose or guide.
    * @param lineWidth of edges, device pixels.
    */
-  draw({ source, pose, guide, camera, isCritical, lineWidth }) {
-    const { renderer } = this, shown = pose || guide;
+  draw({ source, poses, guide, camera, lineWidth }) {
+    const { renderer } = this, isPosed = poses.some((one) => one.cam_from_model), shown = isPosed || guide;
+    this.parts.forEach((part, id) => {
+      part.pose = isPosed ? poses[id]?.cam_from_model ?? null : id === 0 ? guide : null;
+      part.dimming.value = isPosed && poses[id]?.isCritical ? CRITICAL_DIMMING : 1;
+    });
     if (shown) {
-      this.#prepare(camera, shown, lineWidth);
-      this.shared.dimming.value = pose && isCritical ? CRITICAL_DIMMING : 1;
-      this.target.scissor.set(...this.#box(camera, shown, this.distortion.window, this.target.height, false));
+      this.#prepare(camera, lineWidth);
+      this.target.scissor.set(...this.#box(camera, this.distortion.window, this.target.height, false));
       renderer.setRenderTarget(this.target);
       renderer.setClearColor(0x000000, 0);
       renderer.clear();
-      for (const { moved } of this.components) if (moved) moved.surface.visible = moved.lines.visible = Boolean(pose) && moved.isShown;
-      if (pose) renderer.render(this.model, this.unusedCamera);
+      for (const { part, moved } of this.components) {
+        if (moved) moved.surface.visible = moved.lines.visible = isPosed && Boolean(part.pose) && moved.isShown;
+      }
+      if (isPosed) renderer.render(this.model, this.unusedCamera);
       else this.#drawGuide(lineWidth);
       renderer.setRenderTarget(null);
     }
@@ -219,13 +138,13 @@ export class Ghost {
     if (!shown) return;
     const whole = { left: 0, top: 0, width: camera.width, height: camera.height };
     renderer.setScissorTest(true);
-    renderer.setScissor(...this.#box(camera, shown, whole, this.canvas.height, true));
+    renderer.setScissor(...this.#box(camera, whole, this.canvas.height, true));
     renderer.render(this.layer.scene, this.unusedCamera);
     renderer.setScissorTest(false);
   }
 
   /**
-   * Map of the visible components for the last pose that was drawn.
+   * Map of the visible components for the last poses that were drawn.
    * @returns {columns, rows, cells, window}: number of the component + 1 in each cell, 0 for none.
    */
   visibility() {
@@ -252,8 +171,8 @@ export class Ghost {
     return { columns, rows, cells, window };
   }
 
-  /** Set matrices and render targets for a camera and a pose. */
-  #prepare(camera, pose, lineWidth) {
+  /** Set matrices and render targets for a camera and the poses of the parts. */
+  #prepare(camera, lineWidth) {
     if (!this.camera?.isSame(camera)) this.#distortLike(camera);
     const { window } = this.distortion;
     const scale = this.canvas.width / camera.width;
@@ -265,7 +184,7 @@ export class Ghost {
       this.layer.material.uniforms.image.value = this.target.texture;
     }
     let [near, far] = [Infinity, 0];
-    for (const [place, corners] of this.#places(pose)) {
+    for (const [place, corners] of this.#places()) {
       for (const [x, y, z] of corners) {
         const depth = place[8] * x + place[9] * y + place[10] * z + place[11];
         near = Math.min(near, depth);
@@ -273,13 +192,19 @@ export class Ghost {
       }
     }
     near = Math.max(1, 0.95 * near);
-    this.shared.view.value.fromArray(glView(pose));
     this.shared.projection.value.fromArray(glProjection(camera, window, near, Math.max(1.05 * far, near + 1)));
-    const eye = eyeInModel(pose);
-    for (const { lines, edges, moved } of this.components) {
-      if (lines.visible) chooseLines(lines.geometry, edges, eye);
-      if (!moved?.isShown) continue;
-      const place = multiplied(pose, moved.place);
+    for (const part of this.parts) {
+      if (!part.pose) continue;
+      part.view.value.fromArray(glView(part.pose));
+      part.eye = eyeInModel(part.pose);
+    }
+    for (const component of this.components) {
+      const { part, surface, number, lines, edges, moved } = component, isShown = Boolean(part.pose) && component.isShown;
+      surface.visible = number.visible = isShown;
+      lines.visible = isShown && component.hasLines;
+      if (lines.visible) chooseLines(lines.geometry, edges, part.eye);
+      if (!part.pose || !moved?.isShown) continue;
+      const place = multiplied(part.pose, moved.place);
       moved.view.value.fromArray(glView(place));
       chooseLines(moved.lines.geometry, edges, eyeInModel(place));
     }
@@ -288,13 +213,13 @@ export class Ghost {
   }
 
   /**
-   * Bounding box [x, y, width, height] of the model in a drawing, `height` rows high, of a window of the image plane; y
+   * Bounding box [x, y, width, height] of the models in a drawing, `height` rows high, of a window of the image plane; y
    * counts from below as in GL. It limits the drawing.
    */
-  #box(camera, pose, window, height, isDistorted) {
+  #box(camera, window, height, isDistorted) {
     const scale = height / window.height, reach = { left: Infinity, top: Infinity, right: -Infinity, bottom: -Infinity };
     const all = [0, 0, Math.ceil(window.width * scale), height];
-    for (const [place, corners] of this.#places(pose)) {
+    for (const [place, corners] of this.#places()) {
       for (const corner of corners) {
         const [x, y, z] = toCam(place, corner);
         const pixel = isDistorted ? camera.project([x, y, z]) : z > 1 && [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy];
@@ -316,8 +241,9 @@ export class Ghost {
   }
 
   /** Pairs of a pose and the corners of a component that is drawn at it. */
-  *#places(pose) {
-    for (const { corners_in_model: corners, moved } of this.components) {
+  *#places() {
+    for (const { part: { pose }, corners_in_model: corners, moved } of this.components) {
+      if (!pose) continue;
       yield [pose, corners];
       if (moved?.isShown) yield [multiplied(pose, moved.place), corners];
     }
@@ -326,8 +252,8 @@ export class Ghost {
   /** Draw a component at a second place, or no longer. */
   #move(component, { ghost, edges, isShown, place, placeAlpha }) {
     if (place && !component.moved) {
-      const view = { value: new THREE.Matrix4() }, surface = new THREE.Mesh(component.surface.geometry, this.#surfaceMaterial({ view }));
-      const lines = new THREE.Mesh(lineGeometry(component.edges), this.#lineMaterial([1, 1, 1, 1], { view }));
+      const view = { value: new THREE.Matrix4() }, surface = new THREE.Mesh(component.surface.geometry, this.#surfaceMaterial({ view, dimming: component.part.dimming }));
+      const lines = new THREE.Mesh(lineGeometry(component.edges), this.#lineMaterial([1, 1, 1, 1], { view, dimming: component.part.dimming }));
       for (const mesh of [surface, lines]) mesh.frustumCulled = false;
       this.model.add(surface, lines);
       component.moved = { surface, lines, view };
@@ -380,24 +306,16 @@ export class Ghost {
     }
   }
 
-  #component(given, index) {
-    const corners = given.attributes.position.array;
-    const order = given.index?.array ?? Uint32Array.from({ length: corners.length / 3 }, (_, i) => i);
-    const { positions, indices } = welded(corners, order);
-    const geometry = new THREE.BufferGeometry();
-    geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
-    geometry.setIndex(new THREE.BufferAttribute(indices, 1));
-    geometry.computeBoundingBox();
-    const { min, max } = geometry.boundingBox;
-    const surface = new THREE.Mesh(geometry, this.#surfaceMaterial());
-    const edges = new MeshEdges(positions, indices);
-    const lines = new THREE.Mesh(lineGeometry(edges), this.#lineMaterial([1, 1, 1, 1]));
-    const number = new THREE.Mesh(geometry, this.#numberMaterial(index + 1));
+  #component({ geometry, edges }, part, index) {
+    const { min, max } = geometry.boundingBox, own = { view: part.view, dimming: part.dimming };
+    const surface = new THREE.Mesh(geometry, this.#surfaceMaterial(own));
+    const lines = new THREE.Mesh(lineGeometry(edges), this.#lineMaterial([1, 1, 1, 1], own));
+    const number = new THREE.Mesh(geometry, this.#numberMaterial(index + 1, own));
     for (const mesh of [surface, lines, number]) mesh.frustumCulled = false;
     this.model.add(surface, lines);
     this.numbers.add(number);
     return {
-      surface, lines, number, edges,
+      part, surface, lines, number, edges, isShown: true, hasLines: true,
       center_in_model: [(min.x + max.x) / 2, (min.y + max.y) / 2, (min.z + max.z) / 2],
       corners_in_model: [0, 1, 2, 3, 4, 5, 6, 7].map((k) => [
         (k & 1 ? max : min).x, (k & 2 ? max : min).y, (k & 4 ? max : min).z,
@@ -424,8 +342,8 @@ export class Ghost {
     return this.#material(LINE_VERTEX, LINE_FRAGMENT, uniforms, { ...OVER, depthWrite: false });
   }
 
-  #numberMaterial(number) {
-    const uniforms = { ...this.shared, number: { value: new THREE.Vector2((number & 255) / 255, (number >> 8) / 255) } };
+  #numberMaterial(number, own) {
+    const uniforms = { ...this.shared, ...own, number: { value: new THREE.Vector2((number & 255) / 255, (number >> 8) / 255) } };
     return this.#material(SURFACE_VERTEX, NUMBER_FRAGMENT, uniforms, { blending: THREE.NoBlending });
   }
 
@@ -453,6 +371,24 @@ const OVER = {
   blendSrcAlpha: THREE.OneFactor,
   blendDstAlpha: THREE.OneMinusSrcAlphaFactor,
 };
+
+/** Geometry and edges of the components of a GLB, in which component i is node c<i>. */
+async function shapesOf(buffer, count) {
+  const gltf = await new THREE.GLTFLoader().parseAsync(buffer, "");
+  gltf.scene.updateMatrixWorld(true);
+  return Array.from({ length: count }, (_, i) => {
+    const mesh = gltf.scene.getObjectByName(`c${i}`);
+    if (!mesh?.isMesh) throw new Error(`the model has no component ${i}`);
+    const given = mesh.geometry.applyMatrix4(mesh.matrixWorld), corners = given.attributes.position.array;
+    const order = given.index?.array ?? Uint32Array.from({ length: corners.length / 3 }, (_, k) => k);
+    const { positions, indices } = welded(corners, order);
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+    geometry.setIndex(new THREE.BufferAttribute(indices, 1));
+    geometry.computeBoundingBox();
+    return { geometry, edges: new MeshEdges(positions, indices) };
+  });
+}
 
 /** Four corners for each line; `corner` is (1 at the start or -1 at the end, side). chooseLines sets the index. */
 function lineGeometry({ starts, ends, count }) {

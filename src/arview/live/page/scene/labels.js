@@ -1,4 +1,5 @@
-// HTML labels beside the part with leader lines, and displacement arrows, drawn over the picture.
+// HTML labels beside the parts with leader lines, and displacement arrows, drawn over the picture. The labels of all parts
+// are laid out together.
 
 import { icon, make } from "../icons.js";
 import { LabelLayout } from "./layout.js";
@@ -17,24 +18,25 @@ const STUB_PX = 10, SIGN_PX = 24, ARROW_HEAD_PX = 11;
 
 export class Labels {
   #layout = new LabelLayout();
-  #labels = new Map(); // name → {element, leader, dot, sign, pointer, width, height, isShown, key}
+  #labels = new Map(); // number of the component → {element, leader, dot, sign, pointer, width, height, isShown, key}
   #arrows = new Map();
   #integral = null;
   #visible = null;
 
-  /** @param onPick called with the name of a component whose label was pressed. */
+  /** @param onPick called with name and part of a component whose label was pressed. */
   constructor(box, svg, onPick) {
     Object.assign(this, { box, svg, onPick });
-    this.part = null;
+    this.parts = [];
+    this.tags = []; // names of the parts at their centres, where there are several
     this.banner = make("div", "banner", [], { role: "alert" });
     this.legend = make("div", "legend");
     this.banner.hidden = this.legend.hidden = true;
     box.append(this.banner, this.legend);
   }
 
-  /** Set the part document; all labels are created again. */
-  setPart(part, centersInModel) {
-    this.part = part;
+  /** Set the parts; all labels are created again. The components of all of them are numbered through. */
+  setParts(parts, centersInModel) {
+    this.parts = parts;
     this.centers = centersInModel;
     this.clear();
     for (const label of this.#labels.values()) {
@@ -43,22 +45,31 @@ export class Labels {
     for (const arrow of this.#arrows.values()) arrow.remove();
     this.#labels.clear();
     this.#arrows.clear();
-    this.all = part.components.map((component, index) => ({ ...component, index }));
+    this.all = parts.flatMap((part) => part.components.map((component) => ({ ...component, part: part.id })));
+    this.all.forEach((component, index) => { component.index = index; });
     for (const component of this.all) this.#add(component);
-    this.setEvidence({ labels: new Map(), withheld: null, legend: [] });
+    for (const tag of this.tags) tag.remove();
+    this.tags = parts.length > 1 ? parts.map(tagOf) : [];
+    this.box.prepend(...this.tags);
+    this.setEvidence({ labels: new Map(), withheld: [], legend: [] });
   }
 
-  /** Set what the pictures say: {labels: by the number of the component, withheld, legend}, see Pose in the protocol. */
+  /** Set what the pictures say: {labels: by the number of the component, withheld: by part, legend}, see Pose in the protocol. */
   setEvidence({ labels, withheld, legend }) {
     const rank = (component) => component.rank ?? Infinity;
     const isRefuted = (component) => REFUTED.includes(labels.get(component.index)?.evidence);
     this.seen = labels;
     this.withheld = withheld;
+    // Of several parts the urgent components come first, the others in turns, so that each part gets its share of the room.
+    const isLater = (component) => this.parts.length > 1 && !this.#isUrgent(component);
     this.inspected = this.all.filter((component) => component.rank !== null || isRefuted(component))
-      .sort((a, b) => isRefuted(b) - isRefuted(a) || rank(a) - rank(b));
+      .sort((a, b) => isRefuted(b) - isRefuted(a) || isLater(a) - isLater(b) || rank(a) - rank(b));
     for (const component of this.all) this.#fill(component);
-    this.banner.hidden = !withheld;
-    this.banner.replaceChildren(...(withheld ? [make("b", "", [withheld.title]), make("span", "", [withheld.text])] : []));
+    const reasons = withheld.flatMap((one, id) => (one ? [[id, one]] : []));
+    this.banner.hidden = !reasons.length;
+    this.banner.replaceChildren(...reasons.map(([id, { title, text }]) => {
+      return make("div", "", [make("b", "", [...this.#mark(id), title]), make("span", "", [text])]);
+    }));
     this.legend.hidden = !legend.length;
     this.legend.replaceChildren(...legend.map(({ kind, text }) => make("span", "", [make("i", `swatch ${kind}`), text])));
   }
@@ -72,7 +83,7 @@ export class Labels {
         const number = cells[row * columns + column];
         if (number) {
           counts.set(number - 1, (counts.get(number - 1) ?? 0) + 1);
-          sum += this.part.components[number - 1]?.rank === null ? CONTEXT_WEIGHT : 1;
+          sum += this.all[number - 1]?.rank === null ? CONTEXT_WEIGHT : 1;
         }
         integral[(row + 1) * (columns + 1) + column + 1] = integral[row * (columns + 1) + column + 1] + sum;
       }
@@ -99,13 +110,13 @@ export class Labels {
   }
 
   /**
-   * Place labels and arrows for a pose.
+   * Place labels and arrows for the poses of a frame.
    * @param place {left, top, scale} position of the picture on the stage: CSS px = left + scale * (u + 0.5).
    * @param area {left, top, width, height} that labels may use, CSS px.
    */
-  update(pose, place, area, { labels, only }, glides) {
-    const toScreen = (point) => {
-      const pixel = pose.lens.project(toCam(pose.cam_from_model, point));
+  update(pose, place, area, { labels, only, only_part }, glides) {
+    const toScreen = (part, point) => {
+      const { cam_from_model } = pose.parts[part], pixel = cam_from_model && pose.lens.project(toCam(cam_from_model, point));
       return pixel && [place.left + place.scale * (pixel[0] + 0.5), place.top + place.scale * (pixel[1] + 0.5)];
     };
     const picture = {
@@ -113,7 +124,8 @@ export class Labels {
       bottom: place.top + place.scale * pose.lens.height,
     };
     this.box.classList.remove("empty");
-    const wanted = this.withheld ? [] : this.inspected.filter((component) => !only || component.name === only);
+    const wanted = this.inspected.filter(({ name, part }) => !this.withheld[part] && (!only || (name === only && part === only_part)));
+    const tags = this.#putTags(toScreen, picture);
     this.#drawArrows(wanted.filter(({ index }) => !this.seen.has(index)), toScreen);
     this.banner.style.top = `${Math.max(area.top, picture.top) + 8}px`;
     if (!this.legend.hidden) {
@@ -132,25 +144,26 @@ export class Labels {
     const requests = [], signs = new Map();
     for (const label of this.#labels.values()) label.pointer.setAttribute("visibility", "hidden");
     for (const component of labels ? wanted : []) {
-      let anchor = toScreen(component.anchor_in_model);
-      const label = this.#labels.get(component.name), outside = anchor && !isInside(anchor, picture) && this.#isUrgent(component);
+      let anchor = toScreen(component.part, component.anchor_in_model);
+      const label = this.#labels.get(component.index), outside = anchor && !isInside(anchor, picture) && this.#isUrgent(component);
       if (outside) anchor = this.#pointOut(label, anchor, picture);
       this.#pointHere(label, component, outside, toScreen);
       if (!anchor || !isInside(anchor, picture) || !this.#isLabelled(component)) continue;
-      if (!outside) signs.set(component.name, anchor);
+      if (!outside) signs.set(component.index, anchor);
       if (requests.length === maxLabels) continue;
       if (!label.width) [label.width, label.height] = [label.element.offsetWidth, label.element.offsetHeight];
-      requests.push({ key: component.name, width: label.width, height: label.height, x: anchor[0], y: anchor[1] });
+      requests.push({ key: component.index, width: label.width, height: label.height, x: anchor[0], y: anchor[1] });
     }
     const covered = (left, top, width, height) => this.#covered(place, left, top, width, height);
     const placed = this.#layout.place(area, requests, this.#extent(place, requests), covered, glides);
     const anchors = new Map(requests.map((one) => [one.key, one]));
     const names = new Set(placed.map((one) => one.key));
     const taken = []; // signs must not overlap; the more urgent one stays
-    for (const [name, label] of this.#labels) {
-      if (!names.has(name)) show(label, false);
-      const sign = names.has(name) ? null : signs.get(name);
-      if (sign && taken.some((other) => Math.hypot(other[0] - sign[0], other[1] - sign[1]) < SIGN_PX)) {
+    for (const [index, label] of this.#labels) {
+      if (!names.has(index)) show(label, false);
+      const sign = names.has(index) ? null : signs.get(index);
+      const isOnTag = sign && !this.#isUrgent(this.all[index]) && tags.some((tag) => isInside(sign, tag));
+      if (isOnTag || (sign && taken.some((other) => Math.hypot(other[0] - sign[0], other[1] - sign[1]) < SIGN_PX))) {
         label.sign.classList.add("off");
         continue;
       }
@@ -168,28 +181,28 @@ export class Labels {
 
   #add(component) {
     const element = make("button", "label", [], { tabindex: "-1" });
-    element.addEventListener("click", () => this.onPick(component.name));
+    element.addEventListener("click", () => this.onPick(component.name, component.part));
     const [leader, dot, pointer] = ["path", "circle", "path"].map((tag) => document.createElementNS(SVG, tag));
     // Where there is no room for the label, its sign is shown on the component.
     const sign = make("button", "sign off", [], { tabindex: "-1" });
-    sign.addEventListener("click", () => this.onPick(component.name));
+    sign.addEventListener("click", () => this.onPick(component.name, component.part));
     this.box.append(element, sign);
     this.svg.append(leader, dot, pointer);
     const label = { element, leader, dot, sign, pointer, width: 0, height: 0, isShown: true, key: null };
     show(label, false);
-    this.#labels.set(component.name, label);
+    this.#labels.set(component.index, label);
     const hasArrow = component.displacement_mm && component.distance_mm > (component.uncertainty_mm ?? 0);
     if (component.verdict !== "pass" && hasArrow) {
       const arrow = document.createElementNS(SVG, "path");
       arrow.classList.add("arrow");
       this.svg.append(arrow);
-      this.#arrows.set(component.name, arrow);
+      this.#arrows.set(component.index, arrow);
     }
   }
 
   /** Write the texts of a label: those of the inspection, or what the pictures say instead. */
   #fill(component) {
-    const seen = this.seen.get(component.index), label = this.#labels.get(component.name), key = JSON.stringify(seen ?? null);
+    const seen = this.seen.get(component.index), label = this.#labels.get(component.index), key = JSON.stringify(seen ?? null);
     if (label.key === key) return;
     label.key = key;
     label.width = 0;
@@ -200,7 +213,7 @@ export class Labels {
     const what = [make("span", "verdict", [seen?.word ?? component.verdict_text ?? ""])];
     if (u !== null && (seen || !detail)) what.unshift(make("span", "u", [`U ${u.toFixed(2)}`]));
     if (value) what.unshift(make("span", "value", [value]));
-    const rows = [make("span", "who", [icon(kind), middled(component.name)]), make("span", "what", what)];
+    const rows = [make("span", "who", [...this.#mark(component.part), icon(kind), middled(component.name)]), make("span", "what", what)];
     if (detail) rows.push(make("span", "detail", [detail]));
     label.element.replaceChildren(...rows);
     label.sign.replaceChildren(icon(kind));
@@ -228,10 +241,10 @@ export class Labels {
   }
 
   /** Arrow from the nominal place of a displaced component to where it is seen. */
-  #pointHere(label, { index }, outside, toScreen) {
+  #pointHere(label, { index, part }, outside, toScreen) {
     const place = this.seen.get(index)?.model_from_nominal;
     if (outside || !place) return;
-    const [from, to] = [this.centers[index], toCam(place, this.centers[index])].map(toScreen);
+    const [from, to] = [this.centers[index], toCam(place, this.centers[index])].map((point) => toScreen(part, point));
     if (!from || !to || Math.hypot(to[0] - from[0], to[1] - from[1]) < 4) return;
     label.pointer.setAttribute("visibility", "visible");
     label.pointer.setAttribute("d", arrowPath(from, to));
@@ -290,15 +303,44 @@ export class Labels {
     dot.setAttribute("r", 4.5);
   }
 
+  /** The mark of a part in its colour, where there are several. */
+  #mark(id) {
+    if (this.parts.length < 2) return [];
+    const made = make("span", "mark", [this.parts[id].mark]);
+    made.style.color = this.parts[id].tag_color;
+    return [made];
+  }
+
+  /**
+   * Put the names of several parts at their centres; where they would overlap, the later one stands below.
+   * @returns the boxes in which signs would cover them.
+   */
+  #putTags(toScreen, { left, top, right, bottom }) {
+    const taken = [];
+    for (const [id, tag] of this.tags.entries()) {
+      const center = toScreen(id, this.parts[id].part.center_in_model);
+      tag.classList.toggle("off", !center);
+      if (!center) continue;
+      const width = tag.offsetWidth, height = tag.offsetHeight;
+      const x = clamp(center[0] - width / 2, left, Math.max(left, right - width));
+      let y = clamp(center[1] - height / 2, top, Math.max(top, bottom - height));
+      for (const one of taken) if (Math.abs(one.x - x) < Math.max(one.width, width) && Math.abs(one.y - y) < height) y = one.y + height + 2;
+      taken.push({ x, y, width, height });
+      tag.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
+    }
+    const reach = SIGN_PX / 2;
+    return taken.map(({ x, y, width, height }) => ({ left: x - reach, top: y - reach, right: x + width + reach, bottom: y + height + reach }));
+  }
+
   #drawArrows(wanted, toScreen) {
-    const shown = new Set(wanted.map((one) => one.name));
+    const shown = new Set(wanted.map((one) => one.index));
     for (const component of this.inspected) {
-      const arrow = this.#arrows.get(component.name);
+      const arrow = this.#arrows.get(component.index);
       if (!arrow) continue;
       const tail = this.centers[component.index];
-      const tip = tail.map((value, k) => value + this.part.arrow_scale * (component.displacement_mm[k] ?? 0));
-      const [from, to] = [toScreen(tail), toScreen(tip)];
-      const isDrawn = shown.has(component.name) && from && to && Math.hypot(to[0] - from[0], to[1] - from[1]) > 4;
+      const tip = tail.map((value, k) => value + this.parts[component.part].arrow_scale * (component.displacement_mm[k] ?? 0));
+      const [from, to] = [toScreen(component.part, tail), toScreen(component.part, tip)];
+      const isDrawn = shown.has(component.index) && from && to && Math.hypot(to[0] - from[0], to[1] - from[1]) > 4;
       arrow.setAttribute("visibility", isDrawn ? "visible" : "hidden");
       if (isDrawn) arrow.setAttribute("d", arrowPath(from, to));
     }
@@ -317,6 +359,13 @@ function arrowPath([x0, y0], [x1, y1]) {
 function middled(name) {
   const letters = [...name], kept = Math.min(TAIL_LETTERS, letters.length >> 1);
   return make("b", "", [make("span", "", [letters.slice(0, letters.length - kept).join("")]), make("span", "", [letters.slice(letters.length - kept).join("")])]);
+}
+
+/** The tag with mark and name of a part. */
+function tagOf({ mark, name, tag_color }) {
+  const tag = make("span", "tag off", [`${mark} ${name}`]);
+  tag.style.color = tag_color;
+  return tag;
 }
 
 function show(label, isShown) {

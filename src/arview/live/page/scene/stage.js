@@ -3,6 +3,7 @@
 import { CANVAS_OPTIONS } from "../graphics.js";
 import { Ghost } from "./ghost.js";
 import { Labels } from "./labels.js";
+import { partsOf } from "../transport/api.js";
 
 const MAX_CANVAS_PX = 1600; // longer side; larger canvases cost time without visible benefit
 const VISIBILITY_EVERY_MS = 150;
@@ -14,6 +15,7 @@ const DIMMED = 0.45; // factor of the opacity of ghosts that the pictures do not
 const PATTERNS = { missing: 2, displaced: 1 };
 const ROOMY = 0.8; // the picture avoids the bars if it keeps this fraction of its size
 const MARGIN_PX = 8;
+const NO_EVIDENCE = { key: "", labels: new Map(), legend: [], withheld: [] };
 
 export class Stage {
   #visibilityMs = -Infinity;
@@ -23,7 +25,7 @@ export class Stage {
 
   /**
    * @param elements {stage, canvas, leaders, labels, obstacles: [bar, notices, actions, card, side]}
-   * @param onPick called with the name of a component that was pressed in the picture, or null for a press beside all of them.
+   * @param onPick called with name and part of a component that was pressed in the picture, or null for a press beside all.
    * @param onResize called when everything has to be redrawn.
    */
   constructor(elements, style, onPick, onResize) {
@@ -34,7 +36,7 @@ export class Stage {
       this.ghost = null;
       this.context = this.canvas.getContext("2d", CANVAS_OPTIONS);
     }
-    this.part = null;
+    this.components = null; // of all parts, with the number of their part
     this.isChanged = true; // whether style, part or window have changed since the last drawing
     this.labelBoxes = new Labels(this.labels, this.leaders, onPick);
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
@@ -50,14 +52,15 @@ export class Stage {
   }
 
   /** Set the part document. */
-  setPart(part) {
-    this.part = part;
-    if (this.ghost?.components.length === part.components.length) this.#arrange();
+  setPart(document) {
+    this.parts = partsOf(document);
+    this.components = this.parts.flatMap((part) => part.components.map((one) => ({ ...one, part: part.id })));
+    if (this.ghost?.components.length === this.components.length) this.#arrange();
   }
 
-  /** Set the CAD model. */
-  async setModel(buffer, part) {
-    await this.ghost?.load(buffer, part.components.length);
+  /** Set the CAD models of the parts, one for each. */
+  async setModels(buffers, document) {
+    await this.ghost?.load(partsOf(document).map(({ components }, id) => ({ buffer: buffers[id], count: components.length })));
     this.#arrange();
   }
 
@@ -81,7 +84,7 @@ export class Stage {
     this.isChanged = false;
     if (!frame) return this.labelBoxes.hide();
     this.#lay(frame);
-    const isReady = this.ghost?.components.length > 0 && this.part !== null;
+    const isReady = this.ghost?.components.length > 0 && this.components !== null;
     const ownPose = isReady && pose && !isAnnotated && frame.width === pose.lens.width && frame.height === pose.lens.height ? pose : null;
     const ownGuide = isReady && guide && frame.width === guide.lens.width ? guide : null;
     if (ownPose) this.#takeEvidence(ownPose);
@@ -89,14 +92,15 @@ export class Stage {
       this.context.drawImage(frame.canvas, 0, 0, this.canvas.width, this.canvas.height);
     } else {
       this.ghost.draw({
-        source: frame.canvas, pose: ownPose?.cam_from_model ?? null,
+        source: frame.canvas,
+        poses: (ownPose?.parts ?? []).map((one) => ({ cam_from_model: one.cam_from_model, isCritical: one.state === "critical" })),
         guide: ownPose ? null : ownGuide?.guide_cam_from_model ?? null,
-        camera: (ownPose ?? ownGuide)?.lens, isCritical: ownPose?.state === "critical",
+        camera: (ownPose ?? ownGuide)?.lens,
         lineWidth: (LINE_CSS_PX * this.canvas.width) / this.#size.width,
       });
     }
     this.#drawn = ownPose;
-    if (!ownPose?.cam_from_model) return this.labelBoxes.hide();
+    if (!ownPose?.isPosed) return this.labelBoxes.hide();
     const nowMs = performance.now();
     if (nowMs - this.#visibilityMs > VISIBILITY_EVERY_MS) {
       this.#visibilityMs = nowMs;
@@ -106,40 +110,48 @@ export class Stage {
   }
 
   #drawn = null;
-  #evidence = { key: "", labels: new Map(), withheld: null };
+  #evidence = NO_EVIDENCE;
 
-  /** Take over what a pose says of the components, where it has changed. */
-  #takeEvidence({ labels, withheld, legend }) {
-    const key = JSON.stringify([labels, withheld]);
+  /** Take over what a pose says of the components, where it has changed; they are numbered through all parts. */
+  #takeEvidence({ parts }) {
+    const key = JSON.stringify(parts.map(({ labels, withheld }) => [labels, withheld]));
     if (key === this.#evidence.key) return;
-    this.#evidence = { key, withheld, legend, labels: new Map(labels.map((one) => [one.index, one])) };
+    const labels = new Map(), legend = new Map();
+    let first = 0;
+    for (const [id, part] of parts.entries()) {
+      for (const one of part.labels) labels.set(first + one.index, one);
+      for (const one of part.legend) legend.set(one.kind, one);
+      first += this.parts[id].components.length;
+    }
+    this.#evidence = { key, labels, legend: [...legend.values()], withheld: parts.map((one) => one.withheld) };
     this.ghost.style(this.#styles());
     this.labelBoxes.setEvidence(this.#evidence);
   }
 
   #arrange() {
     this.isChanged = true;
-    this.#evidence = { key: "", labels: new Map(), withheld: null };
-    this.labelBoxes.setPart(this.part, this.ghost?.components.map((one) => one.center_in_model) ?? []);
+    this.#evidence = NO_EVIDENCE;
+    this.labelBoxes.setParts(this.parts, this.ghost?.components.map((one) => one.center_in_model) ?? []);
     this.ghost?.style(this.#styles());
   }
 
   #styles() {
-    const { ghost, edges, opacity, only } = this.style, isInspected = this.part.inspection !== null;
-    const { labels, withheld } = this.#evidence;
-    return this.part.components.map((one, index) => {
+    const { ghost, edges, opacity, only, only_part } = this.style, { labels } = this.#evidence;
+    return this.components.map((one, index) => {
+      const { inspection, tag_color } = this.parts[one.part], isInspected = inspection !== null;
+      const withheld = this.#evidence.withheld[one.part], isOnly = only === one.name && only_part === one.part;
       const seen = labels.get(index), pattern = PATTERNS[seen?.evidence] ?? 0;
       const isContext = (isInspected && one.verdict === null && !pattern) || withheld;
-      const color = rgb(isContext ? CONTEXT : seen?.color ?? one.verdict_color ?? NEUTRAL);
-      let alpha = only === one.name || one.verdict !== "pass" ? opacity : opacity * PASS_DIMMING;
+      const color = rgb(isContext ? CONTEXT : seen?.color ?? one.verdict_color ?? tag_color ?? NEUTRAL);
+      let alpha = isOnly || one.verdict !== "pass" ? opacity : opacity * PASS_DIMMING;
       if (pattern) alpha = HATCH_ALPHA;
       else if (seen?.is_dimmed) alpha *= DIMMED;
-      if (!ghost || withheld || (isContext && only !== one.name)) alpha = 0;
+      if (!ghost || withheld || (isContext && !isOnly)) alpha = 0;
       const edgeAlpha = edges === "none" ? 0 : isContext && !withheld ? CONTEXT_ALPHA : 1;
       return {
         ghost: [...color, alpha],
         edges: [...color.map((value) => 0.75 * value + 0.25), edgeAlpha],
-        isShown: !only || only === one.name,
+        isShown: !only || isOnly,
         pattern: withheld ? 0 : pattern,
         isDashed: !withheld && ["unverified", "uncertain", "displaced"].includes(seen?.evidence),
         place: withheld ? null : seen?.model_from_nominal ?? null,
@@ -183,12 +195,12 @@ export class Stage {
     for (let r = Math.floor(row) - reach; r <= row + reach; r++) {
       for (let c = Math.floor(column) - reach; c <= column + reach; c++) {
         if (r < 0 || c < 0 || r >= rows || c >= columns) continue;
-        const component = this.part.components[cells[r * columns + c] - 1];
+        const component = this.components[cells[r * columns + c] - 1];
         const distance = Math.hypot(c + 0.5 - column, r + 0.5 - row);
-        if (component && component.rank !== null && distance < nearest && distance <= reach) [best, nearest] = [component.name, distance];
+        if (component && component.rank !== null && distance < nearest && distance <= reach) [best, nearest] = [component, distance];
       }
     }
-    this.onPick(best);
+    this.onPick(best?.name ?? null, best?.part ?? 0);
   }
 }
 

@@ -40,7 +40,10 @@ export async function ask(path, { method = "GET", json, body, headers = {}, keep
 }
 
 export const getPart = async () => (await ask("/api/part")).json();
-export const getModel = async () => (await ask("/api/model.glb")).arrayBuffer();
+export const getModel = async (id) => (await ask(`/api/model.glb?part=${id}`)).arrayBuffer();
+
+/** The parts of a *Part* or *Pose* document: their list, or the document itself where there is only one. */
+export const partsOf = (document) => document.parts ?? [{ ...document, id: 0 }];
 
 const CLIENT_KEY = "arview-client";
 

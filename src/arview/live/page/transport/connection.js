@@ -1,6 +1,6 @@
 // The connection to the server: choice of the transport, reconnection after failures, and messages about both.
 
-import { Refusal, control, getModel, getPart } from "./api.js";
+import { Refusal, control, getModel, getPart, partsOf } from "./api.js";
 import { JpegLink } from "./jpeg.js";
 import { NoWebrtc, WebrtcLink } from "./webrtc.js";
 
@@ -14,7 +14,8 @@ export class Connection {
   hasGhost = true; // whether this page can draw the overlay
   status = null;
   #part = null;
-  #modelHash = null;
+  #models = new Map(); // GLB by the hash of the model
+  #shownModels = "";
   #isWebrtcBlocked = false;
   #isOver = false;
   #skipPause = () => {};
@@ -22,7 +23,7 @@ export class Connection {
 
   /**
    * @param video element for the video that the server sends.
-   * @param events {onPhase({name, text, inS}), onPart(part), onModel(buffer, part), onOpen(link), onPose, onStatus,
+   * @param events {onPhase({name, text, inS}), onPart(part), onModels(buffers, part), onOpen(link), onPose, onStatus,
    *     onFrame}. Names of phases: loading, connecting, connected, retrying, busy, denied.
    */
   constructor(video, events) {
@@ -130,10 +131,11 @@ export class Connection {
     if (part.state === "failed") throw new Refusal(503, "failed", part.text);
     this.#part = part;
     this.events.onPart(part);
-    if (part.part.model_hash !== this.#modelHash) {
-      await this.events.onModel(await getModel(), part);
-      this.#modelHash = part.part.model_hash;
-    }
+    const hashes = partsOf(part).map((one) => one.part.model_hash);
+    if (hashes.join() === this.#shownModels) return;
+    for (const [id, hash] of hashes.entries()) if (!this.#models.has(hash)) this.#models.set(hash, await getModel(id));
+    await this.events.onModels(hashes.map((hash) => this.#models.get(hash)), part);
+    this.#shownModels = hashes.join();
   }
 
   /** Connect until the connection ends; returns the reason, or null when another transport was chosen. */

@@ -1,0 +1,53 @@
+"""The live page in a browser: opening it, waiting for it, and what it has drawn."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from helpers.live_client import Running
+
+TIMEOUT_S = 120.0
+"""Chromium without a GPU, the tracker and the tests share two cores."""
+VIEWPORT = {"width": 680, "height": 640}
+"""Here the picture is shown a little larger than it is."""
+
+
+@contextmanager
+def opened(chromium: Any, server: Running, script: str = "", viewport: dict[str, int] = VIEWPORT) -> Iterator[Any]:
+    """The open page; at the end it is checked that it raised no errors."""
+    context = chromium.new_context(viewport=viewport, accept_downloads=True)
+    page = context.new_page()
+    troubles: list[str] = []
+    page.on("pageerror", lambda error: troubles.append(f"error: {error}"))
+    page.on("console", lambda said: troubles.append(said.text) if "Content Security" in said.text else None)
+    if script:
+        page.add_init_script(script)
+    try:
+        page.goto(f"http://127.0.0.1:{server.port}/?token={server.token}")
+        yield page
+    finally:
+        context.close()
+    assert not troubles
+
+
+def until(page: Any, condition: str | Callable[[], Any], timeout_s: float = TIMEOUT_S) -> Any:
+    """Wait until an expression of the page, or a function, is true; returns its value."""
+    end_s = time.monotonic() + timeout_s
+    while True:
+        value = page.evaluate(condition) if isinstance(condition, str) else condition()
+        if value:
+            return value
+        if time.monotonic() > end_s:
+            state = page.inner_text("#state"), page.inner_text("#link-state"), page.inner_text("#message")
+            raise AssertionError(f"not within {timeout_s:.0f} s: {condition}; the page says {state}")
+        page.wait_for_timeout(150)
+
+
+WATCH = """
+window.drawn = null;
+window.draws = 0;
+document.addEventListener("arview:drawn", (event) => { window.drawn = event.detail; window.draws += 1; });
+"""
