@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from pathlib import Path
 
@@ -50,6 +51,21 @@ def test_named_solids_keep_the_places_of_their_product(unit: str, tmp_path: Path
     # (20, 20, 8) to (30, 30, 48), moved by (1, 2, 3), turned by a quarter about z, moved by (100, 0, 5).
     bounds = model.component("right/fixture/pin left").bounds_in_model
     np.testing.assert_allclose(bounds, [[68, 21, 16], [78, 31, 56]], atol=1e-4)
+
+
+def test_products_in_other_files_are_told(tmp_path: Path) -> None:
+    sub = StepAssembly("sub", [("pin", StepPart("pin"), np.eye(4))])
+    places = [("plate", StepPart("plate", (50.0, 40.0, 5.0)), np.eye(4)), ("sub", sub, np.eye(4))]
+    path = StepWriter().write(tmp_path / "a.step", StepAssembly("root", places))
+    assert load_cad(path).notes == ()
+    text = path.read_text()
+    _, pin = re.finditer(r"ADVANCED_BREP_SHAPE_REPRESENTATION\('',\((#\d+),#\d+\)", text)
+    path.write_text(text.replace(pin[0], f"SHAPE_REPRESENTATION('',({pin[1]})"))
+    cad = load_cad(path)
+    assert [c.name for c in cad.model.components] == ["plate"]
+    assert len(cad.notes) == 1
+    assert "1 products of the STEP file have no shape in it and are left out" in cad.notes[0]
+    assert cad.notes[0].endswith(": pin")
 
 
 @pytest.mark.slow

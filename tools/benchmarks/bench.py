@@ -23,6 +23,7 @@ from arview.evaluation import Scene, evaluate_scene, scene_guide_views
 from arview.guideviews import GuideViewOptions, load_guide_views, make_guide_views
 from arview.tracking import SessionOptions
 from recordings import SAMPLE, sample_command, scenes, skip, table
+from suites.lenses import lens_errors
 from suites.live_latency import live_latencies
 from suites.registration import MEASURED, REFERENCE, registrations
 
@@ -35,16 +36,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     parser.add_argument(
-        "--only", choices=["guideviews", "track", "detect", "annotate", "register", "live"], help="only this section"
+        "--only",
+        choices=["guideviews", "track", "detect", "annotate", "register", "lenses", "live"],
+        help="only this section",
     )
     chosen = parser.parse_args()
-    found = scenes()
+    found: dict[str, Scene] = {} if chosen.only in ("register", "lenses") else scenes()
     sections = {
         "guideviews": lambda: bench_guide_views(found),
         "track": lambda: bench_tracking(found),
         "detect": lambda: bench_detection(found),
         "annotate": bench_annotate,
         "register": bench_registration,
+        "lenses": bench_lenses,
         "live": bench_live,
     }
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
@@ -146,6 +150,17 @@ def bench_annotate() -> tuple[dict[str, Any], list[TableRow]]:
                 raise SystemExit(f"annotate printed no frame rate: {text}")
             figures[label] = {"fps": float(match[1]), "peak_mb": peak_mb}
             rows.append((f"annotate, {label}", SAMPLE.name, f"{match[1]} fps, peak memory {peak_mb:.0f} MB"))
+    return figures, rows
+
+
+def bench_lenses() -> tuple[dict[str, Any], list[TableRow]]:
+    """Largest errors of the lens models, px, over a picture of 1280×720."""
+    figures: dict[str, Any] = {}
+    rows: list[TableRow] = []
+    for name, library, forth, back, tracked in lens_errors():
+        figures[name] = {"reference": library, "projection_px": forth, "way_back_px": back, "resampling_px": tracked}
+        text = f"{forth:.1e} px from {library}, {back:.1e} px there and back, resampled {tracked:.3f} px off"
+        rows.append((f"lens, {name}", "1280×720", text))
     return figures, rows
 
 

@@ -96,19 +96,20 @@ class Undistorter:
     Attributes:
         camera: of the pictures that are resampled.
         ideal: the pinhole camera; rays and poses are the same in both.
+        maps: OpenCV's fixed-point maps from pixels of the ideal picture to the original, of 1/32 px.
     """
 
     def __init__(self, camera: Camera, options: UndistortOptions | None = None) -> None:
         """Prepare the maps for a camera; raises InputError when its lens sees nothing in front of it."""
         self.camera = camera
         self.ideal = _covering_pinhole(camera, options or UndistortOptions())
-        self._maps = _maps(self.ideal, camera)
+        self.maps = _maps(self.ideal, camera)
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The picture (H,W,3) uint8 of the ideal camera; outside the original the nearest border goes on."""
         import cv2
 
-        resampled: NDArray[np.uint8] = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        resampled: NDArray[np.uint8] = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return resampled
 
     def to_ideal(self, pixels: Array) -> Array:

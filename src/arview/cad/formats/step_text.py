@@ -31,6 +31,7 @@ _SHAPE = re.compile(
     + _REF
     + rb"\)\s*;"
 )
+_PLACEMENT = re.compile(rb"#(\d+)\s*=\s*AXIS2_PLACEMENT_3D\s*\(")
 _SHAPE_OF = re.compile(rb"=\s*SHAPE_DEFINITION_REPRESENTATION\s*\(" + _REF + rb"," + _REF + rb"\)")
 _SAME_SHAPE = re.compile(
     rb"=\s*SHAPE_REPRESENTATION_RELATIONSHIP\s*\(" + _TEXT + rb",[^,]*," + _REF + rb"," + _REF + rb"\)"
@@ -93,6 +94,27 @@ def step_unit_mm(data: bytes, path: Path) -> float:
     if len(units) != 1 or None in units:
         raise InputError(f"{path}: its length unit is not known, so that unit cannot be overridden; leave unit out")
     return float(next(value for value in units if value is not None))
+
+
+def products_without_shape(data: bytes) -> list[str]:
+    """Names of products that assemblies use, that hold no others, and that have no shape: it is in other files."""
+    uses = [(match[2], match[3]) for match in _USE.finditer(data)]
+    if not uses:
+        return []
+    parents = {parent for parent, _ in uses}
+    placements = {m[1] for m in _PLACEMENT.finditer(data)}
+    linked = {one for m in _SAME_SHAPE.finditer(data) for one in (m[2], m[3])}
+    items = {m[1]: set(re.findall(rb"\d+", m[3])) for m in _SHAPE.finditer(data)}
+    # A representation of nothing but its own frame stands for a shape in another file.
+    empty = {one for one, held in items.items() if held <= placements and one not in linked}
+    definition_of_property = {m[1]: m[3] for m in _DEFINITION_SHAPE.finditer(data)}
+    without_shape = {definition_of_property.get(m[1]) for m in _SHAPE_OF.finditer(data) if m[2] in empty}
+    formation = {m[1]: m[3] for m in _DEFINITION.finditer(data)}
+    product = {m[1]: m[3] for m in _FORMATION.finditer(data)}
+    name = {m[1]: m[3] for m in _PRODUCT.finditer(data)}
+    missing = dict.fromkeys(child for _, child in uses if child not in parents and child in without_shape)
+    texts = [name.get(product.get(formation.get(one, b""), b""), b"'#" + one + b"'") for one in missing]
+    return [text[1:-1].decode("utf-8", errors="replace") for text in texts]
 
 
 def _check_whole(data: bytes, path: Path) -> None:
