@@ -268,7 +268,7 @@ def test_labels_and_parts_say_what_was_measured(chromium: Any, server: Running) 
         page.locator(".components button[data-name=nut_1]").evaluate("e => e.click()")
         card = page.locator("#card")
         assert all(
-            text in card.inner_text() for text in ("nut_1", "UNDECIDED", "0.45 mm", "U 0.12 mm", "tolerance 0.50 mm")
+            text in card.inner_text() for text in ("nut_1", "UNDECIDED", "0.45 mm", "U 0.12 mm", "tolerance 0.5 mm")
         )
         until(page, "document.querySelectorAll('#labels .label:not(.off), #labels .sign:not(.off)').length === 1")
         page.keyboard.press("ArrowRight")

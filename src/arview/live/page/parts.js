@@ -1,6 +1,7 @@
 // The list of components with their verdicts, and the card of the isolated component.
 
 import { icon, make } from "./icons.js";
+import { exact, rounded } from "./rounding.js";
 
 const ORDER = ["fail", "undecided", "not_measured", "measured", "pass"];
 const VERDICT_TEXTS = { fail: "FAIL", undecided: "UNDECIDED", measured: "MEASURED", not_measured: "NOT MEASURED", pass: "PASS" };
@@ -157,7 +158,7 @@ class PartList {
   #row(one) {
     const { kind, value, u, word, notes } = this.#state(one);
     const shown = make("span", "value", [value]);
-    if (u !== null) shown.append(make("small", "", [`U ${u.toFixed(2)}`]));
+    if (u !== null) shown.append(make("small", "", [`U ${rounded(u, u)}`]));
     const row = make("button", kind, [
       icon(kind.split(" ")[0]), make("span", "name", [one.name]), shown, make("span", "verdict", [[word, ...notes].join(", ")]),
     ], { "aria-pressed": "false" });
@@ -189,10 +190,10 @@ class PartList {
     const u = one.uncertainty_mm ?? 0;
     const numbers = make("p", "numbers", [
       make("span", "big", [one.value_text]),
-      make("span", "rest", [`U ${u.toFixed(2)} mm (k = 2)`, ...(one.tolerance_mm === null ? [] : [make("br"), `tolerance ${one.tolerance_mm.toFixed(2)} mm`])]),
+      make("span", "rest", [`U ${rounded(u, u)} mm (k = 2)`, ...(one.tolerance_mm === null ? [] : [make("br"), `tolerance ${exact(one.tolerance_mm)} mm`])]),
     ]);
     const axes = one.displacement_mm.map((value, k) => {
-      const text = value === null ? "?" : `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}`;
+      const text = value === null ? "?" : `${value < 0 ? "−" : "+"}${rounded(Math.abs(value), u)}`;
       return make("span", value !== null && Math.abs(value) <= u ? "small" : "", [`d${"xyz"[k]} ${text}`]);
     });
     const turn = one.detail_text.split("   ").filter((text) => text.startsWith("tilt") || text.startsWith("twist"));
@@ -211,7 +212,7 @@ function gauge({ distance_mm: d, uncertainty_mm: u, tolerance_mm: tolerance }) {
     return made;
   };
   const bar = make("div", "gauge", [part("allowed", 0, tolerance), part("band", d - (u ?? 0), d + (u ?? 0)), part("limit", tolerance), part("mark", d)], {
-    role: "img", "aria-label": `${d.toFixed(2)} mm with U ${(u ?? 0).toFixed(2)} against a tolerance of ${tolerance.toFixed(2)} mm`,
+    role: "img", "aria-label": `${rounded(d, u)} mm with U ${rounded(u ?? 0, u)} against a tolerance of ${exact(tolerance)} mm`,
   });
   return [bar];
 }

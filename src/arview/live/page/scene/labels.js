@@ -2,6 +2,7 @@
 // are laid out together.
 
 import { icon, make } from "../icons.js";
+import { rounded } from "../rounding.js";
 import { LabelLayout } from "./layout.js";
 import { toCam } from "./projection.js";
 
@@ -211,7 +212,7 @@ export class Labels {
     const u = kind === component.verdict ? component.uncertainty_mm : null;
     const detail = seen ? seen.notes.join(", ") : component.verdict !== "pass" ? component.detail_text : "";
     const what = [make("span", "verdict", [seen?.word ?? component.verdict_text ?? ""])];
-    if (u !== null && (seen || !detail)) what.unshift(make("span", "u", [`U ${u.toFixed(2)}`]));
+    if (u !== null && (seen || !detail)) what.unshift(make("span", "u", [`U ${rounded(u, u)}`]));
     if (value) what.unshift(make("span", "value", [value]));
     const rows = [make("span", "who", [...this.#mark(component.part), icon(kind), middled(component.name)]), make("span", "what", what)];
     if (detail) rows.push(make("span", "detail", [detail]));
