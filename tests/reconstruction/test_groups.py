@@ -126,3 +126,12 @@ def test_two_groups_of_photos_are_told_apart(tmp_path: Path) -> None:
     size = np.linalg.norm(np.ptp([photo.centre_in_scan for photo in sparse.photos], axis=0))
     assert deviations_mm.max() < 0.02 * size  # not the whole scene, as where nothing joins the groups
     assert len(sparse.groups) >= 1 and set(sparse.groups[0]) == names
+
+
+def test_intrinsics_do_not_loosen_a_group() -> None:
+    """A wrong principal point turns all cameras alike and leaves the pixels: the photos are still one group."""
+    sparse = model_of([(range(5), range(240)), (range(5, 8), range(200, 400))])
+    turned = np.tile([0.02, 0.01, 0.0, 0.0, 0.0, 0.0], 8)
+    assert sparse.pose_covariance is not None
+    loose = replace(sparse, pose_covariance=sparse.pose_covariance + np.outer(turned, turned))
+    assert linked_groups(loose) == (tuple(range(8)),)

@@ -65,6 +65,7 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
 @click.option("--camera", metavar="CAMERA", help="Calibrated camera file of the photos, or fov:DEG.")
 @click.option("--video-camera", metavar="CAMERA", help="The same for the video, if it was taken with another camera.")
 @click.option("--scale-file", metavar="FILE", help="TOML file of the boards, tags, scale bars and rig in view.")
+@click.option("--masks", metavar="FOLDER", help="Masks as IMAGE.png, black where a photo is not to be used.")
 @click.option("--tolerance", type=click.FloatRange(min=0, min_open=True), metavar="MM",
               help="Tolerance of components that have none in the part file.")  # fmt: skip
 @click.option("--guard", type=click.FloatRange(0, 3), default=1.0, show_default=True, metavar="G",
@@ -91,6 +92,7 @@ def inspect(
     camera: str | None,
     video_camera: str | None,
     scale_file: str | None,
+    masks: str | None,
     tolerance: float | None,
     guard: float,
     max_frames: int,
@@ -106,7 +108,7 @@ def inspect(
     from arview.workflow.run import inspect_part
 
     job = InspectJob(
-        part_path, photos, video, serial, camera, video_camera, scale_file, unit, tolerance, guard, max_frames, seed,
+        part_path, photos, video, serial, camera, video_camera, scale_file, unit, masks, tolerance, guard, max_frames, seed,
         threads, device, not no_pdf,
     )  # fmt: skip
     if store is not None:

@@ -61,6 +61,7 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
 @click.option("--scale-bar", "bars", multiple=True, metavar="SPEC", help="Known distance of two tags; see below.")
 @click.option("--scale-file", metavar="FILE", help="Boards, tags, scale bars and rig in one TOML file.")
 @click.option("--rig", metavar="FILE", help="Known camera poses in mm.")
+@click.option("--masks", metavar="FOLDER", help="Masks as IMAGE.png, black where a photo is not to be used.")
 @click.option("--until", type=click.Choice(STAGES), default="dense", show_default=True, help="Last stage to do.")
 @click.option("--band", type=click.FloatRange(min=0.1), default=5.0, show_default=True, metavar="MM",
               help="Distance of components from their nominal place that the dense stage covers.")  # fmt: skip
@@ -82,6 +83,7 @@ def reconstruct(
     bars: tuple[str, ...],
     scale_file: str | None,
     rig: str | None,
+    masks: str | None,
     until: str,
     band: float,
     max_frames: int,
@@ -112,6 +114,7 @@ def reconstruct(
         sparse=SparseOptions(seed=seed, threads=threads),
         sources=_sources(boards, tags, bars, scale_file, rig),
         dense=DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
+        masks=Path(masks) if masks else None,
         last_stage=get_args(run.StageName)[STAGES.index(until)],
         starts_over=force,
     )

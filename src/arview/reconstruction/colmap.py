@@ -89,10 +89,10 @@ def sparse_model_of(
     reconstruction: Any, photos: Sequence[Photo], unplaced: Sequence[tuple[str, str]] = ()
 ) -> SparseModel:
     """The SparseModel of a pycolmap reconstruction; photos keep their order."""
-    paths = {photo.name: photo.path for photo in photos}
+    given = {photo.name: photo for photo in photos}
     order = {photo.name: place for place, photo in enumerate(photos)}
     images = sorted(
-        (image for image in reconstruction.images.values() if image.has_pose and image.name in paths),
+        (image for image in reconstruction.images.values() if image.has_pose and image.name in given),
         key=lambda image: order[image.name],
     )
     place_of = {image.image_id: place for place, image in enumerate(images)}
@@ -100,7 +100,8 @@ def sparse_model_of(
     for image in images:
         matrix = np.asarray(image.cam_from_world().matrix())
         camera = camera_of(reconstruction.cameras[image.camera_id])
-        posed.append(PosedPhoto(image.name, paths[image.name], camera, rigid(matrix[:, :3], matrix[:, 3])))
+        photo = given[image.name]
+        posed.append(PosedPhoto(photo.name, photo.path, camera, rigid(matrix[:, :3], matrix[:, 3]), photo.mask))
     point_ids = sorted(reconstruction.points3D)
     seen_point, seen_photo, seen_px = [], [], []
     for row, point_id in enumerate(point_ids):

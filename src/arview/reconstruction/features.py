@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from arview.core.progress import StepProgress
 from arview.reconstruction.intake import read_photo
+from arview.reconstruction.intake.masks import read_mask
 from arview.reconstruction.types import Photo
 
 Descriptors = NDArray[np.float32]
@@ -51,8 +52,10 @@ _NONE = Features(
 )
 
 
-def find_features(image: NDArray[np.uint8], options: FeatureOptions | None = None) -> Features:
-    """SIFT features of an (H,W,3) RGB picture, spread over it.
+def find_features(
+    image: NDArray[np.uint8], options: FeatureOptions | None = None, mask: NDArray[np.bool_] | None = None
+) -> Features:
+    """SIFT features of an (H,W,3) RGB picture, spread over it, where the ``mask`` (H,W) is True.
 
     ``enable_precise_upscale`` is required: without it OpenCV's key points are shifted by a quarter of a pixel.
     """
@@ -69,7 +72,9 @@ def find_features(image: NDArray[np.uint8], options: FeatureOptions | None = Non
         contrastThreshold=options.contrast_threshold,
         enable_precise_upscale=True,
     )
-    keys, sums = sift.detectAndCompute(grey, None)
+    size = (grey.shape[1], grey.shape[0])
+    allowed = None if mask is None else cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_NEAREST)
+    keys, sums = sift.detectAndCompute(grey, allowed)
     if not keys:
         return _NONE
     points = np.array([key.pt for key in keys], dtype=np.float32)
@@ -101,14 +106,16 @@ def _spread(points: NDArray[np.float32], strength: NDArray[np.float64], shape: t
 def find_all_features(
     photos: Sequence[Photo], options: FeatureOptions, threads: int, progress: StepProgress | None = None
 ) -> list[Features]:
-    """Features of every photo, in their order; ``threads`` photos are processed at a time.
+    """Features of every photo, in their order, outside of what its mask leaves out; ``threads`` photos at a time.
 
     Raises:
         InputError: a photo cannot be read.
     """
     found: list[Features] = []
     with ThreadPoolExecutor(threads) as pool:
-        for features in pool.map(lambda photo: find_features(read_photo(photo.path), options), photos):
+        for features in pool.map(
+            lambda photo: find_features(read_photo(photo.path), options, read_mask(photo)), photos
+        ):
             found.append(features)
             if progress:
                 progress(len(found), len(photos))

@@ -118,14 +118,21 @@ def relative_px(sparse: SparseModel, parts: Sequence[Members], options: GroupOpt
     if sparse.pose_covariance is None:
         return 0.0
     larger, smaller = sorted(parts, key=len, reverse=True)
+    entries = [np.concatenate([np.arange(6 * i, 6 * i + 6) for i in part]) for part in (larger, smaller)]
+    members = np.concatenate(entries)
     gauge, weights = gauge_of(sparse)
-    rows = [np.concatenate([np.arange(6 * i, 6 * i + 6) for i in part]) for part in (larger, smaller)]
+    # What a wrong principal point or focal length does to all cameras alike leaves the pixels where they are. Only the
+    # photos of the two parts count: others may be free to move against them.
+    lens, weighed = _lens_modes(sparse)[members], weights[members]
+    project = np.eye(len(members)) - (lens @ np.linalg.pinv(lens * weighed[:, None])) * weighed[None, :]
     # Moves of the smaller part against the larger one, by least squares; a lone photo has no scale.
-    inverses = [np.linalg.pinv(gauge[r] * weights[r, None], rcond=1e-9) * weights[None, r] for r in rows]
-    relative = np.zeros((7, len(gauge)))
-    relative[:, rows[1]] += inverses[1]
-    relative[:, rows[0]] -= inverses[0]
-    covariance = relative @ sparse.pose_covariance @ relative.T
+    rows = (np.arange(len(entries[0])), len(entries[0]) + np.arange(len(entries[1])))
+    relative = np.zeros((7, len(members)))
+    for sign, row, entry in zip((-1.0, 1.0), rows, entries, strict=True):
+        inverse = np.linalg.pinv(gauge[entry] * weights[entry, None], rcond=1e-9) * weights[None, entry]
+        relative[:, row] += sign * inverse
+    relative = relative @ project
+    covariance = relative @ sparse.pose_covariance[np.ix_(members, members)] @ relative.T
     total, count = 0.0, 0
     for i in smaller:
         photo = sparse.photos[i]
@@ -137,6 +144,21 @@ def relative_px(sparse: SparseModel, parts: Sequence[Members], options: GroupOpt
         total += float(np.einsum("nij,jk,nik->", jacobian, covariance, jacobian))
         count += len(seen)
     return float(np.sqrt(max(total, 0.0) / max(1, 2 * count)))
+
+
+def _lens_modes(sparse: SparseModel) -> Array:
+    """(6M,10) left twists of all photos by which errors of the intrinsics are compensated, and the seven of the gauge.
+
+    A shift of the principal point is compensated by a common turn about the cameras' x and y axes, a focal length by
+    moves along the viewing directions in proportion to the depth.
+    """
+    modes = np.zeros((6 * len(sparse.photos), 3))
+    for i, photo in enumerate(sparse.photos):
+        points = sparse.points_in_scan[sparse.observed_point[sparse.observed_photo == i]]
+        depth = np.median(points @ photo.cam_from_scan[2, :3]) + photo.cam_from_scan[2, 3] if len(points) else 0.0
+        modes[6 * i, 0] = modes[6 * i + 1, 1] = 1.0
+        modes[6 * i + 5, 2] = depth
+    return np.hstack([modes, gauge_of(sparse)[0]])
 
 
 def _pixel_moves(in_cam: Array, focal_px: float) -> Array:

@@ -43,6 +43,7 @@ from arview.reconstruction.intake import (
     intake_video,
     undistort_photos,
 )
+from arview.reconstruction.intake.masks import with_masks
 from arview.reconstruction.quality import Quality, quality_of
 from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
 from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
@@ -66,6 +67,7 @@ class ReconstructOptions:
     scale: CadOptions = field(default_factory=CadOptions)
     sources: ScaleSources = field(default_factory=ScaleSources)
     dense: DenseOptions = field(default_factory=DenseOptions)
+    masks: Path | None = None  # folder with a mask for each photo, black where it is not to be used
     last_stage: StageName = "dense"
     starts_over: bool = False  # discard what an earlier run left in the folder
 
@@ -152,8 +154,9 @@ class _ReconstructionRun:
         sparse, scale, cloud, cover = None, None, None, None
         last = STAGES.index(self.options.last_stage)
         if last >= 1:
-            key = key_of([replace(photo, path=Path()) for photo in intake.photos], self.options.sparse)
-            key = key_of(key, content_key(photo.path for photo in intake.photos))
+            key = key_of([replace(photo, path=Path(), mask=None) for photo in intake.photos], self.options.sparse)
+            masks = [photo.mask for photo in intake.photos if photo.mask is not None]
+            key = key_of(key, content_key(photo.path for photo in intake.photos), content_key(masks))
             sparse = self._sparse(intake.photos, key)
         if last >= 2 and sparse is not None:
             part_key = None if self.part is None else (self.part.model.source_hash, self.part.effective_view_range)
@@ -178,6 +181,8 @@ class _ReconstructionRun:
             intake = self._frames(Path(source), camera)
         else:
             intake = intake_photos(source, camera, progress=lambda i, n: self.tell("photos", i, n))
+        if self.options.masks is not None:
+            intake = with_masks(intake, self.options.masks)
         intake = undistort_photos(intake, self.folder / "undistorted", lambda i, n: self.tell("photos", i, n))
         write_json(self.folder / "photos.json", intake_summary(intake))
         self._record_time("photos", began)
@@ -216,7 +221,7 @@ class _ReconstructionRun:
         scale = find_scale(sparse, self.part, self.options.sources, self.options.scale, progress=self.tell)
         # The scale's file carries all doubts about the reconstruction to the measurement and its report.
         apart = groups_warning([photo.name for photo in photos], sparse.groups)
-        scale = replace(scale, warnings=(*((apart,) if apart else ()), *scale.warnings))
+        scale = replace(scale, warnings=(*sparse.remarks, *((apart,) if apart else ()), *scale.warnings))
         write_json(path, scale.provenance())
         self.stages.finish("scale", key)
         self._record_time("scale", began)
@@ -258,7 +263,9 @@ class _ReconstructionRun:
 def _write_sparse(folder: Path, sparse: SparseModel) -> None:
     """Write what COLMAP's model, which is already in the folder, does not contain."""
     write_json(folder / "unplaced.json", dict(sparse.unplaced))
-    write_json(folder / "groups.json", [list(group) for group in sparse.groups])
+    write_json(
+        folder / "groups.json", {"groups": [list(one) for one in sparse.groups], "remarks": list(sparse.remarks)}
+    )
     try:
         if sparse.pose_covariance is not None:
             with replacing(folder / "covariance.npy") as file:
@@ -277,7 +284,7 @@ def _read_sparse(folder: Path, photos: tuple[Photo, ...]) -> SparseModel:
         sparse = sparse_model_of(read_reconstruction(folder / "model"), photos, tuple(unplaced.items()))
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{folder}: files are missing or damaged ({error}); run again with --force") from error
-    sparse = replace(sparse, groups=tuple(tuple(group) for group in groups))
+    sparse = replace(sparse, groups=tuple(tuple(group) for group in groups["groups"]), remarks=tuple(groups["remarks"]))
     path = folder / "covariance.npy"
     return replace(sparse, pose_covariance=np.load(path)) if path.exists() else sparse
 

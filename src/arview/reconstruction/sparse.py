@@ -28,6 +28,7 @@ from arview.reconstruction.covariance import pose_covariance
 from arview.reconstruction.features import FeatureOptions, Features, find_all_features
 from arview.reconstruction.groups import GroupOptions, linked_groups
 from arview.reconstruction.matching import Matches, epipolar_inliers, match_along_lines, match_descriptors
+from arview.reconstruction.still import StillOptions, moved_matches, still_features, still_remark, without
 from arview.reconstruction.types import Photo, SparseModel
 
 Pair = tuple[int, int]
@@ -49,6 +50,7 @@ class SparseOptions:
     max_error_px: float = 2.0  # observations with larger errors are left out of the last adjustment
     min_centre_move: float = 0.001  # of the longer side; smaller moves of the principal point are not significant …
     max_centre_move: float = 0.05  # … and larger ones mean that the views do not determine it
+    still: StillOptions = field(default_factory=StillOptions)
     groups: GroupOptions = field(default_factory=GroupOptions)
     min_angle_deg: float = 1.5  # between two rays to a point; smaller angles do not determine depth
     seed: int = 0
@@ -67,15 +69,16 @@ def reconstruct_sparse(
     tell = progress or (lambda stage, done, total: None)
     threads = options.threads or os.cpu_count() or 1
     folder.mkdir(parents=True, exist_ok=True)
-    features = find_all_features(photos, options.features, threads, lambda i, n: tell("features", i, n))
-    pairs = _match_by_appearance(features, options, threads, tell)
+    features, remarks = _moving_features(photos, options, threads, tell)
+    min_move_px = options.still.max_shift_px if remarks else 0.0
+    pairs = _match_by_appearance(features, options, threads, tell, min_move_px)
     database_path = folder / "database.db"
     _write_database(database_path, photos, features, pairs, options)
     models = _map(database_path, folder, options, len(photos), tell)
     if not models or max(model.num_reg_images() for model in models) < 3:
-        raise CannotMeasureError(_why_nothing(photos, features, pairs))
+        raise CannotMeasureError("; ".join([_why_nothing(photos, features, pairs), *remarks]))
     chosen = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    matches = _match_along_lines(chosen, photos, features, options, threads, tell)
+    matches = _match_along_lines(chosen, photos, features, options, threads, tell, min_move_px)
     _write_matches(database_path, matches)
     chosen, adjuster = _triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
     sparse, split = _main_group(chosen, adjuster, photos, options, threads)
@@ -83,21 +86,36 @@ def reconstruct_sparse(
     chosen.write(str(_emptied(folder / "model")))
     groups = _all_groups(sparse, split, models)
     unplaced = _unplaced(photos, features, pairs, groups)
-    return replace(sparse, unplaced=tuple(unplaced), groups=groups)
+    return replace(sparse, unplaced=tuple(unplaced), groups=groups, remarks=tuple(remarks))
+
+
+def _moving_features(
+    photos: Sequence[Photo], options: SparseOptions, threads: int, tell: Progress
+) -> tuple[list[Features], list[str]]:
+    """Features of all photos without those that stand still in the picture, and what is said of these."""
+    features = find_all_features(photos, options.features, threads, lambda i, n: tell("features", i, n))
+    still = still_features(features, options.still, threads)
+    remark = still_remark(features, still, options.still)
+    kept = [without(one, dropped) for one, dropped in zip(features, still, strict=True)]
+    return kept, [remark] if remark else []
 
 
 # --- first pass ------------------------------------------------------------------------------------------
 
 
 def _match_by_appearance(
-    features: Sequence[Features], options: SparseOptions, threads: int, tell: Progress
+    features: Sequence[Features], options: SparseOptions, threads: int, tell: Progress, min_move_px: float = 0.0
 ) -> dict[Pair, Matches]:
-    """Matches of every pair of photos that has enough of them near epipolar lines."""
+    """Matches of every pair of photos that has enough of them near epipolar lines.
+
+    Before a still background, matches that move by less than ``min_move_px`` are left out.
+    """
 
     def match(pair: Pair) -> Matches:
         one, other = (features[index] for index in pair)
         count = options.first_features
         matches = match_descriptors(one.descriptors[:count], other.descriptors[:count])
+        matches = moved_matches(one, other, matches, min_move_px)
         return epipolar_inliers(one, other, matches, options.max_epipolar_px)
 
     found: dict[Pair, Matches] = {}
@@ -216,6 +234,7 @@ def _match_along_lines(
     options: SparseOptions,
     threads: int,
     tell: Progress,
+    min_move_px: float = 0.0,
 ) -> dict[Pair, Matches]:
     """All features of placed photos matched again, now that the relative poses are known."""
     cameras, poses = _cameras_and_poses(model, photos)
@@ -229,7 +248,9 @@ def _match_along_lines(
         second_from_first = poses[j] @ invert(poses[i])
         essential = skew(second_from_first[:3, 3]) @ second_from_first[:3, :3]
         focal = 0.5 * (cameras[i].fx + cameras[j].fx)
-        return match_along_lines((rays[i], rays[j]), focal, (features[i], features[j]), essential, options.band_px)
+        pair_of = (features[i], features[j])
+        matches = match_along_lines((rays[i], rays[j]), focal, pair_of, essential, options.band_px)
+        return moved_matches(*pair_of, matches, min_move_px)
 
     chosen = _pairs_in_common_view(model, poses)
     found: dict[Pair, Matches] = {}
@@ -329,6 +350,11 @@ def _main_group(
     split: list[list[str]] = []
     while True:
         sparse = sparse_model_of(model, photos)
+        if len(sparse.points_in_scan) < options.groups.min_shared_points:
+            raise CannotMeasureError(
+                f"photos: the {len(sparse.photos)} that could be placed share no point seen from two sides; take more, "
+                "10 to 20 degrees apart, moving the camera sideways rather than turning it"
+            )
         sparse = replace(sparse, pose_covariance=pose_covariance(sparse, model, adjuster))
         kept, *others = linked_groups(sparse, options.groups)
         if len(kept) < 3:

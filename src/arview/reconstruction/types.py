@@ -26,6 +26,7 @@ class Photo:
         lens: key shared by photos of the same lens, zoom and size, which share their intrinsics.
         camera: initial intrinsics, upright; exact if ``is_calibrated``.
         is_calibrated: the camera came from a calibration, which self-calibration must not change.
+        mask: picture of the photo's shape, black where the photo is not to be used; None uses all of it.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Photo:
     lens: str
     camera: Camera
     is_calibrated: bool = False
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class PosedPhoto:
     path: Path
     camera: Camera
     cam_from_scan: Array
+    mask: Path | None = None  # see `Photo`
 
     @property
     def centre_in_scan(self) -> Array:
@@ -68,6 +71,7 @@ class SparseModel:
         unplaced: (name, reason) of photos that could not be placed.
         groups: names of the photos of each group that is placed in itself, but not relative to the others; the first
             holds ``photos``. One group, or none where that is not known, is the usual case.
+        remarks: what was found out about the photos, and doubts.
         pose_covariance: (6M,6M) joint covariance of the poses from bundle adjustment: for each photo a twist (rad,
             unit) applied on the left of ``cam_from_scan``, in the scan frame in which the cameras together vary least.
     """
@@ -82,6 +86,7 @@ class SparseModel:
     unplaced: tuple[tuple[str, str], ...] = field(default=())
     pose_covariance: Array | None = None
     groups: tuple[tuple[str, ...], ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.observed_point) != len(self.observed_photo) or len(self.observed_point) != len(self.observed_px):

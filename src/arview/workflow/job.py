@@ -28,6 +28,7 @@ class InspectJob:
     video_camera: str | None = None
     scale_file: str | None = None
     unit: str | None = None
+    masks: str | None = None  # folder of masks of the photos, black where a photo is not to be used
     tolerance_mm: float | None = None  # tolerance of components without one in the part file
     guard: float = 1.0  # fraction of U by which the tolerance is reduced; 1: ISO 14253-1
     max_frames: int = 60  # frames of a video that are used as photos

@@ -56,6 +56,8 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
         part = replace(part, serial=job.serial)
     if not part.inspected:
         raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
+    if job.masks and not Path(job.masks).is_dir():
+        raise InputError(f"{job.masks}: no such folder; give the folder of the masks")
     _check_cameras(job)
     threads, seed = job.threads, job.seed
     reconstruct = ReconstructOptions(
@@ -63,6 +65,7 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
         sparse=SparseOptions(seed=seed, threads=threads),
         sources=load_scale_file(job.scale_file) if job.scale_file else ScaleSources(),
         dense=DenseOptions(seed=seed, threads=threads, device=job.device),
+        masks=Path(job.masks) if job.masks else None,
     )
     measure = MeasureOptions(
         tolerance_mm=job.tolerance_mm, maps_folder=folder / "inspection_distances", decision=DecisionOptions(job.guard)
@@ -90,10 +93,11 @@ def measurement_key(prepared: Prepared) -> str:
     job, part, options = prepared.job, prepared.part, prepared.measure
     source = Path(job.photo_source)
     photos = [source] if source.is_file() else photo_paths(job.photo_source)[0]
+    masks = sorted(Path(job.masks).rglob("*.png")) if job.masks else []
     return key_of(
-        content_key(photos), _content(job.camera), part.model.source_hash, part.name, part.settings, part.datums,
+        content_key(photos), content_key(masks), _content(job.camera), part.model.source_hash, part.name, part.settings, part.datums,
         part.serial, part.effective_view_range, replace(options, maps_folder=None),
-        replace(prepared.reconstruct, sparse=replace(prepared.reconstruct.sparse, threads=0),
+        replace(prepared.reconstruct, masks=None, sparse=replace(prepared.reconstruct.sparse, threads=0),
                 dense=replace(prepared.reconstruct.dense, threads=0)), __version__,
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert
 from arview.reconstruction.dense.options import DenseOptions
+from arview.reconstruction.intake.masks import mask_of
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from arview.rendering.rasterizer import rasterise
 
@@ -143,6 +144,10 @@ def make_view(
     part = region[max(v0, 0) : v0 + height, max(u0, 0) : u0 + width]
     inside[max(-v0, 0) :, max(-u0, 0) :][: part.shape[0], : part.shape[1]] = part
     color, is_seen = _undistorted(image, photo.camera, camera)
+    if photo.mask is not None:
+        allowed = mask_of(photo.mask, photo.camera.width, photo.camera.height)
+        grey = np.repeat(np.where(allowed, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
+        is_seen &= _undistorted(grey, photo.camera, camera)[0][..., 0] > 127
     return DenseView(
         index, photo.name, camera, photo.cam_from_scan, color, inside & is_seen, nearest, farthest, sources
     )

@@ -6,11 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from arview.camera.undistort import FrameView, UndistortOptions
 from arview.core.atomic import replacing
 from arview.core.progress import StepProgress
 from arview.errors import OutputError
+from arview.reconstruction.intake.masks import read_mask
 from arview.reconstruction.intake.photos import Intake
 from arview.reconstruction.intake.reading import read_photo
 from arview.reconstruction.types import Photo
@@ -55,4 +57,14 @@ def _copied(photo: Photo, view: FrameView, path: Path, index: int) -> Photo:
             file.write(png.tobytes())
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
-    return replace(photo, path=path, width=camera.width, height=camera.height, camera=camera)
+    mask = None if photo.mask is None else _copied_mask(photo, view, path.with_suffix(".mask.png"))
+    return replace(photo, path=path, width=camera.width, height=camera.height, camera=camera, mask=mask)
+
+
+def _copied_mask(photo: Photo, view: FrameView, path: Path) -> Path:
+    """The photo's mask, undistorted like the photo."""
+    mask = read_mask(photo)
+    assert mask is not None
+    grey = view.picture(np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2), -1)
+    cv2.imwrite(str(path), np.where(grey[..., 0] > 127, 255, 0).astype(np.uint8))
+    return path
