@@ -82,3 +82,52 @@ def test_what_did_not_come_with_the_report_does_not_run(chromium: Any, report: P
     kinds = {text.split()[0] for text in page.evaluate("window.violations")}
     assert {"script-src-elem", "script-src-attr", "img-src", "style-src-attr"} <= kinds
     page.close()
+
+
+def test_surfaces_that_no_two_photos_saw_are_hatched(chromium: Any, tmp_path: Path) -> None:
+    """With photos from one side only, most of the part is hatched; the switch removes the hatching."""
+    from dataclasses import replace
+
+    from arview.camera import Camera
+    from arview.core.progress import Progress
+    from arview.geometry import look_at
+    from arview.reconstruction.types import PosedPhoto, SparseModel
+    from arview.report.evidence import gather
+    from arview.report.page import ReportOptions, build_context, render
+
+    part = load_part(str(PART))
+    middle, diameter = part.model.center_in_model, part.model.diameter_mm
+    camera = Camera(800, 600, 900.0, 900.0, 399.5, 299.5)
+    eyes = [middle + 2.0 * diameter * np.array([0.7, 0.1 * k, 0.7]) for k in range(3)]
+    poses = [look_at(eye, middle, np.array([0.0, 0.0, 1.0])) for eye in eyes]
+    photos = tuple(PosedPhoto(f"{k}.jpg", tmp_path, camera, pose) for k, pose in enumerate(poses))
+    none, ints = np.zeros((0, 3)), np.zeros(0, np.int32)
+    sparse = SparseModel(photos, none, none.astype(np.uint8), np.zeros(0), ints, ints, np.zeros((0, 2)))
+    quiet: Progress = lambda what, done, total: None  # noqa: E731
+    evidence = gather(INSPECTION, part)
+    context = build_context(evidence, ReportOptions(), quiet)
+    from arview.report.page import _viewer
+
+    context |= _viewer(replace(evidence, sparse=sparse), ReportOptions())
+    path = tmp_path / "report.html"
+    path.write_text(render(context, for_print=False), encoding="utf-8")
+    page, said = opened(chromium, path)
+    page.wait_for_selector("#viewer.live canvas", timeout=60_000)
+    page.locator("#viewer canvas").scroll_into_view_if_needed()
+    page.wait_for_timeout(500)
+
+    def hatched() -> float:
+        """Share of pixels in the colour of the hatching."""
+        rgb = np.asarray(Image.open(io.BytesIO(page.locator("#viewer canvas").screenshot())).convert("RGB")).astype(int)
+        return float(np.mean((rgb[..., 0] > rgb[..., 2] + 60) & (rgb[..., 1] > rgb[..., 2] + 40)))
+
+    with_hatching = hatched()
+    page.click("input[name=unseen]")
+    page.wait_for_timeout(500)
+    without = hatched()
+    page.click("input[name=unseen]")
+    page.click("button[data-view=right]")
+    page.wait_for_timeout(500)
+    assert with_hatching > without + 0.005, (with_hatching, without)
+    assert not [text for text in said if "rror" in text], said
+    page.close()

@@ -108,8 +108,8 @@ def inspect(
     from arview.workflow.run import inspect_part
 
     job = InspectJob(
-        part_path, photos, video, serial, camera, video_camera, scale_file, unit, masks, tolerance, guard, max_frames, seed,
-        threads, device, not no_pdf,
+        part_path, photos, video, serial, camera, video_camera, scale_file, unit, masks, tolerance, guard,
+        max_frames, seed, threads, device, not no_pdf,
     )  # fmt: skip
     if store is not None:
         from arview.history import HistoryStore

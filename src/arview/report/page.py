@@ -404,10 +404,11 @@ def _charts(evidence: ReportEvidence) -> dict[str, Markup]:
 
 def _viewer(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
     model = None if evidence.part is None else evidence.part.model
-    scene = make_scene(evidence.inspection, model, evidence.cloud, evidence.distances, options.scene)
+    scene = make_scene(evidence.inspection, model, evidence.cloud, evidence.distances, options.scene, evidence.sparse)
     if scene is None:
         return {"scene": ""}
     cloud = scene.get("cloud", {})
+    has_unseen = bool(scene.get("unseen", {}).get("points"))
     lead = ["Components at their design positions (transparent) and measured positions (solid)."]
     if "mesh" not in scene:
         lead = [
@@ -418,12 +419,15 @@ def _viewer(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
         lead.append(f"{shown:,} of the {cloud['of']:,} points of the cloud.")
     else:
         lead.append(evidence.absent.get("cloud", "There is no cloud."))
+    if has_unseen:
+        lead.append("Hatched: surfaces that no two photos saw; the CAD model stands in for them.")
     modes = [(name, text) for name, text in (("photo", "photos"), ("distance", "distance to the CAD model"))
              if ("colors" if name == "photo" else "distances") in cloud]  # fmt: skip
     return {
         "scene": Markup(scene_json(scene)),
         "scene_lead": " ".join(lead),
         "has_mesh": "mesh" in scene,
+        "has_unseen": has_unseen,
         "cloud_modes": modes,
         "exaggerations": _EXAGGERATIONS,
         "exaggeration": round(scene.get("arrow_scale", 1.0)),

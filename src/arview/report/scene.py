@@ -18,7 +18,8 @@ from arview.measurement.cloud.distance_map import COLOR_STOPS, DistanceMap
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.overlay.labels import arrow_scale
 from arview.overlay.options import OverlayOptions
-from arview.reconstruction.types import DenseCloud
+from arview.reconstruction.seen_surface import seen_surface
+from arview.reconstruction.types import DenseCloud, SparseModel
 
 _STEPS = 65535
 """Steps of the coordinates, which are stored in 16 bits over their bounding box: a metre in steps of 15 µm."""
@@ -40,9 +41,12 @@ class SceneOptions:
 
 def make_scene(
     inspection: Inspection, model: Model | None, cloud: DenseCloud | None, distances: DistanceMap | None,
-    options: SceneOptions | None = None,
+    options: SceneOptions | None = None, sparse: SparseModel | None = None,
 ) -> dict[str, Any] | None:  # fmt: skip
     """The scene as a JSON object; None when there is neither CAD model nor cloud. All data are in one frame.
+
+    Surfaces of the CAD that no two photos saw are listed on their own, to be hatched: there the CAD model stands in
+    for what the cloud lacks.
 
     Args:
         inspection: the deviations.
@@ -50,6 +54,7 @@ def make_scene(
         cloud: cloud in the colours of the photos, or None.
         distances: distances of a cloud to the CAD model, used if there is no cloud with colours.
         options: see `SceneOptions`.
+        sparse: photos with their poses, or None.
     """
     options = options or SceneOptions()
     if model is not None and len(model.mesh[1]) > options.max_faces:
@@ -57,6 +62,8 @@ def make_scene(
     scene: dict[str, Any] = {"stops": COLOR_STOPS.tolist(), "components": []}
     if model is not None:
         scene["mesh"] = _mesh(model)
+        if sparse is not None and sparse.photos:
+            scene["unseen"] = _unseen(model, sparse)
         scene["arrow_scale"] = arrow_scale(inspection, model.diameter_mm, OverlayOptions())
     points = _points(cloud, model, distances, options)
     if points is not None:
@@ -102,6 +109,14 @@ def _mesh(model: Model) -> dict[str, Any]:
         mine = np.flatnonzero(owner == index)
         ranges.append([int(mine[0]), int(mine[-1]) + 1])
     return {**_packed(vertices), "faces": _text(faces.astype("<u4")), "ranges": ranges}
+
+
+def _unseen(model: Model, sparse: SparseModel) -> dict[str, Any]:
+    """Pieces of the surface that no two photos saw, three corners each, and their share of each component's surface."""
+    surface = seen_surface(model, [(photo.camera, photo.cam_from_scan) for photo in sparse.photos])
+    corners = surface.corners[~surface.is_seen].reshape(-1, 3)
+    shares = [round(1.0 - surface.share_of(index), 4) for index in range(len(model.components))]
+    return {**(_packed(corners) if len(corners) else {"points": ""}), "shares": shares}
 
 
 def _points(

@@ -95,8 +95,8 @@ def measurement_key(prepared: Prepared) -> str:
     photos = [source] if source.is_file() else photo_paths(job.photo_source)[0]
     masks = sorted(Path(job.masks).rglob("*.png")) if job.masks else []
     return key_of(
-        content_key(photos), content_key(masks), _content(job.camera), part.model.source_hash, part.name, part.settings, part.datums,
-        part.serial, part.effective_view_range, replace(options, maps_folder=None),
+        content_key(photos), content_key(masks), _content(job.camera), part.model.source_hash, part.name, part.settings,
+        part.datums, part.serial, part.effective_view_range, replace(options, maps_folder=None),
         replace(prepared.reconstruct, masks=None, sparse=replace(prepared.reconstruct.sparse, threads=0),
                 dense=replace(prepared.reconstruct.dense, threads=0)), __version__,
     )  # fmt: skip
