@@ -484,5 +484,6 @@ def _default_output(source: str) -> str:
     """Name in the current folder for the annotated video of a source."""
     if source.isdecimal():
         return f"camera_{source}_annotated.mp4"
-    stem = "".join(letter for letter in Path(source).stem if letter.isalnum() or letter in "-_. ")
+    name = Path(source if "://" not in source else source.split("://", 1)[1].rsplit("@", 1)[-1].split("?")[0])
+    stem = "".join(letter for letter in name.stem if letter.isalnum() or letter in "-_. ")
     return f"{stem.strip(' .') or 'video'}_annotated.mp4"

@@ -19,7 +19,7 @@ import click
 from arview.cli.exit_codes import ExitCode, help_rows
 from arview.core.atomic import is_device, replacing
 from arview.core.progress import Progress, StepProgress
-from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError
+from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError, without_credentials
 from arview.version import __version__
 
 if TYPE_CHECKING:
@@ -198,9 +198,12 @@ def say_bug(error: Exception) -> None:
 
 
 def say(text: str) -> None:
-    """Print one line on stderr, whatever the text holds. A stderr that cannot be written to is ignored."""
+    """Print one line on stderr, whatever the text holds, without passwords of addresses.
+
+    A stderr that cannot be written to is ignored.
+    """
     try:
-        click.echo("arview: " + " ".join(text.split()), err=True)
+        click.echo("arview: " + without_credentials(" ".join(text.split())), err=True)
     except OSError:
         _discard(sys.stderr)
 

@@ -9,9 +9,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from arview.live.server.live_server import LiveServer
     from arview.live.stream.subjects import Subjects
 
+STOP_DEADLINE_S = 4.0
+"""Time from a signal to the end of the program, whatever its workers do."""
 EXTRA = ("aiortc", "starlette", "uvicorn", "cryptography", "segno")
 _AGES_S = {"min": 60.0, "h": 3600.0, "d": 86400.0}
 
@@ -97,7 +100,9 @@ A camera that is not given is guessed and not estimated then.
 The page reloads inspection.json when it changes, and warns when it is older than --max-age or has another
 serial number than the part file (or --serial). Recordings made from the page are put in the folder of
 --record, or in the current one. Beside each video is a file of its poses that ends in .jsonl, see annotate; its
-lines have the numbers of the frames in the video. Ctrl-C ends the run and finishes the files.""",
+lines have the numbers of the frames in the video. A recording ends by itself, and the page says so, when all in
+the folder reach --quota or the disk is almost full. Ctrl-C ends the run and finishes the files, within five
+seconds.""",
     exit_codes={ExitCode.INTERRUPTED: "ended by Ctrl-C; files are finished"},
 )
 @click.option("--part", "part_paths", required=True, multiple=True, metavar="PART",
@@ -123,6 +128,8 @@ lines have the numbers of the frames in the video. Ctrl-C ends the run and finis
 @click.option("--clients", type=click.IntRange(1, 64), metavar="N",
               help="Most pages at once; default: 2 phones, or 8 pages of a station camera.")  # fmt: skip
 @click.option("--record", metavar="OUT.mp4", help="Record from the start; the video of a second phone is OUT-2.mp4.")
+@click.option("--quota", type=click.FloatRange(0, min_open=True), default=20.0, show_default=True, metavar="GB",
+              help="Largest size of all recordings in their folder.")  # fmt: skip
 @click.option("--serial", metavar="TEXT", help="Serial number of the part in view; default: that of the part file.")
 @click.option("--max-age", callback=_parse_age, default="24h", show_default=True, metavar="AGE",
               help="Age from which an inspection is called old: 8h, 3d, 90min, never.")  # fmt: skip
@@ -149,6 +156,7 @@ def live(
     key: Path | None,
     clients: int | None,
     record: str | None,
+    quota: float,
     serial: str | None,
     max_age: float | None,
     size: tuple[int, int],
@@ -161,7 +169,7 @@ def live(
 
     require_extra()
     from arview.cad.part_file import find_part_file
-    from arview.live.options import LiveOptions
+    from arview.live.options import LiveOptions, RecordingOptions
     from arview.live.server.live_server import LiveServer, open_endpoint
     from arview.video.sources import check_source
 
@@ -175,11 +183,7 @@ def live(
     if (cert is None) != (key is None):
         raise InputError("--cert and --key belong together; give both or none")
     inputs = [*part_paths, views_path, *inspection_paths, camera_spec, source]
-    record_path = output_path(record, inputs) if record else None
-    if record_path is not None and record_path.suffix.lower() not in (".mp4", ".m4v", ".mov"):
-        raise InputError(f"--record {record}: the name of the video must end in .mp4, .m4v or .mov")
-    if record_path is not None:
-        output_path(str(record_path.with_suffix(".jsonl")), inputs)
+    record_path = _record_path(record, inputs) if record else None
     if source != "phone":
         check_source(source)
     options = LiveOptions(
@@ -192,6 +196,7 @@ def live(
         guide=init.removeprefix("guide:") if init else None,
         record=record_path,
         record_folder=record_path.parent if record_path else Path(),
+        recording=RecordingOptions(quota_bytes=round(1e9 * quota)),
         width=size[0],
         height=size[1],
         fps=fps,
@@ -208,10 +213,58 @@ def live(
                 part_paths, unit, views_path, options, GuideViewOptions(renderer=renderer), progress, instances
             )
 
-    asyncio.run(_serve(server, load))
+    with _stopped_by_signals(server):
+        asyncio.run(_serve(server, load))
     say("ended; files are finished")
     _leave_threads()
     ctx.exit(ExitCode.INTERRUPTED)
+
+
+def _record_path(record: str, inputs: list[Any]) -> Path:
+    """Path of the video to record; neither it nor its poses may be one of the inputs. Raises InputError."""
+    path = output_path(record, inputs)
+    if path.suffix.lower() not in (".mp4", ".m4v", ".mov"):
+        raise InputError(f"--record {record}: the name of the video must end in .mp4, .m4v or .mov")
+    output_path(str(path.with_suffix(".jsonl")), inputs)
+    return path
+
+
+@contextmanager
+def _stopped_by_signals(server: LiveServer) -> Iterator[None]:
+    """Stop the server at the first SIGINT or SIGTERM: in good order, or anyway when it takes too long.
+
+    A thread of its own waits for the signal (`signal.set_wakeup_fd`), so that neither a blocked event loop nor a stuck
+    worker can delay it. A second signal ends at once.
+    """
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+
+    def wait() -> None:
+        if not os.read(reading, 1) or is_over.is_set():
+            return
+        server.stop()
+        if is_over.wait(STOP_DEADLINE_S):
+            return
+        say("ended, but a worker did not come back: a recording may be incomplete")
+        sys.stdout.flush()
+        os._exit(ExitCode.INTERRUPTED)
+
+    def again(number: int, frame: object) -> None:
+        """The first signal leaves the second one to the system."""
+        signal.signal(number, signal.SIG_DFL)
+
+    is_over = threading.Event()
+    before = {number: signal.signal(number, again) for number in (signal.SIGINT, signal.SIGTERM)}
+    woken = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    threading.Thread(target=wait, name="signals", daemon=True).start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        signal.set_wakeup_fd(woken)
+        os.write(writing, b"\0")
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _leave_threads() -> None:
@@ -236,19 +289,7 @@ def require_extra() -> None:
 
 
 async def _serve(server: LiveServer, load: Callable[[], Subjects]) -> None:
-    import asyncio
-
     from arview.live.server.loading import warm_up
-
-    loop = asyncio.get_running_loop()
-
-    def end(number: int) -> None:
-        """The first signal ends in good order; a second one ends at once."""
-        loop.remove_signal_handler(number)
-        server.stop()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, end, number)
 
     def ready(hub: Hub) -> None:
         gc.collect()

@@ -17,6 +17,9 @@ MIN_SIDE_PX, MAX_SIDE_PX = 120, 1920
 class FeedOptions:
     """How the frames of one stream are tracked and drawn."""
 
+    stuck_s: float = 90.0  # a frame that is tracked for longer is given up with its thread; compiling takes a minute
+    max_lost: int = 4  # threads given up; then the stream ends, with a notice
+    draw_timeout_s: float = 10.0  # a picture that is drawn for longer is given up, and others are drawn without it
     kept_frames: int = 12  # tracked frames kept for snapshots while the network is slow; 33 MB at 720p
     kept_styles: int = 4  # overlay styles that keep a renderer and their last picture: pages, recording and screens
     rate_window_s: float = 2.0  # window over which frame rates are counted
@@ -35,6 +38,8 @@ class StationOptions:
     max_pause_s: float = 8.0
     open_timeout_s: float = 10.0
     read_timeout_s: float = 3.0
+    stuck_s: float = 30.0  # a reader that neither delivers nor fails for so long is given up with its thread
+    max_lost: int = 8  # readers given up; then the camera counts as broken
     frozen_s: float = 2.0  # pictures that stay equal, pixel for pixel, for so long: sensors have noise
     sample_step_px: int = 7  # distance of the pixels that are compared
 
@@ -43,7 +48,10 @@ class StationOptions:
 class RecordingOptions:
     """When a recording ends by itself."""
 
+    quota_bytes: int = 20_000_000_000  # size of all recordings in the folder, those of earlier runs included
     min_free_bytes: int = 500_000_000  # free disk space that is left to other programs
+    low_bytes: int = 2_000_000_000  # free disk space or rest of the quota below which the page warns
+    stop_timeout_s: float = 60.0  # time for the encoder to finish a file that a page stops
     max_duration_s: float = 3600.0
     check_interval_s: float = 5.0  # time between two checks of the free disk space
 
@@ -125,6 +133,8 @@ class LiveOptions:
     status_interval_s: float = 1.0  # a status is sent at least this often
     reload_interval_s: float = 1.0  # time between two checks of the inspection file
     renewal_interval_s: float = 12 * 3600.0  # time between two checks of the age of the certificate
+    worker_timeout_s: float = 30.0  # a thread for drawing, JPEG or files that takes longer is given up and replaced
+    closing_timeout_s: float = 1.5  # at the end, time for each of pages, camera and tracking to close
     workers: int = 16  # threads for drawing, JPEG and files; most of them wait for a renderer
     feed: FeedOptions = field(default_factory=FeedOptions)
     station: StationOptions = field(default_factory=StationOptions)

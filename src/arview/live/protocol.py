@@ -179,4 +179,6 @@ NOTICE_CODES: Final = {
     "stamp_unreadable": "the frame counter cannot be read: the picture arrives damaged",
     "tracking_failed": "an internal error of the tracking, which was restarted",
     "recording_failed": "the recording could not be written",
+    "recording_ended": "the recording has ended by itself: its longest duration, its quota, or the disk is almost full",
+    "disk_low": "there is little room left for the recording",
 }

@@ -10,7 +10,7 @@ from typing import Protocol
 import av
 import cv2
 
-from arview.errors import InputError
+from arview.errors import InputError, without_credentials
 from arview.video.clock import plausible_fps
 from arview.video.deinterlace import Deinterlacer
 from arview.video.frame import Frame, Image
@@ -226,4 +226,4 @@ class CameraGrabber:
 def _reason(error: Exception) -> str:
     if isinstance(error, av.error.ExitError):
         return "no answer in time"
-    return getattr(error, "strerror", None) or str(error)
+    return without_credentials(getattr(error, "strerror", None) or str(error))

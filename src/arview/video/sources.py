@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from arview.core.checks import PATH, check_type
-from arview.errors import InputError
+from arview.errors import InputError, without_credentials
 from arview.video.files import VideoFileSource
 from arview.video.live import CameraGrabber, LiveSource, UrlGrabber
 from arview.video.pictures import (
@@ -56,7 +56,7 @@ def open_source(
     path = Path(text.removeprefix("file://"))
     if _URL.match(text) and not text.startswith("file://"):
         return LiveSource(
-            text,
+            without_credentials(text),
             lambda: UrlGrabber(text, open_timeout_s, read_timeout_s),
             wanted,
             open_timeout_s,

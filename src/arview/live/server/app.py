@@ -27,6 +27,7 @@ from arview.live.security.refusals import Refusal
 from arview.live.server.annotated_png import annotated_png
 from arview.live.server.clients import Client
 from arview.live.server.hub import Hub
+from arview.live.server.workers import StuckError
 from arview.live.stream.documents import Document, pose_document
 from arview.live.stream.feed import TrackedFrame
 from arview.live.stream.frames import DecodedFrame, IncomingFrame, from_jpeg
@@ -62,7 +63,10 @@ def make_app(hub: Hub, access: Access, connections: ConnectionTable | None = Non
         Route(f"{client}/snapshot.png", handlers.annotated_png),
         Route("/api/recordings/{number:int}", handlers.recording),
     ]
-    app = Starlette(routes=routes, exception_handlers={Refusal: _refused, HTTPException: _http_error, Exception: _bug})
+    app = Starlette(
+        routes=routes,
+        exception_handlers={Refusal: _refused, HTTPException: _http_error, StuckError: _stuck, Exception: _bug},
+    )
     strangers = RateLimit(limits.strangers_per_s, limits.strangers_burst)
     return Gate(app, access, RateLimit(limits.per_s, limits.burst), connections, strangers)
 
@@ -284,6 +288,10 @@ async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     code = _CODES.get(error.status_code, "bad_request")
     return Refusal(error.status_code, code, str(error.detail)).response()
+
+
+async def _stuck(request: Request, error: Exception) -> Response:
+    return Refusal(503, "busy", str(error), {"Retry-After": "5"}).response()
 
 
 async def _bug(request: Request, error: Exception) -> Response:

@@ -6,7 +6,7 @@ import asyncio
 import gc
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Awaitable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from arview.live.protocol import Transport, ViewMode
 from arview.live.security.refusals import Refusal
 from arview.live.server.clients import Client, check_control, choice_of
 from arview.live.server.glb import model_glb
+from arview.live.server.workers import in_daemon_thread
 from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.documents import (
     Document,
@@ -104,7 +105,7 @@ class Hub:
         subjects, _ = self.ready()
         model = subjects[part].part.model
         if model.source_hash not in self._glb:
-            self._glb[model.source_hash] = asyncio.ensure_future(asyncio.to_thread(model_glb, model))
+            self._glb[model.source_hash] = asyncio.ensure_future(in_daemon_thread(lambda: model_glb(model)))
         return await asyncio.shield(self._glb[model.source_hash])
 
     # --- clients --------------------------------------------------------------------------------------
@@ -228,13 +229,22 @@ class Hub:
             self._ticker.cancel()
             with suppress(asyncio.CancelledError):
                 await self._ticker
-        await asyncio.gather(*(self.leave(name) for name in list(self.clients)))
-        if self._station is not None:
-            await asyncio.to_thread(self._station.close)
+        # The files come first; what does not close in time is left to the end of the program.
         if self.recordings is not None:
-            await asyncio.to_thread(self.recordings.stop_all)
+            await self._within(in_daemon_thread(self.recordings.stop_all), 2.0 * self.options.closing_timeout_s)
+        closing: list[Awaitable[object]] = [self.leave(name) for name in list(self.clients)]
+        if self._station is not None:
+            closing.append(in_daemon_thread(self._station.close))
         if self._shared is not None:
-            await asyncio.to_thread(self._shared[0].close)
+            closing.append(in_daemon_thread(self._shared[0].close))
+        await self._within(asyncio.gather(*closing, return_exceptions=True), self.options.closing_timeout_s)
+
+    async def _within(self, work: Awaitable[object], timeout_s: float) -> None:
+        """Wait for work, but not for long."""
+        try:
+            await asyncio.wait_for(work, timeout_s)
+        except TimeoutError:
+            logger.warning("a worker did not come back at the end")
 
     # --- internals ---------------------------------------------------------------------------------------
 
@@ -298,6 +308,7 @@ class Hub:
                 if now_s - reloaded_s >= self.options.reload_interval_s and self.subjects is not None:
                     reloaded_s = now_s
                     await asyncio.to_thread(self.subjects.reload)
+                self._replace_stuck()
                 for client in list(self.clients.values()):
                     if self._is_gone(client, now_s):
                         await self.leave(client.name)
@@ -307,6 +318,15 @@ class Hub:
                 logger.warning("%s", error)
             except Exception:  # the ticker serves all pages and must not end
                 logger.exception("the regular work for all pages failed")
+
+    def _replace_stuck(self) -> None:
+        """Replace threads of tracking and camera that do not come back."""
+        for feed in {id(client.feed): client.feed for client in self.clients.values()}.values():
+            feed.replace_if_stuck()
+        if self._shared is not None:
+            self._shared[0].replace_if_stuck()
+        if self._station is not None:
+            self._station.replace_if_stuck()
 
     def _is_gone(self, client: Client, now_s: float) -> bool:
         if client.connection is None:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 from arview.errors import InputError
 from arview.live.options import LiveOptions
@@ -27,11 +24,11 @@ from arview.live.security.trust_page import trust_app
 from arview.live.server.app import make_app
 from arview.live.server.hub import Hub
 from arview.live.server.uvicorn_server import UvicornServer
+from arview.live.server.workers import WorkerPool, in_daemon_thread
 from arview.live.stream.subjects import Subjects
 from arview.live.transport.webrtc import raise_bitrates
 
 logger = logging.getLogger("arview.live")
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -143,7 +140,7 @@ class LiveServer:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         if self._is_stopped:
             self._stop.set()
-        self._loop.set_default_executor(ThreadPoolExecutor(self.options.workers, thread_name_prefix="arview-worker"))
+        self._loop.set_default_executor(WorkerPool(self.options.workers, self.options.worker_timeout_s))
         raise_bitrates()
         hub = Hub(self.options, [address for address in self.endpoint.addresses if address != "localhost"])
         connections, place = ConnectionTable(self.options.connections), self.endpoint
@@ -154,7 +151,7 @@ class LiveServer:
         stopped = asyncio.ensure_future(self._stop.wait())
         tasks = [asyncio.ensure_future(server.run_until_stopped()) for server in servers]
         tasks.append(asyncio.ensure_future(self._renew(servers[0])))
-        loaded = asyncio.ensure_future(_in_daemon_thread(load))
+        loaded = asyncio.ensure_future(in_daemon_thread(load))
         try:
             await asyncio.wait([stopped, loaded, *tasks], return_when=asyncio.FIRST_COMPLETED)
             if loaded.done():
@@ -183,30 +180,3 @@ class LiveServer:
                 server.renew(await asyncio.to_thread(local_certificates, self.endpoint.addresses))
             except Exception as error:  # the current certificate stays valid for weeks
                 logger.warning("the certificate could not be renewed: %s", error)
-
-
-async def _in_daemon_thread(work: Callable[[], T]) -> T:
-    """As `asyncio.to_thread`, but in a daemon thread, which does not keep the program from exiting."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[T] = loop.create_future()
-
-    def set_outcome(result: T | None, error: BaseException | None) -> None:
-        if done.cancelled():
-            return
-        if error is not None:
-            done.set_exception(error)
-        else:
-            done.set_result(result)  # type: ignore[arg-type]
-
-    def run() -> None:
-        result: T | None = None
-        failure: BaseException | None = None
-        try:
-            result = work()
-        except BaseException as error:
-            failure = error
-        with suppress(RuntimeError):  # the loop has ended in the meantime
-            loop.call_soon_threadsafe(set_outcome, result, failure)
-
-    threading.Thread(target=run, name="arview-loader", daemon=True).start()
-    return await done

@@ -77,17 +77,24 @@ class FrameAnnotator:
             style: overlay style; default: the one that the pages have chosen.
         """
         wanted = style or self.style
-        with self._lock:
-            renderer = self._renderers.pop(wanted, None) or _StyleRenderer(self._subjects, wanted)
-            self._renderers[wanted] = renderer
-            if len(self._renderers) > self._subjects.options.feed.kept_styles:
-                self._renderers.popitem(last=False)
+        lock, renderers = self._lock, self._renderers
+        if not lock.acquire(timeout=self._subjects.options.feed.draw_timeout_s):
+            # The thread that draws does not come back: it keeps its renderers, and others get new ones.
+            if lock is self._lock:
+                self._lock, self._renderers = threading.Lock(), OrderedDict()
+            return self.draw(tracked, style)
+        try:
+            renderer = renderers.pop(wanted, None) or _StyleRenderer(self._subjects, wanted)
+            renderers[wanted] = renderer
+            if len(renderers) > self._subjects.options.feed.kept_styles:
+                renderers.popitem(last=False)
             return renderer.draw(tracked)
+        finally:
+            lock.release()
 
     def close(self) -> None:
         """Release pictures and renderers."""
-        with self._lock:
-            self._renderers.clear()
+        self._renderers = OrderedDict()
 
     def draw_with_status(self, tracked: TrackedFrame) -> AnnotatedFrame:
         """As `draw`, with the status line: for files, which are viewed without the page around them."""

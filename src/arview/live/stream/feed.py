@@ -110,8 +110,9 @@ class Feed:
         self._shape: tuple[int, int, int] | None = None
         self._unreadable_in_a_row = 0
         self._serial = 0
-        self._thread = threading.Thread(target=self._run, name=f"arview-{kind}", daemon=True)
-        self._thread.start()
+        self._lost = 0
+        self._step_began_s: float | None = None
+        self._start()
 
     def put(self, incoming: IncomingFrame) -> None:
         """Add a frame; one that still waits is dropped."""
@@ -145,6 +146,22 @@ class Feed:
         """End the tracking, after the frame that is being tracked."""
         self._slot.close()
         self._thread.join(timeout=5.0)
+
+    def replace_if_stuck(self) -> None:
+        """Give the stream another thread when decoding or tracking of a frame does not come back."""
+        began_s = self._step_began_s
+        if began_s is None or time.monotonic() - began_s < self.options.stuck_s or self._slot.is_closed:
+            return
+        self._step_began_s = None
+        self._lost += 1
+        self.failures += 1
+        if self._lost > self.options.max_lost:
+            logger.error("the tracking did not come back %d times; the stream has ended", self._lost)
+            self._slot.close()
+            return
+        logger.warning("the tracking of a frame did not come back within %.0f s and is replaced", self.options.stuck_s)
+        self._shape = self._session = None
+        self._start()
 
     @property
     def dropped(self) -> int:
@@ -202,14 +219,28 @@ class Feed:
         except ArviewError as error:
             logger.error("%s", error)
 
+    def _start(self) -> None:
+        self._thread = threading.Thread(target=self._run, name=f"arview-{self.kind}", daemon=True)
+        self._thread.start()
+
+    @property
+    def _is_replaced(self) -> bool:
+        """Whether the calling thread was given up: then another one tracks the stream."""
+        return threading.current_thread() is not self._thread
+
     def _run(self) -> None:
         while (incoming := self._slot.take()) is not None:
+            self._step_began_s = time.monotonic()
             try:
                 self._step(incoming)
             except Exception:  # a bug must not end the stream: restart with the next frame, and report it
-                logger.exception("tracking failed and is restarted")
-                self.failures += 1
-                self._shape = None
+                if not self._is_replaced:
+                    logger.exception("tracking failed and is restarted")
+                    self.failures += 1
+                    self._shape = None
+            if self._is_replaced:
+                return
+            self._step_began_s = None
         self._tell_estimate()
         # Reference cycles can keep a broken connection alive for a while; its pictures are released now.
         self._kept.clear()
@@ -224,6 +255,8 @@ class Feed:
             return
         self._unreadable_in_a_row = 0
         tracked = self._track(frame, incoming.arrived_s, started_s)
+        if self._is_replaced:
+            return
         self.newest = tracked
         self._kept.append(tracked)
         self.tracked_rate.tick()

@@ -7,7 +7,9 @@ import re
 import shutil
 import threading
 import time
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -38,15 +40,23 @@ class Recorder:
         annotator: draws the overlay on its frames.
         path: the video.
         options: when the recording ends by itself.
+        space: says how much may still be recorded; default: by disk and quota for this video alone.
 
     Attributes:
         fault: why the file could not be written; empty when it could.
+        ended_by: why the recording ended by itself; empty when it did not.
     """
 
     def __init__(
-        self, feed: Feed, annotator: FrameAnnotator, path: Path, options: RecordingOptions | None = None
+        self,
+        feed: Feed,
+        annotator: FrameAnnotator,
+        path: Path,
+        options: RecordingOptions | None = None,
+        space: Callable[[], Space] | None = None,
     ) -> None:
-        self.path, self.fault = path, ""
+        self.path, self.fault, self.ended_by = path, "", ""
+        self._space = space or (lambda: free_space(path.parent, self._options, [path]))
         self._options = options or RecordingOptions()
         self._feed, self._annotator = feed, annotator
         self._slot: NewestSlot[TrackedFrame] = NewestSlot()
@@ -76,7 +86,9 @@ class Recorder:
         """
         self._feed.unlisten(self._slot.put)
         self._slot.close()
-        self._thread.join()
+        self._thread.join(self._options.stop_timeout_s)
+        if self._thread.is_alive():
+            self.fault = f"{self.path}: the encoder does not come back"
         return self._sink is not None and not self.fault
 
     def _run(self) -> None:
@@ -114,8 +126,61 @@ class Recorder:
         if time.monotonic() - self._disk_checked_s < self._options.check_interval_s:
             return True
         self._disk_checked_s = time.monotonic()
-        free_bytes = shutil.disk_usage(self.path.parent).free
-        return self.seconds < self._options.max_duration_s and free_bytes > self._options.min_free_bytes
+        if self.seconds >= self._options.max_duration_s:
+            self.ended_by = f"the recording has ended: it was {self._options.max_duration_s / 60:.0f} minutes long"
+        else:
+            self.ended_by = self._space().exhausted
+        return not self.ended_by
+
+
+@dataclass(frozen=True)
+class Space:
+    """Room for recordings.
+
+    Attributes:
+        free_bytes: bytes that may still be written.
+        limit: what limits them, for a message.
+        low_bytes: number below which users are warned.
+    """
+
+    free_bytes: int
+    limit: str
+    low_bytes: int
+
+    @property
+    def exhausted(self) -> str:
+        """Why nothing more can be recorded; empty while something can."""
+        return f"the recording has ended: {self.limit}" if self.free_bytes <= 0 else ""
+
+    @property
+    def warning(self) -> str:
+        """A warning before that; empty while there is enough room."""
+        if 0 < self.free_bytes < self.low_bytes:
+            return f"little room for recordings, {self.free_bytes / 1e9:.1f} GB: then {self.limit}"
+        return ""
+
+
+def free_space(folder: Path, options: RecordingOptions, paths: Sequence[Path] = ()) -> Space:
+    """Room for recordings in a folder, by the free disk and by the quota.
+
+    Args:
+        folder: the folder.
+        options: the limits.
+        paths: further recordings, beside those in the folder that pages have asked for; unfinished ones count, too.
+    """
+    on_disk = shutil.disk_usage(folder).free - options.min_free_bytes
+    known = {*folder.glob("live_*"), *folder.glob(".live_*")}
+    for path in paths:
+        known |= {path, *path.parent.glob(f".{path.name}*"), *path.parent.glob(f"{path.name}*")}
+    used = 0
+    for path in known:
+        with suppress(OSError):
+            used += path.stat().st_size
+    left = options.quota_bytes - used
+    if left < on_disk:
+        gb = options.quota_bytes / 1e9
+        return Space(left, f"recordings fill their quota of {gb:g} GB; move some, or raise --quota", options.low_bytes)
+    return Space(on_disk, "the disk is almost full", options.low_bytes)
 
 
 class Recordings:
@@ -128,10 +193,12 @@ class Recordings:
     """
 
     def __init__(self, folder: Path, part_name: str, options: RecordingOptions | None = None) -> None:
-        self._folder, self._part_name, self._options = folder, part_name, options
+        self._folder, self._part_name, self._options = folder, part_name, options or RecordingOptions()
         self._running: dict[Feed, Recorder] = {}
         self._finished: list[Path] = []
         self._fault: dict[Feed, str] = {}
+        self._ended_by: dict[Feed, str] = {}
+        self._checked: tuple[float, Space | None] = (0.0, None)
 
     def of(self, feed: Feed) -> Recorder | None:
         """The running recorder of a feed, or None."""
@@ -143,13 +210,21 @@ class Recordings:
         if self.of(feed) is None:
             self.stop(feed)
             self._fault.pop(feed, None)
-            self._running[feed] = Recorder(feed, annotator, path or self._new_path(), self._options)
+            self._ended_by.pop(feed, None)
+            if full := self.space().exhausted:
+                self._ended_by[feed] = full
+                logger.warning("%s", full)
+                return
+            self._running[feed] = Recorder(feed, annotator, path or self._new_path(), self._options, self.space)
 
     def stop(self, feed: Feed) -> None:
         """End the recording of a feed, if there is one, and wait for its file."""
         recorder = self._running.pop(feed, None)
         if recorder is None:
             return
+        if recorder.ended_by:
+            self._ended_by[feed] = recorder.ended_by
+            logger.warning("%s", recorder.ended_by)
         if recorder.stop():
             self._finished.append(recorder.path)
             logger.info("recorded %s", recorder.path)
@@ -163,11 +238,20 @@ class Recordings:
         """End the recording of a feed that was closed."""
         self.stop(feed)
         self._fault.pop(feed, None)
+        self._ended_by.pop(feed, None)
 
     def stop_all(self) -> None:
-        """End all recordings."""
-        for feed in list(self._running):
-            self.stop(feed)
+        """End all recordings, together: each waits for its encoder."""
+        threads = [threading.Thread(target=self.stop, args=(feed,), daemon=True) for feed in list(self._running)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+
+    def space(self) -> Space:
+        """Room for further recordings."""
+        paths = [*self._finished, *(recorder.path for recorder in self._running.values())]
+        return free_space(self._folder, self._options, paths)
 
     @property
     def finished(self) -> list[int]:
@@ -179,10 +263,24 @@ class Recordings:
         return self._finished[number] if 0 <= number < len(self._finished) else None
 
     def notices(self, feed: Feed) -> list[Notice]:
-        """The notice about a failed recording of a feed, if there is one."""
+        """The notices about the recording of a feed: it failed, it ended by itself, or there is little room for it."""
         running = self._running.get(feed)
         fault = running.fault if running is not None else self._fault.get(feed, "")
-        return [Notice("recording_failed", "error", fault.replace(f"{self._folder}/", ""))] if fault else []
+        ended = running.ended_by if running is not None else self._ended_by.get(feed, "")
+        notices = [Notice("recording_failed", "error", fault.replace(f"{self._folder}/", ""))] if fault else []
+        if ended:
+            notices.append(Notice("recording_ended", "warning", ended))
+        elif running is not None and (low := self._recent_space().warning):
+            notices.append(Notice("disk_low", "warning", low))
+        return notices
+
+    def _recent_space(self) -> Space:
+        """As `space`, looked up once in a while only: notices are made several times a second."""
+        checked_s, space = self._checked
+        if space is None or time.monotonic() - checked_s > self._options.check_interval_s:
+            space = self.space()
+            self._checked = time.monotonic(), space
+        return space
 
     def _new_path(self) -> Path:
         name = re.sub(r"[^\w.-]+", "_", self._part_name).strip("._") or "part"

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 
-from arview.errors import ArviewError
+from arview.errors import ArviewError, without_credentials
 from arview.live.options import StationOptions
 from arview.live.protocol import FRAME_IDS
 from arview.live.stream.feed import Feed
@@ -39,6 +39,8 @@ class StationCamera:
         self._sample: Image | None = None
         self._same_since_s: float | None = None
         self._is_live = False
+        self._lost = 0
+        self._alive_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="arview-station", daemon=True)
         self._thread.start()
 
@@ -46,6 +48,25 @@ class StationCamera:
         """Stop reading and release the source."""
         self._ended.set()
         self._thread.join(timeout=2.0)
+
+    def replace_if_stuck(self) -> None:
+        """Give the camera another thread when opening or reading it does not come back."""
+        options = self._options
+        if self._count and not self._is_live:
+            return  # a file, whose frames may be far apart
+        if time.monotonic() - self._alive_s < options.stuck_s or self._ended.is_set() or self._lost >= options.max_lost:
+            return
+        self._lost += 1
+        self._fault = f"the camera does not answer, for {options.stuck_s:.0f} s"
+        logger.warning("%s; it is opened anew", self._fault)
+        self._alive_s = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name="arview-station", daemon=True)
+        self._thread.start()
+
+    @property
+    def _is_over(self) -> bool:
+        """Whether the calling thread has to end: the camera was closed, or another thread reads it."""
+        return self._ended.is_set() or threading.current_thread() is not self._thread
 
     @property
     def state(self) -> tuple[str, str]:
@@ -76,7 +97,8 @@ class StationCamera:
     def _run(self) -> None:
         options = self._options
         pause_s = options.first_pause_s
-        while not self._ended.is_set():
+        while not self._is_over:
+            self._alive_s = time.monotonic()
             count = self._count
             try:
                 with open_source(
@@ -87,11 +109,11 @@ class StationCamera:
             except ArviewError as error:
                 fault = str(error)
             except Exception as error:  # drivers and decoders can raise anything, and the station must go on
-                logger.exception("reading %s failed", self._spec)
+                logger.exception("reading %s failed", without_credentials(self._spec))
                 fault = f"reading failed ({type(error).__name__})"
-            if self._ended.is_set():
+            if self._is_over:
                 return
-            self._fault = without_folder(fault, self._spec)
+            self._fault = without_folder(without_credentials(fault), self._spec)
             if self._count > count:
                 pause_s = options.first_pause_s
             if fault:
@@ -108,14 +130,14 @@ class StationCamera:
                 first_s = frame.time_s
             if not source.is_live and self._ended.wait(max(0.0, began_s + frame.time_s - first_s - time.monotonic())):
                 return
-            if self._ended.is_set():
+            if self._is_over:
                 return
             self._put(frame, source)
         if not source.is_live and source.fps:
             self._ended.wait(1.0 / source.fps)
 
     def _put(self, frame: Frame, source: FrameSource) -> None:
-        now_s = time.monotonic()
+        now_s = self._alive_s = time.monotonic()
         self._fault = ""
         step = self._options.sample_step_px
         sample = frame.image[::step, ::step].copy()

@@ -1,0 +1,100 @@
+"""Fuzzing: damaged files, requests and command lines, made from valid ones by Hypothesis, against all readers.
+
+    python tools/benchmarks/fuzz --minutes 60
+
+Each target runs in a process of its own. Properties: no traceback but errors of one line, no hang (10 s of the
+processor), no memory above 1 GB, and no answer that differs from a plain reader's where there is one. Faults are
+printed, one for each cause, and their inputs kept. The exit code is 1 when there was one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[3]
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(ROOT / "tests"), str(HERE)]
+
+SLICE_S = 60.0
+DEADLINE_S = 900.0
+
+
+def worker(options: argparse.Namespace) -> None:
+    """Fuzz one target in this process; prints a JSON line with the number of inputs and the faults."""
+    from targets import fuzz
+
+    found = fuzz(options.worker, options.seed, options.examples, options.seconds, options.folder)
+    print(json.dumps(found))
+
+
+def run_worker(name: str, seed: int, examples: int | None, seconds: float, folder: Path) -> dict[str, Any]:
+    """Run `worker` as a process; a crash of it is a fault, too."""
+    command = [sys.executable, str(HERE), "--worker", name, "--seed", str(seed), "--seconds", str(seconds)]
+    command += ["--folder", str(folder), *(["--examples", str(examples)] if examples else [])]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=seconds + DEADLINE_S, check=False)
+    except subprocess.TimeoutExpired:
+        return {"inputs": 0, "faults": [[f"{name} process hangs", f"seed {seed}"]]}
+    lines = done.stdout.strip().splitlines()
+    if done.returncode == 0 and lines:
+        return dict(json.loads(lines[-1]))
+    kept = folder / f"crash-{name}-{seed}"
+    for path in (folder / name).glob("current*"):
+        kept.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, kept)
+    last = done.stderr.strip().splitlines()[-1:] or [""]
+    return {"inputs": 0, "faults": [[f"{name} process ended with {done.returncode}", f"{last[0]} (input in {kept})"]]}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, help="how long, over all targets")
+    parser.add_argument("--examples", type=int, help="inputs of each target instead of a time")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="*", help="targets; default: all")
+    parser.add_argument("--folder", type=Path, help="where inputs of faults are kept; default: a new temporary folder")
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
+    parser.add_argument("--seconds", type=float, default=DEADLINE_S, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.worker:
+        worker(options)
+        return 0
+    from targets import TARGETS
+
+    names = options.only or list(TARGETS)
+    folder = options.folder or Path(tempfile.mkdtemp(prefix="arview-fuzz-"))
+    ends_s = time.monotonic() + 60.0 * (options.minutes or 1e6)
+    inputs = dict.fromkeys(names, 0)
+    faults: dict[str, str] = {}
+    seed = options.seed
+    while time.monotonic() < ends_s:
+        for name in names:
+            left_s = ends_s - time.monotonic()
+            if left_s <= 0:
+                break
+            slice_s = DEADLINE_S if options.examples else min(SLICE_S, left_s)
+            found = run_worker(name, seed, options.examples, slice_s, folder)
+            inputs[name] += found["inputs"]
+            for signature, text in found["faults"]:
+                if signature not in faults:
+                    faults[signature] = text
+                    print(f"fault: {signature}: {text}", flush=True)
+        if options.examples:
+            break
+        seed += 1
+        print(f"{sum(inputs.values())} inputs, {len(faults)} faults", flush=True)
+    print("inputs by target: " + ", ".join(f"{name} {count}" for name, count in inputs.items()))
+    print(f"{sum(inputs.values())} inputs, {len(faults)} faults" + (f"; inputs in {folder}" if faults else ""))
+    return 1 if faults or not all(inputs.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
