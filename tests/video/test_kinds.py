@@ -313,6 +313,27 @@ def test_declared_bits_hold_for_a_dark_picture(tmp_path: Path) -> None:
     assert next(iter(open_source(path))).image[5, 5, 0] == round(400 * 255 / 4095)
 
 
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_pictures_that_say_that_their_pixels_are_not_square(tmp_path: Path, suffix: str) -> None:
+    """As FFmpeg writes the frames of an anamorphic film."""
+    for index, ratio in enumerate(["4/3", "1/1"]):
+        folder = tmp_path / str(index)
+        folder.mkdir()
+        for k in range(2):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 90 + k, np.uint8), format="rgb24")
+            codec = av.CodecContext.create("png" if suffix == ".png" else "mjpeg", "w")
+            codec.width, codec.height, codec.time_base = 64, 48, Fraction(1, 30)
+            codec.pix_fmt = "rgb24" if suffix == ".png" else "yuvj420p"
+            codec.sample_aspect_ratio = Fraction(ratio)
+            packets = [*codec.encode(frame.reformat(format=codec.pix_fmt)), *codec.encode(None)]
+            (folder / f"f{k}{suffix}").write_bytes(b"".join(bytes(packet) for packet in packets))
+        with open_source(folder) as source:
+            assert len([*source]) == 2
+            assert (source.width, source.height) == (64, 48)
+            told = any("its pixels are not square (4:3)" in note for note in source.notes)
+        assert told == (ratio == "4/3")
+
+
 def test_folder_of_heic(tmp_path: Path) -> None:
     pillow_heif = pytest.importorskip("pillow_heif")
     for k in (1, 2, 4):

@@ -29,6 +29,8 @@ PROBED_PICTURES = 5
 """Pictures, spread over the sequence, whose largest values tell how many bits of 16 are used."""
 MAX_DEFLATE_RATIO = 1032
 """Bytes that a byte of compressed data can stand for (RFC 1951): a PNG that claims more is damaged or hostile."""
+MIN_ASPECT_DIFFERENCE = 0.01
+"""Relative difference of the sides of a pixel from which it is not square."""
 USED_BITS = (8, 10, 12, 14, 16)
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
@@ -84,6 +86,7 @@ class PictureSource(FrameSource):
             )
             raise InputError(f"{name}: {which}; save {'it' if len(paths) == 1 else 'them'} as JPEG or PNG")
         self.first_path = path
+        self._aspect_note = _aspect_note(path)
         self.height, self.width = first.shape[:2]
         self.quarter_turns_clockwise = _turns_of_picture(path)
 
@@ -91,13 +94,16 @@ class PictureSource(FrameSource):
         return read_ahead(self._frames)
 
     def _frames(self) -> Iterator[Frame]:
-        self.skipped, self.notes = 0, ()
+        self.skipped, self.notes = 0, (self._aspect_note,) if self._aspect_note else ()
+        has_told_size = False
         for index, path in self._pictures:
             image = self._read(path)
             if image is None or image.shape != (self.height, self.width, 3):
                 self.skipped += 1
-                if image is not None and not self.notes:
+                if image is not None and not has_told_size:
+                    has_told_size = True
                     self.notes = (
+                        *self.notes,
                         f"{path.name} is {image.shape[1]}×{image.shape[0]} px, not {self.width}×{self.height} as the "
                         "first picture: pictures of another size are left out",
                     )
@@ -341,6 +347,25 @@ def _read_raw(data: bytes) -> Image | None:
             return np.ascontiguousarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8))
     except Exception:  # the reader raises whatever a damaged file makes it run into
         return None
+
+
+def _aspect_note(path: Path) -> str:
+    """What to know of pictures whose header says that their pixels are not square; empty if they are.
+
+    Programs disagree on which way round JFIF and PNG state it, so that the pixels are left as they are stored.
+    """
+    try:
+        with open_picture(path.read_bytes()) as picture:
+            is_ratio = picture.info.get("jfif_unit") == 0
+            ratio = picture.info.get("aspect") or (picture.info.get("jfif_density") if is_ratio else None)
+    except (InputError, OSError):
+        return ""
+    if ratio is None or len(ratio) != 2 or min(ratio) <= 0 or abs(ratio[0] / ratio[1] - 1.0) < MIN_ASPECT_DIFFERENCE:
+        return ""
+    return (
+        f"{path.name} says that its pixels are not square ({ratio[0]}:{ratio[1]}): the pictures are used as they are "
+        "stored, which needs a camera calibrated from such pictures (fx and fy differ)"
+    )
 
 
 def _turns_of_picture(path: Path) -> int:
