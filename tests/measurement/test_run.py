@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from arview.cad.part import ComponentSettings, Part
+from arview.cad.part import ComponentSettings, Datum, Part
 from arview.cad.part_file import load_part
 from arview.cli import ExitCode, main
 from arview.errors import InputError
-from arview.geometry import apply, exp_so3, invert, rigid
+from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.summary import overall_verdict
 from arview.measurement import folder as folder_module
@@ -28,6 +28,7 @@ from arview.measurement.run import measure
 from arview.measurement.uncertainty.budget import UncertaintyOptions
 from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import PosedPhoto, SparseModel
+from helpers import photo_scene
 from helpers.cad_files import box, obj_text
 from helpers.photo_scene import CAMERA, photograph, ring, write_photos
 from helpers.plate_scene import TRUTH, as_built, nominal, part
@@ -38,8 +39,12 @@ ROUGH_FROM_TRUE = rigid(exp_so3(np.deg2rad([0.03, -0.02, 0.05])), [0.15, -0.2, 0
 @pytest.fixture(scope="module")
 def reconstruction(tmp_path_factory: pytest.TempPathFactory) -> MetricReconstruction:
     """Twelve photos of the part as built, with poses that are exact in a frame 0.27 mm and 0.06° off."""
+    return _photographed(tmp_path_factory.mktemp("photos"))
+
+
+def _photographed(folder: Path) -> MetricReconstruction:
     built, poses = as_built(), ring(12, distance_mm=420.0)
-    paths = write_photos(tmp_path_factory.mktemp("photos"), [photograph(built, pose, seed=4) for pose in poses])
+    paths = write_photos(folder, [photograph(built, pose, seed=4) for pose in poses])
     photos = tuple(
         PosedPhoto(path.name, path, CAMERA, pose @ invert(ROUGH_FROM_TRUE))
         for path, pose in zip(paths, poses, strict=True)
@@ -81,9 +86,9 @@ def test_displacements_against_truth(inspection: Inspection) -> None:
 
 @pytest.mark.slow
 def test_a_datum_that_fails_does_not_stop_the_rest(reconstruction: MetricReconstruction, tmp_path: Path) -> None:
-    """Datum A is the underside, which no photo shows: it is named with the top face, and all else is measured."""
+    """Datum A is the underside of a block, which no photo shows: it is named, and all else is measured."""
     whole = part()
-    underside = replace(whole.datums[0], point_in_model=(0.0, 0.0, -8.0), direction_in_model=(0.0, 0.0, -1.0))
+    underside = Datum("A", "plane", "block_2", (55.0, -60.0, 0.0), (0.0, 0.0, -1.0))
     found = measure(
         reconstruction,
         replace(whole, datums=(underside, *whole.datums[1:])),
@@ -92,8 +97,8 @@ def test_a_datum_that_fails_does_not_stop_the_rest(reconstruction: MetricReconst
     system = found.datum_system
     assert system is not None and system.frame == "partial" and [one.label for one in system.not_measured] == ["A"]
     failed = system.not_measured[0]
-    assert "points on it could be measured" in failed.reason and failed.feature == "plane"
-    assert failed.instead[0].startswith("plane at (") and failed.instead[0].endswith(", 0)"), failed.instead
+    assert "clear of other components; nor by its edges" in failed.reason and failed.feature == "plane"
+    assert failed.instead[0].startswith("plane at ("), failed.instead
     assert "best fit of plate" in failed.instead[-1]
     assert any(
         text.startswith("datum A (plane): ") and "Could be measured: plane at" in text for text in found.warnings
@@ -108,6 +113,28 @@ def test_a_datum_that_fails_does_not_stop_the_rest(reconstruction: MetricReconst
     assert verdicts["block_2"] is Verdict.UNDECIDED and verdicts["block_1"] is verdicts["block_4"] is Verdict.FAIL
     save_inspection(found, tmp_path / "partial.json")
     assert load_inspection(tmp_path / "partial.json") == found
+
+
+@pytest.mark.slow
+def test_a_plane_without_texture_is_carried_by_its_edges(tmp_path: Path) -> None:
+    """Everything is painted in one grey: datum A is measured by the borders and holes of its face."""
+
+    def paint(points: Array, seed: int) -> Array:
+        return np.where(points[:, 2] > 0.01, 150.0, 90.0)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photo_scene, "_texture", paint)
+        painted = _photographed(tmp_path)
+    found = measure(painted, part(), MeasureOptions(methods=("sweep", "edges")))
+    system = found.datum_system
+    assert system is not None and system.frame == "datums" and not system.not_measured
+    assert (system.datums[0].label, system.datums[0].feature, system.datums[0].method) == ("A", "plane", "edges")
+    assert system.datums[0].locked == "rx ry tz" and system.datums[1].locked == "tx ty"
+    for name, (shift, _) in TRUTH.items():
+        one = found.find(name)
+        assert one is not None and one.distance_mm is not None and one.uncertainty_mm is not None
+        assert np.linalg.norm(np.array(one.displacement_mm, dtype=float) - shift) < 0.15  # a pixel is 0.58 mm
+        assert abs(one.distance_mm - np.linalg.norm(shift)) < one.uncertainty_mm < 0.4
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import cast
@@ -26,7 +26,7 @@ from arview.inspection import (
     Provenance,
     Verdict,
 )
-from arview.measurement.datums.alignment import Alignment
+from arview.measurement.datums.alignment import Alignment, DatumResult
 from arview.measurement.folder import MetricReconstruction
 from arview.measurement.measurand import Measurand
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
@@ -248,12 +248,12 @@ def datum_record(
 ) -> DatumSystem:  # fmt: skip
     """The datum system of an inspection."""
     components = {datum.label: datum.component for datum in part.datums}
-    methods = dict.fromkeys(("plane", "point", "cylinder"), "sweep") | dict.fromkeys(("hole", "pin", "edge"), "edges")
+    features = {datum.label: datum.feature for datum in part.datums if datum.feature != "fit"}
     reports = tuple(
         DatumReport(
-            one.label, one.feature, components.get(one.label, base[0]), one.locked, one.used, one.of,
-            one.residual_mm, one.rest_mm, one.radius_mm,
-            methods.get(one.feature, "sweep and edges") if reconstruction.sparse.photos else "cloud",
+            one.label, features.get(one.label, one.feature), components.get(one.label, base[0]), one.locked, one.used,
+            one.of, one.residual_mm, one.rest_mm, one.radius_mm,
+            _datum_method(one, features) if reconstruction.sparse.photos else "cloud",
         )
         for one in alignment.datums
     )  # fmt: skip
@@ -267,6 +267,13 @@ def datum_record(
         scale.scale, scale.scale_std, "; ".join(used), notes, failed,
         "partial" if failed else "datums" if part.datums else "best_fit",
     )  # fmt: skip
+
+
+def _datum_method(one: DatumResult, features: Mapping[str, str]) -> str:
+    """The method by which a datum was measured in photos."""
+    if one.feature == "fit":
+        return "edges" if one.label in features else "sweep and edges"
+    return "edges" if one.feature in ("hole", "pin", "edge") else "sweep"
 
 
 def failed_datum_text(one: FailedDatum) -> str:

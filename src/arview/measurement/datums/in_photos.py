@@ -14,7 +14,7 @@ from arview.cad.samples import sample_surface
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.datums.cad_features import edge_line, round_faces
-from arview.measurement.datums.datum_fit import robust_weights
+from arview.measurement.datums.datum_fit import check_covered, robust_weights
 from arview.measurement.datums.equations import (
     DatumEquations,
     DatumNotMeasuredError,
@@ -22,6 +22,7 @@ from arview.measurement.datums.equations import (
     surface_equations,
 )
 from arview.measurement.datums.options import DatumOptions
+from arview.measurement.datums.plane_edges import measure_plane_by_edges
 from arview.measurement.datums.planes import inside_triangles, plane_neighbours, plane_samples
 from arview.measurement.datums.rims import Rim, find_rim
 from arview.measurement.photo.edges import EdgePoints, edge_offsets
@@ -64,12 +65,33 @@ def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move], o: Datu
         return _measure_cylinder(datum, views, o)
     if datum.feature == "edge":
         return _measure_edge(datum, views, o)
+    try:
+        by_surface = _measure_flat(datum, views, o)
+        if datum.feature == "plane":
+            check_covered(by_surface, o.alignment)
+        return by_surface
+    except DatumNotMeasuredError as error:
+        if datum.feature != "plane":
+            raise
+        try:
+            return measure_plane_by_edges(datum, views, o)
+        except DatumNotMeasuredError as by_edges:
+            reason = str(by_edges).removeprefix(f"datum {datum.label} ({datum.feature}): ")
+            raise DatumNotMeasuredError(f"{error}; nor by its edges: {reason}") from by_edges
+
+
+def _measure_flat(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquations:
+    """Offsets of the flat faces of a plane, or of the disc around a point, by the sweep."""
     component = views.model.component(datum.component)
     radius_mm = o.point_radius_mm if datum.feature == "point" else None
     points = plane_samples(component, datum, o.samples, radius_mm)
     if not len(points):
         raise InputError(f"datum {datum.label}: {datum.component!r} has no flat face at {list(datum.point_in_model)}")
     points = _clear(points, views, component, datum, o)
+    if not len(points):
+        raise DatumNotMeasuredError(
+            f"datum {datum.label} ({datum.feature}): none of it is {o.min_clear_mm:g} mm clear of other components"
+        )
     normals = np.tile(np.array(datum.direction_in_model), (len(points), 1))
     index = views.model.index(datum.component)
     found = sweep_offsets(points, normals, views, o.reach_mm, o.sweep, index)
@@ -88,6 +110,8 @@ def _clear(points: Array, views: PhotoViews, component: Component, datum: Datum,
         kept = points[~near_others(points, views.model, index, clear_mm)]
         if len(kept) >= min(100, 0.3 * len(points)):
             break
+    if not len(kept):
+        return kept
     # A patch leaves the face where a point displaced by half a patch does.
     around = plane_neighbours(kept, np.array(datum.direction_in_model), 0.7 * patch_mm)
     normal, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
@@ -201,9 +225,22 @@ def _rim_views(views: PhotoViews, rim: Rim, points: Array, radial: Array, o: Dat
         window = views.window(index, None, np.eye(4), groups[:, 0])
         visible = views.visible(index, window, groups)
         pixels, rivals = (camera.project(p @ pose[:3, :3].T + pose[:3, 3]) for p in (points, other))
-        apart = np.linalg.norm(pixels[:, None] - rivals[None], axis=2).min(axis=1)
+        # At the near side the other rim is hidden behind this one; only a rim that is seen can be mistaken for it.
+        shown = _seen_through(rim, other, views.centres[index])
+        apart = np.linalg.norm(pixels[:, None] - rivals[None], axis=2)
+        apart = np.where(shown[None], apart, np.inf).min(axis=1)
         result[:, index] = visible & (apart > o.rival_px)
     return result
+
+
+def _seen_through(rim: Rim, other: Array, eye: Array) -> NDArray[np.bool_]:
+    """(N,) which points of the other rim are seen from a point (3,): for a hole through it, for a pin beside it."""
+    toward = eye - other
+    height = (rim.center - other) @ rim.axis
+    at_rim = other + toward * (height / (toward @ rim.axis))[:, None] - rim.center
+    off = np.linalg.norm(at_rim - (at_rim @ rim.axis)[:, None] * rim.axis, axis=1)
+    is_inside = off < rim.radius_mm
+    return is_inside if rim.is_hole else ~is_inside
 
 
 # --- cylinders and edges ---------------------------------------------------------------------------------

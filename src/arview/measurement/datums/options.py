@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from arview.measurement.datums.equations import AlignmentOptions
 from arview.measurement.photo.options import EdgeOptions, SweepOptions
 
 
@@ -21,4 +22,5 @@ class DatumOptions:
     rim_px: float = 0.07  # standard uncertainty of a rim's position by rust, chalk and burrs beside it
     rival_px: float = 3.0  # rim points with the opposite rim this near in a photo are not used there
     sweep: SweepOptions = field(default_factory=SweepOptions)
+    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     edges: EdgeOptions = field(default_factory=EdgeOptions)

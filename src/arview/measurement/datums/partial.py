@@ -11,11 +11,10 @@ from arview.cad.datum_check import find_rims
 from arview.cad.model import Component, Model
 from arview.cad.part import Datum, DatumFeature
 from arview.errors import InputError
-from arview.geometry import Array
 from arview.inspection import FailedDatum
 from arview.measurement.datums.datum_fit import check_covered
 from arview.measurement.datums.equations import AlignmentOptions, DatumEquations, DatumNotMeasuredError
-from arview.measurement.photo.patches import tangents_of
+from arview.measurement.datums.plane_edges import plane_directions
 
 MeasureDatum = Callable[[Datum], DatumEquations]
 """Measures one datum, or raises InputError."""
@@ -80,18 +79,10 @@ def measure_each(
             directions = ""
             if datum.feature == "plane" and rest is not None:
                 # Without it a hole would lock tilts, which a small circle determines poorly.
-                equations.append(replace(rest, directions=_of_plane(np.array(datum.direction_in_model))))
+                equations.append(replace(rest, directions=plane_directions(np.array(datum.direction_in_model))))
                 directions = "two rotations and the displacement along its normal"
             failed.append(FailedDatum(datum.label, datum.feature, datum.component, reason, tuple(instead), directions))
     return MeasuredDatums(equations, tuple(failed))
-
-
-def _of_plane(normal: Array) -> Array:
-    """(6,3) the directions that a plane locks: rotations about lines in it, translation along its normal."""
-    first, second = (vectors[0] for vectors in tangents_of(normal[None]))
-    result = np.zeros((6, 3))
-    result[:3, 0], result[:3, 1], result[3:, 2] = first, second, normal
-    return result
 
 
 def _alternatives(datum: Datum, component: Component, measure: MeasureDatum, options: PartialOptions) -> list[str]:

@@ -22,6 +22,7 @@ class Rim:
         axis: (3,) unit, towards the cameras.
         radius_mm: of the edge.
         other_center, other_radius_mm: of the edge at the other end.
+        is_hole: whether it is of a hole, otherwise of a pin.
     """
 
     center: Array
@@ -29,6 +30,7 @@ class Rim:
     radius_mm: float
     other_center: Array
     other_radius_mm: float
+    is_hole: bool = True
 
     def points(self, count: int, other: bool = False) -> tuple[Array, Array, Array]:
         """``count`` points (N,3) around the edge, with radial (N,3) and tangent (N,3) unit directions."""
@@ -72,4 +74,4 @@ def find_rim(model: Model, datum: Datum, toward: Array) -> Rim:
     ends = [c for c in circles if c[0] >= top - 0.05 and c[0] <= top + 0.25 * diameter]
     height, radius = max(ends, key=lambda c: (round(c[0], 1), -abs(c[1] - 0.5 * diameter)))
     other = min(wall)
-    return Rim(point + height * axis, axis, radius, point + other[0] * axis, other[1])
+    return Rim(point + height * axis, axis, radius, point + other[0] * axis, other[1], datum.feature == "hole")

@@ -1,0 +1,103 @@
+"""A plane without texture, carried by the edges of its faces: holes, steps and borders that lie in it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arview.cad.part import Datum
+from arview.geometry import Array, exp_so3, log_so3, rigid
+from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, move_equations
+from arview.measurement.datums.options import DatumOptions
+from arview.measurement.photo.component import MeasuredComponent
+from arview.measurement.photo.edges import ComponentEdges, EdgePoints, edge_offsets
+from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
+from arview.measurement.photo.options import PhotoOptions
+from arview.measurement.photo.patches import tangents_of
+from arview.measurement.photo.rival_edges import rival_px
+from arview.measurement.photo.views import PhotoViews
+from arview.measurement.types import Move
+
+
+def measure_plane_by_edges(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquations:
+    """Equations of a datum plane from steps of brightness across all edges of the component that lie in it.
+
+    Shift and turn of these edges are fitted in space from all photos at once; only the two rotations and the
+    displacement along the normal, which a plane locks, are used. Edges beside which another one runs are left out.
+
+    Raises:
+        DatumNotMeasuredError: too few of its edges are seen, or they do not determine the plane.
+    """
+    name = f"datum {datum.label} ({datum.feature})"
+    index = views.model.index(datum.component)
+    body = MeasuredComponent(views, index, None, PhotoOptions(edges=o.edges))
+    predicted = ComponentEdges(body).predicted(np.eye(4))
+    normal, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
+    lies = np.abs((predicted.points - point) @ normal) < 0.05
+    lies &= np.abs(predicted.tangents @ normal) < 0.02
+    edges = predicted.of(lies & (rival_px(predicted, views, o.rival_px) > o.rival_px))
+    if len(edges.points) < o.edges.min_points or len(np.unique(edges.view)) < 3:
+        raise DatumNotMeasuredError(
+            f"{name}: {len(edges.points)} points of edges in it are seen in {len(np.unique(edges.view))} photos"
+        )
+    center = edges.points.mean(axis=0)
+    radius_mm = float(np.sqrt(((edges.points - center) ** 2).sum(axis=1).mean()))
+    place, fit, dark = np.eye(4), None, np.zeros(6)
+    px_mm = views.mm_per_px(center)
+    for reach_px in (o.reach_mm / px_mm + 2.0, o.fine_reach_px, o.fine_reach_px):
+        found = _fitted(edges, place, center, radius_mm, views, reach_px, px_mm, o)
+        if found is None:
+            raise DatumNotMeasuredError(f"{name}: its edges are not seen where they should be")
+        fit, dark = found
+        turn = exp_so3(fit.twist[:3])
+        middle = place[:3, :3] @ center + place[:3, 3]
+        place = rigid(turn, middle - turn @ middle + fit.twist[3:]) @ place
+    assert fit is not None
+    unit = np.array([radius_mm] * 3 + [1.0] * 3)
+    project = (np.eye(6) - fit.undetermined.T @ fit.undetermined) / unit[:, None] * unit
+    twist = project @ np.concatenate([log_so3(place[:3, :3]), place[:3, :3] @ center + place[:3, 3] - center])
+    systematic = np.diag(1.0 / unit**2) * (o.rim_px * px_mm) ** 2
+    # Where the face is brighter than all around it, glare moves all its edges alike.
+    covariance = fit.covariance + project @ (systematic + np.outer(dark, dark)) @ project.T
+    used = int(np.count_nonzero(fit.weights > 0.1))
+    move = Move(
+        datum.component, "edges", center, twist, covariance, fit.undetermined, radius_mm, used, fit.residual_mm, 1.0
+    )
+    directions = plane_directions(normal)
+    if len(fit.undetermined) and np.linalg.norm(fit.undetermined @ directions, axis=1).max() > 0.1:
+        raise DatumNotMeasuredError(f"{name}: the edges in it do not determine its tilt; photograph it from more sides")
+    equations, _ = move_equations(datum.label, move, datum.locks)
+    return DatumEquations(
+        equations.label, "fit", equations.rows, equations.offsets_mm, equations.variances, equations.points,
+        equations.of, None, datum.locks, directions=directions,
+    )  # fmt: skip
+
+
+def plane_directions(normal: Array) -> Array:
+    """(6,3) the directions that a plane locks: rotations about lines in it, translation along its normal."""
+    first, second = (vectors[0] for vectors in tangents_of(normal[None]))
+    result = np.zeros((6, 3))
+    result[:3, 0], result[:3, 1], result[3:, 2] = first, second, normal
+    return result
+
+
+def _fitted(
+    edges: EdgePoints, place: Array, center: Array, radius_mm: float, views: PhotoViews, reach_px: float,
+    px_mm: float, o: DatumOptions,
+) -> tuple[RigidFit, Array] | None:  # fmt: skip
+    """Motion of the edges from a place (4,4), and the twist (6,) that a shift of all of them to the dark side makes.
+
+    None if too few steps are found.
+    """
+    moved = EdgePoints(edges.points @ place[:3, :3].T + place[:3, 3], edges.tangents @ place[:3, :3].T, edges.view)
+    middle = place[:3, :3] @ center + place[:3, 3]
+    found = edge_offsets(moved, middle, views, reach_px, o.edges)
+    ok = found.seen & (found.slopes != 0.0)
+    if np.count_nonzero(ok) < o.edges.min_points:
+        return None
+    slope = np.abs(found.slopes[ok])
+    sigmas = 0.3 * found.mm_per_px[ok] * np.sqrt((slope + o.edges.half_slope) / slope)
+    fit = fit_rigid(
+        move_rows(moved.points[ok], found.directions[ok], middle), found.offsets_mm[ok], sigmas, np.zeros((0, 6)),
+        radius_mm, o.reach_mm, moved.points[ok] / (4.0 * px_mm), o.edges.min_sigma_px / 0.3, max_pairs=3000,
+    )  # fmt: skip
+    return fit, fit.gain @ (np.sign(found.slopes[ok]) * found.mm_per_px[ok]) * (0.5 * o.edges.max_dark_shift_px)
