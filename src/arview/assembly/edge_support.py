@@ -1,9 +1,8 @@
 """How well image edges support each component at its nominal placement, and at displaced ones.
 
 For every component the kernels measure the share of its visible edge points that lie on image edges, at the best of
-the small shifts that tolerance and pose error allow; the same share at the best of many larger shifts; how the colours
-change across its outline; and whether the edges around it are found, which separates occluded components from missing
-ones.
+the small shifts that tolerance and pose error allow; the same share at the best of many larger shifts; and how the
+colours change across its outline.
 
 Source: scores of a shifted edge template by Borgefors (PAMI 1988).
 """
@@ -34,8 +33,6 @@ MAX_RUN_CONTRAST = 10.0
 """Colour change of a run, in standard deviations, above which it counts no more."""
 ACROSS = np.array([-1.0, 0.0, 1.0])
 """Steps along a point's normal at which an edge is looked for."""
-FIRST_REACH_PX, REACH_GROWTH, MAX_REACH_PX = 16.0, 1.5, 130.0
-"""Surrounding points are gathered within the first distance, which grows by the factor until there are enough."""
 
 
 class PointLimits(NamedTuple):
@@ -48,8 +45,6 @@ class PointLimits(NamedTuple):
         well_supported: share of supported points from which on displaced placements are not tried, to save time.
         typical_displaced: share that is then assumed at the best displaced placement.
         color_reach_px: distance from an edge at which colours are compared.
-        max_surroundings: points of other components gathered around one.
-        min_surroundings: with fewer of them the surroundings are unknown and count as found.
     """
 
     min_slope: float = 1.5
@@ -58,8 +53,6 @@ class PointLimits(NamedTuple):
     well_supported: float = 0.8
     typical_displaced: float = 0.45
     color_reach_px: float = 3.0
-    max_surroundings: int = 16
-    min_surroundings: int = 8
 
 
 @dataclass(frozen=True)
@@ -100,16 +93,12 @@ class EdgeSupport(NamedTuple):
         supported: share of its points on image edges at the nominal placement.
         displaced: share of its points on image edges at the best displaced placement.
         contrast: mean colour change across its outline in standard deviations; -1 without an outline of its own.
-        surroundings: share of the points around its unsupported ones that lie on image edges; 1 if there are few.
-        others: share of all other components' points on image edges; 1 if there are none.
         determined: number of points that determine its position in the least determined image direction.
     """
 
     supported: Array
     displaced: Array
     contrast: Array
-    surroundings: Array
-    others: Array
     determined: Array
 
 
@@ -143,14 +132,6 @@ class _Projected(NamedTuple):
     pixels: Array
     normals: Array
     depths: Array
-
-
-class _MeasuredPoints(NamedTuple):
-    """Points measured: indices (C,K), how many (C,), and which are supported (C,K)."""
-
-    chosen: NDArray[np.int64]
-    sizes: NDArray[np.int64]
-    hit: NDArray[np.bool_]
 
 
 class EdgeSupportMeter:
@@ -245,9 +226,9 @@ def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:
 @kernel
 def _best_shift(
     picture: EdgePicture, c: int, places: NDArray[np.int64], along: NDArray[np.int64], count: int,
-    scores: NDArray[np.float64], shifts: NDArray[np.int64], costs: NDArray[np.float64], hit: NDArray[np.bool_]
+    scores: NDArray[np.float64], shifts: NDArray[np.int64], costs: NDArray[np.float64]
 ) -> float:  # fmt: skip
-    """Share of ``count`` points on edges at the best shift (by the sum of scores less its cost); sets ``hit`` (count,).
+    """Share of ``count`` points on edges at the best shift, by the sum of scores less its cost.
 
     Args:
         picture: with thin edges and owners.
@@ -255,11 +236,9 @@ def _best_shift(
         places, along: (K,3,2) pixels across the edge at each point, and (K,2) normals in 127ths.
         scores: (256,) by edge strength.
         shifts, costs: (S,2) px, and the share (S,) that each must gain.
-        hit: becomes True for points on an edge at the best shift.
     """
     directions, strength, owners = picture.directions, picture.strength, picture.owners
     best = -1e9
-    best_shift = 0
     share = 0.0
     for s in range(shifts.shape[0]):
         total = -costs[s] * count
@@ -271,10 +250,7 @@ def _best_shift(
             if total + (count - 1 - k) < best:
                 break
         if total > best:
-            best, best_shift, share = total, s, hits / count
-    dx, dy = shifts[best_shift, 0], shifts[best_shift, 1]
-    for k in range(count):
-        hit[k] = strength_at(directions, strength, owners, c, places[k], along[k], dx, dy) > 0
+            best, share = total, hits / count
     return share
 
 
@@ -323,41 +299,6 @@ def _contrast(image: NDArray[np.uint8], edges: VisibleEdges, projected: _Project
 
 
 @kernel
-def _surroundings(pixels: NDArray[np.float64], points: _MeasuredPoints, c: int, limits: PointLimits) -> float:
-    """Share of other components' points on edges, of those nearest to a component's unsupported points; 1 if few."""
-    chosen, sizes, hit = points.chosen, points.sizes, points.hit
-    low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
-    for k in range(sizes[c]):
-        if not hit[c, k]:
-            i = chosen[c, k]
-            low_u, high_u = min(low_u, pixels[i, 0]), max(high_u, pixels[i, 0])
-            low_v, high_v = min(low_v, pixels[i, 1]), max(high_v, pixels[i, 1])
-    reach = FIRST_REACH_PX
-    hits = 0
-    tried = 0
-    while reach < MAX_REACH_PX:
-        hits = 0
-        tried = 0
-        for o in range(sizes.shape[0]):
-            if o == c:
-                continue
-            for k in range(sizes[o]):
-                u, v = pixels[chosen[o, k], 0], pixels[chosen[o, k], 1]
-                if u < low_u - reach or u > high_u + reach or v < low_v - reach or v > high_v + reach:
-                    continue
-                for q in range(sizes[c]):
-                    j = chosen[c, q]
-                    if not hit[c, q] and (pixels[j, 0] - u) ** 2 + (pixels[j, 1] - v) ** 2 < reach * reach:
-                        tried += 1
-                        hits += hit[o, k]
-                        break
-        if tried >= limits.max_surroundings:
-            break
-        reach *= REACH_GROWTH
-    return hits / tried if tried >= limits.min_surroundings else 1.0
-
-
-@kernel
 def _usable_points(
     edges: VisibleEdges, projected: _Projected, c: int, shape: tuple[int, int], usable: NDArray[np.int64]
 ) -> tuple[int, float]:  # fmt: skip
@@ -389,20 +330,18 @@ def _usable_points(
 
 @kernel
 def _place_points(
-    projected: _Projected, usable: NDArray[np.int64], chosen: NDArray[np.int64], places: NDArray[np.int64],
-    along: NDArray[np.int64]
+    projected: _Projected, usable: NDArray[np.int64], places: NDArray[np.int64], along: NDArray[np.int64]
 ) -> int:  # fmt: skip
-    """Choose evenly spread points of those usable: sets their indices, pixels and normals, see `_best_shift`.
+    """Choose evenly spread points of those usable: sets their pixels and normals, see `_best_shift`.
 
     Returns:
         how many they are.
     """
     pixels, normals = projected.pixels, projected.normals
     inside = usable.shape[0]
-    count = min(inside, chosen.shape[0])
+    count = min(inside, places.shape[0])
     for k in range(count):
         i = usable[int((k + 0.5) * inside / count)]
-        chosen[k] = i
         along[k, 0] = int(np.round(127.0 * normals[i, 0]))
         along[k, 1] = int(np.round(127.0 * normals[i, 1]))
         for t in range(3):
@@ -435,40 +374,23 @@ def measure_edge_support(
     pixels = projected.pixels
     find_thin_edges(picture, limits.min_slope)
     mark_owners(pixels, projected.depths, edges.component, picture.owners)
-    found = np.full((6, count), -1.0)
-    support = EdgeSupport(found[0], found[1], found[2], found[3], found[4], found[5])
-    points = _MeasuredPoints(
-        np.empty((count, limits.max_points), dtype=np.int64),
-        np.zeros(count, dtype=np.int64),
-        np.zeros((count, limits.max_points), dtype=np.bool_),
-    )
-    ignored = np.zeros(limits.max_points, dtype=np.bool_)
+    found = np.full((4, count), -1.0)
+    support = EdgeSupport(found[0], found[1], found[2], found[3])
     usable = np.empty(pixels.shape[0], dtype=np.int64)
     places = np.empty((limits.max_points, 3, 2), dtype=np.int64)
     along = np.empty((limits.max_points, 2), dtype=np.int64)
     scores = np.arange(256) / (np.arange(256) + HALF_SCORE_STRENGTH)
     no_costs = np.zeros(shifts.far.shape[0])
-    all_hits = 0.0
-    all_points = 0
     for c in range(count):
         inside, determined = _usable_points(edges, projected, c, shape, usable)
         if inside < limits.min_points:
             continue
-        kept = _place_points(projected, usable[:inside], points.chosen[c], places, along)
-        points.sizes[c] = kept
-        here = _best_shift(picture, c, places, along, kept, scores, shifts.near, shifts.near_costs, points.hit[c])
+        kept = _place_points(projected, usable[:inside], places, along)
+        here = _best_shift(picture, c, places, along, kept, scores, shifts.near, shifts.near_costs)
         support.supported[c] = here
         support.displaced[c] = limits.typical_displaced
         if here < limits.well_supported:
-            support.displaced[c] = _best_shift(picture, c, places, along, kept, scores, shifts.far, no_costs, ignored)
+            support.displaced[c] = _best_shift(picture, c, places, along, kept, scores, shifts.far, no_costs)
         support.contrast[c] = _contrast(picture.image, edges, projected, c, limits.color_reach_px)
         support.determined[c] = determined
-        all_points += kept
-        all_hits += here * kept
-    for c in range(count):
-        if points.sizes[c] == 0:
-            continue
-        support.surroundings[c] = _surroundings(pixels, points, c, limits)
-        others = all_points - points.sizes[c]
-        support.others[c] = (all_hits - support.supported[c] * points.sizes[c]) / others if others > 0 else 1.0
     return support
