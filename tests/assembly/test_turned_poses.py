@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from arview.assembly.monitor import AssemblyMonitor
-from arview.assembly.turned_poses import TurnedPoses, TurnEvidence, base_symmetries
+from arview.assembly.turned_poses import TurnedPoses, TurnEvidence, base_turns
+from arview.cad.model import Component
 from arview.geometry import Array, apply
 from arview.pose import Presence
 from arview.tracking import TrackingSession
@@ -15,50 +16,78 @@ from helpers.synthetic import CAMERA, assembly, assembly_views, changed, compone
 
 NAMES = tuple(one.name for one in assembly().components)
 PLATE = assembly().components[0]
-HALF_TURN = base_symmetries(PLATE)
+TURNS = base_turns(assembly().components, 0)
+NOTHING = np.zeros(len(NAMES), dtype=bool)
+SEEN = np.where(np.arange(len(NAMES)) > 0, 2.0, 0.0)
 
 
 def upright_turn() -> Array:
     """The half turn about the plate's normal."""
-    return next(turn for turn in HALF_TURN if turn[2, 2] > 0.9)
+    return next(turn.model_from_model for turn in TURNS if turn.model_from_model[2, 2] > 0.9)
+
+
+def turns_of(base: Component) -> list[Array]:
+    return [turn.model_from_model for turn in base_turns([base], 0)]
 
 
 def test_the_symmetries_of_a_base_leave_it_where_it_is() -> None:
-    assert len(HALF_TURN) == 3
+    assert len(TURNS) == 3
     corners = PLATE.vertices_in_model
-    for turn in HALF_TURN:
-        turned = apply(turn, corners)
+    for turn in TURNS:
+        turned = apply(turn.model_from_model, corners)
         assert np.allclose(np.sort(turned, axis=0), np.sort(corners, axis=0), atol=1e-6)
         assert not np.allclose(turned, corners, atol=1.0)
+        assert turn.is_exact
     square = component("square", box((0, 0, 0), (50, 50, 10)), (0.5, 0.5, 0.5))
-    assert len(base_symmetries(square)) == 5
+    assert len(turns_of(square)) == 5
     stepped = component("stepped", box((0, 0, 0), (80, 50, 20)), (0.5, 0.5, 0.5))
     uneven = np.array(stepped.vertices_in_model)
     uneven[(uneven[:, 0] > 40) & (uneven[:, 2] > 10)] += [0.0, 0.0, 12.0]
-    assert base_symmetries(component("uneven", (uneven, stepped.faces), (0.5, 0.5, 0.5))) == []
+    assert turns_of(component("uneven", (uneven, stepped.faces), (0.5, 0.5, 0.5))) == []
+
+
+def test_components_of_one_shape_change_places() -> None:
+    names = ("plate", "left", "right", "corner")
+    boxes = (
+        ((0, 0, 0), (100, 60, 6)),
+        ((10, 26, 6), (18, 34, 20)),
+        ((82, 26, 6), (90, 34, 20)),
+        ((5, 5, 6), (15, 15, 9)),
+    )
+    parts = [component(name, box(*corners), (0.5, 0.5, 0.5)) for name, corners in zip(names, boxes, strict=True)]
+    upright = next(turn for turn in base_turns(parts, 0) if turn.model_from_model[2, 2] > 0.9)
+    assert upright.counterparts.tolist() == [0, 2, 1, -1]
+    turned = TurnedPoses(parts, 0)
+    assert len(turned.open_turns(np.array([True, True, True, False]))) == 1
+    assert turned.open_turns(np.array([True, True, True, True])) == []
+    # What is seen of the two says nothing, even where noise favours one pose.
+    for _ in range(20):
+        turned.compare(np.eye(4), lambda at: TurnEvidence(np.array([0.0, 3.0, 2.0, 0.0]) * (np.trace(at) > 3.9), 0.8))
+    assert len(turned.open_turns(np.array([True, True, False, False]))) == 1 and turned.better is None
 
 
 @pytest.mark.parametrize(
     ("here", "there", "is_better", "is_open"),
     [
-        (TurnEvidence(0.0, 0.8), TurnEvidence(9.0, 0.8), True, True),
-        (TurnEvidence(9.0, 0.8), TurnEvidence(0.0, 0.8), False, False),
-        (TurnEvidence(0.0, 0.8), TurnEvidence(0.5, 0.8), False, True),
-        (TurnEvidence(0.0, 0.5), TurnEvidence(0.0, 0.8), True, True),
+        (TurnEvidence(0.0 * SEEN, 0.8), TurnEvidence(SEEN, 0.8), True, True),
+        (TurnEvidence(SEEN, 0.8), TurnEvidence(0.0 * SEEN, 0.8), False, False),
+        (TurnEvidence(0.0 * SEEN, 0.8), TurnEvidence(0.05 * SEEN, 0.8), False, True),
+        # The plate is exactly symmetric: that less of its edges are found says nothing.
+        (TurnEvidence(0.0 * SEEN, 0.5), TurnEvidence(0.0 * SEEN, 0.8), False, True),
     ],
 )
 def test_what_is_seen_decides_between_poses(
     here: TurnEvidence, there: TurnEvidence, is_better: bool, is_open: bool
 ) -> None:
-    turned = TurnedPoses(PLATE)
-    assert not turned.is_open and turned.better is None and turned.poses(np.eye(4)) == ()
+    turned = TurnedPoses(assembly().components, 0)
+    assert len(turned.open_turns(NOTHING)) == 3 and turned.better is None
     pose = pose_from(0, 45, 520)
     for _ in range(2):
         turned.compare(pose, lambda at: here if at is pose else there)
     assert (turned.better is not None) == is_better
-    assert turned.is_open == is_open
+    assert bool(turned.open_turns(NOTHING)) == is_open
     turned.reset()
-    assert not turned.is_open
+    assert len(turned.open_turns(NOTHING)) == 3
 
 
 @pytest.mark.slow

@@ -150,7 +150,7 @@ class AssemblyMonitor:
         self.options = options or MonitorOptions()
         self._views, self._camera, self._model = views, camera, model
         self._lines: PresentLines | None = None
-        self._turned = TurnedPoses(model.components[base_of(model)], self.options.turned_poses)
+        self._turned = TurnedPoses(model.components, base_of(model), self.options.turned_poses)
         self._has_components = len(model.components) > 1
         self._observer = ComponentObserver(views, camera, model, self.options.observation)
         boxes = np.array([one.bounds_in_model for one in model.components])
@@ -183,7 +183,10 @@ class AssemblyMonitor:
 
     def other_poses(self, cam_from_model: Array) -> tuple[Array, ...]:
         """Poses (4,4) in which the base looks the same, and of which nothing has yet shown that they are wrong."""
-        return self._turned.poses(cam_from_model) if self._is_suspect().any() else ()
+        if not self._is_suspect().any():
+            return ()
+        turns = self._turned.open_turns(self._state.is_verified)
+        return tuple(cam_from_model @ turn.model_from_model for turn in turns)
 
     def set_aside(self) -> None:
         """Keep what is known while the part is lost, for `resume`."""
@@ -284,6 +287,21 @@ class AssemblyMonitor:
         self._lines = self._lines or PresentLines(self._model, part)
         return self._lines.update(self._is_suspect(), self._state.is_verified, cam_from_model)
 
+    def base_lines(self, part: PartView, cam_from_model: Array) -> PartView:
+        """As `present_lines` where only the base was found: the others are left out until they are seen."""
+        self._lines = self._lines or PresentLines(self._model, part)
+        is_base = np.arange(len(self._state.log_odds)) == self._observer.base
+        return self._lines.update(~is_base, is_base, cam_from_model)
+
+    def best_turned(self, image: NDArray[np.uint8], cam_from_model: Array) -> Array:
+        """Of a pose (4,4) and those in which the base looks the same, the one of which a picture shows most.
+
+        Args:
+            image: (H,W,3) uint8 RGB of the camera's size.
+            cam_from_model: (4,4) mm.
+        """
+        return self._turned.best(cam_from_model, lambda pose: self._observer.pose_evidence(image, pose))
+
     def presence(self, cam_from_model: Array, is_ambiguous: bool = False) -> Mapping[str, ComponentPresence]:
         """Presence of each component by its name; empty for a part of one component.
 
@@ -293,7 +311,6 @@ class AssemblyMonitor:
         """
         if not self._has_components:
             return {}
-        is_ambiguous = is_ambiguous or (self._turned.is_open and bool(self._is_suspect().any()))
         visibilities = self._visibilities(cam_from_model)
         key = (self._state.observations, is_ambiguous, visibilities.tobytes())
         if self._said is None or self._said[0] != key:
@@ -312,13 +329,13 @@ class AssemblyMonitor:
 
     def _presence_now(self, visibilities: NDArray[np.int8], is_ambiguous: bool) -> dict[str, ComponentPresence]:
         """Presence of each component by its name, for visibilities (C,) as indices of `VISIBILITIES`."""
-        state, presences = self._state, self._presences(is_ambiguous)
+        state, (presences, is_open) = self._state, self._presences(is_ambiguous)
         probabilities, spreads_deg = 1.0 / (1.0 + np.exp(state.log_odds)), state.directions.spreads_deg
         return {
             name: ComponentPresence(
                 presence=presences[c],
                 visibility=VISIBILITIES[visibilities[c]],
-                probability=0.5 if is_ambiguous and c != self._observer.base else float(probabilities[c]),
+                probability=0.5 if is_open[c] else float(probabilities[c]),
                 observations=int(state.directions.observations[c]),
                 spread_deg=float(spreads_deg[c]),
                 model_from_nominal=rigid(np.eye(3), state.shifts[c]) if presences[c] is Presence.DISPLACED else None,
@@ -326,8 +343,8 @@ class AssemblyMonitor:
             for c, name in enumerate(self._views.component_names)
         }
 
-    def _presences(self, is_ambiguous: bool) -> list[Presence]:
-        """Presence of each component."""
+    def _presences(self, is_ambiguous: bool) -> tuple[list[Presence], NDArray[np.bool_]]:
+        """Presence of each component, and (C,) those of which it depends on which of several poses is right."""
         o, state = self.options, self._state
         is_displaced = state.is_missing & (state.alternative > o.displaced_log_odds)
         is_uncertain = self._is_uncertain() | state.is_mismatched
@@ -336,9 +353,15 @@ class AssemblyMonitor:
             [Presence.DISPLACED, Presence.MISSING, Presence.PRESENT, Presence.UNCERTAIN],
             Presence.UNVERIFIED,
         )
-        if is_ambiguous:
-            found[np.arange(len(found)) != self._observer.base] = Presence.UNCERTAIN
-        return [Presence(one) for one in found]
+        is_open = np.full(len(found), is_ambiguous)
+        for turn in self._turned.open_turns(state.is_verified):
+            # In the turned pose each component is what was found at the place of its counterpart.
+            turned = np.where(turn.counterparts >= 0, found[turn.counterparts], Presence.UNVERIFIED)
+            is_open |= (turned != found) & ((found == Presence.PRESENT) | state.is_missing)
+        is_open[self._observer.base] = False
+        unsure = Presence.UNCERTAIN if is_ambiguous or self._is_suspect().any() else Presence.UNVERIFIED
+        found[is_open] = unsure
+        return [Presence(one) for one in found], is_open
 
     def _visibilities(self, cam_from_model: Array) -> NDArray[np.int8]:
         """(C,) visibility of each component in a frame, as indices of `VISIBILITIES`."""

@@ -224,8 +224,8 @@ class ComponentObserver:
         by_edges = np.where(support.supported >= 0.0, edge_log_odds(support, o.log_odds), 0.0)
         is_base = np.arange(self._count) == self.base
         points = self._meter.found_points(edges, is_base)
-        seen = np.clip(-by_edges[~is_base], 0.0, o.max_seen)
-        return TurnEvidence(float(seen.sum()), float(np.mean(points.is_found)) if len(points.is_found) else 0.0)
+        seen = np.where(is_base, 0.0, np.clip(-by_edges, 0.0, o.max_seen))
+        return TurnEvidence(seen, float(np.mean(points.is_found)) if len(points.is_found) else 0.0)
 
     def motion_px(self, before: Array | None, cam_from_model: Array) -> float:
         """Largest motion of a corner of the part's box between two poses, px after shrinking; 0 for an unknown one."""

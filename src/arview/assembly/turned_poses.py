@@ -1,23 +1,25 @@
 """Is the part turned? Poses in which its base looks the same, so that the components would be elsewhere.
 
 Where many components are absent, a pose that is turned by a symmetry of the base is found as well as the right one, and
-all components then look absent. Which of them it is, is said by components that are seen in one of the poses, and by
-what breaks the symmetry of the base. Absent components say nothing: any number may be absent.
+all components then look absent. Which of them it is, is said by components that are seen in one of the poses where no
+component of their shape belongs in the other, and by what breaks the symmetry of the base. Absent components say
+nothing: any number may be absent. Two that change places say nothing either: each pose explains what is seen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from arview.cad.model import Component
 from arview.cad.samples import sample_surface
-from arview.geometry import Array, exp_so3, rigid
+from arview.geometry import Array, apply, exp_so3, rigid
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,8 @@ class TurnedPoseOptions:
         max_samples: samples of the surface of the base.
         same_share: distance in diameters of the base up to which a turned sample lies on its surface.
         min_same: share of the samples that must.
+        exact_share: distance in diameters of the base up to which all its corners, turned, lie on corners if the
+            symmetry is exact.
         base_weight: log odds per share of the base's edge points that are found.
         max_added: bound on what one observation adds.
         better: summed log odds from which on a turned pose is better.
@@ -37,97 +41,166 @@ class TurnedPoseOptions:
     max_samples: int = 3000
     same_share: float = 0.015
     min_same: float = 0.9
+    exact_share: float = 0.003
     base_weight: float = 30.0
     max_added: float = 4.0
-    better: float = 6.0
+    better: float = 5.5
     worse: float = -3.5
 
 
 class TurnEvidence(NamedTuple):
-    """Log odds by the components that are seen at a pose, and the share of the base's edge points that are found."""
+    """What a picture shows at a pose.
 
-    components: float
+    Attributes:
+        seen: (C,) log odds for each component by its edges, at least 0; 0 for the base.
+        base: share of the base's edge points that are found.
+    """
+
+    seen: Array
     base: float
+
+
+class Turn(NamedTuple):
+    """A rotation after which the base looks the same.
+
+    Attributes:
+        model_from_model: (4,4) from the turned pose, on the model's side: ``cam_from_model @ model_from_model``.
+        counterparts: (C,) the component at whose place each component is in the turned pose, and that has its shape;
+            -1 where there is none.
+        is_exact: nothing of the base breaks the symmetry, so that its edges cannot tell.
+    """
+
+    model_from_model: Array
+    counterparts: NDArray[np.int64]
+    is_exact: bool
+
+    def unmatched(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(C,) components whose sight says that the part is not turned, and whose sight in the turned pose says so.
+
+        A component that is seen is, in the turned pose, seen at another place. If one of its shape belongs there, both
+        poses explain the picture.
+        """
+        is_counterpart = np.zeros(len(self.counterparts), dtype=bool)
+        is_counterpart[self.counterparts[self.counterparts >= 0]] = True
+        return ~is_counterpart, self.counterparts < 0
 
 
 class TurnedPoses:
     """Compares a tracked pose with those in which the base looks the same.
 
     Args:
-        base: the component that carries the others.
+        components: of the part.
+        base: index of the one that carries the others.
         options: see `TurnedPoseOptions`.
     """
 
-    def __init__(self, base: Component, options: TurnedPoseOptions | None = None) -> None:
-        self._options, self._base = options or TurnedPoseOptions(), base
-        self.reset()
+    def __init__(self, components: Sequence[Component], base: int, options: TurnedPoseOptions | None = None) -> None:
+        self._options, self._components, self._base = options or TurnedPoseOptions(), components, base
+        self._excluded: set[int] = set()
+        self._sums: list[float] = []
 
     @cached_property
-    def _all(self) -> list[Array]:
+    def turns(self) -> list[Turn]:
         """All turns; few parts need them."""
-        return base_symmetries(self._base, self._options)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether a turned pose may be the right one."""
-        return bool(self._turns)
+        return base_turns(self._components, self._base, self._options)
 
     @property
     def better(self) -> Array | None:
         """(4,4) from the tracked pose, on the model's side, to a turned one that is clearly better; None: none is."""
         best = int(np.argmax(self._sums)) if self._sums else 0
-        return self._turns[best] if self._sums and self._sums[best] > self._options.better else None
+        is_better = bool(self._sums) and self._sums[best] > self._options.better
+        return self.turns[best].model_from_model if is_better else None
 
-    def poses(self, cam_from_model: Array) -> tuple[Array, ...]:
-        """The poses (4,4) that fit as well as the tracked one, as far as was seen."""
-        return tuple(cam_from_model @ turn for turn in self._turns)
+    def open_turns(self, is_present: NDArray[np.bool_]) -> list[Turn]:
+        """The turns that nothing has excluded.
+
+        Args:
+            is_present: (C,) components seen at their nominal placements in the tracked pose; a turn in which one of
+                them would be where no component of its shape belongs is excluded.
+        """
+        is_seen = is_present & (np.arange(len(is_present)) != self._base)
+        return [
+            turn
+            for k, turn in enumerate(self.turns)
+            if k not in self._excluded and not np.any(is_seen & turn.unmatched()[0])
+        ]
 
     def reset(self) -> None:
         """Forget all comparisons."""
-        self._turns: list[Array] = []
-        self._sums: list[float] = []
-        self._is_compared = False
+        self._excluded, self._sums = set(), []
 
     def compare(self, cam_from_model: Array, evidence_at: Callable[[Array], TurnEvidence]) -> None:
-        """Compare the poses in one picture, and drop those that are clearly worse.
+        """Compare the poses in one picture, and exclude those that are clearly worse.
 
         Args:
             cam_from_model: (4,4) the tracked pose.
             evidence_at: the evidence for a pose in the picture.
         """
-        if not self._is_compared:
-            self._turns, self._sums, self._is_compared = list(self._all), [0.0] * len(self._all), True
-        if not self._turns:
+        self._sums = self._sums or [0.0] * len(self.turns)
+        if len(self._excluded) == len(self.turns):
             return
         o = self._options
         here = evidence_at(cam_from_model)
-        kept = []
-        for turn, total in zip(self._turns, self._sums, strict=True):
-            there = evidence_at(cam_from_model @ turn)
-            added = there.components - here.components + o.base_weight * (there.base - here.base)
-            total += float(np.clip(added, -o.max_added, o.max_added))
-            if total > o.worse:
-                kept.append((turn, total))
-        self._turns, self._sums = [turn for turn, _ in kept], [total for _, total in kept]
+        for k, turn in enumerate(self.turns):
+            if k in self._excluded:
+                continue
+            there = evidence_at(cam_from_model @ turn.model_from_model)
+            self._sums[k] += float(np.clip(self._gain(turn, here, there), -o.max_added, o.max_added))
+            if self._sums[k] <= o.worse:
+                self._excluded.add(k)
+
+    def best(self, cam_from_model: Array, evidence_at: Callable[[Array], TurnEvidence]) -> Array:
+        """The best (4,4) of a pose and those turned from it, by one picture; see `compare` for the arguments."""
+        if not self.turns:
+            return cam_from_model
+        here = evidence_at(cam_from_model)
+        poses = [cam_from_model @ turn.model_from_model for turn in self.turns]
+        gains = [self._gain(turn, here, evidence_at(pose)) for turn, pose in zip(self.turns, poses, strict=True)]
+        best = int(np.argmax(gains))
+        return poses[best] if gains[best] > 0.0 else cam_from_model
+
+    def _gain(self, turn: Turn, here: TurnEvidence, there: TurnEvidence) -> float:
+        """Log odds of a turned pose to the tracked one by what is seen in both."""
+        is_against, is_for = turn.unmatched()
+        gain = float(there.seen[is_for].sum() - here.seen[is_against].sum())
+        return gain if turn.is_exact else gain + self._options.base_weight * (there.base - here.base)
 
 
-def base_symmetries(base: Component, options: TurnedPoseOptions | None = None) -> list[Array]:
-    """Rotations (4,4) in the model frame, by 90° and 180°, after which most of a component's surface lies on itself."""
+def base_turns(components: Sequence[Component], base: int, options: TurnedPoseOptions | None = None) -> list[Turn]:
+    """Rotations by 90° and 180° after which most of the base's surface lies on itself, and what else they move."""
     o = options or TurnedPoseOptions()
-    diameter_mm = float(np.linalg.norm(np.ptp(base.bounds_in_model, axis=0)))
-    points = sample_surface(base, 0.01 * diameter_mm, o.max_samples).points
-    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    tree = cKDTree(points - center)
-    spacing_mm = 2.0 * float(np.median(tree.query(points - center, k=2)[0][:, 1]))
+    carrier = components[base]
+    diameter_mm = float(np.linalg.norm(np.ptp(carrier.bounds_in_model, axis=0)))
+    points = sample_surface(carrier, 0.01 * diameter_mm, o.max_samples).points
+    center = carrier.bounds_in_model.mean(axis=0)
+    tree, corners = cKDTree(points), cKDTree(carrier.vertices_in_model)
+    near_mm = max(o.same_share * diameter_mm, 2.0 * float(np.median(tree.query(points, k=2)[0][:, 1])))
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    found: list[Array] = []
-    for axes in (np.eye(3), principal):
-        for axis in axes:
-            for quarter in (2, 1, 3):
-                rotation = exp_so3(0.5 * np.pi * quarter * axis)
-                if any(np.trace(rotation.T @ other[:3, :3]) > 2.9 for other in found):
-                    continue
-                distance = tree.query((points - center) @ rotation.T)[0]
-                if np.mean(distance < max(o.same_share * diameter_mm, spacing_mm)) >= o.min_same:
-                    found.append(rigid(rotation, center - rotation @ center))
+    surfaces: list[Array] = []
+    found: list[Turn] = []
+    for axis in (*np.eye(3), *principal):
+        for quarter in (2, 1, 3):
+            rotation = exp_so3(0.5 * np.pi * quarter * axis)
+            if any(np.trace(rotation.T @ other.model_from_model[:3, :3]) > 2.9 for other in found):
+                continue
+            turned = rigid(rotation, center - rotation @ center)
+            if np.mean(tree.query(apply(turned, points))[0] < near_mm) < o.min_same:
+                continue
+            surfaces = surfaces or [sample_surface(one, 0.5 * near_mm, o.max_samples).points for one in components]
+            off_mm = float(corners.query(apply(turned, carrier.vertices_in_model))[0].max())
+            counterparts = _counterparts(surfaces, turned, near_mm, o.min_same)
+            found.append(Turn(turned, counterparts, off_mm < o.exact_share * diameter_mm))
+    return found
+
+
+def _counterparts(surfaces: Sequence[Array], turned: Array, near_mm: float, min_same: float) -> NDArray[np.int64]:
+    """(C,) index of the surface on which each one lies after a turn (4,4), or -1, by samples (N,3) of each."""
+    found = np.full(len(surfaces), -1)
+    trees = [cKDTree(points) for points in surfaces]
+    for c, points in enumerate(surfaces):
+        moved = apply(turned, points)
+        for d, other in enumerate(surfaces):
+            apart = (moved.min(axis=0) - other.min(axis=0), moved.max(axis=0) - other.max(axis=0))
+            if np.abs(apart).max() < near_mm and np.mean(trees[d].query(moved)[0] < near_mm) >= min_same:
+                found[c] = d
     return found

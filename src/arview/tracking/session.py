@@ -8,7 +8,9 @@ states are a table, see `session_state`.
 
 from __future__ import annotations
 
+import math
 import time
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +25,11 @@ from arview.detection.scene_change import SceneChange
 from arview.detection.search.local_search import LocalSearch
 from arview.errors import MismatchError
 from arview.fiducials.serial_code import SerialNumbers
-from arview.geometry import Array, apply, check_rigid, invert
+from arview.geometry import Array, apply, are_near, check_rigid, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Identity, Pose, TrackingState
 from arview.tracking.appearance_memory import AppearanceMemory
+from arview.tracking.base_detection import BaseDetection
 from arview.tracking.diagnosis import NOTHING_IN_VIEW, diagnose_loss, diagnose_picture, diagnose_search
 from arview.tracking.disambiguation import HypothesisSet
 from arview.tracking.estimate import Estimate
@@ -109,6 +112,9 @@ class TrackingSession:
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
         self._guided_init: GuidedInit | None = None
+        self._base: BaseDetection = (
+            BaseDetection(views, camera, model, o.detector, o.base_detection) if like is None else like._base
+        )
         self.components = AssemblyMonitor(views, camera, model)
         self.appearance_memory = AppearanceMemory(views, camera)
         self._scene = SceneChange(views, camera, o.scene_change)
@@ -279,15 +285,40 @@ class TrackingSession:
         searched = hide_specimens(image, self.others, self.views, self.camera)
         detections = self._detect_remembered(searched) if is_resting else self._detect(searched, searches)
         detections = [one for one in detections if not self._is_other(one.cam_from_model)]
+        reason = ""
         if detections:
-            start = detections[0].cam_from_model
-            s.hypotheses = HypothesisSet([invert(start) @ other for other in detections[0].alternatives])
-            return self._begin(image, start, o.lock_quality)
+            estimate, reason = self._begin_detected(image, detections[0], o.lock_quality)
+            if estimate is not None or is_resting:
+                return estimate, reason
         if not is_resting:
-            return None, self._diagnose(image, self.detector.best_rejected)
+            found = self._detect_base(searched, searches) if o.use_base_detection else None
+            if found is not None:
+                estimate, base_reason = self._begin_detected(image, found, math.inf)
+                if estimate is not None:
+                    return estimate, base_reason
+            return None, reason or self._diagnose(image, self.detector.best_rejected)
         if self._guide is not None and self.is_aligning:
             return self._align(image, self._guide)
         return None, s.reason
+
+    def _begin_detected(
+        self, image: NDArray[np.uint8], found: Detection, lock_quality: float
+    ) -> tuple[Estimate | None, str]:
+        """Accept a detection and its alternatives, see `_begin`."""
+        start = found.cam_from_model
+        self._state.hypotheses = HypothesisSet([invert(start) @ other for other in found.alternatives])
+        return self._begin(image, start, lock_quality)
+
+    def _detect_base(self, image: NDArray[np.uint8], searches: list[int] | None) -> Detection | None:
+        """Detect the base of the part alone; the other components are not expected until they are seen."""
+        found = [one for one in self._base.detect(image, searches) if not self._is_other(one.cam_from_model)]
+        if not found:
+            return None
+        pose = self.components.best_turned(image, found[0].cam_from_model)
+        self.tracker.refiner.part = self.components.base_lines(self._local.refiner.part, pose)
+        same_mm, same_deg = 0.25 * self.views.diameter_mm, 8.0
+        others = [other for other in found[0].alternatives if not are_near(other, pose, same_mm, same_deg)]
+        return replace(found[0], cam_from_model=pose, alternatives=tuple(others))
 
     def _is_other(self, cam_from_model: Array) -> bool:
         """Whether a pose (4,4) is that of another specimen."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from arview.detection.detector import DetectorOptions
 from arview.detection.scene_change import SceneChangeOptions
 from arview.errors import InputError
+from arview.tracking.base_detection import BaseDetectionOptions
 from arview.tracking.identity import IdentityOptions
 
 
@@ -20,6 +21,7 @@ class SessionOptions:
         use_texture: let the tracker use the part's own texture.
         use_recheck: run the detector's local search where a tracked pose is far from the predicted one.
         use_appearance_memory: remember how the part looks while it is tracked, and look for that after a loss.
+        use_base_detection: search for the base alone where the search for the whole part fails.
         lock_quality: a detection of this quality is accepted at once; a weaker one must be confirmed by a second frame.
             Near a given initial pose ``tracked_quality`` is enough.
         tracked_quality: quality needed to become ``tracked``.
@@ -40,6 +42,7 @@ class SessionOptions:
         min_in_picture: share of the outline inside the picture below which no pose is kept.
         distance_margin: factor by which a pose may be nearer or farther than the declared range.
         detector: options of the detector; None chooses them by the declared range.
+        base_detection: of the search for the base.
         identity: of the monitoring of the identity.
     """
 
@@ -48,6 +51,7 @@ class SessionOptions:
     use_texture: bool = True
     use_recheck: bool = True
     use_appearance_memory: bool = True
+    use_base_detection: bool = True
     lock_quality: float = 0.8
     tracked_quality: float = 0.5
     critical_quality: float = 0.25
@@ -66,6 +70,7 @@ class SessionOptions:
     min_in_picture: float = 0.25
     distance_margin: float = 2.0
     detector: DetectorOptions | None = None
+    base_detection: BaseDetectionOptions = field(default_factory=BaseDetectionOptions)
     identity: IdentityOptions = field(default_factory=IdentityOptions)
 
     def __post_init__(self) -> None:

@@ -1,0 +1,61 @@
+"""A part of which only the base is there: found by it, and nothing is said of the others before they are seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from arview.assembly.turned_poses import base_turns
+from arview.geometry import Array, apply
+from arview.pose import Presence
+from arview.tracking import TrackingSession
+from arview.tracking.base_detection import BaseDetection
+from helpers.synthetic import CAMERA, assembly, assembly_views, block, changed, picture, pose_from
+
+NAMES = tuple(one.name for one in assembly().components)
+PLATE = assembly().components[0]
+BARE = changed(assembly(), **dict.fromkeys(NAMES[1:]))
+
+
+def is_right(found: Array, truth: Array) -> bool:
+    """Whether a pose is the true one, or one in which the bare plate looks the same."""
+    turns = [np.eye(4), *(turn.model_from_model for turn in base_turns(assembly().components, 0))]
+    corners = PLATE.vertices_in_model
+    return any(np.abs(apply(found, corners) - apply(truth @ turn, corners)).max() < 6.0 for turn in turns)
+
+
+@pytest.mark.slow
+def test_a_bare_base_is_found() -> None:
+    detection = BaseDetection(assembly_views(), CAMERA, assembly())
+    for k in range(3):
+        pose = pose_from(-40 + 40 * k, 40, 520)
+        (found,) = detection.detect(picture(pose, BARE, seed=k, scene=k, noise=3.0), [0])
+        assert found.quality >= detection.options.min_quality
+        assert is_right(found.cam_from_model, pose)
+
+
+@pytest.mark.slow
+def test_only_some_full_searches_are_followed_by_one_of_the_base() -> None:
+    detection = BaseDetection(assembly_views(), CAMERA, assembly())
+    image = picture(pose_from(0, 40, 520), BARE, seed=1, scene=1)
+    assert [len(detection.detect(image, None)) for _ in range(3)] == [1, 0, 1]
+
+
+def test_a_part_of_one_component_has_no_base_to_look_for() -> None:
+    detection = BaseDetection(assembly_views(), CAMERA, block())
+    assert not detection.is_possible
+    assert detection.detect(np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8), None) == []
+
+
+@pytest.mark.slow
+def test_a_session_finds_a_bare_base_and_says_of_nothing_that_it_is_present() -> None:
+    session = TrackingSession(assembly_views(), CAMERA, assembly())
+    followed = 0
+    for k in range(10):
+        pose = pose_from(-20 + 4 * k, 40, 520)
+        result = session.process(picture(pose, BARE, seed=k, scene=2, noise=3.0), k, k / 30)
+        if result.cam_from_model is not None:
+            followed += 1
+            assert is_right(result.cam_from_model, pose)
+            assert not any(result.components[name].presence is Presence.PRESENT for name in NAMES[1:])
+    assert followed >= 8
