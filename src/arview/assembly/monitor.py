@@ -21,7 +21,7 @@ from arview.assembly.present_lines import PresentLines
 from arview.assembly.turned_poses import TurnedPoseOptions, TurnedPoses
 from arview.cad.model import Model
 from arview.camera import Camera
-from arview.geometry import Array, rigid
+from arview.geometry import Array, are_near, rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import ComponentPresence, Presence, Visibility
 from arview.refinement.view_model import PartView
@@ -140,6 +140,10 @@ class AssemblyMonitor:
         camera: of the pictures.
         model: of the guide views.
         options: see `MonitorOptions`.
+
+    Attributes:
+        is_placed: whether the pose is known to be that of the part; of one that rests on the base alone nothing is
+            called missing.
     """
 
     _state: MonitorState
@@ -175,6 +179,18 @@ class AssemblyMonitor:
     def unverified(self) -> tuple[str, ...]:
         """Names of components not yet confirmed at their nominal placement; none of a part of one component."""
         return self._names(~self._state.is_verified) if self._has_components else ()
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether components were observed, and none but the base was seen at its nominal placement."""
+        state = self._state
+        is_other = np.arange(len(state.log_odds)) != self._observer.base
+        return self._has_components and state.observations > 0 and not np.any(state.is_verified & is_other)
+
+    @property
+    def has_absent(self) -> bool:
+        """Whether a component probably is not where the CAD has it."""
+        return bool(self._is_suspect().any())
 
     @property
     def better_turn(self) -> Array | None:
@@ -221,8 +237,9 @@ class AssemblyMonitor:
     def reset(self) -> None:
         """Forget the observations since the part was found: another part may be in view."""
         self._turned.reset()
+        self.is_placed = True
         count = len(self._views.component_names)
-        self._said: tuple[tuple[int, bool, bytes], Mapping[str, ComponentPresence]] | None = None
+        self._said: tuple[tuple[int, bool, bool, bytes], Mapping[str, ComponentPresence]] | None = None
         self._state = MonitorState(
             log_odds=np.zeros(count),
             directions=DirectionEvidence(count, self._views.center_in_model, self.options.directions),
@@ -293,6 +310,11 @@ class AssemblyMonitor:
         is_base = np.arange(len(self._state.log_odds)) == self._observer.base
         return self._lines.update(~is_base, is_base, cam_from_model)
 
+    def is_same_but_turned(self, a: Array, b: Array, same_mm: float, same_deg: float) -> bool:
+        """Whether two poses (4,4) are the same within bounds, or would be if the base had no other components."""
+        turns = [np.eye(4), *(turn.model_from_model for turn in self._turned.turns)]
+        return any(are_near(a @ turn, b, same_mm, same_deg) for turn in turns)
+
     def best_turned(self, image: NDArray[np.uint8], cam_from_model: Array) -> Array:
         """Of a pose (4,4) and those in which the base looks the same, the one of which a picture shows most.
 
@@ -312,7 +334,7 @@ class AssemblyMonitor:
         if not self._has_components:
             return {}
         visibilities = self._visibilities(cam_from_model)
-        key = (self._state.observations, is_ambiguous, visibilities.tobytes())
+        key = (self._state.observations, is_ambiguous, self.is_placed, visibilities.tobytes())
         if self._said is None or self._said[0] != key:
             self._said = key, MappingProxyType(self._presence_now(visibilities, is_ambiguous))
         return self._said[1]
@@ -358,6 +380,8 @@ class AssemblyMonitor:
             # In the turned pose each component is what was found at the place of its counterpart.
             turned = np.where(turn.counterparts >= 0, found[turn.counterparts], Presence.UNVERIFIED)
             is_open |= (turned != found) & ((found == Presence.PRESENT) | state.is_missing)
+        if not self.is_placed and self.is_bare:
+            is_open |= state.is_missing
         is_open[self._observer.base] = False
         unsure = Presence.UNCERTAIN if is_ambiguous or self._is_suspect().any() else Presence.UNVERIFIED
         found[is_open] = unsure

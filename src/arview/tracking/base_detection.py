@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +17,7 @@ from arview.assembly.observation import base_of
 from arview.cad.model import Model, make_model
 from arview.camera import Camera
 from arview.detection.detector import Detection, Detector, DetectorOptions, options_for
+from arview.geometry import Array, apply
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 
@@ -25,6 +27,12 @@ class BaseDetectionOptions:
     """Options of the detection by the base.
 
     Attributes:
+        min_width: smaller side of the base's outline, in diameters of the base, below which a pose is not accepted: a
+            plate seen edge-on fits every strip.
+        recheck_frames: while no component but the base is seen, it is searched for again after so many frames, because
+            it may have been mistaken; no component is called missing before it is found there once more.
+        restless_frames: the same where the pose jumps while components are absent.
+        same_share, same_deg: distance in diameters and rotation within which two poses are the same.
         min_quality: probability below which a pose of the base is not accepted: bases are plainer than whole parts.
         full_every: every so many-th of the full searches of the whole part that fail is followed by one of the base.
         views: options of the base's guide views; they are fewer than those of the part, because they are made while a
@@ -32,6 +40,11 @@ class BaseDetectionOptions:
     """
 
     min_quality: float = 0.9
+    min_width: float = 0.25
+    recheck_frames: int = 15
+    restless_frames: int = 8
+    same_share: float = 0.1
+    same_deg: float = 12.0
     full_every: int = 2
     views: GuideViewOptions = field(default_factory=lambda: GuideViewOptions(subdivisions=3))
 
@@ -59,7 +72,7 @@ class BaseDetection:
         self._views, self._camera, self._model = views, camera, model
         self._detector_options = detector
         self._detector: Detector | None = None
-        self._full_searches = 0
+        self._full_searches = self._frames_since = 0
 
     @property
     def is_possible(self) -> bool:
@@ -80,8 +93,33 @@ class BaseDetection:
             self._full_searches += 1
             if not is_due:
                 return []
-        found = self.detector.detect(image, max_results=1, searches=searches)
-        return [one for one in found if one.quality >= self.options.min_quality]
+        self._frames_since = 0
+        found = self.detector.detect(image, searches=searches)
+        is_accepted = [one.quality >= self.options.min_quality and self._is_wide(one.cam_from_model) for one in found]
+        return [one for one, is_good in zip(found, is_accepted, strict=True) if is_good][:1]
+
+    def is_recheck_due(self, is_bare: bool, is_restless: bool) -> bool:
+        """Whether the base of a part that is followed is to be searched for again.
+
+        It is asked in each frame in which components are absent.
+
+        Args:
+            is_bare: no component but the base has been seen.
+            is_restless: the pose jumps.
+        """
+        self._frames_since += 1
+        wait = self.options.restless_frames if is_restless else self.options.recheck_frames
+        return (is_bare or is_restless) and self._frames_since >= wait
+
+    def _is_wide(self, cam_from_model: Array) -> bool:
+        """Whether enough of the base is seen at a pose (4,4) for it not to fit every strip."""
+        base = self._model.components[base_of(self._model)]
+        in_cam = apply(cam_from_model, base.vertices_in_model)
+        if in_cam[:, 2].min() <= 0.0:
+            return True
+        flat = (in_cam[:, :2] / in_cam[:, 2:]).astype(np.float32)
+        width = min(cv2.minAreaRect(flat)[1]) * float(in_cam[:, 2].mean())
+        return width >= self.options.min_width * float(np.linalg.norm(np.ptp(base.bounds_in_model, axis=0)))
 
     @property
     def detector(self) -> Detector:

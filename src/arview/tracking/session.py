@@ -293,8 +293,10 @@ class TrackingSession:
         if not is_resting:
             found = self._detect_base(searched, searches) if o.use_base_detection else None
             if found is not None:
+                self._expect_base(found.cam_from_model)
                 estimate, base_reason = self._begin_detected(image, found, math.inf)
                 if estimate is not None:
+                    self.components.is_placed = False
                     return estimate, base_reason
             return None, reason or self._diagnose(image, self.detector.best_rejected)
         if self._guide is not None and self.is_aligning:
@@ -310,15 +312,18 @@ class TrackingSession:
         return self._begin(image, start, lock_quality)
 
     def _detect_base(self, image: NDArray[np.uint8], searches: list[int] | None) -> Detection | None:
-        """Detect the base of the part alone; the other components are not expected until they are seen."""
+        """Detect the base of the part alone, and turn it as the picture shows the other components."""
         found = [one for one in self._base.detect(image, searches) if not self._is_other(one.cam_from_model)]
         if not found:
             return None
         pose = self.components.best_turned(image, found[0].cam_from_model)
-        self.tracker.refiner.part = self.components.base_lines(self._local.refiner.part, pose)
         same_mm, same_deg = 0.25 * self.views.diameter_mm, 8.0
         others = [other for other in found[0].alternatives if not are_near(other, pose, same_mm, same_deg)]
         return replace(found[0], cam_from_model=pose, alternatives=tuple(others))
+
+    def _expect_base(self, cam_from_model: Array) -> None:
+        """Let the tracker expect no component but the base until they are seen."""
+        self.tracker.refiner.part = self.components.base_lines(self._local.refiner.part, cam_from_model)
 
     def _is_other(self, cam_from_model: Array) -> bool:
         """Whether a pose (4,4) is that of another specimen."""
@@ -441,6 +446,9 @@ class TrackingSession:
     def _disambiguate(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> tuple[Estimate, str]:
         """Compare an ambiguous pose with its alternatives until the frames decide between them."""
         s = self._state
+        has_absent = self.options.use_base_detection and self.components.has_absent
+        if has_absent and self._base.is_recheck_due(self.components.is_bare, estimate.is_restless):
+            estimate = self._recheck_base(image, estimate)
         if (turn := self.components.better_turn) is not None:
             return self._restart(image, estimate.cam_from_model @ turn), reason
         if not s.hypotheses:
@@ -455,6 +463,20 @@ class TrackingSession:
         s.apply(Event.CONTRADICTED)
         poses = "another pose fits" if len(s.hypotheses) == 1 else f"{len(s.hypotheses)} other poses fit"
         return estimate, f"ambiguous: {poses} as well; show another side"
+
+    def _recheck_base(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
+        """Search again for a part of which little is seen, and go on where it is if that is elsewhere."""
+        o, found = self._base.options, self._detect_base(image, [0])
+        same_mm = o.same_share * self.views.diameter_mm
+        if found is None or self.components.is_same_but_turned(
+            found.cam_from_model, estimate.cam_from_model, same_mm, o.same_deg
+        ):
+            self.components.is_placed |= found is not None
+            return estimate
+        self._expect_base(found.cam_from_model)
+        estimate = self._restart(image, found.cam_from_model)
+        self.components.is_placed = False
+        return estimate
 
     def _check_components(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:
         """Check that the components are where the CAD has them; a part with a wrong one is never ``tracked``."""
