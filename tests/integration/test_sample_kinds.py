@@ -7,6 +7,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from arview.cad.part_file import load_part
 from helpers.paths import SAMPLES, TOOLS
@@ -125,9 +126,49 @@ def test_layouts_and_lens():
     assert (camera["fx"], camera["dist"][:2], camera["height"]) == (750.0, [-0.2, 0.05], 600)
 
 
+def test_photos_with_exif(kind, truth):
+    paths = sorted((SAMPLES / kind / "photos").iterdir())
+    assert [path.name for path in paths] == sorted(truth["cam_from_model_mm"])
+    assert len(paths) == 24
+    for path in paths:
+        with Image.open(path) as photo:
+            assert photo.size == (1600, 1200)
+            exif = photo.getexif()
+            details = exif.get_ifd(0x8769)
+        assert (exif[0x010F], exif[0x0110], exif[0x0112]) == ("arview", "sample", 1)
+        focal_px = details[0xA405] / 43.27 * np.hypot(1600, 1200)
+        assert focal_px == pytest.approx(truth["K"][0][0], rel=0.015)
+
+
 def test_size(kind):
     files = [p for p in (SAMPLES / kind).rglob("*") if p.is_file() and "__pycache__" not in p.parts]
     assert 0 < sum(path.stat().st_size for path in files) <= 12e6
+
+
+@pytest.mark.slow
+def test_truth_lies_on_the_photos_edges(kind, part, truth):
+    """CAD edges at their true place, projected; the picture's edges must not be shifted against them."""
+    edges = loaded(SAMPLES / "common" / "edges.py")
+    meshes = {}
+    for component in part.model.components:
+        if truth["truth"][component.name]["present"]:
+            pose = np.array(truth["truth"][component.name]["measured_from_nominal"])
+            vertices = component.vertices_in_model @ pose[:3, :3].T + pose[:3, 3]
+            meshes[component.name] = vertices, component.faces
+    points = edges.crease_points(meshes, BASES[kind], -np.inf)
+    matrix, distortion = np.array(truth["K"]), np.array([*truth["dist_k1_k2"], 0.0, 0.0])
+    for name in ("img_002.jpg", "img_011.jpg", "img_020.jpg"):
+        picture = cv2.imread(str(SAMPLES / kind / "photos" / name))
+        for wrong_px in (0.0, 1.0):
+            moved = matrix.copy()
+            moved[0, 2] += wrong_px
+            pixel, normal = edges.projected(points, np.array(truth["cam_from_model_mm"][name]), moved, distortion)
+            inside = np.all((pixel > 12) & (pixel < (1588, 1188)), axis=1)
+            offset, strength = edges.gradient_offsets(picture, pixel[inside], normal[inside])
+            shift = edges.common_shift(offset[strength > 12], normal[inside][strength > 12])
+            # Edges hidden by the part itself find other edges, which follow a shift less.
+            limit_px = 0.15 + 0.2 * wrong_px
+            assert max(abs(shift[0] + wrong_px), abs(shift[1])) < limit_px, f"{name}: {shift} px"
 
 
 def entry(name, displacement, uncertainty=0.05, verdict="pass", finding=None, angle_tolerance=None, center=None):
