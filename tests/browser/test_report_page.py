@@ -122,10 +122,10 @@ def test_surfaces_that_no_two_photos_saw_are_hatched(chromium: Any, tmp_path: Pa
         return float(np.mean((rgb[..., 0] > rgb[..., 2] + 60) & (rgb[..., 1] > rgb[..., 2] + 40)))
 
     with_hatching = hatched()
-    page.click("input[name=unseen]")
+    page.click("input[name=uncovered]")
     page.wait_for_timeout(500)
     without = hatched()
-    page.click("input[name=unseen]")
+    page.click("input[name=uncovered]")
     page.click("button[data-view=right]")
     page.wait_for_timeout(500)
     assert with_hatching > without + 0.005, (with_hatching, without)

@@ -61,6 +61,8 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
 @click.option("--scale-bar", "bars", multiple=True, metavar="SPEC", help="Known distance of two tags; see below.")
 @click.option("--scale-file", metavar="FILE", help="Boards, tags, scale bars and rig in one TOML file.")
 @click.option("--rig", metavar="FILE", help="Known camera poses in mm.")
+@click.option("--sparse", "poses", metavar="FOLDER|FILE",
+              help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.")  # fmt: skip
 @click.option("--masks", metavar="FOLDER", help="Masks as IMAGE.png, black where a photo is not to be used.")
 @click.option("--until", type=click.Choice(STAGES), default="dense", show_default=True, help="Last stage to do.")
 @click.option("--band", type=click.FloatRange(min=0.1), default=5.0, show_default=True, metavar="MM",
@@ -83,6 +85,7 @@ def reconstruct(
     bars: tuple[str, ...],
     scale_file: str | None,
     rig: str | None,
+    poses: str | None,
     masks: str | None,
     until: str,
     band: float,
@@ -114,6 +117,7 @@ def reconstruct(
         sparse=SparseOptions(seed=seed, threads=threads),
         sources=_sources(boards, tags, bars, scale_file, rig),
         dense=DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
+        poses=Path(poses) if poses else None,
         masks=Path(masks) if masks else None,
         last_stage=get_args(run.StageName)[STAGES.index(until)],
         starts_over=force,

@@ -85,6 +85,25 @@ def camera_of(camera: Any) -> Camera:
     return Camera(camera.width, camera.height, fx, fy, cx - HALF_PX, cy - HALF_PX, dist)
 
 
+def model_of_poses(posed: Sequence[tuple[Photo, Array]]) -> Any:
+    """A pycolmap reconstruction of posed photos without points; photo i has image id i + 1, a lens the id of its first.
+
+    Args:
+        posed: photos with ``cam_from_scan`` (4,4).
+    """
+    pycolmap = import_pycolmap()
+    model = pycolmap.Reconstruction()
+    ids: dict[str, int] = {}
+    for index, (photo, pose) in enumerate(posed):
+        if photo.lens not in ids:
+            camera = colmap_camera(photo.camera, photo.is_calibrated)
+            ids[photo.lens] = camera.camera_id = len(ids) + 1
+            model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=photo.name, camera_id=ids[photo.lens], image_id=index + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    return model
+
+
 def sparse_model_of(
     reconstruction: Any, photos: Sequence[Photo], unplaced: Sequence[tuple[str, str]] = ()
 ) -> SparseModel:

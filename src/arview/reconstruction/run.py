@@ -34,6 +34,7 @@ from arview.geometry import Array
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of, write_model
 from arview.reconstruction.coverage import Coverage, coverage
 from arview.reconstruction.dense import Cad, DenseOptions, read_ply, reconstruct_dense, write_ply
+from arview.reconstruction.given_poses import photos_with_poses, read_poses
 from arview.reconstruction.groups import groups_warning
 from arview.reconstruction.intake import (
     Intake,
@@ -46,7 +47,7 @@ from arview.reconstruction.intake import (
 from arview.reconstruction.intake.masks import with_masks
 from arview.reconstruction.quality import Quality, quality_of
 from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
-from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
+from arview.reconstruction.sparse import SparseOptions, reconstruct_from_poses, reconstruct_sparse
 from arview.reconstruction.types import DenseCloud, Photo, SparseModel
 from arview.version import __version__
 
@@ -67,6 +68,7 @@ class ReconstructOptions:
     scale: CadOptions = field(default_factory=CadOptions)
     sources: ScaleSources = field(default_factory=ScaleSources)
     dense: DenseOptions = field(default_factory=DenseOptions)
+    poses: Path | None = None  # camera poses made elsewhere, see `given_poses`; None: structure from motion
     masks: Path | None = None  # folder with a mask for each photo, black where it is not to be used
     last_stage: StageName = "dense"
     starts_over: bool = False  # discard what an earlier run left in the folder
@@ -157,6 +159,8 @@ class _ReconstructionRun:
             key = key_of([replace(photo, path=Path(), mask=None) for photo in intake.photos], self.options.sparse)
             masks = [photo.mask for photo in intake.photos if photo.mask is not None]
             key = key_of(key, content_key(photo.path for photo in intake.photos), content_key(masks))
+            if self.options.poses is not None:
+                key = key_of(key, [(one.name, one.cam_from_scan.tolist()) for one in read_poses(self.options.poses)])
             sparse = self._sparse(intake.photos, key)
         if last >= 2 and sparse is not None:
             part_key = None if self.part is None else (self.part.model.source_hash, self.part.effective_view_range)
@@ -206,11 +210,19 @@ class _ReconstructionRun:
         if self.stages.is_finished("sparse", key):
             return _read_sparse(folder, photos)
         self.stages.restart("sparse")
-        sparse = reconstruct_sparse(photos, folder, self.options.sparse, self.tell)
+        sparse = self._placed(photos, folder)
         _write_sparse(folder, sparse)
         self.stages.finish("sparse", key)
         self._record_time("sparse", began)
         return sparse
+
+    def _placed(self, photos: tuple[Photo, ...], folder: Path) -> SparseModel:
+        """The photos placed by structure from motion, or by the poses that were given."""
+        if self.options.poses is None:
+            return reconstruct_sparse(photos, folder, self.options.sparse, self.tell)
+        posed, left_out = photos_with_poses(photos, read_poses(self.options.poses), self.options.poses)
+        sparse = reconstruct_from_poses(posed, folder, self.options.sparse, self.tell)
+        return replace(sparse, unplaced=(*sparse.unplaced, *left_out))
 
     def _scale(self, photos: tuple[Photo, ...], sparse: SparseModel, key: str) -> ScaleResult:
         began = time.perf_counter()

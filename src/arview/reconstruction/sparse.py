@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,13 +23,21 @@ from arview.camera import Camera
 from arview.core.progress import Progress
 from arview.errors import CannotMeasureError
 from arview.geometry import Array, invert, skew
-from arview.reconstruction.colmap import CALIBRATED_MODEL, HALF_PX, colmap_camera, import_pycolmap, sparse_model_of
+from arview.reconstruction.colmap import (
+    CALIBRATED_MODEL,
+    HALF_PX,
+    colmap_camera,
+    import_pycolmap,
+    model_of_poses,
+    sparse_model_of,
+)
 from arview.reconstruction.covariance import pose_covariance
 from arview.reconstruction.features import FeatureOptions, Features, find_all_features
 from arview.reconstruction.groups import GroupOptions, linked_groups
 from arview.reconstruction.matching import Matches, epipolar_inliers, match_along_lines, match_descriptors
 from arview.reconstruction.still import StillOptions, moved_matches, still_features, still_remark, without
 from arview.reconstruction.types import Photo, SparseModel
+from arview.reconstruction.unplaced import unplaced_photos, why_nothing
 
 Pair = tuple[int, int]
 
@@ -76,17 +84,74 @@ def reconstruct_sparse(
     _write_database(database_path, photos, features, pairs, options)
     models = _map(database_path, folder, options, len(photos), tell)
     if not models or max(model.num_reg_images() for model in models) < 3:
-        raise CannotMeasureError("; ".join([_why_nothing(photos, features, pairs), *remarks]))
+        raise CannotMeasureError("; ".join([why_nothing(photos, features, pairs), *remarks]))
     chosen = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
     matches = _match_along_lines(chosen, photos, features, options, threads, tell, min_move_px)
     _write_matches(database_path, matches)
     chosen, adjuster = _triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
-    sparse, split = _main_group(chosen, adjuster, photos, options, threads)
-    _color(chosen, features)
-    chosen.write(str(_emptied(folder / "model")))
-    groups = _all_groups(sparse, split, models)
-    unplaced = _unplaced(photos, features, pairs, groups)
+    sparse, groups = _finished(chosen, adjuster, photos, features, folder, options, threads, models)
+    unplaced = unplaced_photos(photos, features, pairs, groups)
     return replace(sparse, unplaced=tuple(unplaced), groups=groups, remarks=tuple(remarks))
+
+
+def reconstruct_from_poses(
+    posed: Sequence[tuple[Photo, Array]],
+    folder: Path,
+    options: SparseOptions | None = None,
+    progress: Progress | None = None,
+) -> SparseModel:
+    """Points for photos whose poses are known, and all of them adjusted; otherwise as `reconstruct_sparse`.
+
+    Features are matched along the epipolar lines of the given poses, so that poses wrong by more than a few pixels
+    give no points.
+
+    Args:
+        posed: photos with their ``cam_from_scan`` (4,4).
+        folder: where COLMAP's database and model are left.
+        options: see `SparseOptions`.
+        progress: called with (what, done, total).
+
+    Raises:
+        CannotMeasureError: the photos have nothing in common along these lines.
+    """
+    options = options or SparseOptions()
+    tell = progress or (lambda stage, done, total: None)
+    threads = options.threads or os.cpu_count() or 1
+    folder.mkdir(parents=True, exist_ok=True)
+    photos = [photo for photo, _ in posed]
+    features, remarks = _moving_features(photos, options, threads, tell)
+    database_path = folder / "database.db"
+    _write_database(database_path, photos, features, {}, options)
+    model = model_of_poses(posed)
+    matches = _match_along_lines(model, photos, features, options, threads, tell)
+    _write_matches(database_path, matches)
+    try:
+        model, adjuster = _triangulate_and_adjust(model, database_path, folder, options, threads, tell)
+        sparse, groups = _finished(model, adjuster, photos, features, folder, options, threads, [])
+    except (CannotMeasureError, ValueError, RuntimeError) as error:
+        raise CannotMeasureError(
+            "the given poses do not fit the photos: features along their epipolar lines give no points; check that the "
+            f"poses belong to these photos ({error})"
+        ) from error
+    unplaced = unplaced_photos(photos, features, matches, groups)
+    return replace(sparse, unplaced=tuple(unplaced), groups=groups, remarks=tuple(remarks))
+
+
+def _finished(
+    model: Any,
+    adjuster: Any,
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    folder: Path,
+    options: SparseOptions,
+    threads: int,
+    models: Sequence[Any],
+) -> tuple[SparseModel, tuple[tuple[str, ...], ...]]:
+    """The main group of an adjusted model, written to the folder, and the names of all groups."""
+    sparse, split = _main_group(model, adjuster, photos, options, threads)
+    _color(model, features)
+    model.write(str(_emptied(folder / "model")))
+    return sparse, _all_groups(sparse, split, models)
 
 
 def _moving_features(
@@ -421,65 +486,5 @@ def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25)
     return adjuster
 
 
-# --- what could not be placed ----------------------------------------------------------------------------
-
-FEW_FEATURES = 200
-"""A photo with fewer features is blurred, or shows only bare surfaces."""
-
-
-def _unplaced(
-    photos: Sequence[Photo],
-    features: Sequence[Features],
-    pairs: dict[Pair, Matches],
-    groups: Sequence[Sequence[str]],
-) -> list[tuple[str, str]]:
-    """(name, reason) of every photo that is not in the first group."""
-    placed = set(groups[0])
-    reasons = []
-    for index, photo in enumerate(photos):
-        if photo.name in placed:
-            continue
-        partners = {photos[other].name for pair in pairs for other in pair if index in pair and other != index}
-        group = set(next((names for names in groups[1:] if photo.name in names), ()))
-        if len(features[index]) < FEW_FEATURES:
-            reason = f"only {len(features[index])} features: blurred, too dark, or nothing but bare surfaces in view"
-        elif len(group) > 1:
-            company = _some(group - {photo.name})
-            reason = f"has points in common only with {company}, but none, or too few, with the {len(placed)} used"
-        elif not partners:
-            reason = "nothing in common with the other photos: another part, or a view too far from the others"
-        elif not partners & placed:
-            reason = f"has something in common only with {_some(partners)}, but not with the other {len(placed)}"
-        else:
-            reason = "too little in common with the placed photos: take more photos between this view and theirs"
-        reasons.append((photo.name, reason))
-    return reasons
-
-
 def _names(model: Any) -> set[str]:
     return {model.images[image_id].name for image_id in model.reg_image_ids()}
-
-
-def _some(names: Iterable[str]) -> str:
-    """The first few of some names, for a message."""
-    listed = sorted(names)
-    return ", ".join(listed[:3]) + (f" and {len(listed) - 3} more" if len(listed) > 3 else "")
-
-
-def _why_nothing(photos: Sequence[Photo], features: Sequence[Features], pairs: dict[Pair, Matches]) -> str:
-    """Why no three photos could be placed together, and what to do."""
-    poor = [photo.name for photo, found in zip(photos, features, strict=True) if len(found) < FEW_FEATURES]
-    if 2 * len(poor) > len(photos):
-        return (
-            f"photos: {len(poor)} of {len(photos)} show almost no texture ({_some(poor)}); better light, or a "
-            "patterned mat or printed sheets around the part, give features"
-        )
-    if not pairs:
-        return (
-            f"photos: no two of the {len(photos)} have enough in common; take them 10 to 20 degrees apart, all of the "
-            "same part in one place"
-        )
-    return (
-        f"photos: no three of the {len(photos)} could be placed together ({len(pairs)} pairs have features in common); "
-        "take more, 10 to 20 degrees apart, moving the camera sideways rather than turning it"
-    )

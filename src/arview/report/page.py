@@ -408,7 +408,7 @@ def _viewer(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
     if scene is None:
         return {"scene": ""}
     cloud = scene.get("cloud", {})
-    has_unseen = bool(scene.get("unseen", {}).get("points"))
+    has_uncovered = bool(scene.get("uncovered", {}).get("points"))
     lead = ["Components at their design positions (transparent) and measured positions (solid)."]
     if "mesh" not in scene:
         lead = [
@@ -419,7 +419,7 @@ def _viewer(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
         lead.append(f"{shown:,} of the {cloud['of']:,} points of the cloud.")
     else:
         lead.append(evidence.absent.get("cloud", "There is no cloud."))
-    if has_unseen:
+    if has_uncovered:
         lead.append("Hatched: surfaces that no two photos saw; the CAD model stands in for them.")
     modes = [(name, text) for name, text in (("photo", "photos"), ("distance", "distance to the CAD model"))
              if ("colors" if name == "photo" else "distances") in cloud]  # fmt: skip
@@ -427,7 +427,7 @@ def _viewer(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
         "scene": Markup(scene_json(scene)),
         "scene_lead": " ".join(lead),
         "has_mesh": "mesh" in scene,
-        "has_unseen": has_unseen,
+        "has_uncovered": has_uncovered,
         "cloud_modes": modes,
         "exaggerations": _EXAGGERATIONS,
         "exaggeration": round(scene.get("arrow_scale", 1.0)),

@@ -63,7 +63,7 @@ def make_scene(
     if model is not None:
         scene["mesh"] = _mesh(model)
         if sparse is not None and sparse.photos:
-            scene["unseen"] = _unseen(model, sparse)
+            scene["uncovered"] = _uncovered(model, sparse)
         scene["arrow_scale"] = arrow_scale(inspection, model.diameter_mm, OverlayOptions())
     points = _points(cloud, model, distances, options)
     if points is not None:
@@ -111,7 +111,7 @@ def _mesh(model: Model) -> dict[str, Any]:
     return {**_packed(vertices), "faces": _text(faces.astype("<u4")), "ranges": ranges}
 
 
-def _unseen(model: Model, sparse: SparseModel) -> dict[str, Any]:
+def _uncovered(model: Model, sparse: SparseModel) -> dict[str, Any]:
     """Pieces of the surface that no two photos saw, three corners each, and their share of each component's surface."""
     surface = seen_surface(model, [(photo.camera, photo.cam_from_scan) for photo in sparse.photos])
     corners = surface.corners[~surface.is_seen].reshape(-1, 3)

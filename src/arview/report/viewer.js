@@ -44,8 +44,8 @@
     const controls = new THREE.OrbitControls(camera, renderer.domElement);
     controls.enableDamping = false;
     const groups = { design: new THREE.Group(), measured: new THREE.Group(), cloud: new THREE.Group(),
-                     arrows: new THREE.Group(), names: new THREE.Group(), unseen: new THREE.Group() };
-    for (const key of ["design", "measured", "cloud", "arrows", "unseen"]) world.add(groups[key]);
+                     arrows: new THREE.Group(), names: new THREE.Group(), uncovered: new THREE.Group() };
+    for (const key of ["design", "measured", "cloud", "arrows", "uncovered"]) world.add(groups[key]);
 
     const box = new THREE.Box3();
     const pickable = [];
@@ -99,9 +99,9 @@
 
     // ---- surfaces that no two photos saw: the CAD model stands in for them, hatched in the plane
     // of the picture. Faces that look away are left out: the design is transparent, and the underside would show.
-    if (scene.unseen && scene.unseen.points) {
+    if (scene.uncovered && scene.uncovered.points) {
       const geometry = new THREE.BufferGeometry();
-      geometry.setAttribute("position", new THREE.BufferAttribute(points(scene.unseen), 3));
+      geometry.setAttribute("position", new THREE.BufferAttribute(points(scene.uncovered), 3));
       geometry.computeVertexNormals();
       const material = new THREE.MeshLambertMaterial({
         color: 0xc9a227, side: THREE.FrontSide, polygonOffset: true, polygonOffsetFactor: -1, polygonOffsetUnits: -1 });
@@ -110,7 +110,7 @@
         shader.fragmentShader = shader.fragmentShader.replace("void main() {",
           `void main() {\n  if (mod(gl_FragCoord.x + gl_FragCoord.y, ${period}) > ${width}) discard;`);
       };
-      groups.unseen.add(new THREE.Mesh(geometry, material));
+      groups.uncovered.add(new THREE.Mesh(geometry, material));
     }
 
     // ---- the cloud, coloured by the photos or by distance
@@ -196,7 +196,7 @@
         if (component.distance != null) line(`distance ${number(component.distance, component.digits)} ± ${number(component.uncertainty, component.digits)} mm`);
         component.displacement.forEach((value, k) => line(`d${"xyz"[k]} ${number(value, component.digits)}${value === null ? "" : " mm"}`));
       }
-      const share = scene.unseen ? scene.unseen.shares[scene.components.indexOf(component)] : 0;
+      const share = scene.uncovered ? scene.uncovered.shares[scene.components.indexOf(component)] : 0;
       if (share >= 0.005) line(`${Math.round(100 * share)} % of its surface was seen by fewer than two photos`);
       panel.hidden = false;
     }
