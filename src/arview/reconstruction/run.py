@@ -45,6 +45,7 @@ from arview.reconstruction.intake import (
     undistort_photos,
 )
 from arview.reconstruction.intake.masks import with_masks
+from arview.reconstruction.intake.sensor import share_lenses
 from arview.reconstruction.quality import Quality, quality_of
 from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
 from arview.reconstruction.sparse import SparseOptions, reconstruct_from_poses, reconstruct_sparse
@@ -185,6 +186,8 @@ class _ReconstructionRun:
             intake = self._frames(Path(source), camera)
         else:
             intake = intake_photos(source, camera, progress=lambda i, n: self.tell("photos", i, n))
+            if self.options.poses is None and self.options.masks is None:  # both are made for upright photos
+                intake = share_lenses(intake, self.folder / "turned")
         if self.options.masks is not None:
             intake = with_masks(intake, self.options.masks)
         intake = undistort_photos(intake, self.folder / "undistorted", lambda i, n: self.tell("photos", i, n))

@@ -25,7 +25,7 @@ class Lens:
     """One lens at one zoom and picture size, whose photos share their intrinsics.
 
     Portrait and landscape photos of one phone are two lenses here, because their upright pictures have different
-    cameras.
+    cameras; `share_lenses` joins them.
 
     Attributes:
         key: unique and readable ("iPhone 12 4.2 mm 4032×3024").
