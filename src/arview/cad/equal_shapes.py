@@ -24,7 +24,7 @@ class ShapeSearchOptions:
         max_shapes: shapes that are searched.
     """
 
-    max_faces: int = 400_000
+    max_faces: int = 150_000
     max_shapes: int = 120
 
 

@@ -52,12 +52,17 @@ class MeshEdges:
 
 
 def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
-    """The edges of all components of a model, whose vertices are merged when they are within a micrometre."""
+    """The edges of all components of a model, with vertices within a micrometre merged.
+
+    In models smaller than a centimetre it is a ten-thousandth of the diameter.
+    """
     vertices, faces, component_of_face = model.mesh
     # Vertices are merged inside a component only: components that touch keep their own outlines.
     owner = np.zeros(len(vertices), dtype=np.int64)
     owner[faces.ravel()] = np.repeat(component_of_face, 3)
-    keys = np.concatenate([np.round(vertices * 1000.0).astype(np.int64), owner[:, None]], axis=1)
+    keys = np.concatenate(
+        [np.round(vertices * max(1000.0, 1e4 / model.diameter_mm)).astype(np.int64), owner[:, None]], axis=1
+    )
     _, first, welded = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     faces = first[welded.ravel()][faces].astype(np.int32)
     corners = vertices[faces]
@@ -166,6 +171,7 @@ def _sample_visible(
     owners = np.empty(capacity, dtype=np.int32)
     found = 0
     carry = 0.5
+    near = min(1.0, depth_tolerance)  # parts of a millimetre are seen from nearer than one
     for e in range(ends.shape[0]):
         a = vertices[ends[e, 0]]
         b = vertices[ends[e, 1]]
@@ -177,7 +183,7 @@ def _sample_visible(
             continue
         ax, ay, az = _to_cam(rotation, translation, a)
         bx, by, bz = _to_cam(rotation, translation, b)
-        if az < 1.0 or bz < 1.0:
+        if az < near or bz < near:
             continue
         du = fx * (bx / bz - ax / az)
         dv = fy * (by / bz - ay / az)

@@ -141,7 +141,7 @@ def rasterise(
     cy: float,
     width: int,
     height: int,
-    near_mm: float = 1.0,
+    near_mm: float | None = None,
     origin: tuple[int, int] = (0, 0),
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Z-buffer of a mesh in the view of an ideal pinhole camera.
@@ -151,7 +151,8 @@ def rasterise(
         faces: (F,3) vertex indices; both sides are drawn.
         fx, fy, cx, cy: intrinsics in px, pixel centres at integers.
         width, height: size of the buffer, px.
-        near_mm: depth of the near plane, at which geometry is clipped.
+        near_mm: depth of the near plane, at which geometry is clipped; None takes 1, or a hundredth of the largest
+            depth if that is less, for parts of a millimetre.
         origin: (u, v) of the buffer's first pixel, to draw a window of a larger image.
 
     Returns:
@@ -159,6 +160,8 @@ def rasterise(
     """
     inverse_depth = np.zeros((height, width))
     face_ids = np.full((height, width), -1, dtype=np.int32)
+    if near_mm is None:
+        near_mm = min(1.0, max(0.01 * float(np.max(points_in_cam[:, 2], initial=0.0)), 1e-6))
     fill_buffers(
         np.ascontiguousarray(points_in_cam, dtype=np.float64),
         faces, fx, fy, cx, cy, near_mm, origin[0], origin[1], inverse_depth, face_ids,
