@@ -134,3 +134,11 @@ def test_distances_in_metres_are_asked_about(tmp_path: Path) -> None:
     (tmp_path / "q.toml").write_text('[part]\ncad = "a.glb"\n[components.post]\nposition_tolerance_mm = 0\n')
     done = CliRunner().invoke(main, ["check", str(tmp_path / "q.toml")])
     assert "position_tolerance_mm = 0: expected a positive number" in done.output
+
+
+def test_parts_that_are_too_near_to_be_tracked_are_told() -> None:
+    part = assembly(2)
+    tiny = tuple(replace(one, vertices_in_model=one.vertices_in_model * 0.01) for one in part.model.components)
+    said = [f.text for f in check_part(replace(part, model=make_model("a", tiny))).findings if f.severity == "problem"]
+    assert any("detection and tracking need 3 mm and more" in text for text in said)
+    assert not any("need 3 mm" in f.text for f in check_part(part).findings)

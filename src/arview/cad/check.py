@@ -36,6 +36,9 @@ MANY_TRIANGLES = 200_000
 """Number of triangles above which guide views are rendered slowly, without any gain."""
 
 
+MIN_TRACKED_MM = 3.0
+"""Distance from the camera below which detection and tracking were not made to work: steps there are absolute."""
+
 GATHERED_ROWS = 40
 """Number of components from which equal rows of the table become one."""
 
@@ -258,6 +261,9 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Pa
                 f"at {near_mm:.0f} mm the part is {share:.1f} pictures wide: little of its contour is visible",
             )
         )
+    if near_mm < MIN_TRACKED_MM:
+        text = f"the nearest distance is {near_mm:.2g} mm: detection and tracking need {MIN_TRACKED_MM:g} mm and more"
+        findings.append(PartFinding("problem", text))
     across_px = camera.fx * diameter_mm / far_mm
     if across_px < 60.0:
         findings.append(

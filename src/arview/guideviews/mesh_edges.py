@@ -171,7 +171,6 @@ def _sample_visible(
     owners = np.empty(capacity, dtype=np.int32)
     found = 0
     carry = 0.5
-    near = min(1.0, depth_tolerance)  # parts of a millimetre are seen from nearer than one
     for e in range(ends.shape[0]):
         a = vertices[ends[e, 0]]
         b = vertices[ends[e, 1]]
@@ -183,7 +182,7 @@ def _sample_visible(
             continue
         ax, ay, az = _to_cam(rotation, translation, a)
         bx, by, bz = _to_cam(rotation, translation, b)
-        if az < near or bz < near:
+        if min(az, bz) < min(1.0, depth_tolerance):
             continue
         du = fx * (bx / bz - ax / az)
         dv = fy * (by / bz - ay / az)
