@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Callable
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, cast
 
 from arview.cad.formats.raw import UNIT_MM
-from arview.cad.load import SUFFIXES, load_cad
+from arview.cad.load import SUFFIXES, LoadedCad, load_cad
 from arview.cad.model import Model, make_model
 from arview.cad.part import (
     DOF_NAMES,
@@ -153,15 +154,37 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
         settings = tuple(ComponentSettings(component.name) for component in cad.model.components)
         return Part(path.stem, path, path, cad.model, settings, up=cad.up, notes=cad.notes, paths=cad.paths)
     try:
-        content = tomllib.loads(path.read_bytes().decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        text = path.read_bytes().decode("utf-8")
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    return _read_part(TomlTable(path, "", content), path, unit)
+    return part_from_text(text, path, unit)
 
 
-def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
+def part_from_text(
+    text: str, path: str | Path, unit: str | None = None, load: Callable[..., LoadedCad] = load_cad
+) -> Part:
+    """The part that the text of a part file describes.
+
+    Args:
+        text: TOML, see PART_FILE_EXAMPLE.
+        path: where the file is, or will be; the CAD file is relative to it.
+        unit: as in `load_part`.
+        load: reads the CAD file; who edits a text again and again keeps what it has read.
+
+    Raises:
+        InputError: as `load_part`.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    return _read_part(TomlTable(path, "", content), path, unit, load)
+
+
+def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[..., LoadedCad]) -> Part:
     for key in ("part", "view_range", "guides", "defaults", "components", "symmetry", "datums"):
         root.known(key)
     root.finish()
@@ -180,7 +203,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None) -> Part:
         raise InputError(f"{path}: [part] cad = {str(head.content['cad'])!r}: there is no file {cad_path}")
     view_range = _read_view_range(root.table("view_range")) if "view_range" in root.content else None
     guides = _read_guides(root.table("guides"))
-    cad = load_cad(cad_path, unit or own_unit, cast(float, tol_linear_mm), cast(float, tol_angular_deg))
+    cad = load(cad_path, unit or own_unit, cast(float, tol_linear_mm), cast(float, tol_angular_deg))
     up = cast(Up, own_up or cad.up)
     view_range = replace(view_range, up=up) if view_range else None
     names = [component.name for component in cad.model.components]
