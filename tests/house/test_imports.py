@@ -26,6 +26,7 @@ ROOMS = (
     ("measurement",),
     ("report", "history", "calibration", "acceptance", "evaluation"),
     ("live",),
+    ("studio",),
     ("workflow",),
     ("cli",),
 )

@@ -22,7 +22,7 @@ from arview.live.security.access import Access
 from arview.live.security.addresses import LOOPBACK
 from arview.live.security.limits import MAX_ADDRESSES, RateLimit
 from arview.live.security.refusals import Refusal
-from arview.live.server.app import page_files
+from arview.live.server.app import static_files
 from arview.live.server.uvicorn_server import TimeLimitedProtocol
 from arview.live.stream.frames import to_jpeg
 from helpers.live_client import Http, Running, running
@@ -152,7 +152,7 @@ def test_no_file_but_the_listed_ones_can_be_had(page: Http, path: str) -> None:
 
 
 def test_what_is_served_is_what_pages_need() -> None:
-    served = page_files()
+    served = static_files("arview.live")
     assert {"index.html", "watch.html", "main.js", "web/three.min.js"} <= set(served)
     assert not [
         name for name in served if name.endswith((".py", ".pem", ".key", ".map")) or name.startswith((".", "/"))

@@ -1,4 +1,4 @@
-"""The command guideviews: the guide views of a part, rendered into a file."""
+"""The commands guideviews (the guide views of a part into a file) and studio (a page to set up a part)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import time
 
 import click
 
-from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, write_bytes
+from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, say, write_bytes
+from arview.cli.exit_codes import ExitCode
 from arview.errors import OutputError
 
 
@@ -66,3 +67,54 @@ def guideviews(
         _, png = cv2.imencode(".png", cv2.cvtColor(contact_sheet(model, views, unique=unique), cv2.COLOR_RGB2BGR))
         write_bytes(preview_path, png.tobytes())
         click.echo(f"wrote {preview_path}")
+
+
+@main.command(
+    short_help="Set up a part on a page: datums, range, guide views.",
+    epilog="""\b
+Examples:
+  arview studio bracket.step
+  arview studio part.toml --port 8500
+
+\b
+Opens a page for the browser of this machine; nothing leaves it. There roles, colours and tolerances are set in the
+assembly tree, a click on a plane, hole, cylinder or edge makes it a datum, the range of viewpoints is dragged, guide
+views are shown with what weakens them and what would help, photos are planned, and a picture or clip is tried. Save
+writes part.toml beside the CAD (comments are kept); guide views (.gv), a contact sheet and a sheet to print for the
+station can be written, too. What the page does can be done by hand: in the part file (`arview check --help`), and by
+the commands check, guideviews and annotate.""",
+)
+@click.argument("part", metavar="PART")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8460, show_default=True, help="Port of the page; 0: any."
+)
+@UNIT
+@click.option("--no-browser", is_flag=True, help="Print the address, open no browser.")
+@click.pass_context
+def studio(ctx: click.Context, part: str, port: int, unit: str | None, no_browser: bool) -> None:
+    """Set up PART, a CAD or part file, on a local page."""
+    import asyncio
+    import signal
+    import webbrowser
+
+    from arview.cli.live import require_extra
+
+    require_extra()
+    from arview.studio.document import StudioDocument
+    from arview.studio.server import StudioServer
+
+    server = StudioServer(StudioDocument(part, unit), port)
+
+    async def serve() -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, server.stop)
+        await server.serve(ready)
+
+    def ready() -> None:
+        click.echo(f"studio: {server.link}")
+        say("Ctrl-C ends it; the part file is written by Save only")
+        if not no_browser:
+            webbrowser.open(server.link)
+
+    asyncio.run(serve())
+    ctx.exit(ExitCode.INTERRUPTED)

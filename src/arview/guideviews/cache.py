@@ -19,7 +19,7 @@ from arview.version import __version__
 def cached_path(model: Model, view_range: ViewRange, options: GuideViewOptions) -> Path:
     """The file of the set of a model, range and options; each version of the code has files of its own."""
     key = repr((model.source_hash, asdict(view_range), asdict(options), __version__, _code_hash()))
-    name = f"{model.source_hash[:12]}-{hashlib.sha256(key.encode()).hexdigest()[:16]}.guideviews"
+    name = f"{model.source_hash[:12]}-{hashlib.sha256(key.encode()).hexdigest()[:16]}.gv"
     return cache_folder() / "guideviews" / name
 
 

@@ -58,7 +58,7 @@ def contact_sheet(
     count = min(max_views, len(views))
     chosen = order[((np.arange(count) + 0.5) * len(views) / count).astype(np.intp)]
     renderer = ZBufferRenderer(model, views.camera.scaled(2 * tile_px, 2 * tile_px))
-    tiles = [_tile(renderer, views, int(index), unique, tile_px) for index in chosen]
+    tiles = [view_tile(renderer, views, int(index), unique, tile_px) for index in chosen]
     columns = min(columns, count)
     height, width = tiles[0].shape[:2]
     rows = -(-count // columns)
@@ -73,7 +73,7 @@ def contact_sheet(
     return sheet
 
 
-def _tile(
+def view_tile(
     renderer: ZBufferRenderer, views: GuideViewSet, index: int, unique: Uniqueness, tile_px: int
 ) -> NDArray[np.uint8]:
     """A tile (tile_px + caption, tile_px, 3): one view and its caption."""

@@ -7,6 +7,7 @@ import json
 import logging
 import mimetypes
 import time
+from collections.abc import Awaitable, Callable
 from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import Any
@@ -34,6 +35,8 @@ from arview.live.stream.frames import DecodedFrame, IncomingFrame, from_jpeg
 from arview.live.transport.motion_jpeg import MotionJpeg
 
 logger = logging.getLogger("arview.live")
+
+ErrorHandler = Callable[[Request, Exception], Awaitable[Response]]
 
 SERVED_SUFFIXES = {".html", ".js", ".css", ".svg", ".png", ".webmanifest", ".woff2", ".txt", ".json"}
 """Suffixes of the static files that are served."""
@@ -63,10 +66,8 @@ def make_app(hub: Hub, access: Access, connections: ConnectionTable | None = Non
         Route(f"{client}/snapshot.png", handlers.annotated_png),
         Route("/api/recordings/{number:int}", handlers.recording),
     ]
-    app = Starlette(
-        routes=routes,
-        exception_handlers={Refusal: _refused, HTTPException: _http_error, StuckError: _stuck, Exception: _bug},
-    )
+    handlers_of_errors = {**refusal_handlers(), HTTPException: _http_error, StuckError: _stuck}
+    app = Starlette(routes=routes, exception_handlers=handlers_of_errors)
     strangers = RateLimit(limits.strangers_per_s, limits.strangers_burst)
     return Gate(app, access, RateLimit(limits.per_s, limits.burst), connections, strangers)
 
@@ -79,7 +80,7 @@ class Handlers:
         limits = hub.options.requests
         self._joins = RateLimit(limits.joins_per_s, limits.joins_burst)
         self._snapshots = RateLimit(limits.images_per_s, limits.images_burst)
-        self._files = page_files()
+        self._files = static_files("arview.live")
 
     async def index(self, request: Request) -> Response:
         """The page."""
@@ -241,8 +242,13 @@ class Handlers:
         return _jpeg_response(await asyncio.to_thread(lambda: client.annotator.draw(tracked).jpeg), tracked)
 
 
-def page_files() -> dict[str, tuple[bytes, str]]:
-    """Content and media type of the static files by their path: those of the page, and under ``web/`` shared ones."""
+def refusal_handlers() -> dict[type[Exception], ErrorHandler]:
+    """What answers to refusals and to bugs."""
+    return {Refusal: _refused, Exception: _bug}
+
+
+def static_files(package: str) -> dict[str, tuple[bytes, str]]:
+    """Content and media type of static files by path: those of a package's ``page``, and under ``web/`` shared ones."""
     files: dict[str, tuple[bytes, str]] = {}
 
     def add(folder: Traversable, prefix: str) -> None:
@@ -254,7 +260,7 @@ def page_files() -> dict[str, tuple[bytes, str]]:
                 media_type = _TYPES.get(suffix) or mimetypes.guess_type(entry.name)[0] or "application/octet-stream"
                 files[f"{prefix}{entry.name}"] = entry.read_bytes(), media_type
 
-    add(resources.files("arview.live") / "page", "")
+    add(resources.files(package) / "page", "")
     add(resources.files("arview.web"), "web/")
     return files
 

@@ -1,0 +1,50 @@
+"""The life cycle of the studio's server, which is reached from this machine only."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from arview.live.security.access import Access
+from arview.live.security.addresses import LOOPBACK
+from arview.live.server.live_server import open_endpoint
+from arview.live.server.uvicorn_server import UvicornServer
+from arview.studio.app import make_app
+from arview.studio.document import StudioDocument
+
+
+class StudioServer:
+    """Serves the studio of one part at the loopback address.
+
+    Args:
+        document: the part.
+        port: of the page; 0 stands for any free one.
+
+    Raises:
+        InputError: the port is not available.
+    """
+
+    def __init__(self, document: StudioDocument, port: int) -> None:
+        self._endpoint = open_endpoint(None, port, is_plain=True)
+        self.access = Access.to([LOOPBACK, "localhost"], self._endpoint.port, is_secure=False)
+        self._server = UvicornServer(make_app(document, self.access), self._endpoint.listener)
+
+    @property
+    def port(self) -> int:
+        """Port of the page."""
+        return self._endpoint.port
+
+    @property
+    def link(self) -> str:
+        """URL of the page with the token of this run."""
+        return f"http://{LOOPBACK}:{self.port}/?token={self.access.token}"
+
+    def stop(self) -> None:
+        """Make `serve` end."""
+        self._server.stop()
+
+    async def serve(self, on_ready: Callable[[], None] = lambda: None) -> None:
+        """Serve until `stop`."""
+        task = asyncio.ensure_future(self._server.run_until_stopped())
+        on_ready()
+        await task
